@@ -1,0 +1,1 @@
+"""The ``aenerf`` command, one file for each subcommand."""

@@ -1,0 +1,25 @@
+"""``aenerf``: what Nerfstudio's own commands do not do."""
+
+from __future__ import annotations
+
+import sys
+
+import tyro
+
+from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.errors import DataError
+
+
+def main() -> None:
+    """Entry point of the ``aenerf`` command. Bad input ends it with one line and exit status 1."""
+    command = tyro.extras.subcommand_cli_from_dict(
+        {"simulate": Simulate}, prog="aenerf", description="AE-NeRF tools; train with ns-train aenerf."
+    )
+    try:
+        command.main()
+    except (DataError, ValueError) as error:
+        sys.exit(f"Error: {error}")
+
+
+if __name__ == "__main__":
+    main()

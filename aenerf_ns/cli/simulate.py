@@ -1,0 +1,108 @@
+"""``aenerf simulate``: a dataset of a built-in scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.scenes import built_in_scene
+from aenerf_ns.simulation import Simulation
+from aenerf_ns.trajectory.noise import perturb
+from aenerf_ns.trajectory.trajectory import homogeneous
+
+
+@dataclass
+class Simulate:
+    """Simulate an event camera that moves through a built-in scene, and write a dataset for ns-train aenerf."""
+
+    output: Path
+    """Dataset folder to create."""
+    scene: Literal["room", "object"] = "room"
+    """A furnished room seen from inside, or an object seen from around it."""
+    speed: Literal["easy", "hard"] = "easy"
+    """Constant speed, or the same path at 8^sin(2 pi t) times that speed."""
+    width: int = 346
+    """Pixel columns of the sensor."""
+    height: int = 260
+    """Pixel rows of the sensor."""
+    duration: float = 4.0
+    """Seconds that the path takes at constant speed."""
+    pose_rate: float = 250.0
+    """Poses a second in the trajectories."""
+    pose_noise_degrees: float = 0.0
+    """Error of the estimated rotations: root mean square of its angle, in degrees."""
+    pose_noise_translation: float = 0.0
+    """Error of the estimated positions: root mean square of its length, in scene units (metres)."""
+    pose_noise_correlation_time: float = 0.25
+    """Seconds over which the pose errors are alike."""
+    positive_contrast_threshold: float = 0.25
+    """C+: rise of log-radiance that triggers an event."""
+    negative_contrast_threshold: float = 0.25
+    """C-: fall of log-radiance that triggers an event."""
+    contrast_threshold_spread: float = 0.0
+    """Standard deviation of the thresholds over the pixels."""
+    refractory_period_ns: int = 0
+    """Time for which a pixel is blind after each event, in nanoseconds."""
+    bayer_pattern: BayerPattern = ""
+    """RGGB for a colour sensor."""
+    max_displacement: float = 0.5
+    """Pixels that the image may move between two rendered frames."""
+    train_images: int = 50
+    """Reference images along the trajectory. They are never trained on."""
+    validation_views: int = 20
+    """Reference views around the trajectory, for colour correction."""
+    test_views: int = 20
+    """Reference views from novel places, for evaluation."""
+    seed: int = 0
+    """Seed of everything random: the scene, the sensor, the pose noise and the test views."""
+
+    def main(self) -> None:
+        """Renders the scene along its path and writes the dataset."""
+        scene = built_in_scene(self.scene, self.seed)
+        focal_length = scene.focal_length_ratio * self.width
+        camera = EventCamera(self.width, self.height, focal_length, focal_length, self.width / 2, self.height / 2)
+        sensor = SensorModel(
+            self.positive_contrast_threshold,
+            self.negative_contrast_threshold,
+            self.refractory_period_ns,
+            self.bayer_pattern,
+        )
+        simulation = Simulation(scene, camera, sensor, self.speed, self.duration, self.seed)
+        truth = simulation.trajectory(self.pose_rate)
+        estimated = perturb(
+            truth,
+            self.pose_noise_degrees,
+            self.pose_noise_translation,
+            self.pose_noise_correlation_time,
+            self.seed,
+        )
+        num_events = 0
+        with NativeDatasetWriter(self.output, camera, sensor, "srgb", scene.aabb) as writer:
+            writer.add_trajectories(estimated, truth)
+            for events in simulation.events(self.max_displacement, self.contrast_threshold_spread):
+                writer.events.append(*events)
+                num_events += len(events[0])
+            for time in np.linspace(truth.start, truth.end, self.train_images, dtype=np.int64).tolist():
+                # The picture shows what is true; the pose beside it is what the user of the dataset is given.
+                pose = homogeneous(estimated.interpolate(time))
+                writer.add_image("train", simulation.reference_image(simulation.pose(time)), pose, time)
+            for split, poses in (
+                ("val", scene.validation_views(self.validation_views)),
+                ("test", scene.test_views(self.test_views, self.seed)),
+            ):
+                for pose in torch.from_numpy(poses):
+                    writer.add_image(split, simulation.reference_image(pose), pose)
+        seconds = (truth.end - truth.start) * 1e-9
+        CONSOLE.print(
+            f"{self.output}: {num_events:,} events in {seconds:.2f} s, {len(truth)} poses, {self.train_images} train, "
+            f"{self.validation_views} validation and {self.test_views} test images.\n"
+            f"Train with: ns-train aenerf --data {self.output}"
+        )

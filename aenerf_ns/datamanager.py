@@ -1,0 +1,81 @@
+"""The event datamanager: batches of event pairs for training, reference views for evaluation."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+
+from aenerf_ns.dataset import EventDataset
+from aenerf_ns.errors import DataError
+from aenerf_ns.ray_sampler import EventRaySampler
+
+
+@dataclass
+class EventDataManagerConfig(VanillaDataManagerConfig):
+    """Of the inherited options, those on sampling pixels of images have no effect: no image is trained on."""
+
+    _target: type = field(default_factory=lambda: EventDataManager)
+    train_num_rays_per_batch: int = 8192
+    """Rays of a training batch; a pair of events takes two."""
+    eval_num_rays_per_batch: int = 8192
+    """Rays of a batch of pairs on which the loss is logged without training; a pair of events takes two."""
+
+
+class EventDataManager(VanillaDataManager[EventDataset]):
+    """Nerfstudio's datamanager with events to train on.
+
+    Raises:
+        SystemExit: with one clear line, when the dataset cannot be used.
+    """
+
+    config: EventDataManagerConfig
+    train_pixel_sampler: EventRaySampler | None  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        config: EventDataManagerConfig,
+        device: torch.device | str = "cpu",
+        test_mode: Literal["test", "val", "inference"] = "val",
+        **kwargs: Any,
+    ) -> None:
+        try:
+            super().__init__(config, device=device, test_mode=test_mode, **kwargs)
+        except DataError as error:
+            raise SystemExit(f"Error: {error}") from None
+
+    def create_eval_dataset(self) -> EventDataset | None:  # type: ignore[override]
+        """The reference views, or None where there are none."""
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        if not outputs.image_filenames:
+            return None
+        return self.dataset_type(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
+
+    def setup_train(self) -> None:
+        """Reads the events, for training only: a trained run is opened without them."""
+        if self.test_mode != "val":
+            return
+        metadata = self.train_dataset.metadata
+        self.train_pixel_sampler = EventRaySampler(
+            self.train_dataset.pairs,
+            metadata["event_camera"],
+            metadata["sensor"],
+            deepcopy(metadata["trajectory"]).to(self.device),
+            self.config.train_num_rays_per_batch,
+        )
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+        """A batch of pairs; see :meth:`EventRaySampler.sample`."""
+        self.train_count += 1
+        assert self.train_pixel_sampler is not None
+        return self.train_pixel_sampler.sample()
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+        """A batch of pairs to log the loss on."""
+        self.eval_count += 1
+        assert self.train_pixel_sampler is not None
+        return self.train_pixel_sampler.sample(max(self.config.eval_num_rays_per_batch // 2, 1))

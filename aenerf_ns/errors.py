@@ -1,0 +1,18 @@
+"""The one error for bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class DataError(ValueError):
+    """Input that cannot be used, told in one line that names the file, the value and the remedy.
+
+    Args:
+        source: the file, folder or option the value came from.
+        problem: what is wrong, with the offending value.
+        remedy: what the user can do about it.
+    """
+
+    def __init__(self, source: str | Path, problem: str, remedy: str) -> None:
+        super().__init__(f"{source}: {problem}; {remedy}")

@@ -1,0 +1,120 @@
+"""The event camera's lens: which direction each pixel looks in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from numpy.typing import NDArray
+from torch import Tensor
+
+LensModel = Literal["radial_tangential", "fisheye"]
+
+# A pixel whose undistorted direction projects back this far off, in pixels, lies where the lens model folds over.
+_MAX_ROUND_TRIP_ERROR = 1e-3
+
+
+@dataclass(frozen=True)
+class EventCamera:
+    """Intrinsics and distortion of a camera.
+
+    Attributes:
+        width: number of pixel columns.
+        height: number of pixel rows.
+        fx: focal length along the rows, in pixels.
+        fy: focal length along the columns, in pixels.
+        cx: principal point from the left edge of the image, in pixels. The centre of the first pixel is at 0.5
+            (Nerfstudio's convention); OpenCV, Kalibr and ESIM count from that centre: add 0.5 to theirs.
+        cy: principal point from the top edge of the image, in pixels, likewise.
+        lens_model: "radial_tangential" (OpenCV's Brown-Conrady, "plumb_bob") or "fisheye" (OpenCV's fisheye,
+            Kannala-Brandt, "equidistant", "kb4").
+        distortion: k1, k2, p1, p2, k3 of the first or k1, k2, k3, k4 of the second, in OpenCV's order.
+
+    Raises:
+        ValueError: a focal length or a size is not positive, a value is not finite, or the number of distortion
+            parameters does not fit the model.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    lens_model: LensModel = "radial_tangential"
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "fx", "fy"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
+        if not np.isfinite([self.cx, self.cy, *self.distortion]).all():
+            raise ValueError("principal point and distortion must be finite")
+        expected = {"radial_tangential": 5, "fisheye": 4}
+        if self.lens_model not in expected:
+            raise ValueError(f'lens_model must be one of {sorted(expected)}, not "{self.lens_model}"')
+        if len(self.distortion) != expected[self.lens_model]:
+            raise ValueError(
+                f"{self.lens_model} distortion takes {expected[self.lens_model]} numbers, not {len(self.distortion)}"
+            )
+
+    @property
+    def _opencv_matrix(self) -> NDArray[np.float64]:
+        return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
+
+    def pixel_directions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Directions through the pixel centres, undistorted to the last digit.
+
+        Returns:
+            (height, width, 3) float64 unit vectors in the camera's frame with Nerfstudio's axes (x right, y up,
+            z backward), and (height, width) whether the pixel has one: beyond the range in which a distortion model
+            can be inverted there is none.
+        """
+        columns, rows = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
+        pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
+        matrix, distortion = self._opencv_matrix, np.array(self.distortion)
+        no_rotation, no_translation = np.zeros(3), np.zeros(3)
+        if self.lens_model == "fisheye":
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
+            plane = cv2.fisheye.undistortPoints(pixels, matrix, distortion, criteria=criteria)
+            projected = cv2.fisheye.distortPoints(plane, matrix, distortion)
+        else:
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+            plane = cv2.undistortPointsIter(pixels, matrix, distortion, None, None, criteria)
+            points = np.concatenate([plane, np.ones_like(plane[..., :1])], -1)
+            projected = cv2.projectPoints(points, no_rotation, no_translation, matrix, distortion)[0]
+        error = np.linalg.norm(projected - pixels, axis=-1).reshape(self.height, self.width)
+        plane = plane.reshape(self.height, self.width, 2)
+        directions = np.stack([plane[..., 0], -plane[..., 1], np.full(plane.shape[:2], -1.0)], -1)
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        return directions, error < _MAX_ROUND_TRIP_ERROR
+
+    def cameras(self, camera_to_worlds: Tensor) -> Cameras:
+        """Nerfstudio's cameras with this lens.
+
+        Args:
+            camera_to_worlds: (N, 3, 4) poses, OpenGL camera axes.
+        """
+        if self.lens_model == "fisheye":
+            k1, k2, k3, k4 = self.distortion
+            distortion, camera_type = [k1, k2, k3, k4, 0.0, 0.0], CameraType.FISHEYE
+        else:
+            k1, k2, p1, p2, k3 = self.distortion
+            distortion, camera_type = [k1, k2, k3, 0.0, p1, p2], CameraType.PERSPECTIVE
+        return Cameras(
+            camera_to_worlds=camera_to_worlds.float(),
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx,
+            cy=self.cy,
+            width=self.width,
+            height=self.height,
+            distortion_params=torch.tensor(distortion) if any(distortion) else None,
+            camera_type=camera_type,
+            # The framework's renderers write into it.
+            metadata={},
+        )

@@ -1,0 +1,173 @@
+"""Pairs of consecutive events of a pixel: the unit of supervision."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventStream
+
+_NEVER = np.iinfo(np.int64).min
+_MAX_MERGED = 255
+
+
+@dataclass(frozen=True)
+class EventPairs:
+    """Every event with the previous event of its pixel (paper, eq. 3), in the order of the later event.
+
+    Events of one pixel with one time are one event here, with their polarities counted.
+
+    Attributes:
+        x: (N,) uint16 pixel columns.
+        y: (N,) uint16 pixel rows.
+        previous_time: (N,) int64, time of the pixel's previous event in nanoseconds.
+        time: (N,) int64, time of the event in nanoseconds.
+        num_positive: (N,) uint8, positive events at ``time``.
+        num_negative: (N,) uint8, negative events at ``time``.
+        num_events: events in the stream.
+        num_outside: events outside the time window, which are left out.
+        num_first: events left out because they are the first of their pixel.
+        num_merged: events merged into another of the same pixel and time.
+        num_within_refractory_period: events that follow the previous one of their pixel by no more than the
+            refractory period, and give no pair.
+    """
+
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    previous_time: NDArray[np.int64]
+    time: NDArray[np.int64]
+    num_positive: NDArray[np.uint8]
+    num_negative: NDArray[np.uint8]
+    num_events: int
+    num_outside: int
+    num_first: int
+    num_merged: int
+    num_within_refractory_period: int
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def summary(self) -> str:
+        """One line that accounts for every event of the stream."""
+        return (
+            f"{self.num_events:,} events gave {len(self):,} pairs; left out: {self.num_outside:,} outside the time "
+            f"window, {self.num_first:,} first of their pixel, {self.num_within_refractory_period:,} within the "
+            f"refractory period; {self.num_merged:,} merged with one of the same pixel and time"
+        )
+
+
+@numba.njit(cache=True)
+def _pair_chunk(columns, width, refractory_period, last_time, last_record, records, n):
+    """Continues the pairing with one chunk.
+
+    Returns:
+        The new number of records and the chunk's counts; or −1 and the index of the event that cannot be counted.
+    """
+    x, y, t, p = columns
+    out_x, out_y, out_previous, out_time, out_pos, out_neg = records
+    first = merged = refractory = 0
+    for i in range(t.shape[0]):
+        pixel = np.int64(y[i]) * width + x[i]
+        if t[i] == last_time[pixel]:
+            merged += 1
+            record = last_record[pixel]
+            if record >= 0:
+                counts = out_pos if p[i] > 0 else out_neg
+                if counts[record] == _MAX_MERGED:
+                    return -1, i, merged, refractory
+                counts[record] += 1
+            continue
+        previous = last_time[pixel]
+        last_time[pixel] = t[i]
+        last_record[pixel] = -1
+        if previous == _NEVER:
+            first += 1
+        elif t[i] - previous <= refractory_period:
+            refractory += 1
+        else:
+            out_x[n] = x[i]
+            out_y[n] = y[i]
+            out_previous[n] = previous
+            out_time[n] = t[i]
+            out_pos[n] = p[i] > 0
+            out_neg[n] = p[i] < 0
+            last_record[pixel] = n
+            n += 1
+    return n, first, merged, refractory
+
+
+def pair_events(
+    chunks: Iterable[EventStream],
+    *,
+    refractory_period: int = 0,
+    start: int | None = None,
+    end: int | None = None,
+    expected_events: int | None = None,
+) -> EventPairs:
+    """Pairs each event with the previous event of its pixel, in one pass over the stream.
+
+    Besides the chunk at hand and the pairs themselves (22 bytes each) it holds 16 bytes a pixel.
+
+    Args:
+        chunks: the stream in pieces, in the order of time, all of one sensor.
+        refractory_period: τ in nanoseconds; an event that follows its pixel's previous one by no more gives no pair.
+        start: events before this time in nanoseconds are left out.
+        end: events after this time in nanoseconds are left out.
+        expected_events: the number of events, when known, which saves growing the arrays.
+
+    Returns:
+        The pairs, with every event of the stream accounted for.
+
+    Raises:
+        DataError: no event lies in the time window, or more than 255 events of one polarity share a pixel and a time.
+    """
+    dtypes = (np.uint16, np.uint16, np.int64, np.int64, np.uint8, np.uint8)
+    # numpy.empty only reserves addresses: memory is used as the pairs are written.
+    records = [np.empty(expected_events or 0, dtype) for dtype in dtypes]
+    size = total = outside = first = merged = refractory = 0
+    last_time = last_record = None
+    source: object = "events"
+    for full_chunk in chunks:
+        total += len(full_chunk)
+        source = full_chunk.source
+        chunk = full_chunk.between(
+            _NEVER + 1 if start is None else start, np.iinfo(np.int64).max - 1 if end is None else end
+        )
+        outside += len(full_chunk) - len(chunk)
+        if last_time is None or last_record is None:
+            last_time = np.full(chunk.width * chunk.height, _NEVER, dtype=np.int64)
+            last_record = np.full(chunk.width * chunk.height, -1, dtype=np.int64)
+        if size + len(chunk) > len(records[0]):
+            capacity = max(size + len(chunk), 3 * len(records[0]) // 2)
+            records = [np.concatenate([r[:size], np.empty(capacity - size, r.dtype)]) for r in records]
+        new_size, chunk_first, chunk_merged, chunk_refractory = _pair_chunk(
+            (chunk.x, chunk.y, chunk.t, chunk.p),
+            chunk.width,
+            refractory_period,
+            last_time,
+            last_record,
+            tuple(records),
+            size,
+        )
+        if new_size < 0:
+            raise DataError(
+                chunk.source,
+                f"more than {_MAX_MERGED} events of one polarity at pixel ({chunk.x[chunk_first]}, "
+                f"{chunk.y[chunk_first]}) share the time {chunk.t[chunk_first]} ns",
+                "check the unit of the times",
+            )
+        size = new_size
+        first, merged, refractory = first + chunk_first, merged + chunk_merged, refractory + chunk_refractory
+    if total == outside:
+        raise DataError(
+            str(source),
+            f"none of its {total} events lies between {start} and {end} ns, the span of the poses and the time window",
+            "check that events and poses share one clock and one unit of time",
+        )
+    columns = [r[:size] for r in records]
+    return EventPairs(*columns, total, outside, first, merged, refractory)

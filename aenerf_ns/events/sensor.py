@@ -1,0 +1,67 @@
+"""The event sensor model: contrast thresholds, refractory period and Bayer pattern."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+BayerPattern = Literal["", "RGGB"]
+
+# Index of the colour filter (0 red, 1 green, 2 blue) over the 2 x 2 pixels that repeat, [row % 2, column % 2].
+_RGGB = np.array([[0, 1], [1, 2]], dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """How a pixel turns log-radiance into events (paper, eq. 4).
+
+    Attributes:
+        positive_contrast_threshold: C+, the rise of log-radiance that triggers an event of polarity +1.
+        negative_contrast_threshold: C−, the fall of log-radiance (a positive number) that triggers one of polarity −1.
+        refractory_period: τ in nanoseconds, for which a pixel is blind after each of its events.
+        bayer_pattern: "RGGB" for a colour sensor whose pixel (0, 0) is red, "" for a monochrome one.
+
+    Raises:
+        ValueError: a threshold is not positive, the refractory period is negative, or the pattern is unknown.
+    """
+
+    positive_contrast_threshold: float = 0.25
+    negative_contrast_threshold: float = 0.25
+    refractory_period: int = 0
+    bayer_pattern: BayerPattern = ""
+
+    def __post_init__(self) -> None:
+        for name in ("positive_contrast_threshold", "negative_contrast_threshold"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be a positive number, not {getattr(self, name)}")
+        if self.refractory_period < 0:
+            raise ValueError(f"refractory_period must not be negative, not {self.refractory_period} ns")
+        if self.bayer_pattern not in ("", "RGGB"):
+            raise ValueError(f'bayer_pattern must be "" or "RGGB", not "{self.bayer_pattern}"')
+
+    @property
+    def mean_contrast_threshold(self) -> float:
+        """C̄ = (C+ + C−) / 2, which the paper's losses are normalised by."""
+        return (self.positive_contrast_threshold + self.negative_contrast_threshold) / 2
+
+    @property
+    def num_channels(self) -> int:
+        """Number of radiance channels the sensor sees: 1 for a monochrome sensor, 3 for a colour one."""
+        return 3 if self.bayer_pattern else 1
+
+    def channel(self, x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Radiance channel that each pixel's filter passes.
+
+        Args:
+            x: (N,) raw integer pixel columns, before any undistortion.
+            y: (N,) raw integer pixel rows.
+
+        Returns:
+            (N,) channel indices: 0 for a monochrome sensor; 0 red, 1 green, 2 blue for a colour one.
+        """
+        if not self.bayer_pattern:
+            return np.zeros(len(x), dtype=np.int64)
+        return _RGGB[y % 2, x % 2].astype(np.int64)

@@ -1,0 +1,166 @@
+"""Validated event streams, in memory and in files."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+
+_COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
+
+
+@dataclass(frozen=True)
+class EventStream:
+    """Events of one sensor in the order of their times.
+
+    Attributes:
+        x: (N,) uint16 pixel columns, 0 at the left.
+        y: (N,) uint16 pixel rows, 0 at the top.
+        t: (N,) int64 times in nanoseconds, never decreasing.
+        p: (N,) int8 polarities, +1 or −1.
+        width: number of pixel columns of the sensor.
+        height: number of pixel rows of the sensor.
+        source: where the events came from, for messages.
+
+    Raises:
+        DataError: an array has the wrong type or length, a time decreases, a polarity is not ±1, or a pixel lies
+            outside the sensor.
+    """
+
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    t: NDArray[np.int64]
+    p: NDArray[np.int8]
+    width: int
+    height: int
+    source: str | Path = "events"
+
+    def __post_init__(self) -> None:
+        for name, dtype in _COLUMNS.items():
+            column = getattr(self, name)
+            if column.dtype != dtype or column.ndim != 1:
+                raise DataError(
+                    self.source,
+                    f"column {name} has type {column.dtype} and shape {column.shape}",
+                    f"store it as one row of {np.dtype(dtype).name}",
+                )
+            if len(column) != len(self.t):
+                raise DataError(
+                    self.source,
+                    f"column {name} has {len(column)} entries but column t has {len(self.t)}",
+                    "store all four columns with the same length",
+                )
+        if len(self.t) == 0:
+            return
+        for name, limit, size in (("x", self.width, "width"), ("y", self.height, "height")):
+            column = getattr(self, name)
+            if column.max() >= limit:
+                index = int(np.argmax(column >= limit))
+                raise DataError(
+                    self.source,
+                    f"event {index} has {name} = {column[index]} on a sensor of {size} {limit}",
+                    "check the sensor size and the order of the columns",
+                )
+        if (self.t[1:] < self.t[:-1]).any():
+            index = int(np.argmax(self.t[1:] < self.t[:-1])) + 1
+            raise _unsorted(self.source, index, int(self.t[index]), int(self.t[index - 1]))
+        if (np.abs(self.p) != 1).any():
+            index = int(np.argmax(np.abs(self.p) != 1))
+            raise DataError(
+                self.source,
+                f"event {index} has polarity {self.p[index]}",
+                "store polarities as -1 and +1 (from 0 and 1: 2 * p - 1)",
+            )
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, index: slice) -> EventStream:
+        """The events of a slice, as views."""
+        columns = {name: getattr(self, name)[index] for name in _COLUMNS}
+        return EventStream(**columns, width=self.width, height=self.height, source=self.source)
+
+    def between(self, start: int, end: int) -> EventStream:
+        """The events with start <= t <= end, in nanoseconds."""
+        first, last = np.searchsorted(self.t, [start, end + 1])
+        return self[first:last]
+
+
+def _unsorted(source: str | Path, index: int, time: int, previous: int) -> DataError:
+    return DataError(
+        source,
+        f"event {index} is at {time} ns, before the event ahead of it at {previous} ns",
+        "sort the events by time",
+    )
+
+
+class EventFile(ABC):
+    """A file of events, opened only when its events are asked for.
+
+    Readers of a format implement :meth:`read_chunks` and :meth:`time_span`; this class checks that the whole stream
+    is in order.
+
+    Args:
+        path: the file.
+        width: number of pixel columns of the sensor.
+        height: number of pixel rows of the sensor.
+    """
+
+    def __init__(self, path: Path, width: int, height: int) -> None:
+        self.path = path
+        self.width = width
+        self.height = height
+
+    @abstractmethod
+    def read_chunks(self) -> Iterator[EventStream]:
+        """Yields the events in pieces that fit in memory, each checked in itself.
+
+        Raises:
+            DataError: the file is missing or its content cannot be used.
+        """
+
+    @abstractmethod
+    def time_span(self) -> tuple[int, int]:
+        """Times of the first and the last event in nanoseconds, read without reading all events.
+
+        Raises:
+            DataError: the file is missing or empty.
+        """
+
+    def count(self) -> int | None:
+        """Number of events when the file tells it without being read through, else None."""
+        return None
+
+    def require(self) -> None:
+        """Raises a DataError when the file does not exist."""
+        if not self.path.is_file():
+            raise DataError(self.path, "there is no such event file", "check the path of the dataset")
+
+    def empty_error(self) -> DataError:
+        """The error for a file without events."""
+        return DataError(self.path, "the file holds no events", "record or convert it again")
+
+    def chunks(self) -> Iterator[EventStream]:
+        """Yields all events in pieces that fit in memory, in the order of their times.
+
+        Raises:
+            DataError: the file is missing, empty or out of order, or an event is malformed.
+        """
+        self.require()
+        total, last_time = 0, None
+        for chunk in self.read_chunks():
+            if len(chunk) == 0:
+                continue
+            if last_time is not None and chunk.t[0] < last_time:
+                raise _unsorted(self.path, total, int(chunk.t[0]), last_time)
+            last_time = int(chunk.t[-1])
+            total += len(chunk)
+            yield chunk
+        if total == 0:
+            raise self.empty_error()

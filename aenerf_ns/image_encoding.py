@@ -1,0 +1,37 @@
+"""What the values of an image mean: linear radiance, or its sRGB encoding for display."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+ImageEncoding = Literal["srgb", "linear"]
+
+# Luminance of linear RGB, Rec. 709: what a monochrome sensor sees of a colour image.
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+def decode(image: Tensor, encoding: ImageEncoding) -> Tensor:
+    """Linear radiance in [0, 1] of image values in [0, 1] (sRGB: IEC 61966-2-1)."""
+    if encoding == "linear":
+        return image
+    return torch.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
+
+
+def encode(radiance: Tensor, encoding: ImageEncoding) -> Tensor:
+    """Image values in [0, 1] of linear radiance, which is clipped to [0, 1]."""
+    radiance = radiance.clamp(0, 1)
+    if encoding == "linear":
+        return radiance
+    return torch.where(
+        radiance <= 0.0031308, radiance * 12.92, 1.055 * radiance.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
+    )
+
+
+def to_channels(radiance: Tensor, num_channels: int) -> Tensor:
+    """Linear (..., 3) RGB as a sensor of 1 (luminance) or 3 channels sees it."""
+    if num_channels == 3:
+        return radiance
+    return (radiance * radiance.new_tensor(_LUMINANCE)).sum(-1, keepdim=True)

@@ -1,0 +1,56 @@
+"""Image metrics that neither need a download nor report a number they do not have."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+
+class ImageMetrics:
+    """PSNR, SSIM and, when asked for, LPIPS of an image.
+
+    Args:
+        with_lpips: whether to report LPIPS. Its network is built on first use; where the weights cannot be had, the
+            metric is left out and ``lpips_absent`` tells why.
+
+    Attributes:
+        lpips_absent: why LPIPS is not reported, or None.
+    """
+
+    def __init__(self, with_lpips: bool) -> None:
+        self._with_lpips = with_lpips
+        self._lpips: Metric | None = None
+        self.lpips_absent: str | None = None if with_lpips else "not asked for (--pipeline.model.lpips True)"
+
+    def __call__(self, predicted: Tensor, reference: Tensor) -> dict[str, float]:
+        """Metrics of display values in [0, 1].
+
+        Args:
+            predicted: (H, W, 3).
+            reference: (H, W, 3).
+        """
+        predicted, reference = (image.moveaxis(-1, 0)[None].float() for image in (predicted, reference))
+        metrics = {
+            "psnr": float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)),
+            "ssim": float(torch.as_tensor(structural_similarity_index_measure(predicted, reference, data_range=1.0))),
+        }
+        if self._with_lpips and self.lpips_absent is None:
+            self._build_lpips(predicted.device)
+        if self._lpips is not None:
+            metrics["lpips"] = float(self._lpips(predicted, reference))
+        return metrics
+
+    def _build_lpips(self, device: torch.device) -> None:
+        if self._lpips is not None:
+            return
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        try:
+            self._lpips = LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
+        except Exception as error:
+            # torch.hub raises whatever its connection raises.
+            self.lpips_absent = f"the weights of AlexNet could not be had ({error})"
+            CONSOLE.print(f"[yellow]LPIPS is not reported: {self.lpips_absent}.")

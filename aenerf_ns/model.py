@@ -1,0 +1,287 @@
+"""The AE-NeRF model: two-stage event radiance field, its losses and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.configs.config_utils import to_immutable_dict
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.field_components.spatial_distortions import SceneContraction
+from nerfstudio.fields.density_fields import HashMLPDensityField
+from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
+from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
+from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.utils import colormaps
+from nerfstudio.utils.misc import scale_dict
+from torch import Tensor, nn
+from torch.nn import Parameter
+
+from aenerf_ns.color_correction import AffineColorCorrection
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.field import EventRadianceField
+from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
+from aenerf_ns.image_metrics import ImageMetrics
+from aenerf_ns.losses import log_radiance_change, reconstruction_loss
+
+
+@dataclass
+class AENeRFModelConfig(ModelConfig):
+    """AE-NeRF on hash grids."""
+
+    _target: type = field(default_factory=lambda: AENeRFModel)
+    scene_contraction: Literal["auto", "l2", "linf", "none"] = "auto"
+    """How unbounded space is contracted (paper, eq. 6: l2). "auto" is "none" for a dataset that states a scene box
+    and "l2" for others."""
+    near_plane: float = 0.05
+    """Distance at which rays start, in scene units."""
+    far_plane: float = 1000.0
+    """Distance at which rays end in an unbounded scene, in scene units."""
+    background: Literal["auto", "learned", "none"] = "auto"
+    """Whether rays that pass the scene see a uniform background of learned radiance. "auto" is "learned" for a dataset
+    that states a scene box and "none" for others."""
+    num_levels: int = 16
+    """Levels of the field's hash grid."""
+    base_resolution: int = 16
+    """Cells along an axis on its coarsest level."""
+    max_resolution: int = 2048
+    """Cells along an axis on its finest level."""
+    log2_hashmap_size: int = 19
+    """Binary logarithm of the entries of a level."""
+    hidden_dim: int = 64
+    """Width of the field's hidden layers."""
+    geometry_feature_dim: int = 15
+    """Length of the feature that the radiance is computed from, with the view direction."""
+    average_init_density: float = 0.01
+    """Density before training."""
+    num_proposal_samples_per_ray: tuple[int, ...] = (256, 96)
+    """Samples of each proposal network."""
+    num_nerf_samples_per_ray: int = 48
+    """Samples of the field."""
+    proposal_max_resolutions: tuple[int, ...] = (128, 256)
+    """Cells along an axis on the finest level of each proposal network's hash grid; its length is their number."""
+    proposal_num_levels: int = 5
+    """Levels of the proposal networks' hash grids."""
+    proposal_log2_hashmap_size: int = 17
+    """Binary logarithm of the entries of a level there."""
+    proposal_hidden_dim: int = 16
+    """Width of the proposal networks' hidden layer."""
+    proposal_weights_anneal_iterations: int = 1000
+    """Steps over which sampling turns from broad to following the proposal weights."""
+    loss_coefficients: dict[str, float] = to_immutable_dict(
+        {"reconstruction_loss": 1.0, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
+    )
+    """Weights of the losses (paper, eq. 13: alpha, gamma, eta). A weight of 0 turns a loss off."""
+    color_correction_num_rays: int = 16384
+    """Pixels, spread over all validation views, on which the colour correction is fitted."""
+    lpips: bool = False
+    """Also report LPIPS. It needs the AlexNet weights of torchvision, which are downloaded on first use."""
+    eval_num_rays_per_chunk: int = 1 << 15
+    """Rays rendered at once outside training."""
+
+
+class AENeRFModel(Model):
+    """Renders radiance along event rays and compares its logarithm with the events.
+
+    Needs the dataparser's metadata: ``sensor``, ``image_encoding``, ``bounded``.
+    """
+
+    config: AENeRFModelConfig
+
+    def populate_modules(self) -> None:
+        """Builds the networks, the sampler and the colour correction."""
+        metadata: dict[str, Any] = self.kwargs["metadata"]
+        config = self.config
+        bounded: bool = metadata["bounded"]
+        self.sensor: SensorModel = metadata["sensor"]
+        self.image_encoding: ImageEncoding = metadata["image_encoding"]
+        contraction = config.scene_contraction
+        if contraction == "auto":
+            contraction = "none" if bounded else "l2"
+        distortion = {"l2": SceneContraction(), "linf": SceneContraction(order=float("inf")), "none": None}[contraction]
+        self.collider: nn.Module
+        if distortion is None:
+            self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)
+        else:
+            self.collider = NearFarCollider(config.near_plane, config.far_plane)
+
+        self.field = EventRadianceField(
+            self.scene_box.aabb,
+            num_channels=self.sensor.num_channels,
+            spatial_distortion=distortion,
+            num_levels=config.num_levels,
+            base_resolution=config.base_resolution,
+            max_resolution=config.max_resolution,
+            log2_hashmap_size=config.log2_hashmap_size,
+            hidden_dim=config.hidden_dim,
+            geometry_feature_dim=config.geometry_feature_dim,
+            average_init_density=config.average_init_density,
+        )
+        self.proposal_networks = nn.ModuleList(
+            HashMLPDensityField(
+                self.scene_box.aabb,
+                spatial_distortion=distortion,
+                num_levels=config.proposal_num_levels,
+                max_res=resolution,
+                log2_hashmap_size=config.proposal_log2_hashmap_size,
+                hidden_dim=config.proposal_hidden_dim,
+                average_init_density=config.average_init_density,
+                implementation="torch",
+            )
+            for resolution in config.proposal_max_resolutions
+        )
+        self.proposal_sampler = ProposalNetworkSampler(
+            num_nerf_samples_per_ray=config.num_nerf_samples_per_ray,
+            num_proposal_samples_per_ray=config.num_proposal_samples_per_ray,
+            num_proposal_network_iterations=len(self.proposal_networks),
+            single_jitter=True,
+            # In a bounded scene samples are spread evenly; else the framework's default, evenly and then in disparity.
+            initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
+        )
+        background = config.background if config.background != "auto" else ("learned" if bounded else "none")
+        # softplus(0.54) = 1: of the size of the radiance before training.
+        self.raw_background = (
+            Parameter(torch.full((self.sensor.num_channels,), 0.54)) if background == "learned" else None
+        )
+        self.color_correction = AffineColorCorrection(self.sensor.num_channels)
+        self.renderer_accumulation = AccumulationRenderer()
+        self.renderer_depth = DepthRenderer(method="median")
+        self.image_metrics = ImageMetrics(with_lpips=config.lpips)
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """Hash tables (and the background) apart from the networks, on whose weights alone there is weight decay."""
+        groups: dict[str, list[Parameter]] = {"encodings": [], "networks": []}
+        for module in (self.field, self.proposal_networks):
+            for name, parameter in module.named_parameters():
+                groups["encodings" if name.endswith("hash_table") else "networks"].append(parameter)
+        if self.raw_background is not None:
+            groups["encodings"].append(self.raw_background)
+        return groups
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Schedules the proposal sampler as the framework's own methods do."""
+
+        def set_anneal(step: int) -> None:
+            # https://arxiv.org/pdf/2111.12077.pdf, eq. 18
+            progress = min(step / max(self.config.proposal_weights_anneal_iterations, 1), 1.0)
+            slope = 10.0
+            self.proposal_sampler.set_anneal(slope * progress / ((slope - 1) * progress + 1))
+
+        return [
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], set_anneal, update_every_num_iters=1),
+            TrainingCallback(
+                [TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
+                self.proposal_sampler.step_cb,
+                update_every_num_iters=1,
+            ),
+        ]
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
+        """Renders rays.
+
+        Returns:
+            ``rgb`` (N, 3) colour-corrected display values, ``log_radiance`` (N, channels) the raw log L̂,
+            ``accumulation`` (N, 1), ``depth`` (N, 1) median distance along the ray in scene units; and, while
+            training, the samples and weights of both stages.
+        """
+        samples, weights_list, samples_list = self.proposal_sampler(
+            ray_bundle, density_fns=[network.density_fn for network in self.proposal_networks]
+        )
+        field_outputs = self.field(samples)
+        weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
+        weights_list.append(weights)
+        samples_list.append(samples)
+        accumulation = self.renderer_accumulation(weights)
+        # Not the framework's RGBRenderer, which clips to [0, 1] outside training: radiance has no upper bound.
+        radiance = (weights * field_outputs[FieldHeadNames.RGB]).sum(-2)
+        if self.raw_background is not None:
+            radiance = radiance + (1 - accumulation) * F.softplus(self.raw_background)
+        log_radiance = torch.log(radiance + _RADIANCE_EPSILON)
+        outputs = {
+            "rgb": self._display(self.color_correction(log_radiance.detach())),
+            "log_radiance": log_radiance,
+            "accumulation": accumulation,
+        }
+        with torch.no_grad():
+            outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
+        if self.training:
+            outputs["weights_list"] = weights_list
+            outputs["ray_samples_list"] = samples_list
+        return outputs
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        """The weighted terms of the paper's total loss (eq. 13) on a batch of the event ray sampler."""
+        mean_threshold = self.sensor.mean_contrast_threshold
+        predicted, target = self._log_radiance_changes(outputs, batch)
+        losses = {"reconstruction_loss": reconstruction_loss(predicted, target, mean_threshold)}
+        if self.training:
+            weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
+            losses["interlevel_loss"] = interlevel_loss(weights, samples) / mean_threshold**2
+            losses["distortion_loss"] = distortion_loss(weights, samples)
+        return scale_dict(losses, self.config.loss_coefficients)
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        """How far the rendered changes of log-radiance agree with the events."""
+        predicted, target = self._log_radiance_changes(outputs, batch)
+        return {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
+
+    def _log_radiance_changes(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """Rendered and true changes (N,) over the intervals of a batch, each of its pixel's channel."""
+        start, end = outputs["log_radiance"].chunk(2)
+        predicted = (end - start).gather(1, batch["channel"][:, None])[:, 0]
+        target = log_radiance_change(
+            batch["num_positive"],
+            batch["num_negative"],
+            self.sensor.positive_contrast_threshold,
+            self.sensor.negative_contrast_threshold,
+        )
+        return predicted, target
+
+    def reference_radiance(self, image: Tensor) -> Tensor:
+        """Linear radiance (..., channels), as the sensor sees it, of reference image values (..., 3)."""
+        return to_channels(decode(image[..., :3], self.image_encoding), self.sensor.num_channels)
+
+    def _display(self, radiance: Tensor) -> Tensor:
+        """Display values (..., 3) of linear radiance (..., channels)."""
+        return encode(radiance, self.image_encoding).expand(*radiance.shape[:-1], 3)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR, SSIM (and LPIPS) of the display values against the reference, as the sensor sees it, side by side."""
+        predicted = outputs["rgb"]
+        reference = self._display(self.reference_radiance(batch["image"].to(predicted.device)))
+        images = {
+            "img": torch.cat([reference, predicted], dim=1),
+            "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
+            "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
+        }
+        return self.image_metrics(predicted, reference), images
+
+    @torch.no_grad()
+    def render_log_radiance(self, ray_bundles: Sequence[RayBundle]) -> Tensor:
+        """Log-radiance (N, channels) of rays, in evaluation mode and whatever the number of rays."""
+        was_training = self.training
+        self.eval()
+        rendered = [
+            self(bundle[begin : begin + self.config.eval_num_rays_per_chunk])["log_radiance"]
+            for bundle in ray_bundles
+            for begin in range(0, len(bundle), self.config.eval_num_rays_per_chunk)
+        ]
+        self.train(was_training)
+        return torch.cat(rendered)
+
+
+# ε of the paper's appendix "Model Architecture": the least radiance that can be rendered.
+_RADIANCE_EPSILON = 1e-3

@@ -1,0 +1,131 @@
+"""An event camera moving through a built-in scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.esim import EventSimulator
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.image_encoding import encode, to_channels
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.scenes import BuiltInScene
+from aenerf_ns.scenes.frames import frame_parameters
+from aenerf_ns.scenes.paths import SpeedProfile
+from aenerf_ns.scenes.raycast import render
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+Events = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
+
+# Rays through a pixel: enough that the frames' own aliasing triggers few events, and references without visible noise.
+_EVENT_SAMPLES = 4
+_REFERENCE_SAMPLES = 16
+
+
+class Simulation:
+    """One pass of an event camera along a scene's path.
+
+    Args:
+        scene: what is seen, and the path.
+        camera: the lens; it must be free of distortion.
+        sensor: thresholds, refractory period and Bayer pattern.
+        speed: "easy" for constant speed, "hard" for 8^sin(2πt) times that speed.
+        easy_duration: seconds that the path takes at constant speed.
+        seed: of the sensor's thresholds.
+
+    Raises:
+        ValueError: the duration is not positive.
+    """
+
+    def __init__(
+        self,
+        scene: BuiltInScene,
+        camera: EventCamera,
+        sensor: SensorModel,
+        speed: Literal["easy", "hard"],
+        easy_duration: float,
+        seed: int,
+    ) -> None:
+        self._scene = scene
+        self._camera = camera
+        self._sensor = sensor
+        self._profile = SpeedProfile(speed, easy_duration)
+        self._seed = seed
+
+    @property
+    def _intrinsics(self) -> tuple[float, float, float, float]:
+        return self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy
+
+    def trajectory(self, pose_rate: float) -> Trajectory:
+        """The true trajectory from the start to the end, camera-to-world, OpenCV axes, in metres.
+
+        Args:
+            pose_rate: poses a second.
+
+        Raises:
+            ValueError: the rate is not positive.
+        """
+        if not 0 < pose_rate < np.inf:
+            raise ValueError(f"pose_rate must be positive, not {pose_rate}")
+        end = self._profile.duration
+        seconds = np.append(np.arange(0, end - 0.5 / pose_rate, 1 / pose_rate), end)
+        return Trajectory(_nanoseconds(seconds), self._poses(self._profile.parameter(seconds)))
+
+    def pose(self, time: int) -> Tensor:
+        """The true (4, 4) pose at a time in nanoseconds."""
+        return self._poses(np.atleast_1d(self._profile.parameter(time * 1e-9)))[0]
+
+    def _poses(self, parameters: NDArray[np.float64]) -> Tensor:
+        return torch.from_numpy(np.stack([self._scene.path(float(s)) for s in parameters.clip(0, 1)]))
+
+    def events(self, max_displacement: float, contrast_threshold_spread: float) -> Iterator[Events]:
+        """Renders the path densely and yields the events (x, y, t in nanoseconds, p) from frame to frame.
+
+        Args:
+            max_displacement: pixels that the image may move between two frames.
+            contrast_threshold_spread: standard deviation of the thresholds over the pixels.
+
+        Raises:
+            ValueError: an argument is out of range.
+        """
+        camera, sensor = self._camera, self._sensor
+        simulator = EventSimulator(
+            camera.width,
+            camera.height,
+            positive_contrast_threshold=sensor.positive_contrast_threshold,
+            negative_contrast_threshold=sensor.negative_contrast_threshold,
+            contrast_threshold_spread=contrast_threshold_spread,
+            refractory_period=sensor.refractory_period,
+            bayer_pattern=sensor.bayer_pattern,
+            seed=self._seed,
+        )
+        parameters = frame_parameters(
+            self._scene.scene, self._scene.path, self._intrinsics, camera.width, camera.height, max_displacement
+        )
+        times = _nanoseconds(self._profile.time(parameters))
+        with progress_bar() as progress:
+            for parameter, time in progress.track(
+                zip(parameters, times, strict=True), total=len(times), description="Simulating events"
+            ):
+                image = self._render(self._scene.path(float(parameter)), _EVENT_SAMPLES)
+                yield simulator(image, int(time))
+
+    def reference_image(self, camera_to_world: NDArray[np.float64] | Tensor) -> NDArray[np.uint8]:
+        """The (height, width, 3) sRGB picture from a pose, grey for a monochrome sensor."""
+        radiance = torch.from_numpy(self._render(np.asarray(camera_to_world), _REFERENCE_SAMPLES))
+        seen = to_channels(radiance, self._sensor.num_channels).expand(-1, -1, 3)
+        return (encode(seen, "srgb") * 255).round().to(torch.uint8).numpy()
+
+    def _render(self, camera_to_world: NDArray[np.float64], samples: int) -> NDArray[np.float32]:
+        camera = self._camera
+        return render(self._scene.scene, camera_to_world, self._intrinsics, camera.width, camera.height, samples)[0]
+
+
+def _nanoseconds(seconds: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.rint(seconds * 1e9).astype(np.int64)

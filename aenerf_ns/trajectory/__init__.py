@@ -1,0 +1,1 @@
+"""Camera poses in continuous time."""

@@ -1,0 +1,59 @@
+"""Smooth, time-correlated pose noise: a controlled stand-in for the errors of structure from motion."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from aenerf_ns.trajectory.rotation import rotation_from_vector
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+_NUM_WAVES = 64
+
+
+def perturb(
+    trajectory: Trajectory, rotation_degrees: float, translation: float, correlation_time: float, seed: int
+) -> Trajectory:
+    """A trajectory with smooth errors of a given size.
+
+    The error's three rotation and three translation components are independent, approximately Gaussian processes
+    with the correlation exp(−(Δt / correlation_time)² / 2), drawn as sums of random waves (random Fourier features),
+    so that they are defined at any time and do not depend on the rate of the poses.
+
+    Args:
+        trajectory: the true camera-to-world poses.
+        rotation_degrees: root mean square over the knots of the error's angle, in degrees.
+        translation: root mean square of the error's length, in the units of the poses.
+        correlation_time: in seconds.
+        seed: of the random draw.
+
+    Returns:
+        The trajectory whose pose at each knot is the true one composed with the error, in the camera's frame.
+
+    Raises:
+        ValueError: a size is negative or the correlation time is not positive.
+    """
+    if rotation_degrees < 0 or translation < 0 or not correlation_time > 0:
+        raise ValueError(
+            f"pose noise of {rotation_degrees} degrees, {translation} units and {correlation_time} s: "
+            "sizes must not be negative and the correlation time must be positive"
+        )
+    generator = torch.Generator().manual_seed(seed)
+    shape = (_NUM_WAVES, 6)
+    frequency = torch.randn(shape, generator=generator, dtype=torch.float64) / correlation_time
+    phase = torch.rand(shape, generator=generator, dtype=torch.float64) * (2 * math.pi)
+    seconds = trajectory.seconds(trajectory.times)
+    error = torch.cos(seconds[:, None, None] * frequency + phase).sum(1)
+    rotation_error = _with_root_mean_square(error[:, :3], math.radians(rotation_degrees))
+    translation_error = _with_root_mean_square(error[:, 3:], translation)
+    rotations, positions = trajectory.camera_to_worlds[..., :3], trajectory.camera_to_worlds[..., 3:]
+    noisy = torch.cat(
+        [rotations @ rotation_from_vector(rotation_error), positions + rotations @ translation_error[..., None]], -1
+    )
+    return Trajectory(trajectory.times, noisy, trajectory.source)
+
+
+def _with_root_mean_square(vectors: Tensor, size: float) -> Tensor:
+    return vectors * (size / vectors.square().sum(-1).mean().sqrt())

@@ -1,0 +1,163 @@
+"""A camera trajectory: timed poses, and the pose at any time between them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor, nn
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.trajectory.rotation import quaternion_from_rotation, rotation_from_vector, vector_from_quaternion
+
+# Multiplying by it from the right turns OpenCV camera axes (x right, y down, z forward) into OpenGL ones, which
+# Nerfstudio uses (x right, y up, z backward), and back.
+OPENCV_TO_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+class Trajectory(nn.Module):
+    """Camera-to-world poses in continuous time, by linear interpolation of the positions and spherical linear
+    interpolation of the rotations between knots (paper, appendix "Training").
+
+    A module only so that the knots travel with a model to its device; it has no parameters and adds nothing to
+    checkpoints. Everything is float64, and times are integer nanoseconds or float64 seconds since ``start``: float32
+    cannot tell two events of one pixel apart.
+
+    Args:
+        times: (N,) times of the knots in nanoseconds, strictly increasing, N >= 2.
+        camera_to_worlds: (N, 3, 4) or (N, 4, 4) poses, of any convention for the camera's axes.
+        source: where they came from, for messages.
+
+    Raises:
+        DataError: fewer than two poses, times that do not increase, a value that is not finite, or a matrix that is
+            not a rotation.
+    """
+
+    times: Tensor
+    camera_to_worlds: Tensor
+
+    def __init__(self, times: ArrayLike | Tensor, camera_to_worlds: Tensor, source: str | Path = "trajectory") -> None:
+        super().__init__()
+        self.source = source
+        times = torch.as_tensor(np.asarray(times), dtype=torch.int64)
+        poses = camera_to_worlds.detach().to(torch.float64)[:, :3, :4]
+        if len(times) != len(poses) or len(times) < 2:
+            raise DataError(source, f"{len(times)} times and {len(poses)} poses", "give at least two timed poses")
+        backward = times[1:] <= times[:-1]
+        if backward.any():
+            index = int(backward.nonzero()[0]) + 1
+            raise DataError(
+                source,
+                f"pose {index} is at {int(times[index])} ns, not after the pose ahead of it at "
+                f"{int(times[index - 1])} ns",
+                "sort the poses by time and drop repeated ones",
+            )
+        bad = ~poses.isfinite().flatten(1).all(1)
+        if bad.any():
+            raise DataError(source, f"pose {int(bad.nonzero()[0])} is not finite", "drop it or interpolate it")
+        rotations = poses[:, :, :3]
+        error = (rotations @ rotations.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
+        error = torch.maximum(error, (torch.linalg.det(rotations) - 1).abs())
+        if error.max() > 1e-4:
+            raise DataError(
+                source,
+                f"pose {int(error.argmax())} is not a rigid motion (it is off by {float(error.max()):.2g})",
+                "give rotations without scale or reflection",
+            )
+        relative = rotations[:-1].mT @ rotations[1:]
+        for name, value in (
+            ("times", times),
+            ("camera_to_worlds", poses),
+            ("_rotation_steps", vector_from_quaternion(quaternion_from_rotation(relative))),
+            ("_translation_steps", poses[1:, :, 3] - poses[:-1, :, 3]),
+        ):
+            self.register_buffer(name, value, persistent=False)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def start(self) -> int:
+        """Time of the first knot in nanoseconds."""
+        return int(self.times[0])
+
+    @property
+    def end(self) -> int:
+        """Time of the last knot in nanoseconds."""
+        return int(self.times[-1])
+
+    def seconds(self, times: Tensor) -> Tensor:
+        """Float64 seconds since ``start`` of integer times in nanoseconds."""
+        return (times - self.times[0]).to(torch.float64) * 1e-9
+
+    def pose(self, seconds: Tensor) -> Tensor:
+        """Poses at times inside the span, differentiable with respect to time.
+
+        Exact at the knots. Not checked against the span, which would stall a GPU: see :meth:`interpolate`.
+
+        Args:
+            seconds: (...) float64 seconds since ``start``.
+
+        Returns:
+            (..., 3, 4) float64 camera-to-world poses.
+        """
+        knots = self.seconds(self.times)
+        segment = (torch.searchsorted(knots, seconds.detach(), right=True) - 1).clamp(0, len(knots) - 2)
+        begin = knots[segment]
+        weight = ((seconds - begin) / (knots[segment + 1] - begin))[..., None]
+        pose = self.camera_to_worlds[segment]
+        rotation = pose[..., :3] @ rotation_from_vector(weight * self._rotation_steps[segment])
+        translation = pose[..., 3] + weight * self._translation_steps[segment]
+        return torch.cat([rotation, translation[..., None]], -1)
+
+    def interpolate(self, times: ArrayLike | Tensor) -> Tensor:
+        """Poses at given times.
+
+        Args:
+            times: (...) integer times in nanoseconds.
+
+        Returns:
+            (..., 3, 4) float64 camera-to-world poses.
+
+        Raises:
+            DataError: a time lies outside the span of the knots.
+        """
+        times = torch.as_tensor(np.asarray(times), dtype=torch.int64, device=self.times.device)
+        outside = (times < self.start) | (times > self.end)
+        if outside.any():
+            raise DataError(
+                self.source,
+                f"no pose at {int(times[outside].flatten()[0])} ns, outside the trajectory's {self.start} to "
+                f"{self.end} ns",
+                "leave out what lies outside, or give poses that cover it",
+            )
+        return self.pose(self.seconds(times))
+
+    def between(self, start: int, end: int) -> Trajectory:
+        """The shortest run of knots that covers as much of [start, end] (nanoseconds) as the trajectory does.
+
+        Raises:
+            DataError: the trajectory and the interval do not overlap.
+        """
+        first = max(int(torch.searchsorted(self.times, start, right=True)) - 1, 0)
+        last = min(int(torch.searchsorted(self.times, end)), len(self) - 1)
+        if start > self.end or end < self.start or first >= last:
+            raise DataError(
+                self.source,
+                f"its poses from {self.start} to {self.end} ns do not overlap the events from {start} to {end} ns",
+                "check that events and poses share one clock and one unit of time",
+            )
+        return Trajectory(self.times[first : last + 1], self.camera_to_worlds[first : last + 1], self.source)
+
+    def mapped(self, function) -> Trajectory:
+        """The trajectory with ``function`` applied to its (N, 4, 4) float64 camera-to-world matrices."""
+        return Trajectory(self.times, function(homogeneous(self.camera_to_worlds)), self.source)
+
+
+def homogeneous(poses: Tensor) -> Tensor:
+    """(..., 4, 4) matrices of (..., 3, 4) poses."""
+    bottom = torch.zeros_like(poses[..., :1, :])
+    bottom[..., 3] = 1
+    return torch.cat([poses, bottom], -2)

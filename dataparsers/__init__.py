@@ -1,0 +1,1 @@
+"""Dataset formats, one file each. Nothing outside this package knows a file format."""

@@ -1,0 +1,206 @@
+"""The native dataset format (docs/dataset_format.md): reading it for Nerfstudio."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
+
+from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile
+from aenerf_ns.dataparsers.recording import (
+    EventDataParser,
+    EventDataParserConfig,
+    Recording,
+    ReferenceView,
+    Split,
+)
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.image_encoding import ImageEncoding
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+
+_SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@dataclass
+class NativeDataParserConfig(EventDataParserConfig):
+    """aenerf-ns dataset folder."""
+
+    _target: type = field(default_factory=lambda: NativeDataParser)
+    positive_contrast_threshold: float | None = None
+    """C+, in place of the dataset's."""
+    negative_contrast_threshold: float | None = None
+    """C-, in place of the dataset's."""
+    refractory_period_ns: int | None = None
+    """Time for which a pixel is blind after each event, in place of the dataset's."""
+
+
+class NativeDataParser(EventDataParser):
+    """Reads a dataset folder that holds transforms.json, an event file and trajectory_estimated.txt."""
+
+    config: NativeDataParserConfig
+
+    def read_recording(self) -> Recording:
+        folder = Path(self.config.data)
+        meta = _Metadata.read(folder / "transforms.json")
+        block = meta.block("event_camera")
+        event_camera = _camera(block, "width", "height")
+        trajectory = read_tum_trajectory(folder / "trajectory_estimated.txt")
+        frames = meta.get("frames", list, [])
+        try:
+            sensor = SensorModel(
+                self.config.positive_contrast_threshold or block.get("positive_contrast_threshold", float),
+                self.config.negative_contrast_threshold or block.get("negative_contrast_threshold", float),
+                block.get("refractory_period_ns", int, 0)
+                if self.config.refractory_period_ns is None
+                else self.config.refractory_period_ns,
+                block.get("bayer_pattern", str, ""),  # type: ignore[arg-type]
+            )
+        except ValueError as error:
+            raise DataError(meta.path, f"event_camera: {error}", "correct the sensor's values") from None
+        encoding: ImageEncoding = meta.get("image_encoding", str, "srgb")  # type: ignore[assignment]
+        if encoding not in ("srgb", "linear"):
+            raise DataError(meta.path, f'image_encoding is "{encoding}"', 'use "srgb" or "linear"')
+        box = meta.get("scene_box", list, None)
+        return Recording(
+            event_file=Hdf5EventFile(folder / block.get("file", str), event_camera.width, event_camera.height),
+            event_camera=event_camera,
+            sensor=sensor,
+            trajectory=trajectory,
+            frame_camera=_camera(meta, "w", "h") if frames else event_camera,
+            reference_views=_reference_views(meta, frames, trajectory, block.matrix("T_frame_event")),
+            image_encoding=encoding,
+            scene_box=None if box is None else _scene_box(meta, box),
+        )
+
+
+class _Metadata:
+    """A JSON object that reports a missing or ill-typed value with its file and name."""
+
+    def __init__(self, path: Path, values: dict[str, Any], prefix: str = "") -> None:
+        self.path = path
+        self._values = values
+        self._prefix = prefix
+
+    @classmethod
+    def read(cls, path: Path) -> _Metadata:
+        if not path.is_file():
+            raise DataError(
+                path, "there is no such file", "give a dataset folder as --data, or name its format after the options"
+            )
+        try:
+            # Decimal keeps every digit of a time stamp; float would drop nanoseconds of the Unix time.
+            values = json.loads(path.read_text(encoding="utf-8"), parse_float=Decimal)
+        except ValueError as error:
+            raise DataError(path, f"not valid JSON ({error})", "correct it there") from None
+        if not isinstance(values, dict):
+            raise DataError(path, "not a JSON object", "see the dataset format in the docs")
+        return cls(path, values)
+
+    def error(self, name: str, problem: str) -> DataError:
+        return DataError(self.path, f"{self._prefix}{name} {problem}", "see the dataset format in the docs")
+
+    def get(self, name: str, kind: type, *default: Any) -> Any:
+        """The value of ``name``, converted to ``kind`` (float also takes integers)."""
+        if name not in self._values:
+            if default:
+                return default[0]
+            raise self.error(name, "is missing")
+        value = self._values[name]
+        accepted = (int, Decimal) if kind is float else kind
+        if not isinstance(value, accepted) or isinstance(value, bool):
+            raise self.error(name, f"is {value!r}, not of type {kind.__name__}")
+        return kind(value)
+
+    def block(self, name: str) -> _Metadata:
+        return _Metadata(self.path, self.get(name, dict), f"{self._prefix}{name}.")
+
+    def matrix(self, name: str) -> Tensor | None:
+        """The (4, 4) float64 matrix ``name``, or None when it is absent."""
+        if name not in self._values:
+            return None
+        return self.numbers(name, self._values[name], (4, 4))
+
+    def numbers(self, name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
+        try:
+            array = torch.tensor(_floats(value), dtype=torch.float64)
+        except (TypeError, ValueError):
+            raise self.error(name, f"is not a table of numbers: {value!r}") from None
+        if array.shape != shape or not array.isfinite().all():
+            raise self.error(name, f"must be {' x '.join(map(str, shape))} finite numbers")
+        return array
+
+
+def _floats(value: Any) -> Any:
+    return [_floats(item) for item in value] if isinstance(value, list) else float(value)
+
+
+def _camera(meta: _Metadata, width: str, height: str) -> EventCamera:
+    """A camera from Nerfstudio's names for intrinsics; the distortion in OpenCV's order k1 k2 p1 p2 k3 (or k1..k4)."""
+    lens = meta.get("lens_model", str, "radial_tangential")
+    names = ("k1", "k2", "k3", "k4") if lens == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    try:
+        return EventCamera(
+            meta.get(width, int),
+            meta.get(height, int),
+            *(meta.get(name, float) for name in ("fl_x", "fl_y", "cx", "cy")),
+            lens,
+            tuple(meta.get(name, float, 0.0) for name in names),
+        )
+    except DataError:
+        raise
+    except ValueError as error:
+        raise meta.error("intrinsics:", str(error)) from None
+
+
+def _scene_box(meta: _Metadata, value: list) -> Tensor:
+    box = meta.numbers("scene_box", value, (2, 3))
+    if (box[0] >= box[1]).any():
+        raise meta.error("scene_box", f"has corners {box.tolist()}, the first not below the second")
+    return box
+
+
+def _reference_views(
+    meta: _Metadata, frames: list, trajectory: Trajectory, frame_from_event: Tensor | None
+) -> dict[Split, list[ReferenceView]]:
+    """The images of each split. A frame without a pose but with a time stamp gets that of the trajectory."""
+    if frame_from_event is None:
+        frame_from_event = torch.eye(4, dtype=torch.float64)
+    views = {}
+    for index, values in enumerate(frames):
+        if not isinstance(values, dict):
+            raise meta.error("frames", f"holds {values!r}")
+        frame = _Metadata(meta.path, values, f"frames[{index}].")
+        name = frame.get("file_path", str)
+        file = meta.path.parent / name
+        if not file.is_file():
+            raise frame.error("file_path", f"names {name}, which does not exist")
+        stamp = frame.get("timestamp", float, None)
+        time = None if stamp is None else int((Decimal(values["timestamp"]) * 1_000_000_000).to_integral_value())
+        pose = frame.matrix("transform_matrix")
+        if pose is not None:
+            pose = pose @ OPENCV_TO_OPENGL
+        elif time is not None:
+            pose = homogeneous(trajectory.interpolate(time)) @ torch.linalg.inv(frame_from_event)
+        else:
+            raise frame.error("transform_matrix", "is missing, and so is timestamp")
+        views[name] = ReferenceView(file, pose, time)
+    splits: dict[Split, list[ReferenceView]] = {}
+    for split in _SPLITS:
+        names = meta.get(f"{split}_filenames", list, [])
+        unknown = [name for name in names if name not in views]
+        if unknown:
+            raise meta.error(f"{split}_filenames", f"names {unknown[0]}, which is not among the frames")
+        splits[split] = [views[name] for name in names]
+    return splits
+
+
+native_dataparser = DataParserSpecification(config=NativeDataParserConfig(), description="aenerf-ns dataset folder")

@@ -1,0 +1,137 @@
+"""Writing the native dataset format (docs/dataset_format.md)."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventWriter
+from aenerf_ns.dataparsers.recording import Split
+from aenerf_ns.dataparsers.text import format_seconds
+from aenerf_ns.dataparsers.tum_trajectory import write_tum_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.image_encoding import ImageEncoding
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory
+
+
+class NativeDatasetWriter:
+    """Writes a dataset folder, all of it or nothing. Use it as a context manager.
+
+    The folder gets its name when the last file is complete; when anything fails, nothing is left behind.
+
+    Args:
+        folder: the dataset folder to create.
+        event_camera: the event camera's lens.
+        sensor: its contrast thresholds, refractory period and Bayer pattern.
+        image_encoding: of the images to come.
+        scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
+
+    Raises:
+        DataError: the folder exists.
+
+    Attributes:
+        events: takes the events, in the order of time.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        event_camera: EventCamera,
+        sensor: SensorModel,
+        image_encoding: ImageEncoding,
+        scene_box: NDArray[np.float64] | None = None,
+    ) -> None:
+        if folder.exists():
+            raise DataError(folder, "the folder exists already", "remove it or choose another --output")
+        self._folder = folder
+        self._partial = folder.with_name(f".{folder.name}.partial")
+        shutil.rmtree(self._partial, ignore_errors=True)
+        self._partial.mkdir(parents=True)
+        self.events = Hdf5EventWriter(self._partial / "events.h5")
+        lens = _lens(event_camera)
+        self._meta: dict[str, Any] = {
+            "w": event_camera.width,
+            "h": event_camera.height,
+            **lens,
+            "image_encoding": image_encoding,
+            "event_camera": {
+                "file": "events.h5",
+                "width": event_camera.width,
+                "height": event_camera.height,
+                **lens,
+                "positive_contrast_threshold": sensor.positive_contrast_threshold,
+                "negative_contrast_threshold": sensor.negative_contrast_threshold,
+                "refractory_period_ns": sensor.refractory_period,
+                "bayer_pattern": sensor.bayer_pattern,
+            },
+            "frames": [],
+            **{f"{split}_filenames": [] for split in ("train", "val", "test")},
+        }
+        if scene_box is not None:
+            self._meta["scene_box"] = scene_box.tolist()
+
+    def __enter__(self) -> NativeDatasetWriter:
+        return self
+
+    def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
+        self.events.__exit__()
+        if error_type is not None:
+            shutil.rmtree(self._partial)
+            return
+        # A JSON number has all the digits that it is written with, but Python writes none with those of a nanosecond.
+        text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(self._meta, indent=2))
+        (self._partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
+        self._partial.rename(self._folder)
+
+    def add_trajectories(self, estimated: Trajectory, ground_truth: Trajectory | None = None) -> None:
+        """Writes the estimated and, where it is known, the true trajectory (OpenCV camera axes)."""
+        write_tum_trajectory(self._partial / "trajectory_estimated.txt", estimated)
+        if ground_truth is not None:
+            write_tum_trajectory(self._partial / "trajectory_ground_truth.txt", ground_truth)
+
+    def add_image(
+        self, split: Split, image: NDArray[np.uint8], camera_to_world: Tensor, time: int | None = None
+    ) -> None:
+        """Adds a reference image.
+
+        Args:
+            split: which split it belongs to.
+            image: (height, width, 3) display values.
+            camera_to_world: (4, 4) pose, OpenCV camera axes.
+            time: in nanoseconds, when the image was taken on the trajectory.
+        """
+        names = self._meta[f"{split}_filenames"]
+        name = f"images/{split}/{len(names):05d}.png"
+        (self._partial / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(self._partial / name)
+        frame: dict[str, Any] = {
+            "file_path": name,
+            "transform_matrix": (camera_to_world.double() @ OPENCV_TO_OPENGL).tolist(),
+        }
+        if time is not None:
+            frame["timestamp"] = format_seconds(time)
+        self._meta["frames"].append(frame)
+        names.append(name)
+
+
+def _lens(camera: EventCamera) -> dict[str, Any]:
+    names = ("k1", "k2", "k3", "k4") if camera.lens_model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    return {
+        "camera_model": "OPENCV_FISHEYE" if camera.lens_model == "fisheye" else "OPENCV",
+        "lens_model": camera.lens_model,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        **dict(zip(names, camera.distortion, strict=True)),
+    }

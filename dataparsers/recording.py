@@ -1,0 +1,229 @@
+"""What every dataset format gives, and how Nerfstudio is given it: the base of all dataparsers."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import torch
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventFile
+from aenerf_ns.image_encoding import ImageEncoding
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+
+Split = Literal["train", "val", "test"]
+
+# Training cameras are only there to be seen: the framework's viewer and its start-up slow down with their number.
+_MAX_SHOWN = 100
+
+
+@dataclass(frozen=True)
+class ReferenceView:
+    """An image with its pose. Reference images serve evaluation, colour correction and the viewer, never training.
+
+    Attributes:
+        file: the image.
+        camera_to_world: (4, 4) float64 pose, OpenCV camera axes.
+        time: in nanoseconds on the clock of the events, or None for an image that was not taken on the trajectory.
+    """
+
+    file: Path
+    camera_to_world: Tensor
+    time: int | None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording of an event camera, in the world frame and the units of its poses.
+
+    Attributes:
+        event_file: the events, not yet read.
+        event_camera: the event camera's lens.
+        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
+        trajectory: the estimated trajectory of the event camera, camera-to-world, OpenCV camera axes.
+        frame_camera: the lens of the camera that took the reference views.
+        reference_views: the images of each split.
+        image_encoding: whether the images' values are sRGB or linear in radiance.
+        scene_box: (2, 3) smallest and largest corner of a box that holds the whole scene, or None for a scene
+            without bounds.
+    """
+
+    event_file: EventFile
+    event_camera: EventCamera
+    sensor: SensorModel
+    trajectory: Trajectory
+    frame_camera: EventCamera
+    reference_views: dict[Split, list[ReferenceView]]
+    image_encoding: ImageEncoding
+    scene_box: Tensor | None = None
+
+
+@dataclass
+class EventDataParserConfig(DataParserConfig):
+    """What all event dataparsers have in common."""
+
+    _target: type = field(default_factory=lambda: EventDataParser)
+    scale_factor: float = 1.0
+    """Factor on the camera positions, after the automatic scale."""
+    auto_scale_poses: bool = True
+    """Scale the estimated poses to fit in a box of +/- 1. Turn it off where the camera moves little compared to the
+    distance of the scene, and choose a scale_factor that brings the scene to a size of about 1 instead."""
+    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
+    """How to turn the world. Not used where the dataset states a scene box."""
+    center_method: Literal["poses", "focus", "none"] = "poses"
+    """Where to put the origin. Not used where the dataset states a scene box."""
+    start_time_ns: int | None = None
+    """Leave out what happened before this time on the clock of the events, in nanoseconds. By default the first event
+    or pose, whichever is later. A run's saved configuration holds the value that was used."""
+    end_time_ns: int | None = None
+    """Leave out what happened after this time, likewise."""
+
+
+class EventDataParser(DataParser):
+    """Gives Nerfstudio places on the estimated trajectory as training cameras and the reference views of a split for
+    evaluation. A format implements :meth:`read_recording` and nothing else.
+    """
+
+    config: EventDataParserConfig
+    downscale_factor: int | None = None
+
+    @abstractmethod
+    def read_recording(self) -> Recording:
+        """Reads all but the events.
+
+        Raises:
+            DataError: a file is missing or its content cannot be used.
+        """
+
+    @cached_property
+    def _recording(self) -> Recording:
+        return self.read_recording()
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs: object) -> DataparserOutputs:
+        recording = self._recording
+        start, end = self._time_window(recording)
+        trajectory = recording.trajectory.between(start, end).mapped(lambda poses: poses @ OPENCV_TO_OPENGL)
+        transform, scale, scene_box = self._world_transform(trajectory, recording.scene_box)
+
+        def to_scene(poses: Tensor) -> Tensor:
+            moved = transform @ poses
+            return torch.cat([moved[..., :3], scale * moved[..., 3:]], -1)
+
+        trajectory = trajectory.mapped(to_scene)
+        if split == "train":
+            times, images = _training_views(trajectory, recording.reference_views["train"])
+            cameras = recording.event_camera.cameras(trajectory.interpolate(times))
+        else:
+            views = _views_within(recording.reference_views[_as_split(split)], start, end)
+            poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
+            cameras = recording.frame_camera.cameras(to_scene(poses @ OPENCV_TO_OPENGL))
+            times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
+        # The framework wants a name for every camera, also for one without an image.
+        names = [images.get(index, Path(self.config.data) / f"camera_{index:05d}") for index in range(len(cameras))]
+        return DataparserOutputs(
+            image_filenames=names,
+            cameras=cameras,
+            scene_box=SceneBox(aabb=scene_box.float()),
+            dataparser_transform=transform.float(),
+            dataparser_scale=scale,
+            metadata={
+                "trajectory": trajectory,
+                "event_camera": recording.event_camera,
+                "event_file": recording.event_file,
+                "sensor": recording.sensor,
+                "time_window": (start, end),
+                "camera_times": times,
+                "has_image": [index in images for index in range(len(cameras))],
+                "image_encoding": recording.image_encoding,
+                "bounded": recording.scene_box is not None,
+            },
+        )
+
+    def _time_window(self, recording: Recording) -> tuple[int, int]:
+        """Resolves the time window and stores it in the configuration, so that opening a trained run needs no
+        events."""
+        config = self.config
+        if config.start_time_ns is None or config.end_time_ns is None:
+            first, last = recording.event_file.time_span()
+            if last < first:
+                raise DataError(
+                    recording.event_file.path,
+                    f"its last event, at {last} ns, is before its first, at {first} ns",
+                    "sort the events by time",
+                )
+            covered = recording.trajectory.between(first, last)
+            if config.start_time_ns is None:
+                config.start_time_ns = max(first, covered.start)
+            if config.end_time_ns is None:
+                config.end_time_ns = min(last, covered.end)
+        if config.start_time_ns >= config.end_time_ns:
+            raise DataError(
+                str(config.data),
+                f"nothing is left from {config.start_time_ns} to {config.end_time_ns} ns",
+                "widen the time window (--start-time-ns, --end-time-ns)",
+            )
+        return config.start_time_ns, config.end_time_ns
+
+    def _world_transform(self, trajectory: Trajectory, box: Tensor | None) -> tuple[Tensor, float, Tensor]:
+        """The (3, 4) motion and then the scale that bring the world to the scene's frame, and the scene box there.
+
+        Only the estimated trajectory and the stated box may enter here, never a true pose.
+        """
+        poses = homogeneous(trajectory.camera_to_worlds)
+        if box is not None:
+            center, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
+            transform = torch.cat([torch.eye(3, dtype=torch.float64), -center[:, None]], -1)
+            scale = self.config.scale_factor / float(half.max())
+            return transform, scale, torch.stack([-half, half]) * scale
+        oriented, transform = auto_orient_and_center_poses(
+            poses.float(), method=self.config.orientation_method, center_method=self.config.center_method
+        )
+        transform = transform.double()
+        scale = self.config.scale_factor
+        if self.config.auto_scale_poses:
+            scale /= float(oriented[:, :3, 3].abs().max())
+        return transform, scale, torch.tensor([[-1.0] * 3, [1.0] * 3])
+
+
+def _as_split(split: str) -> Split:
+    if split not in ("train", "val", "test"):
+        raise ValueError(f"there is no split {split!r}")
+    return split  # type: ignore[return-value]
+
+
+def _views_within(views: list[ReferenceView], start: int, end: int) -> list[ReferenceView]:
+    kept = [view for view in views if view.time is None or start <= view.time <= end]
+    if len(kept) < len(views):
+        CONSOLE.print(
+            f"{len(views) - len(kept)} of {len(views)} reference images are left out: they were taken outside the "
+            f"events' {start} to {end} ns."
+        )
+    return kept
+
+
+def _training_views(trajectory: Trajectory, views: list[ReferenceView]) -> tuple[Tensor, dict[int, Path]]:
+    """Where the viewer shows the camera: at knots and where images were taken, evenly thinned out.
+
+    Returns:
+        (N,) times in nanoseconds, and the images among them by index.
+    """
+    taken = {v.time: v.file for v in views if v.time is not None and trajectory.start <= v.time <= trajectory.end}
+    shown = _thin_out(sorted(taken))
+    times = sorted({*_thin_out(trajectory.times.tolist()), *shown})
+    return torch.tensor(times), {times.index(time): taken[time] for time in shown}
+
+
+def _thin_out(times: list[int]) -> list[int]:
+    count = min(len(times), _MAX_SHOWN)
+    return [times[round(i * (len(times) - 1) / max(count - 1, 1))] for i in range(count)]

@@ -1,0 +1,62 @@
+"""Trajectories in the text format of the TUM RGB-D benchmark: t tx ty tz qx qy qz qw, in seconds, camera-to-world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from aenerf_ns.dataparsers.text import format_seconds, parse_numbers, parse_seconds, read_rows
+from aenerf_ns.errors import DataError
+from aenerf_ns.trajectory.rotation import quaternion_from_rotation, rotation_from_quaternion
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+# Trajectories are commonly printed with six or more digits.
+_MAX_NORM_ERROR = 1e-3
+
+
+def read_tum_trajectory(path: Path) -> Trajectory:
+    """Reads a trajectory.
+
+    Args:
+        path: text file of t tx ty tz qx qy qz qw; # starts a comment.
+
+    Returns:
+        Camera-to-world poses with the axes of the file.
+
+    Raises:
+        DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
+            not increase.
+    """
+    rows = read_rows(path, "t tx ty tz qx qy qz qw")
+    if not rows:
+        raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
+    times = parse_seconds(path, [row[0] for row in rows])
+    values = parse_numbers(path, [row[1:] for row in rows])
+    bad = ~np.isfinite(values).all(1)
+    if bad.any():
+        index = int(np.argmax(bad))
+        raise DataError(path, f"pose {index} holds {' '.join(rows[index][1:])}", "drop poses that are not finite")
+    norms = np.linalg.norm(values[:, 3:], axis=1)
+    bad = np.abs(norms - 1) > _MAX_NORM_ERROR
+    if bad.any():
+        index = int(np.argmax(bad))
+        raise DataError(
+            path,
+            f"the quaternion of pose {index} has length {norms[index]:.6g}",
+            "write unit quaternions in the order qx qy qz qw",
+        )
+    rotations = rotation_from_quaternion(torch.from_numpy(values[:, 3:] / norms[:, None]))
+    poses = torch.cat([rotations, torch.from_numpy(values[:, :3, None])], -1)
+    return Trajectory(times, poses, path)
+
+
+def write_tum_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Writes a trajectory; reading it again gives the same poses to 12 digits and the same times exactly."""
+    quaternions = quaternion_from_rotation(trajectory.camera_to_worlds[:, :, :3])
+    values = torch.cat([trajectory.camera_to_worlds[:, :, 3], quaternions], -1)
+    with path.open("w", encoding="utf-8") as file:
+        file.write("# t[s] tx ty tz qx qy qz qw, camera-to-world, OpenCV camera axes\n")
+        for time, row in zip(trajectory.times.tolist(), values.tolist(), strict=True):
+            file.write(f"{format_seconds(time)} {' '.join(f'{value:.12g}' for value in row)}\n")

@@ -1,0 +1,44 @@
+"""``ns-train aenerf``: AE-NeRF on hash grids, for a GPU."""
+
+from __future__ import annotations
+
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import MultiStepSchedulerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from aenerf_ns.datamanager import EventDataManagerConfig
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.ffmpeg import provide_ffmpeg
+from aenerf_ns.model import AENeRFModelConfig
+from aenerf_ns.pipeline import AENeRFPipelineConfig
+from aenerf_ns.training import AENeRFTrainerConfig
+
+# Every ns-* command imports this module, ns-render among them.
+provide_ffmpeg()
+
+aenerf = MethodSpecification(
+    config=AENeRFTrainerConfig(
+        method_name="aenerf",
+        max_num_iterations=30000,
+        steps_per_save=2000,
+        steps_per_eval_batch=500,
+        steps_per_eval_image=500,
+        pipeline=AENeRFPipelineConfig(
+            datamanager=EventDataManagerConfig(dataparser=NativeDataParserConfig()), model=AENeRFModelConfig()
+        ),
+        optimizers={
+            "encodings": {
+                "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15),
+                "scheduler": MultiStepSchedulerConfig(gamma=0.33),
+            },
+            "networks": {
+                "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
+                "scheduler": MultiStepSchedulerConfig(gamma=0.33),
+            },
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="viewer",
+    ),
+    description="AE-NeRF: event camera to radiance field, on hash grids.",
+)

@@ -1,0 +1,42 @@
+"""``ns-train aenerf-small``: the same method, small enough to train in minutes on a laptop's CPU."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+
+from nerfstudio.plugins.types import MethodSpecification
+
+from aenerf_ns.method_configs.aenerf import aenerf
+
+_base = deepcopy(aenerf.config)
+
+aenerf_small = MethodSpecification(
+    config=replace(
+        _base,
+        method_name="aenerf-small",
+        max_num_iterations=2000,
+        steps_per_save=1000,
+        pipeline=replace(
+            _base.pipeline,
+            datamanager=replace(
+                _base.pipeline.datamanager, train_num_rays_per_batch=1024, eval_num_rays_per_batch=1024
+            ),
+            model=replace(
+                _base.pipeline.model,
+                num_levels=8,
+                max_resolution=256,
+                log2_hashmap_size=15,
+                hidden_dim=32,
+                num_proposal_samples_per_ray=(48,),
+                num_nerf_samples_per_ray=24,
+                proposal_max_resolutions=(64,),
+                proposal_num_levels=4,
+                proposal_log2_hashmap_size=14,
+                proposal_weights_anneal_iterations=200,
+                eval_num_rays_per_chunk=1 << 13,
+            ),
+        ),
+    ),
+    description="AE-NeRF, small: for a CPU and for a first look.",
+)

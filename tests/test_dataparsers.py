@@ -1,0 +1,409 @@
+"""Reading datasets: round trips, the real recording, and malformed input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from PIL import Image
+
+from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
+from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.dataparsers.text import format_seconds, parse_seconds
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.dataset import EventDataset
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+
+CAMERA = EventCamera(6, 4, 5.0, 5.5, 3.0, 2.0, "radial_tangential", (0.01, 0.0, 0.001, 0.0, 0.0))
+SENSOR = SensorModel(0.3, 0.2, 1000, "RGGB")
+START, END = 1_600_000_000_000_000_001, 1_600_000_002_000_000_001
+
+
+def make_trajectory() -> Trajectory:
+    """21 poses, 0.1 s apart, that move by 0.3 along x, from above the z axis, with a slow turn."""
+    angles = torch.linspace(0, 0.3, 21, dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(21, 1, 1)
+    poses[:, 0, 0] = poses[:, 1, 1] = torch.cos(angles)
+    poses[:, 0, 1] = -torch.sin(angles)
+    poses[:, 1, 0] = torch.sin(angles)
+    poses[:, 0, 3] = angles
+    poses[:, 2, 3] = 2.0
+    return Trajectory(START + 100_000_000 * np.arange(21), poses)
+
+
+def write_native(folder: Path, scene_box: np.ndarray | None = None) -> Path:
+    trajectory = make_trajectory()
+    rng = np.random.default_rng(0)
+    with NativeDatasetWriter(folder, CAMERA, SENSOR, "srgb", scene_box) as writer:
+        t = np.sort(rng.integers(START, END + 1, 200))
+        x, y = rng.integers(0, 6, 200).astype(np.uint16), rng.integers(0, 4, 200).astype(np.uint16)
+        p = rng.choice(np.array([-1, 1], np.int8), 200)
+        for part in (slice(0, 90), slice(90, 200)):
+            writer.events.append(x[part], y[part], t[part], p[part])
+        writer.add_trajectories(trajectory, trajectory)
+        picture = np.full((4, 6, 3), 77, np.uint8)
+        for time in (START, START + 150_000_000, END):
+            writer.add_image("train", picture, homogeneous(trajectory.interpolate(time)), time)
+        writer.add_image("val", picture, homogeneous(trajectory.camera_to_worlds[3]))
+        writer.add_image("test", picture + 1, homogeneous(trajectory.camera_to_worlds[4]))
+        writer.add_image("test", picture + 2, homogeneous(trajectory.camera_to_worlds[5]))
+    return folder
+
+
+def write_ecd(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "images").mkdir()
+    for index in range(4):
+        Image.fromarray(np.full((4, 6), 40 * index, np.uint8)).save(folder / "images" / f"{index}.png")
+    (folder / "images.txt").write_text("".join(f"{0.05 + 0.1 * i} images/{i}.png\n" for i in range(4)))
+    (folder / "events.txt").write_text("0.01 1 2 1\n0.02 1 2 0\n0.03 5 3 1\n0.31 1 2 1\n")
+    (folder / "calib.txt").write_text("5 5.5 2.5 1.5 0.01 0 0 0 0\n")
+    (folder / "groundtruth.txt").write_text("".join(f"{0.1 * i} {0.02 * i} 0 0 0 0 0 1\n" for i in range(5)))
+    return folder
+
+
+AS_RECORDED = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
+
+
+def parse(config: EcdDataParserConfig | NativeDataParserConfig, split: str = "train") -> DataparserOutputs:
+    return config.setup().get_dataparser_outputs(split)
+
+
+def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    outputs = parse(NativeDataParserConfig(data=folder, **AS_RECORDED))
+    metadata = outputs.metadata
+    assert metadata["event_camera"] == CAMERA
+    assert metadata["sensor"] == SENSOR
+    assert metadata["image_encoding"] == "srgb"
+    assert not metadata["bounded"]
+    expected = make_trajectory()
+    assert torch.equal(metadata["trajectory"].times, expected.times)
+    torch.testing.assert_close(
+        metadata["trajectory"].camera_to_worlds,
+        (homogeneous(expected.camera_to_worlds) @ OPENCV_TO_OPENGL)[:, :3],
+        rtol=0,
+        atol=1e-11,
+    )
+    for split, values in (("val", [77]), ("test", [78, 79])):
+        dataset = EventDataset(parse(NativeDataParserConfig(data=folder), split))
+        assert [int(dataset.get_numpy_image(i)[0, 0, 0]) for i in range(len(dataset))] == values
+    events = list(metadata["event_file"].chunks())
+    assert sum(map(len, events)) == metadata["event_file"].count() == 200
+    assert metadata["event_file"].time_span() == (events[0].t[0], events[-1].t[-1])
+
+
+def test_all_splits_share_one_world_and_the_transform_is_the_one_reported(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    config = NativeDataParserConfig(data=folder)
+    train, test = parse(config), parse(config, "test")
+    assert train.dataparser_scale == test.dataparser_scale
+    assert torch.equal(train.dataparser_transform, test.dataparser_transform)
+    original = train.transform_poses_to_original_space(test.cameras.camera_to_worlds, "opencv")
+    torch.testing.assert_close(original, make_trajectory().camera_to_worlds[[4, 5]].float(), rtol=0, atol=1e-5)
+    # The framework's convention: cameras fit in a box of +/- 1 about the origin.
+    assert train.metadata["trajectory"].camera_to_worlds[:, :, 3].abs().max().item() == pytest.approx(1.0, rel=1e-2)
+
+
+def test_a_scene_box_sets_the_scale_and_bounds_the_scene(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made", np.array([[-1.0, -2.0, 0.0], [3.0, 4.0, 1.0]]))
+    outputs = parse(NativeDataParserConfig(data=folder))
+    assert outputs.metadata["bounded"]
+    torch.testing.assert_close(outputs.scene_box.aabb, torch.tensor([[-2 / 3, -1, -1 / 6], [2 / 3, 1, 1 / 6]]))
+    first = outputs.metadata["trajectory"].camera_to_worlds[0, :, 3]
+    torch.testing.assert_close(first, torch.tensor([-1.0, -1.0, 1.5], dtype=torch.float64) / 3)
+
+
+def test_training_cameras_show_images_where_they_were_taken_and_events_elsewhere(tmp_path: Path) -> None:
+    dataset = EventDataset(parse(NativeDataParserConfig(data=write_native(tmp_path / "made"))))
+    has_image = dataset.metadata["has_image"]
+    # Knots, of which two are also image times, and one image between two knots.
+    assert len(dataset) == 22
+    assert [i for i, image in enumerate(has_image) if image] == [0, 2, 21]
+    assert (dataset.get_numpy_image(2) == 77).all()
+    picture = dataset.get_numpy_image(10)
+    assert picture.shape == (4, 6, 3)
+    assert (picture.max(-1) != picture.min(-1)).any()
+
+
+def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    start, end = START + 500_000_000, START + 1_050_000_000
+    dataset = EventDataset(parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end)))
+    trajectory = dataset.metadata["trajectory"]
+    assert (trajectory.start, trajectory.end) == (start, START + 1_100_000_000)
+    assert not any(dataset.metadata["has_image"])
+    assert dataset.pairs.previous_time.min() >= start
+    assert dataset.pairs.time.max() <= end
+    assert dataset.pairs.num_outside > 0
+    with pytest.raises(DataError, match="nothing is left from 9 to 9 ns"):
+        parse(NativeDataParserConfig(data=folder, start_time_ns=9, end_time_ns=9))
+
+
+def test_opening_again_with_the_resolved_window_needs_no_events(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    config = NativeDataParserConfig(data=folder)
+    before = parse(config)
+    assert config.start_time_ns is not None
+    (folder / "events.h5").unlink()
+    after = parse(config)
+    assert torch.equal(before.cameras.camera_to_worlds, after.cameras.camera_to_worlds)
+    # The viewer shows plain pictures then.
+    assert EventDataset(after).get_numpy_image(10).std() == 0
+
+
+def test_a_frame_without_a_pose_gets_that_of_its_time(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    meta = json.loads((folder / "transforms.json").read_text())
+    time = START + 150_000_000
+    for frame in meta["frames"]:
+        if frame["file_path"] == meta["test_filenames"][0]:
+            del frame["transform_matrix"]
+            frame["timestamp"] = "STAMP"
+    shift = np.eye(4)
+    shift[0, 3] = 0.5
+    meta["event_camera"]["T_frame_event"] = shift.tolist()
+    # Every digit of the time counts, beyond what a JSON writer's float holds.
+    (folder / "transforms.json").write_text(json.dumps(meta).replace('"STAMP"', format_seconds(time)))
+    config = NativeDataParserConfig(
+        data=folder, orientation_method="none", center_method="none", auto_scale_poses=False
+    )
+    pose = parse(config, "test").cameras.camera_to_worlds[0]
+    expected = homogeneous(make_trajectory().interpolate(time)) @ torch.linalg.inv(torch.from_numpy(shift))
+    torch.testing.assert_close(pose, (expected @ OPENCV_TO_OPENGL)[:3].float(), rtol=0, atol=1e-6)
+
+
+def test_nothing_is_left_of_a_dataset_that_could_not_be_completed(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), NativeDatasetWriter(tmp_path / "made", CAMERA, SENSOR, "srgb"):
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+    write_native(tmp_path / "made")
+    with pytest.raises(DataError, match="made: the folder exists already"):
+        NativeDatasetWriter(tmp_path / "made", CAMERA, SENSOR, "srgb")
+
+
+def test_tum_trajectories_round_trip_to_the_nanosecond(tmp_path: Path) -> None:
+    trajectory = make_trajectory()
+    write_tum_trajectory(tmp_path / "poses.txt", trajectory)
+    back = read_tum_trajectory(tmp_path / "poses.txt")
+    assert torch.equal(back.times, trajectory.times)
+    torch.testing.assert_close(back.camera_to_worlds, trajectory.camera_to_worlds, rtol=0, atol=1e-11)
+
+
+def test_seconds_are_parsed_and_printed_exactly() -> None:
+    texts = ["1600000000.123456789", "0", "1e-9", "-0.5", "12."]
+    parsed = parse_seconds(Path("t"), texts)
+    assert parsed.tolist() == [1_600_000_000_123_456_789, 0, 1, -500_000_000, 12_000_000_000]
+    assert parse_seconds(Path("t"), [format_seconds(int(t)) for t in parsed]).tolist() == parsed.tolist()
+
+
+def test_ecd_text_reads(tmp_path: Path) -> None:
+    config = EcdDataParserConfig(data=write_ecd(tmp_path / "made"))
+    dataset = EventDataset(parse(config))
+    camera = dataset.metadata["event_camera"]
+    # The format counts the principal point from the centre of the first pixel.
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (6, 4, 3.0, 2.0)
+    (chunk,) = dataset.metadata["event_file"].chunks()
+    assert chunk.t.tolist() == [10_000_000, 20_000_000, 30_000_000, 310_000_000]
+    assert chunk.p.tolist() == [1, -1, 1, 1]
+    assert dataset.metadata["time_window"] == (10_000_000, 310_000_000)
+    assert dataset.pairs.time.tolist() == [20_000_000, 310_000_000]
+    # Images at 0.05 and 0.25 s validate, 0.15 s tests, 0.35 s is after the last event.
+    assert len(parse(config, "val").image_filenames) == 2
+    assert len(parse(config, "test").image_filenames) == 1
+
+
+def test_the_real_recording_reads(slider_depth: Path) -> None:
+    config = EcdDataParserConfig(data=slider_depth)
+    dataset = EventDataset(parse(config))
+    pairs = dataset.pairs
+    assert pairs.num_events == 50_000
+    # The first pose is at 0.0223 s, the events begin at 0.0038 s.
+    assert dataset.metadata["time_window"] == (22_291_582, 174_156_000)
+    assert pairs.num_outside == 3_251
+    assert len(pairs) + pairs.num_first + pairs.num_outside + pairs.num_merged == 50_000
+    assert len(parse(config, "test").image_filenames) == 2
+    # A linear slider: straight on, no turn.
+    poses = dataset.metadata["trajectory"].camera_to_worlds
+    assert (poses[:, :, :3] - poses[:1, :, :3]).abs().max() < 1e-6
+    assert torch.linalg.matrix_rank(poses[1:, :, 3] - poses[0, :, 3], atol=1e-4) == 1
+
+
+def replace_line(name: str, line: int, text: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        lines = (folder / name).read_text().splitlines()
+        lines[line] = text
+        (folder / name).write_text("\n".join(lines) + "\n")
+
+    return change
+
+
+def write_text(name: str, text: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_text(text) and None
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
+
+
+ECD_FAULTS = {
+    "no folder": (lambda folder: shutil.rmtree(folder), "made: there is no such folder"),
+    "no events": (remove("events.txt"), "events.txt: there is no such event file"),
+    "no poses": (remove("groundtruth.txt"), "groundtruth.txt: there is no such file"),
+    "no calibration": (remove("calib.txt"), "calib.txt: there is no such file"),
+    "missing image": (remove("images/1.png"), "images.txt: it names images/1.png, which does not exist"),
+    "empty stream": (write_text("events.txt", ""), "events.txt: the file holds no events"),
+    "five fields": (replace_line("events.txt", 1, "0.02 1 2 0 9"), "events.txt: .*number of columns"),
+    "a word": (replace_line("events.txt", 1, "0.02 one 2 0"), "events.txt: .*one"),
+    "signed polarity": (replace_line("events.txt", 1, "0.02 1 2 -1"), "line 2 has polarity -1; .* 0 or 1"),
+    "pixel outside": (replace_line("events.txt", 2, "0.03 6 3 1"), "line 3 has x 6; .* below 6"),
+    "negative pixel": (replace_line("events.txt", 2, "0.03 5 -1 1"), "line 3 has y -1; .* below 4"),
+    "fractional pixel": (replace_line("events.txt", 2, "0.03 2.5 1 1"), "line 3 has x 2.5; .*whole numbers"),
+    "time is NaN": (replace_line("events.txt", 2, "nan 2 1 1"), "line 3 has time nan"),
+    "unsorted": (replace_line("events.txt", 2, "0.015 2 1 1"), "event 2 is at 15000000 ns, before .* 20000000 ns"),
+    "NaN pose": (replace_line("groundtruth.txt", 2, "0.2 nan 0 0 0 0 0 1"), "groundtruth.txt: pose 2 holds nan"),
+    "long quaternion": (
+        replace_line("groundtruth.txt", 2, "0.2 0 0 0 0 0 1 1"),
+        "quaternion of pose 2 has length 1.414",
+    ),
+    "seven numbers": (replace_line("groundtruth.txt", 2, "0.2 0 0 0 0 0 1"), "line 3 has 7 fields; .* the 8: t tx"),
+    "pose is a word": (replace_line("groundtruth.txt", 2, "0.2 x 0 0 0 0 0 1"), "groundtruth.txt: not a number .*'x'"),
+    "pose time is a word": (replace_line("groundtruth.txt", 2, "now 0 0 0 0 0 0 1"), "now is not a time in seconds"),
+    "unsorted poses": (replace_line("groundtruth.txt", 2, "0.05 0 0 0 0 0 0 1"), "pose 2 is at 50000000 ns, not after"),
+    "one pose": (write_text("groundtruth.txt", "0 0 0 0 0 0 0 1\n"), "at least two timed poses"),
+    "no pose": (write_text("groundtruth.txt", "# nothing\n"), "groundtruth.txt: the file holds no poses"),
+    "no overlap": (
+        write_text("groundtruth.txt", "5 0 0 0 0 0 0 1\n6 1 0 0 0 0 0 1\n"),
+        "groundtruth.txt: .*do not overlap the events from 10000000 to 310000000 ns; check .* one clock",
+    ),
+    "short calibration": (
+        write_text("calib.txt", "5 5.5 2.5 1.5\n"),
+        "calib.txt: line 1 has 4 fields; .* the 9: fx",
+    ),
+    "empty calibration": (write_text("calib.txt", ""), "calib.txt: the file is empty"),
+    "no focal length": (write_text("calib.txt", "0 5 2 1 0 0 0 0 0\n"), "calib.txt: fx must be positive"),
+}
+
+
+@pytest.mark.parametrize("fault", ECD_FAULTS)
+def test_malformed_ecd_text_is_one_clear_line(fault: str, tmp_path: Path) -> None:
+    folder = write_ecd(tmp_path / "made")
+    change, message = ECD_FAULTS[fault]
+    change(folder)
+    with pytest.raises(DataError, match=message) as error:
+        EventDataset(parse(EcdDataParserConfig(data=folder))).pairs  # noqa: B018
+    assert "\n" not in str(error.value)
+    assert str(folder) in str(error.value)
+
+
+def edit_json(edit: Callable[[dict], object]) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        meta = json.loads((folder / "transforms.json").read_text())
+        edit(meta)
+        (folder / "transforms.json").write_text(json.dumps(meta))
+
+    return change
+
+
+def replace_column(name: str, values: np.ndarray | None) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        with h5py.File(folder / "events.h5", "r+") as file:
+            del file[f"events/{name}"]
+            if values is not None:
+                file[f"events/{name}"] = values
+
+    return change
+
+
+def empty_events(folder: Path) -> None:
+    for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.int8)):
+        replace_column(name, np.zeros(0, dtype))(folder)
+
+
+def set_time_unit(folder: Path) -> None:
+    with h5py.File(folder / "events.h5", "r+") as file:
+        file["events"].attrs["time_unit"] = "fortnight"
+
+
+NATIVE_FAULTS = {
+    "no transforms": (remove("transforms.json"), "transforms.json: there is no such file"),
+    "no JSON": (write_text("transforms.json", "{"), "transforms.json: not valid JSON"),
+    "a list": (write_text("transforms.json", "[]"), "not a JSON object"),
+    "no event camera": (edit_json(lambda m: m.pop("event_camera")), "event_camera is missing"),
+    "no focal length": (edit_json(lambda m: m["event_camera"].pop("fl_x")), "event_camera.fl_x is missing"),
+    "width is a word": (
+        edit_json(lambda m: m["event_camera"].update(width="wide")),
+        "event_camera.width is 'wide'",
+    ),
+    "no threshold": (
+        edit_json(lambda m: m["event_camera"].pop("positive_contrast_threshold")),
+        "event_camera.positive_contrast_threshold is missing",
+    ),
+    "negative threshold": (
+        edit_json(lambda m: m["event_camera"].update(negative_contrast_threshold=-1)),
+        "negative_contrast_threshold must be a positive number",
+    ),
+    "unknown Bayer pattern": (edit_json(lambda m: m["event_camera"].update(bayer_pattern="GRBG")), '"GRBG"'),
+    "unknown lens": (edit_json(lambda m: m["event_camera"].update(lens_model="kb4")), "lens_model must be one of"),
+    "unknown encoding": (edit_json(lambda m: m.update(image_encoding="log")), 'image_encoding is "log"'),
+    "box inside out": (edit_json(lambda m: m.update(scene_box=[[1, 1, 1], [0, 0, 0]])), "scene_box has corners"),
+    "box is flat": (edit_json(lambda m: m.update(scene_box=[[1, 1, 1]])), "scene_box must be 2 x 3"),
+    "missing image": (remove("images/val/00000.png"), "names images/val/00000.png, which does not exist"),
+    "unknown split file": (edit_json(lambda m: m.update(test_filenames=["x.png"])), "names x.png, which is not among"),
+    "short matrix": (
+        edit_json(lambda m: m["frames"][0].update(transform_matrix=[[1]])),
+        r"frames\[0\].transform_matrix must be 4 x 4",
+    ),
+    "neither pose nor time": (
+        edit_json(lambda m: [f.pop(k, None) for f in m["frames"] for k in ("transform_matrix", "timestamp")]),
+        r"frames\[0\].transform_matrix is missing, and so is timestamp",
+    ),
+    "no events": (remove("events.h5"), "events.h5: there is no such event file"),
+    "not HDF5": (write_text("events.h5", "t x y p"), "events.h5: not a readable HDF5 file"),
+    "no column": (replace_column("p", None), "there is no dataset /events/p"),
+    "wrong dtype": (replace_column("t", np.zeros(200)), "/events/t has type float64 .*int64"),
+    "short column": (replace_column("x", np.zeros(3, np.uint16)), "its columns have lengths"),
+    "empty stream": (empty_events, "events.h5: the file holds no events"),
+    "unknown unit": (set_time_unit, "its time unit is 'fortnight'; use one of ns, us, ms"),
+    "polarity 0": (replace_column("p", np.zeros(200, np.int8)), r"event 0 has polarity 0; .*2 \* p - 1"),
+    "pixel outside": (replace_column("x", np.full(200, 6, np.uint16)), "event 0 has x = 6 on a sensor of width 6"),
+    "unsorted": (replace_column("t", START + 10**9 - np.arange(200)), "sort the events by time"),
+    "no overlap": (replace_column("t", np.arange(200)), "trajectory_estimated.txt: .*do not overlap the events"),
+    "no poses": (remove("trajectory_estimated.txt"), "trajectory_estimated.txt: there is no such file"),
+}
+
+
+@pytest.mark.parametrize("fault", NATIVE_FAULTS)
+def test_malformed_native_datasets_are_one_clear_line(fault: str, tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    change, message = NATIVE_FAULTS[fault]
+    change(folder)
+    with pytest.raises(DataError, match=message) as error:
+        EventDataset(parse(NativeDataParserConfig(data=folder))).pairs  # noqa: B018
+    assert "\n" not in str(error.value)
+    assert str(folder) in str(error.value)
+
+
+def test_times_in_other_units_with_an_offset(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        for name, dtype in (("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
+            file[f"events/{name}"] = np.ones(3, dtype)
+        file["events/t"] = np.array([1, 2, 5])
+        file["events"].attrs["time_unit"] = "us"
+        file["events"].attrs["time_offset"] = 1000
+    events = Hdf5EventFile(tmp_path / "events.h5", 2, 2)
+    (chunk,) = events.chunks()
+    assert chunk.t.tolist() == [1_001_000, 1_002_000, 1_005_000]
+    assert events.time_span() == (1_001_000, 1_005_000)

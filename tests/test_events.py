@@ -1,0 +1,147 @@
+"""Event streams, pairing, the sensor model and event pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from conftest import make_stream
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.pairs import EventPairs, pair_events
+from aenerf_ns.events.picture import polarity_picture
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+
+WIDTH, HEIGHT = 4, 3
+# Small ranges, so that pixels repeat and times coincide.
+EVENTS = st.lists(
+    st.tuples(st.integers(0, WIDTH - 1), st.integers(0, HEIGHT - 1), st.integers(0, 30), st.sampled_from([-1, 1])),
+    min_size=1,
+    max_size=120,
+).map(lambda rows: sorted(rows, key=lambda row: row[2]))
+
+
+def brute_force_pairs(rows: list[tuple[int, int, int, int]], refractory_period: int) -> set[tuple[int, ...]]:
+    """(x, y, previous time, time, positives, negatives) of every pair, the slow and obvious way."""
+    pairs = set()
+    for pixel in {(x, y) for x, y, _, _ in rows}:
+        here = [(t, p) for x, y, t, p in rows if (x, y) == pixel]
+        times = sorted({t for t, _ in here})
+        for previous, time in pairwise(times):
+            if time - previous > refractory_period:
+                polarities = [p for t, p in here if t == time]
+                pairs.add((*pixel, previous, time, polarities.count(1), polarities.count(-1)))
+    return pairs
+
+
+def as_set(pairs: EventPairs) -> set[tuple[int, ...]]:
+    columns = (pairs.x, pairs.y, pairs.previous_time, pairs.time, pairs.num_positive, pairs.num_negative)
+    rows = list(zip(*(column.tolist() for column in columns), strict=True))
+    assert len(set(rows)) == len(rows)
+    return set(rows)
+
+
+def cut(stream: EventStream, sizes: list[int]) -> Iterator[EventStream]:
+    begin = 0
+    for size in [*sizes, len(stream)]:
+        yield stream[begin : begin + size]
+        begin += size
+
+
+@settings(max_examples=300, deadline=None)
+@given(EVENTS, st.lists(st.integers(0, 20), max_size=6), st.integers(0, 5))
+def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
+    rows: list[tuple[int, int, int, int]], sizes: list[int], refractory_period: int
+) -> None:
+    pairs = pair_events(cut(make_stream(rows), sizes), refractory_period=refractory_period)
+    assert as_set(pairs) == brute_force_pairs(rows, refractory_period)
+    assert (np.diff(pairs.time) >= 0).all()
+    # Every event is in a pair or accounted for.
+    merged_in_pairs = pairs.num_positive.astype(int).sum() + pairs.num_negative.astype(int).sum() - len(pairs)
+    assert pairs.num_events == len(rows)
+    distinct = len({(x, y, t) for x, y, t, _ in rows})
+    assert pairs.num_merged == len(rows) - distinct >= merged_in_pairs
+    assert len(pairs) + pairs.num_first + pairs.num_within_refractory_period == distinct
+
+
+@given(EVENTS, st.integers(0, 30), st.integers(0, 30))
+@settings(max_examples=100, deadline=None)
+def test_events_outside_the_time_window_are_left_out_and_counted(
+    rows: list[tuple[int, int, int, int]], start: int, end: int
+) -> None:
+    inside = [row for row in rows if start <= row[2] <= end]
+    if not inside:
+        with pytest.raises(DataError, match=f"none of its {len(rows)} events lies between {start} and {end} ns"):
+            pair_events([make_stream(rows)], start=start, end=end)
+        return
+    pairs = pair_events([make_stream(rows)], start=start, end=end, expected_events=len(rows))
+    assert as_set(pairs) == brute_force_pairs(inside, 0)
+    assert pairs.num_outside == len(rows) - len(inside)
+
+
+def test_pairing_large_times_is_exact() -> None:
+    start = 1_600_000_000_000_000_000
+    pairs = pair_events([make_stream([(1, 2, start, 1), (1, 2, start + 1, -1)])])
+    assert as_set(pairs) == {(1, 2, start, start + 1, 0, 1)}
+
+
+def test_more_merged_events_than_can_be_counted_are_refused() -> None:
+    rows = [(0, 0, 1, 1)] + [(0, 0, 7, 1)] * 256
+    with pytest.raises(DataError, match=r"pixel \(0, 0\) share the time 7 ns"):
+        pair_events([make_stream(rows)])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x": np.array([0, 4, 0], np.uint16)}, "event 1 has x = 4 on a sensor of width 4"),
+        ({"y": np.array([0, 0, 3], np.uint16)}, "event 2 has y = 3 on a sensor of height 3"),
+        ({"t": np.array([5, 4, 6], np.int64)}, "event 1 is at 4 ns, before the event ahead of it at 5 ns"),
+        ({"p": np.array([1, 0, 1], np.int8)}, r"event 1 has polarity 0; .*2 \* p - 1"),
+        ({"t": np.array([1.0, 2.0, 3.0])}, "column t has type float64 .*one row of int64"),
+        ({"x": np.array([0, 1, 2], np.int64)}, "column x has type int64"),
+        ({"p": np.array([1, 1], np.int8)}, "column p has 2 entries but column t has 3"),
+    ],
+)
+def test_malformed_streams_are_refused(change: dict[str, np.ndarray], message: str) -> None:
+    columns = {
+        "x": np.array([0, 1, 2], np.uint16),
+        "y": np.array([0, 1, 2], np.uint16),
+        "t": np.array([1, 2, 3], np.int64),
+        "p": np.array([1, -1, 1], np.int8),
+    }
+    EventStream(**columns, width=WIDTH, height=HEIGHT, source="good.h5")
+    with pytest.raises(DataError, match=f"^bad.h5: .*{message}") as error:
+        EventStream(**{**columns, **change}, width=WIDTH, height=HEIGHT, source="bad.h5")
+    assert "\n" not in str(error.value)
+
+
+def test_bayer_channels_follow_the_raw_pixel() -> None:
+    sensor = SensorModel(bayer_pattern="RGGB")
+    x, y = np.array([0, 1, 0, 1, 2, 3], np.uint16), np.array([0, 0, 1, 1, 2, 3], np.uint16)
+    assert sensor.channel(x, y).tolist() == [0, 1, 1, 2, 0, 2]
+    assert sensor.num_channels == 3
+    assert SensorModel().channel(x, y).tolist() == [0] * 6
+    assert SensorModel(0.2, 0.4).mean_contrast_threshold == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    "values", [(0.0, 0.25), (0.25, -1.0), (float("nan"), 0.25), (0.25, 0.25, -1), (0.25, 0.25, 0, "BGGR")]
+)
+def test_impossible_sensors_are_refused(values: tuple) -> None:
+    with pytest.raises(ValueError, match="must"):
+        SensorModel(*values)
+
+
+def test_polarity_picture_shows_signs() -> None:
+    picture = polarity_picture(np.array([0, 0, 1]), np.array([1, 1, 0]), np.array([1, 1, -1]), 2, 2).astype(int)
+    positive, negative, neither = picture[1, 0], picture[0, 1], picture[0, 0]
+    assert positive[0] > neither[0] > positive[2]
+    assert negative[2] > neither[2] > negative[0]
+    assert (picture[1, 1] == neither).all()
+    assert (np.diff(neither) == 0).all()

@@ -1,0 +1,95 @@
+"""Loss values, colour correction and image encodings on cases worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from aenerf_ns.color_correction import AffineColorCorrection
+from aenerf_ns.image_encoding import decode, encode, to_channels
+from aenerf_ns.image_metrics import ImageMetrics
+from aenerf_ns.losses import log_radiance_change, reconstruction_loss
+
+
+def test_changes_count_positive_and_negative_events() -> None:
+    change = log_radiance_change(torch.tensor([1.0, 0.0, 2.0]), torch.tensor([0.0, 1.0, 3.0]), 0.2, 0.5)
+    torch.testing.assert_close(change, torch.tensor([0.2, -0.5, -1.1]))
+
+
+def test_reconstruction_loss_by_hand() -> None:
+    predicted, target = torch.tensor([0.1, -0.2, 0.4]), torch.tensor([0.2, -0.5, 0.2])
+    expected = (0.01 + 0.09 + 0.04) / 3 / 0.35**2
+    assert reconstruction_loss(predicted, target, 0.35).item() == pytest.approx(expected)
+    # A field that does not change misses each event by one threshold.
+    assert reconstruction_loss(torch.zeros(2), torch.tensor([0.3, -0.3]), 0.3).item() == pytest.approx(1.0)
+
+
+def test_srgb_encoding_has_the_standards_values_and_inverts() -> None:
+    radiance = torch.tensor([0.0, 0.0031308, 0.18, 1.0], dtype=torch.float64)
+    expected = torch.tensor([0.0, 0.04045, 0.461356, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(encode(radiance, "srgb"), expected, atol=2e-6, rtol=0)
+    torch.testing.assert_close(decode(encode(radiance, "srgb"), "srgb"), radiance, atol=1e-9, rtol=0)
+    assert torch.equal(encode(torch.tensor([-1.0, 0.5, 2.0]), "linear"), torch.tensor([0.0, 0.5, 1.0]))
+
+
+def test_a_monochrome_sensor_sees_luminance() -> None:
+    colours = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    torch.testing.assert_close(to_channels(colours, 1)[:, 0], torch.tensor([1.0, 0.2126, 0.7152]))
+    assert torch.equal(to_channels(colours, 3), colours)
+
+
+def test_affine_fit_recovers_gain_and_exponent_of_each_channel() -> None:
+    generator = torch.Generator().manual_seed(0)
+    reference = torch.rand(5000, 3, generator=generator)
+    gain, exponent = torch.tensor([0.3, 2.0, 1.0]), torch.tensor([0.5, 1.0, 1.7])
+    log_radiance = exponent * torch.log(reference + 1e-3) + torch.log(gain)
+    correction = AffineColorCorrection(3)
+    correction.fit(log_radiance, reference, num_views=7)
+    torch.testing.assert_close(correction.scale, 1 / exponent)
+    torch.testing.assert_close(correction(log_radiance), reference, atol=1e-4, rtol=1e-4)
+    assert int(correction.num_views) == 7
+    restored = AffineColorCorrection(3)
+    restored.load_state_dict(correction.state_dict())
+    assert torch.equal(restored(log_radiance), correction(log_radiance))
+
+
+def test_affine_fit_of_a_constant_rendering_is_the_mean() -> None:
+    correction = AffineColorCorrection(1)
+    correction.fit(torch.full((4, 1), 0.7), torch.full((4, 1), 0.25), num_views=1)
+    torch.testing.assert_close(correction(torch.tensor([[0.7]])), torch.tensor([[0.25]]))
+
+
+def test_percentile_stretch_covers_the_display() -> None:
+    correction = AffineColorCorrection(1)
+    log_radiance = torch.linspace(-5, 3, 1001)[:, None]
+    correction.stretch(log_radiance)
+    shown = correction(log_radiance)
+    assert shown[10].item() == pytest.approx(0.02, rel=1e-3)
+    assert shown[990].item() == pytest.approx(0.9, rel=1e-3)
+    assert int(correction.num_views) == 0
+
+
+def test_psnr_by_hand_and_lpips_is_absent_unless_asked_for() -> None:
+    reference = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)) * 0.5
+    metrics = ImageMetrics(with_lpips=False)
+    values = metrics(reference + 0.1, reference)
+    assert values["psnr"] == pytest.approx(-20 * math.log10(0.1), abs=1e-3)
+    assert 0 < values["ssim"] < 1
+    assert "lpips" not in values
+    assert metrics.lpips_absent is not None
+
+
+def test_lpips_without_weights_is_absent_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_connection(*_: object, **__: object) -> None:
+        raise OSError("no connection")
+
+    monkeypatch.setattr("torch.hub.load_state_dict_from_url", no_connection)
+    monkeypatch.setattr("torchvision._internally_replaced_utils.load_state_dict_from_url", no_connection, raising=False)
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", no_connection, raising=False)
+    image = torch.rand(64, 64, 3)
+    metrics = ImageMetrics(with_lpips=True)
+    values = metrics(image, image)
+    assert "lpips" not in values
+    assert "no connection" in str(metrics.lpips_absent)
