@@ -56,12 +56,12 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return self.dataset_type(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
 
     def setup_train(self) -> None:
-        """Reads the events, for training only: a trained run is opened without them."""
-        if self.test_mode != "val":
-            return
+        """Reads the events for training. A trained run is opened without them."""
+        if self.test_mode == "val":
+            _ = self.train_dataset.pairs
         metadata = self.train_dataset.metadata
         self.train_pixel_sampler = EventRaySampler(
-            self.train_dataset.pairs,
+            lambda: self.train_dataset.pairs,
             metadata["event_camera"],
             metadata["sensor"],
             deepcopy(metadata["trajectory"]).to(self.device),

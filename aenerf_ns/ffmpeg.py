@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from pathlib import Path
 
 
 def provide_ffmpeg() -> None:
     """Puts the ffmpeg binary that imageio-ffmpeg ships on this process' PATH where there is no other.
 
-    Nerfstudio's ns-render refuses to start without a program of that name, and pip cannot install one.
+    Nerfstudio's ns-render refuses to start without a program of that name, and pip cannot install one. Never fails:
+    where it cannot be done, ns-render tells the user what to install.
     """
     if shutil.which("ffmpeg") is not None:
         return
@@ -19,13 +19,15 @@ def provide_ffmpeg() -> None:
 
     try:
         binary = Path(imageio_ffmpeg.get_ffmpeg_exe())
-    except RuntimeError:
-        # No binary for this platform: ns-render will tell the user what to install.
+        # The shipped file has another name, so it needs a link; the folder's name is that of its version.
+        folder = Path.home() / ".cache" / "aenerf-ns" / binary.stem
+        folder.mkdir(parents=True, exist_ok=True)
+        link = folder / "ffmpeg"
+        if not link.exists() or not link.samefile(binary):
+            # Replaced in one step, for another process may be starting at the same time.
+            new = folder / f"ffmpeg.{os.getpid()}"
+            new.symlink_to(binary)
+            new.replace(link)
+    except (OSError, RuntimeError):
         return
-    # The shipped file has another name. The folder is the user's own and is made once for each binary.
-    folder = Path(tempfile.gettempdir()) / f"aenerf-ns-{os.getuid()}" / binary.stem
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    link = folder / "ffmpeg"
-    if not link.exists():
-        link.symlink_to(binary)
     os.environ["PATH"] = f"{os.environ.get('PATH', '')}{os.pathsep}{folder}"

@@ -7,10 +7,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-ImageEncoding = Literal["srgb", "linear"]
+from aenerf_ns.events.sensor import LUMINANCE
 
-# Luminance of linear RGB, Rec. 709: what a monochrome sensor sees of a colour image.
-_LUMINANCE = (0.2126, 0.7152, 0.0722)
+ImageEncoding = Literal["srgb", "linear"]
 
 
 def decode(image: Tensor, encoding: ImageEncoding) -> Tensor:
@@ -34,4 +33,4 @@ def to_channels(radiance: Tensor, num_channels: int) -> Tensor:
     """Linear (..., 3) RGB as a sensor of 1 (luminance) or 3 channels sees it."""
     if num_channels == 3:
         return radiance
-    return (radiance * radiance.new_tensor(_LUMINANCE)).sum(-1, keepdim=True)
+    return (radiance * radiance.new_tensor(LUMINANCE)).sum(-1, keepdim=True)

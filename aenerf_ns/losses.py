@@ -8,7 +8,7 @@ from torch import Tensor
 def log_radiance_change(
     num_positive: Tensor, num_negative: Tensor, positive_threshold: float, negative_threshold: float
 ) -> Tensor:
-    """Change of log-radiance that a pair of events tells of: Δ = n+ C+ − n− C− (paper, eq. 4).
+    """Change of log-radiance that a pair of events tells of: Δ = n+ C+ − n− C− (paper, eq. 5).
 
     Args:
         num_positive: (N,) positive events at the later time, one but for merged events.
@@ -23,7 +23,7 @@ def log_radiance_change(
 
 
 def reconstruction_loss(predicted: Tensor, target: Tensor, mean_contrast_threshold: float) -> Tensor:
-    """ℓ_r (paper, eq. 10): the mean squared error of log-radiance changes, in units of the mean contrast threshold.
+    """ℓ_r (paper, eq. 11): the mean squared error of log-radiance changes, in units of the mean contrast threshold.
 
     Args:
         predicted: (N,) rendered changes of log-radiance.

@@ -38,7 +38,7 @@ class AENeRFModelConfig(ModelConfig):
 
     _target: type = field(default_factory=lambda: AENeRFModel)
     scene_contraction: Literal["auto", "l2", "linf", "none"] = "auto"
-    """How unbounded space is contracted (paper, eq. 6: l2). "auto" is "none" for a dataset that states a scene box
+    """How unbounded space is contracted (paper, eq. 7: l2). "auto" is "none" for a dataset that states a scene box
     and "l2" for others."""
     near_plane: float = 0.05
     """Distance at which rays start, in scene units."""
@@ -78,7 +78,7 @@ class AENeRFModelConfig(ModelConfig):
     loss_coefficients: dict[str, float] = to_immutable_dict(
         {"reconstruction_loss": 1.0, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
     )
-    """Weights of the losses (paper, eq. 13: alpha, gamma, eta). A weight of 0 turns a loss off."""
+    """Weights of the losses (paper, eq. 14: alpha, gamma, eta). A weight of 0 turns a loss off."""
     color_correction_num_rays: int = 16384
     """Pixels, spread over all validation views, on which the colour correction is fitted."""
     lpips: bool = False
@@ -156,7 +156,7 @@ class AENeRFModel(Model):
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Hash tables (and the background) apart from the networks, on whose weights alone there is weight decay."""
+        """Hash tables (and the background) apart from the networks, which alone get weight decay."""
         groups: dict[str, list[Parameter]] = {"encodings": [], "networks": []}
         for module in (self.field, self.proposal_networks):
             for name, parameter in module.named_parameters():
@@ -221,7 +221,7 @@ class AENeRFModel(Model):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
-        """The weighted terms of the paper's total loss (eq. 13) on a batch of the event ray sampler."""
+        """The weighted terms of the paper's total loss (eq. 14) on a batch of the event ray sampler."""
         mean_threshold = self.sensor.mean_contrast_threshold
         predicted, target = self._log_radiance_changes(outputs, batch)
         losses = {"reconstruction_loss": reconstruction_loss(predicted, target, mean_threshold)}

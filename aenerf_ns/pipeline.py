@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +18,9 @@ from aenerf_ns.datamanager import EventDataManager
 from aenerf_ns.dataset import EventDataset
 from aenerf_ns.model import AENeRFModel
 
-# Steps between fits of the colour correction, so that the viewer shows a sensible picture while training.
-_COLOR_CORRECTION_INTERVAL = 500
+# Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
+_ROUGH_FIT_INTERVAL = 50
+_ROUGH_FIT_SHARE = 1 / 8
 
 
 @dataclass
@@ -55,33 +57,38 @@ class AENeRFPipeline(VanillaPipeline):
         last_step = trainer._start_step + trainer.config.max_num_iterations - 1
 
         def fit(step: int) -> None:
-            due = step_check(step, _COLOR_CORRECTION_INTERVAL) or step_check(step, trainer.config.steps_per_save)
-            if due or step == last_step:
+            if step == last_step or step_check(step, trainer.config.steps_per_save):
                 self.fit_color_correction()
+            elif step_check(step, _ROUGH_FIT_INTERVAL, run_at_zero=True):
+                self.fit_color_correction(_ROUGH_FIT_SHARE)
 
         # After every step, since the trainer saves its last checkpoint before its callbacks for the end of training.
         callback = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], fit, update_every_num_iters=1)
         return [*super().get_training_callbacks(training_callback_attributes), callback]
 
     @torch.no_grad()
-    def fit_color_correction(self) -> None:
+    def fit_color_correction(self, share: float = 1.0) -> None:
         """Fits the colour correction on the validation views (protocol "affine"), or where there are none stretches
         what the training cameras see over the display's range.
+
+        Args:
+            share: of the configured number of pixels to fit it on.
         """
         views = self.datamanager.eval_dataset
+        num_rays = round(share * self.model.config.color_correction_num_rays)
         if views is None:
-            log_radiance, _ = self._sample_pixels(self.datamanager.train_dataset, with_images=False)
+            log_radiance, _ = self._sample_pixels(self.datamanager.train_dataset, num_rays, with_images=False)
             self.model.color_correction.stretch(log_radiance)
             return
-        log_radiance, image = self._sample_pixels(views, with_images=True)
+        log_radiance, image = self._sample_pixels(views, num_rays, with_images=True)
         self.model.color_correction.fit(log_radiance, self.model.reference_radiance(image), len(views))
 
-    def _sample_pixels(self, views: EventDataset, with_images: bool) -> tuple[Tensor, Tensor]:
+    def _sample_pixels(self, views: EventDataset, num_rays: int, with_images: bool) -> tuple[Tensor, Tensor]:
         """Rendered log-radiance (N, channels) and image values (N, 3) of random pixels of all views, the same pixels
         at every call."""
         generator = torch.Generator().manual_seed(0)
         cameras = views.cameras.to(self.device)
-        count = max(self.model.config.color_correction_num_rays // len(views), 1)
+        count = max(num_rays // len(views), 1)
         bundles, values = [], []
         for index in range(len(views)):
             size = (int(cameras.height[index]), int(cameras.width[index]))
@@ -108,6 +115,8 @@ class AENeRFPipeline(VanillaPipeline):
                 "images to evaluate on; ns-render shows what was reconstructed"
             )
         metrics: dict[str, Any] = super().get_average_eval_image_metrics(step, output_path, get_std)
+        # A single view has no standard deviation, and NaN is no JSON.
+        metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
         if self.test_mode == "test":
             # The trainer's log, in the other mode, takes numbers only.
             num_views = int(self.model.color_correction.num_views)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ class EventRaySampler:
     Nerfstudio seeds.
 
     Args:
-        pairs: pairs to sample from; they stay in host memory.
+        pairs: gives the pairs to sample from, which stay in host memory; asked when the first batch is drawn.
         camera: the lens, for the exact direction of each raw pixel.
         sensor: for the refractory period and the pixels' colour filters.
         trajectory: camera-to-world poses, OpenGL camera axes; on the device of the rays.
@@ -32,7 +33,7 @@ class EventRaySampler:
 
     def __init__(
         self,
-        pairs: EventPairs,
+        pairs: Callable[[], EventPairs],
         camera: EventCamera,
         sensor: SensorModel,
         trajectory: Trajectory,
@@ -44,7 +45,7 @@ class EventRaySampler:
         directions, has_direction = camera.pixel_directions()
         if not has_direction.all():
             CONSOLE.print(
-                f"[yellow]The lens model has no direction for {(~has_direction).sum()} pixels: their events are left out."
+                f"[yellow]The lens model gives {(~has_direction).sum()} pixels no direction; their events are left out"
             )
         self._has_direction = has_direction
         self._directions = torch.from_numpy(directions).to(trajectory.times.device)
@@ -64,8 +65,8 @@ class EventRaySampler:
             of events at its end and the ``channel`` (N,) of its pixel's filter.
         """
         num_pairs = num_pairs or max(self.num_rays_per_batch // 2, 1)
-        pairs, device = self._pairs, self._directions.device
-        index = self._draw(num_pairs)
+        pairs, device = self._pairs(), self._directions.device
+        index = self._draw(pairs, num_pairs)
         x, y = pairs.x[index].astype(np.int64), pairs.y[index].astype(np.int64)
         starts = pairs.previous_time[index] + self.sensor.refractory_period
         times = torch.from_numpy(np.concatenate([starts, pairs.time[index]])).to(device)
@@ -88,12 +89,12 @@ class EventRaySampler:
         }
         return rays, batch
 
-    def _draw(self, num_pairs: int) -> np.ndarray:
+    def _draw(self, pairs: EventPairs, num_pairs: int) -> np.ndarray:
         """Uniform indices of pairs whose pixel has a direction, by rejection: a copy of the pairs would be costly."""
         drawn = np.empty(0, dtype=np.int64)
         while len(drawn) < num_pairs:
-            index = torch.randint(len(self._pairs), (num_pairs - len(drawn),)).numpy()
-            keep = self._has_direction[self._pairs.y[index], self._pairs.x[index]]
+            index = torch.randint(len(pairs), (num_pairs - len(drawn),)).numpy()
+            keep = self._has_direction[pairs.y[index], pairs.x[index]]
             drawn = np.concatenate([drawn, index[keep]])
         return drawn
 

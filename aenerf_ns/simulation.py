@@ -13,6 +13,7 @@ from torch import Tensor
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.esim import EventSimulator
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.image_encoding import encode, to_channels
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.scenes import BuiltInScene
@@ -20,8 +21,6 @@ from aenerf_ns.scenes.frames import frame_parameters
 from aenerf_ns.scenes.paths import SpeedProfile
 from aenerf_ns.scenes.raycast import render
 from aenerf_ns.trajectory.trajectory import Trajectory
-
-Events = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
 
 # Rays through a pixel: enough that the frames' own aliasing triggers few events, and references without visible noise.
 _EVENT_SAMPLES = 4
@@ -37,10 +36,12 @@ class Simulation:
         sensor: thresholds, refractory period and Bayer pattern.
         speed: "easy" for constant speed, "hard" for 8^sin(2πt) times that speed.
         easy_duration: seconds that the path takes at constant speed.
+        max_displacement: pixels that the image may move between two rendered frames.
+        contrast_threshold_spread: standard deviation of the thresholds over the pixels.
         seed: of the sensor's thresholds.
 
     Raises:
-        ValueError: the duration is not positive.
+        ValueError: an argument is out of range.
     """
 
     def __init__(
@@ -50,13 +51,19 @@ class Simulation:
         sensor: SensorModel,
         speed: Literal["easy", "hard"],
         easy_duration: float,
+        max_displacement: float,
+        contrast_threshold_spread: float,
         seed: int,
     ) -> None:
         self._scene = scene
         self._camera = camera
         self._sensor = sensor
         self._profile = SpeedProfile(speed, easy_duration)
-        self._seed = seed
+        width, height = camera.width, camera.height
+        self._simulator = EventSimulator(
+            width, height, sensor, contrast_threshold_spread=contrast_threshold_spread, seed=seed
+        )
+        self._frames = frame_parameters(scene.scene, scene.path, self._intrinsics, width, height, max_displacement)
 
     @property
     def _intrinsics(self) -> tuple[float, float, float, float]:
@@ -84,37 +91,16 @@ class Simulation:
     def _poses(self, parameters: NDArray[np.float64]) -> Tensor:
         return torch.from_numpy(np.stack([self._scene.path(float(s)) for s in parameters.clip(0, 1)]))
 
-    def events(self, max_displacement: float, contrast_threshold_spread: float) -> Iterator[Events]:
-        """Renders the path densely and yields the events (x, y, t in nanoseconds, p) from frame to frame.
-
-        Args:
-            max_displacement: pixels that the image may move between two frames.
-            contrast_threshold_spread: standard deviation of the thresholds over the pixels.
-
-        Raises:
-            ValueError: an argument is out of range.
-        """
-        camera, sensor = self._camera, self._sensor
-        simulator = EventSimulator(
-            camera.width,
-            camera.height,
-            positive_contrast_threshold=sensor.positive_contrast_threshold,
-            negative_contrast_threshold=sensor.negative_contrast_threshold,
-            contrast_threshold_spread=contrast_threshold_spread,
-            refractory_period=sensor.refractory_period,
-            bayer_pattern=sensor.bayer_pattern,
-            seed=self._seed,
-        )
-        parameters = frame_parameters(
-            self._scene.scene, self._scene.path, self._intrinsics, camera.width, camera.height, max_displacement
-        )
-        times = _nanoseconds(self._profile.time(parameters))
+    def events(self) -> Iterator[EventStream]:
+        """Renders the path densely and yields the events from frame to frame, once."""
+        camera = self._camera
+        times = _nanoseconds(self._profile.time(self._frames))
         with progress_bar() as progress:
             for parameter, time in progress.track(
-                zip(parameters, times, strict=True), total=len(times), description="Simulating events"
+                zip(self._frames, times, strict=True), total=len(times), description="Simulating events"
             ):
                 image = self._render(self._scene.path(float(parameter)), _EVENT_SAMPLES)
-                yield simulator(image, int(time))
+                yield EventStream(*self._simulator(image, int(time)), camera.width, camera.height, "simulation")
 
     def reference_image(self, camera_to_world: NDArray[np.float64] | Tensor) -> NDArray[np.uint8]:
         """The (height, width, 3) sRGB picture from a pose, grey for a monochrome sensor."""

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+
+with suppress(ImportError):
+    # Registers Blosc and other compression filters with h5py, where the extra is installed.
+    import hdf5plugin  # noqa: F401
 
 _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 _NANOSECONDS = {"ns": 1, "us": 1_000, "ms": 1_000_000}
@@ -48,16 +53,29 @@ class Hdf5EventFile(EventFile):
         if len(set(lengths.values())) > 1:
             raise DataError(self.path, f"its columns have lengths {lengths}", "store all four with the same length")
         attributes = file["events"].attrs
-        unit = attributes.get("time_unit", "ns")
+        unit, offset = attributes.get("time_unit", "ns"), attributes.get("time_offset", 0)
+        unit = unit.decode() if isinstance(unit, bytes) else unit
         if unit not in _NANOSECONDS:
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_NANOSECONDS)}")
-        return columns, _NANOSECONDS[unit], int(attributes.get("time_offset", 0)) * _NANOSECONDS[unit]
+        if offset != int(offset):
+            raise DataError(self.path, f"its time offset is {offset}", "use a whole number in the unit of the times")
+        return columns, _NANOSECONDS[unit], int(offset) * _NANOSECONDS[unit]
+
+    def _read(self, column: h5py.Dataset, index: slice | int) -> Any:
+        try:
+            return column[index]
+        except OSError as error:
+            raise DataError(
+                self.path,
+                f"{column.name} cannot be read ({error})",
+                "where a compression filter is missing, pip install 'aenerf-ns[hdf5-filters]'; else copy it again",
+            ) from None
 
     def read_chunks(self) -> Iterator[EventStream]:
         with self._open() as file:
             columns, tick, offset = self._columns(file)
             for begin in range(0, len(columns["t"]), _CHUNK):
-                part = {name: column[begin : begin + _CHUNK] for name, column in columns.items()}
+                part = {name: self._read(column, slice(begin, begin + _CHUNK)) for name, column in columns.items()}
                 part["t"] = part["t"] * tick + offset
                 yield EventStream(**part, width=self.width, height=self.height, source=self.path)
 
@@ -66,7 +84,8 @@ class Hdf5EventFile(EventFile):
             columns, tick, offset = self._columns(file)
             if len(columns["t"]) == 0:
                 raise self.empty_error()
-            return int(columns["t"][0]) * tick + offset, int(columns["t"][-1]) * tick + offset
+            first, last = (int(self._read(columns["t"], index)) for index in (0, -1))
+            return first * tick + offset, last * tick + offset
 
     def count(self) -> int:
         with self._open() as file:
@@ -85,8 +104,8 @@ class Hdf5EventWriter:
         group = self._file.create_group("events")
         group.attrs["time_unit"] = "ns"
         group.attrs["time_offset"] = 0
-        self._columns = [
-            group.create_dataset(
+        self._columns = {
+            name: group.create_dataset(
                 name,
                 shape=(0,),
                 maxshape=(None,),
@@ -99,8 +118,9 @@ class Hdf5EventWriter:
                 track_times=False,
             )
             for name, dtype in _DTYPES.items()
-        ]
-        self._waiting: list[tuple[NDArray, ...]] = []
+        }
+        self._waiting: list[EventStream] = []
+        self._last_time: int | None = None
 
     def __enter__(self) -> Hdf5EventWriter:
         return self
@@ -109,17 +129,28 @@ class Hdf5EventWriter:
         self._flush()
         self._file.close()
 
-    def append(self, x: NDArray[np.uint16], y: NDArray[np.uint16], t: NDArray[np.int64], p: NDArray[np.int8]) -> None:
-        """Appends events, which must not be earlier than those already written."""
-        self._waiting.append((x, y, t, p))
-        if sum(len(part[0]) for part in self._waiting) >= _WRITE_CHUNK:
+    def append(self, events: EventStream) -> None:
+        """Appends events.
+
+        Raises:
+            DataError: they are earlier than those already written.
+        """
+        if len(events) == 0:
+            return
+        if self._last_time is not None and events.t[0] < self._last_time:
+            raise DataError(
+                events.source, f"{events.t[0]} ns is before {self._last_time} ns", "sort the events by time"
+            )
+        self._last_time = int(events.t[-1])
+        self._waiting.append(events)
+        if sum(map(len, self._waiting)) >= _WRITE_CHUNK:
             self._flush()
 
     def _flush(self) -> None:
         if not self._waiting:
             return
-        for column, parts in zip(self._columns, zip(*self._waiting, strict=True), strict=True):
-            values = np.concatenate(parts)
+        for name, column in self._columns.items():
+            values = np.concatenate([getattr(events, name) for events in self._waiting])
             column.resize(len(column) + len(values), axis=0)
             column[len(column) - len(values) :] = values
         self._waiting = []

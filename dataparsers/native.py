@@ -22,10 +22,16 @@ from aenerf_ns.dataparsers.recording import (
 )
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.event_camera import EventCamera, LensModel
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.image_encoding import ImageEncoding
-from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous, require_rigid
+
+# The lens and the names of its distortion parameters, in OpenCV's order, for Nerfstudio's names of camera models.
+LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
+    "OPENCV": ("radial_tangential", ("k1", "k2", "p1", "p2", "k3")),
+    "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4")),
+}
 
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
@@ -55,17 +61,7 @@ class NativeDataParser(EventDataParser):
         event_camera = _camera(block, "width", "height")
         trajectory = read_tum_trajectory(folder / "trajectory_estimated.txt")
         frames = meta.get("frames", list, [])
-        try:
-            sensor = SensorModel(
-                self.config.positive_contrast_threshold or block.get("positive_contrast_threshold", float),
-                self.config.negative_contrast_threshold or block.get("negative_contrast_threshold", float),
-                block.get("refractory_period_ns", int, 0)
-                if self.config.refractory_period_ns is None
-                else self.config.refractory_period_ns,
-                block.get("bayer_pattern", str, ""),  # type: ignore[arg-type]
-            )
-        except ValueError as error:
-            raise DataError(meta.path, f"event_camera: {error}", "correct the sensor's values") from None
+        sensor = self._sensor(block)
         encoding: ImageEncoding = meta.get("image_encoding", str, "srgb")  # type: ignore[assignment]
         if encoding not in ("srgb", "linear"):
             raise DataError(meta.path, f'image_encoding is "{encoding}"', 'use "srgb" or "linear"')
@@ -80,6 +76,22 @@ class NativeDataParser(EventDataParser):
             image_encoding=encoding,
             scene_box=None if box is None else _scene_box(meta, box),
         )
+
+    def _sensor(self, block: _Metadata) -> SensorModel:
+        """The dataset's sensor, with what the options give in its place."""
+        options = self.config
+        chosen = {
+            name: block.get(name, float) if getattr(options, name) is None else getattr(options, name)
+            for name in ("positive_contrast_threshold", "negative_contrast_threshold")
+        }
+        period = options.refractory_period_ns
+        if period is None:
+            period = block.get("refractory_period_ns", int, 0)
+        pattern = block.get("bayer_pattern", str, "")
+        try:
+            return SensorModel(**chosen, refractory_period=period, bayer_pattern=pattern)
+        except ValueError as error:
+            raise DataError(block.path, f"event_camera: {error}", "correct it there or among the options") from None
 
 
 class _Metadata:
@@ -144,9 +156,11 @@ def _floats(value: Any) -> Any:
 
 
 def _camera(meta: _Metadata, width: str, height: str) -> EventCamera:
-    """A camera from Nerfstudio's names for intrinsics; the distortion in OpenCV's order k1 k2 p1 p2 k3 (or k1..k4)."""
-    lens = meta.get("lens_model", str, "radial_tangential")
-    names = ("k1", "k2", "k3", "k4") if lens == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    """A camera from Nerfstudio's names for intrinsics."""
+    model = meta.get("camera_model", str, "OPENCV")
+    if model not in LENS_MODELS:
+        raise meta.error("camera_model", f"is {model!r}, not one of {', '.join(LENS_MODELS)}")
+    lens, names = LENS_MODELS[model]
     try:
         return EventCamera(
             meta.get(width, int),
@@ -174,12 +188,14 @@ def _reference_views(
     """The images of each split. A frame without a pose but with a time stamp gets that of the trajectory."""
     if frame_from_event is None:
         frame_from_event = torch.eye(4, dtype=torch.float64)
-    views = {}
+    views: dict[str, ReferenceView] = {}
     for index, values in enumerate(frames):
         if not isinstance(values, dict):
             raise meta.error("frames", f"holds {values!r}")
         frame = _Metadata(meta.path, values, f"frames[{index}].")
         name = frame.get("file_path", str)
+        if name in views:
+            raise frame.error("file_path", f"names {name} again")
         file = meta.path.parent / name
         if not file.is_file():
             raise frame.error("file_path", f"names {name}, which does not exist")
@@ -187,6 +203,7 @@ def _reference_views(
         time = None if stamp is None else int((Decimal(values["timestamp"]) * 1_000_000_000).to_integral_value())
         pose = frame.matrix("transform_matrix")
         if pose is not None:
+            require_rigid(pose[None], f"{meta.path}: frames[{index}].transform_matrix")
             pose = pose @ OPENCV_TO_OPENGL
         elif time is not None:
             pose = homogeneous(trajectory.interpolate(time)) @ torch.linalg.inv(frame_from_event)

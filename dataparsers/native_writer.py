@@ -14,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventWriter
+from aenerf_ns.dataparsers.native import LENS_MODELS
 from aenerf_ns.dataparsers.recording import Split
 from aenerf_ns.dataparsers.text import format_seconds
 from aenerf_ns.dataparsers.tum_trajectory import write_tum_trajectory
@@ -40,7 +41,7 @@ class NativeDatasetWriter:
         DataError: the folder exists.
 
     Attributes:
-        events: takes the events, in the order of time.
+        events: takes the events, piece by piece in the order of time.
     """
 
     def __init__(
@@ -84,14 +85,16 @@ class NativeDatasetWriter:
         return self
 
     def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
-        self.events.__exit__()
-        if error_type is not None:
-            shutil.rmtree(self._partial)
-            return
-        # A JSON number has all the digits that it is written with, but Python writes none with those of a nanosecond.
-        text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(self._meta, indent=2))
-        (self._partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
-        self._partial.rename(self._folder)
+        try:
+            self.events.__exit__()
+            if error_type is None:
+                # A JSON number has all the digits that it is written with, but Python writes none with those of a
+                # nanosecond.
+                text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(self._meta, indent=2))
+                (self._partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
+                self._partial.rename(self._folder)
+        finally:
+            shutil.rmtree(self._partial, ignore_errors=True)
 
     def add_trajectories(self, estimated: Trajectory, ground_truth: Trajectory | None = None) -> None:
         """Writes the estimated and, where it is known, the true trajectory (OpenCV camera axes)."""
@@ -125,10 +128,9 @@ class NativeDatasetWriter:
 
 
 def _lens(camera: EventCamera) -> dict[str, Any]:
-    names = ("k1", "k2", "k3", "k4") if camera.lens_model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    model, names = next((model, names) for model, (lens, names) in LENS_MODELS.items() if lens == camera.lens_model)
     return {
-        "camera_model": "OPENCV_FISHEYE" if camera.lens_model == "fisheye" else "OPENCV",
-        "lens_model": camera.lens_model,
+        "camera_model": model,
         "fl_x": camera.fx,
         "fl_y": camera.fy,
         "cx": camera.cx,

@@ -13,6 +13,7 @@ from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
@@ -126,6 +127,8 @@ class EventDataParser(DataParser):
             cameras = recording.event_camera.cameras(trajectory.interpolate(times))
         else:
             views = _views_within(recording.reference_views[_as_split(split)], start, end)
+            for view in views:
+                _check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
             cameras = recording.frame_camera.cameras(to_scene(poses @ OPENCV_TO_OPENGL))
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
@@ -154,7 +157,8 @@ class EventDataParser(DataParser):
         """Resolves the time window and stores it in the configuration, so that opening a trained run needs no
         events."""
         config = self.config
-        if config.start_time_ns is None or config.end_time_ns is None:
+        start, end = config.start_time_ns, config.end_time_ns
+        if start is None or end is None:
             first, last = recording.event_file.time_span()
             if last < first:
                 raise DataError(
@@ -162,17 +166,15 @@ class EventDataParser(DataParser):
                     f"its last event, at {last} ns, is before its first, at {first} ns",
                     "sort the events by time",
                 )
-            covered = recording.trajectory.between(first, last)
-            if config.start_time_ns is None:
-                config.start_time_ns = max(first, covered.start)
-            if config.end_time_ns is None:
-                config.end_time_ns = min(last, covered.end)
-        if config.start_time_ns >= config.end_time_ns:
+            start, end = first if start is None else start, last if end is None else end
+        if start >= end:
             raise DataError(
                 str(config.data),
-                f"nothing is left from {config.start_time_ns} to {config.end_time_ns} ns",
+                f"nothing is left from {start} to {end} ns",
                 "widen the time window (--start-time-ns, --end-time-ns)",
             )
+        covered = recording.trajectory.between(start, end)
+        config.start_time_ns, config.end_time_ns = max(start, covered.start), min(end, covered.end)
         return config.start_time_ns, config.end_time_ns
 
     def _world_transform(self, trajectory: Trajectory, box: Tensor | None) -> tuple[Tensor, float, Tensor]:
@@ -192,7 +194,14 @@ class EventDataParser(DataParser):
         transform = transform.double()
         scale = self.config.scale_factor
         if self.config.auto_scale_poses:
-            scale /= float(oriented[:, :3, 3].abs().max())
+            extent = float(oriented[:, :3, 3].abs().max())
+            if extent < 1e-6:
+                raise DataError(
+                    trajectory.source,
+                    f"the camera moves by no more than {extent:.2g}, which gives the scene no scale",
+                    "record with a moving camera, or give --auto-scale-poses False",
+                )
+            scale /= extent
         return transform, scale, torch.tensor([[-1.0] * 3, [1.0] * 3])
 
 
@@ -200,6 +209,19 @@ def _as_split(split: str) -> Split:
     if split not in ("train", "val", "test"):
         raise ValueError(f"there is no split {split!r}")
     return split  # type: ignore[return-value]
+
+
+def _check_image(file: Path, camera: EventCamera) -> None:
+    """Raises a DataError for an image that the framework would read wrongly."""
+    with Image.open(file) as image:
+        if image.size != (camera.width, camera.height):
+            raise DataError(
+                file,
+                f"the image has {image.width} x {image.height} pixels, its camera {camera.width} x {camera.height}",
+                "give the intrinsics of the images as they are",
+            )
+        if image.mode not in ("L", "RGB", "RGBA"):
+            raise DataError(file, f"the image is of PIL's mode {image.mode}", "store 8 bits of grey or RGB")
 
 
 def _views_within(views: list[ReferenceView], start: int, end: int) -> list[ReferenceView]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.engine.schedulers import MultiStepSchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.datamanager import EventDataManagerConfig
@@ -12,7 +11,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.ffmpeg import provide_ffmpeg
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipelineConfig
-from aenerf_ns.training import AENeRFTrainerConfig
+from aenerf_ns.training import AENeRFTrainerConfig, RelativeMultiStepSchedulerConfig
 
 # Every ns-* command imports this module, ns-render among them.
 provide_ffmpeg()
@@ -30,11 +29,11 @@ aenerf = MethodSpecification(
         optimizers={
             "encodings": {
                 "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15),
-                "scheduler": MultiStepSchedulerConfig(gamma=0.33),
+                "scheduler": RelativeMultiStepSchedulerConfig(),
             },
             "networks": {
                 "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
-                "scheduler": MultiStepSchedulerConfig(gamma=0.33),
+                "scheduler": RelativeMultiStepSchedulerConfig(),
             },
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),

@@ -11,11 +11,12 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from conftest import make_stream
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from PIL import Image
 
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
-from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile
+from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
 from aenerf_ns.dataparsers.text import format_seconds, parse_seconds
@@ -24,6 +25,7 @@ from aenerf_ns.dataset import EventDataset
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 
 CAMERA = EventCamera(6, 4, 5.0, 5.5, 3.0, 2.0, "radial_tangential", (0.01, 0.0, 0.001, 0.0, 0.0))
@@ -51,7 +53,7 @@ def write_native(folder: Path, scene_box: np.ndarray | None = None) -> Path:
         x, y = rng.integers(0, 6, 200).astype(np.uint16), rng.integers(0, 4, 200).astype(np.uint16)
         p = rng.choice(np.array([-1, 1], np.int8), 200)
         for part in (slice(0, 90), slice(90, 200)):
-            writer.events.append(x[part], y[part], t[part], p[part])
+            writer.events.append(EventStream(x[part], y[part], t[part], p[part], 6, 4))
         writer.add_trajectories(trajectory, trajectory)
         picture = np.full((4, 6, 3), 77, np.uint8)
         for time in (START, START + 150_000_000, END):
@@ -79,6 +81,11 @@ AS_RECORDED = {"orientation_method": "none", "center_method": "none", "auto_scal
 
 def parse(config: EcdDataParserConfig | NativeDataParserConfig, split: str = "train") -> DataparserOutputs:
     return config.setup().get_dataparser_outputs(split)
+
+
+def read_everything(config: EcdDataParserConfig | NativeDataParserConfig) -> None:
+    parse(config, "val")
+    assert len(EventDataset(parse(config)).pairs)
 
 
 def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
@@ -148,6 +155,9 @@ def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> N
     assert dataset.pairs.previous_time.min() >= start
     assert dataset.pairs.time.max() <= end
     assert dataset.pairs.num_outside > 0
+    # What lies outside the poses is no part of the window either.
+    config = NativeDataParserConfig(data=folder, start_time_ns=0, end_time_ns=END + 10**12)
+    assert parse(config).metadata["time_window"] == (START, END)
     with pytest.raises(DataError, match="nothing is left from 9 to 9 ns"):
         parse(NativeDataParserConfig(data=folder, start_time_ns=9, end_time_ns=9))
 
@@ -192,6 +202,29 @@ def test_nothing_is_left_of_a_dataset_that_could_not_be_completed(tmp_path: Path
     write_native(tmp_path / "made")
     with pytest.raises(DataError, match="made: the folder exists already"):
         NativeDatasetWriter(tmp_path / "made", CAMERA, SENSOR, "srgb")
+
+
+def test_options_take_the_place_of_the_sensors_values(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    options = {"positive_contrast_threshold": 0.7, "refractory_period_ns": 0}
+    assert parse(NativeDataParserConfig(data=folder, **options)).metadata["sensor"] == SensorModel(0.7, 0.2, 0, "RGGB")
+    with pytest.raises(DataError, match=r"positive_contrast_threshold must be a positive number, not 0\.0; .*options"):
+        parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
+
+
+def test_a_camera_that_only_turns_gives_no_scale(tmp_path: Path) -> None:
+    folder = write_ecd(tmp_path / "made")
+    (folder / "groundtruth.txt").write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n")
+    parse(EcdDataParserConfig(data=folder))
+    with pytest.raises(DataError, match="--auto-scale-poses False"):
+        parse(EcdDataParserConfig(data=folder, auto_scale_poses=True))
+
+
+def test_events_are_written_in_order_only(tmp_path: Path) -> None:
+    with Hdf5EventWriter(tmp_path / "events.h5") as writer:
+        writer.append(make_stream([(0, 0, 5, 1)]))
+        with pytest.raises(DataError, match="4 ns is before 5 ns"):
+            writer.append(make_stream([(0, 0, 4, 1)]))
 
 
 def test_tum_trajectories_round_trip_to_the_nanosecond(tmp_path: Path) -> None:
@@ -303,7 +336,7 @@ def test_malformed_ecd_text_is_one_clear_line(fault: str, tmp_path: Path) -> Non
     change, message = ECD_FAULTS[fault]
     change(folder)
     with pytest.raises(DataError, match=message) as error:
-        EventDataset(parse(EcdDataParserConfig(data=folder))).pairs  # noqa: B018
+        read_everything(EcdDataParserConfig(data=folder))
     assert "\n" not in str(error.value)
     assert str(folder) in str(error.value)
 
@@ -325,6 +358,10 @@ def replace_column(name: str, values: np.ndarray | None) -> Callable[[Path], Non
                 file[f"events/{name}"] = values
 
     return change
+
+
+def resize_image(name: str) -> Callable[[Path], None]:
+    return lambda folder: Image.new("RGB", (3, 2)).save(folder / name)
 
 
 def empty_events(folder: Path) -> None:
@@ -356,7 +393,16 @@ NATIVE_FAULTS = {
         "negative_contrast_threshold must be a positive number",
     ),
     "unknown Bayer pattern": (edit_json(lambda m: m["event_camera"].update(bayer_pattern="GRBG")), '"GRBG"'),
-    "unknown lens": (edit_json(lambda m: m["event_camera"].update(lens_model="kb4")), "lens_model must be one of"),
+    "unknown lens": (
+        edit_json(lambda m: m["event_camera"].update(camera_model="KB4")),
+        "camera_model is 'KB4', not one",
+    ),
+    "image of another size": (resize_image("images/val/00000.png"), "00000.png: the image has 3 x 2 pixels"),
+    "mirrored pose": (
+        edit_json(lambda m: m["frames"][0].update(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist())),
+        r"frames\[0\].transform_matrix: pose 0 is not a rigid motion",
+    ),
+    "frame twice": (edit_json(lambda m: m["frames"].append(m["frames"][0])), r"names images/train/00000.png again"),
     "unknown encoding": (edit_json(lambda m: m.update(image_encoding="log")), 'image_encoding is "log"'),
     "box inside out": (edit_json(lambda m: m.update(scene_box=[[1, 1, 1], [0, 0, 0]])), "scene_box has corners"),
     "box is flat": (edit_json(lambda m: m.update(scene_box=[[1, 1, 1]])), "scene_box must be 2 x 3"),
@@ -391,7 +437,7 @@ def test_malformed_native_datasets_are_one_clear_line(fault: str, tmp_path: Path
     change, message = NATIVE_FAULTS[fault]
     change(folder)
     with pytest.raises(DataError, match=message) as error:
-        EventDataset(parse(NativeDataParserConfig(data=folder))).pairs  # noqa: B018
+        read_everything(NativeDataParserConfig(data=folder))
     assert "\n" not in str(error.value)
     assert str(folder) in str(error.value)
 

@@ -17,7 +17,7 @@ def main() -> None:
     )
     try:
         command.main()
-    except (DataError, ValueError) as error:
+    except DataError as error:
         sys.exit(f"Error: {error}")
 
 

@@ -11,6 +11,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.scenes import built_in_scene
@@ -66,30 +67,41 @@ class Simulate:
 
     def main(self) -> None:
         """Renders the scene along its path and writes the dataset."""
-        scene = built_in_scene(self.scene, self.seed)
-        focal_length = scene.focal_length_ratio * self.width
-        camera = EventCamera(self.width, self.height, focal_length, focal_length, self.width / 2, self.height / 2)
-        sensor = SensorModel(
-            self.positive_contrast_threshold,
-            self.negative_contrast_threshold,
-            self.refractory_period_ns,
-            self.bayer_pattern,
-        )
-        simulation = Simulation(scene, camera, sensor, self.speed, self.duration, self.seed)
-        truth = simulation.trajectory(self.pose_rate)
-        estimated = perturb(
-            truth,
-            self.pose_noise_degrees,
-            self.pose_noise_translation,
-            self.pose_noise_correlation_time,
-            self.seed,
-        )
+        try:
+            scene = built_in_scene(self.scene, self.seed)
+            camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
+            sensor = SensorModel(
+                self.positive_contrast_threshold,
+                self.negative_contrast_threshold,
+                self.refractory_period_ns,
+                self.bayer_pattern,
+            )
+            simulation = Simulation(
+                scene,
+                camera,
+                sensor,
+                self.speed,
+                self.duration,
+                self.max_displacement,
+                self.contrast_threshold_spread,
+                self.seed,
+            )
+            truth = simulation.trajectory(self.pose_rate)
+            estimated = perturb(
+                truth,
+                self.pose_noise_degrees,
+                self.pose_noise_translation,
+                self.pose_noise_correlation_time,
+                self.seed,
+            )
+        except ValueError as error:
+            raise DataError("aenerf simulate", str(error), "see aenerf simulate --help") from error
         num_events = 0
         with NativeDatasetWriter(self.output, camera, sensor, "srgb", scene.aabb) as writer:
             writer.add_trajectories(estimated, truth)
-            for events in simulation.events(self.max_displacement, self.contrast_threshold_spread):
-                writer.events.append(*events)
-                num_events += len(events[0])
+            for events in simulation.events():
+                writer.events.append(events)
+                num_events += len(events)
             for time in np.linspace(truth.start, truth.end, self.train_images, dtype=np.int64).tolist():
                 # The picture shows what is true; the pose beside it is what the user of the dataset is given.
                 pose = homogeneous(estimated.interpolate(time))

@@ -18,7 +18,7 @@ _MAX_MERGED = 255
 
 @dataclass(frozen=True)
 class EventPairs:
-    """Every event with the previous event of its pixel (paper, eq. 3), in the order of the later event.
+    """Every event with the previous event of its pixel (paper, eq. 4), in the order of the later event.
 
     Events of one pixel with one time are one event here, with their polarities counted.
 

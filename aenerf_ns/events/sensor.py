@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 BayerPattern = Literal["", "RGGB"]
 
+# What a monochrome sensor sees of linear RGB: Rec. 709 luminance.
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+
 # Index of the colour filter (0 red, 1 green, 2 blue) over the 2 x 2 pixels that repeat, [row % 2, column % 2].
-_RGGB = np.array([[0, 1], [1, 2]], dtype=np.uint8)
+RGGB = np.array([[0, 1], [1, 2]], dtype=np.uint8)
 
 
 @dataclass(frozen=True)
 class SensorModel:
-    """How a pixel turns log-radiance into events (paper, eq. 4).
+    """How a pixel turns log-radiance into events (paper, eq. 5).
 
     Attributes:
         positive_contrast_threshold: C+, the rise of log-radiance that triggers an event of polarity +1.
@@ -64,4 +67,4 @@ class SensorModel:
         """
         if not self.bayer_pattern:
             return np.zeros(len(x), dtype=np.int64)
-        return _RGGB[y % 2, x % 2].astype(np.int64)
+        return RGGB[y % 2, x % 2].astype(np.int64)

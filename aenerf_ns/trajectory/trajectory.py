@@ -16,6 +16,9 @@ from aenerf_ns.trajectory.rotation import quaternion_from_rotation, rotation_fro
 # Nerfstudio uses (x right, y up, z backward), and back.
 OPENCV_TO_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
+# Matrices printed with five digits pass.
+_MAX_RIGIDITY_ERROR = 1e-4
+
 
 class Trajectory(nn.Module):
     """Camera-to-world poses in continuous time, by linear interpolation of the positions and spherical linear
@@ -57,15 +60,8 @@ class Trajectory(nn.Module):
         bad = ~poses.isfinite().flatten(1).all(1)
         if bad.any():
             raise DataError(source, f"pose {int(bad.nonzero()[0])} is not finite", "drop it or interpolate it")
+        require_rigid(poses, source)
         rotations = poses[:, :, :3]
-        error = (rotations @ rotations.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
-        error = torch.maximum(error, (torch.linalg.det(rotations) - 1).abs())
-        if error.max() > 1e-4:
-            raise DataError(
-                source,
-                f"pose {int(error.argmax())} is not a rigid motion (it is off by {float(error.max()):.2g})",
-                "give rotations without scale or reflection",
-            )
         relative = rotations[:-1].mT @ rotations[1:]
         for name, value in (
             ("times", times),
@@ -154,6 +150,19 @@ class Trajectory(nn.Module):
     def mapped(self, function) -> Trajectory:
         """The trajectory with ``function`` applied to its (N, 4, 4) float64 camera-to-world matrices."""
         return Trajectory(self.times, function(homogeneous(self.camera_to_worlds)), self.source)
+
+
+def require_rigid(poses: Tensor, source: str | Path) -> None:
+    """Raises a DataError unless the (N, 3 or 4, 4) poses are rotations and translations."""
+    rotations = poses[:, :3, :3]
+    error = (rotations @ rotations.mT - torch.eye(3, dtype=poses.dtype)).abs().amax((1, 2))
+    error = torch.maximum(error, (torch.linalg.det(rotations) - 1).abs())
+    if error.max() > _MAX_RIGIDITY_ERROR:
+        raise DataError(
+            source,
+            f"pose {int(error.argmax())} is not a rigid motion (it is off by {float(error.max()):.2g})",
+            "give rotations without scale or reflection",
+        )
 
 
 def homogeneous(poses: Tensor) -> Tensor:

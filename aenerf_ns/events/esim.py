@@ -1,0 +1,290 @@
+"""Event-camera simulator: ESIM (Rebecq et al., CoRL 2018) with the corrections of Robust e-NeRF (Low and Lee, 2023).
+
+Between two frames the log-intensity of every pixel is linear in time, and every threshold crossing is solved for
+its time, so the number of events of a pixel in a frame interval is not limited by the frame rate.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from aenerf_ns.events.sensor import LUMINANCE, RGGB, SensorModel
+
+MINIMUM_CONTRAST_THRESHOLD = 0.01
+
+Events = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
+
+
+@numba.njit(cache=True)
+def _filter(image, channel_weights, intensity):
+    """Fill ``intensity`` (H, W) and return how many values of the image are not a radiance."""
+    height, width, channels = image.shape
+    invalid = 0
+    for y in range(height):
+        for x in range(width):
+            total = 0.0
+            for c in range(channels):
+                value = float(image[y, x, c])
+                if not 0.0 <= value < math.inf:
+                    invalid += 1
+                total += channel_weights[y & 1, x & 1, c] * value
+            intensity[y, x] = total
+    return invalid
+
+
+@numba.njit(cache=True)
+def _bits(count):
+    """Bits that hold 0 to count - 1."""
+    bits = 0
+    while 1 << bits < count:
+        bits += 1
+    return bits
+
+
+@numba.njit(cache=True)
+def _pixel_events(
+    start_log,
+    end_log,
+    start_time,
+    end_time,
+    reference_log,
+    reference_time,
+    positive_threshold,
+    negative_threshold,
+    refractory_period,
+    time_shift,
+    pixel_key,
+    keys,
+    position,
+    write,
+):
+    """Events of one pixel in one frame interval: the new reference and the position after the last event.
+
+    ``reference_time`` lies before ``start_time`` for an armed pixel. Otherwise the reference is still to be taken, at
+    that time: the initial one, or the end of a refractory period, be it in this interval or in a later one.
+    """
+    rise = end_log - start_log
+    duration = end_time - start_time
+    polarity = 1 if rise > 0.0 else -1
+    step = positive_threshold if rise > 0.0 else -negative_threshold
+    earliest = start_time
+    while True:
+        if reference_time >= start_time:
+            if reference_time >= end_time:
+                break
+            reference_log = start_log + rise * ((reference_time - start_time) / duration)
+            earliest = reference_time
+            if refractory_period == 0:
+                reference_time = start_time - 1
+        crossing_log = reference_log + step
+        # The comparison is made in log-intensity, not in time, so that rounding never loses or doubles an event.
+        if rise == 0.0 or (end_log - crossing_log) * polarity < 0.0:
+            break
+        crossing = start_time + np.int64(np.rint(duration * ((crossing_log - start_log) / rise)))
+        time = min(max(crossing, earliest + 1), end_time)
+        if write:
+            keys[position] = (time - start_time) << time_shift | pixel_key | (polarity > 0)
+        position += 1
+        if refractory_period > 0:
+            # Counted from the rounded time stamp: the interval [t_prev + refractory period, t] a reader of the
+            # stream forms is then exactly the one over which the log-intensity changed by the threshold.
+            reference_time = time + refractory_period
+        else:
+            reference_log = crossing_log
+    return reference_log, reference_time, position
+
+
+@numba.njit(cache=True)
+def _frame_events(
+    start_log,
+    end_log,
+    start_time,
+    end_time,
+    reference_log,
+    reference_time,
+    positive_threshold,
+    negative_threshold,
+    refractory_period,
+):
+    """Two passes, count and fill. Returns keys of time, y, x and polarity, from the highest bits to the lowest: their
+    order is that of the stream."""
+    height, width = start_log.shape
+    x_bits, y_bits = _bits(width), _bits(height)
+    no_keys = np.empty(0, np.int64)
+    count = 0
+    for y in range(height):
+        for x in range(width):
+            count = _pixel_events(
+                start_log[y, x],
+                end_log[y, x],
+                start_time,
+                end_time,
+                reference_log[y, x],
+                reference_time[y, x],
+                positive_threshold[y, x],
+                negative_threshold[y, x],
+                refractory_period,
+                x_bits + y_bits + 1,
+                0,
+                no_keys,
+                count,
+                False,
+            )[2]
+    keys = np.empty(count, np.int64)
+    position = 0
+    for y in range(height):
+        for x in range(width):
+            reference_log[y, x], reference_time[y, x], position = _pixel_events(
+                start_log[y, x],
+                end_log[y, x],
+                start_time,
+                end_time,
+                reference_log[y, x],
+                reference_time[y, x],
+                positive_threshold[y, x],
+                negative_threshold[y, x],
+                refractory_period,
+                x_bits + y_bits + 1,
+                (y << x_bits | x) << 1,
+                keys,
+                position,
+                True,
+            )
+    return keys
+
+
+@numba.njit(cache=True)
+def _unpack(keys, start_time, height, width):
+    x_bits, y_bits = _bits(width), _bits(height)
+    count = len(keys)
+    x, y = np.empty(count, np.uint16), np.empty(count, np.uint16)
+    t, p = np.empty(count, np.int64), np.empty(count, np.int8)
+    for i in range(count):
+        p[i] = 2 * (keys[i] & 1) - 1
+        x[i] = keys[i] >> 1 & (1 << x_bits) - 1
+        y[i] = keys[i] >> (1 + x_bits) & (1 << y_bits) - 1
+        t[i] = start_time + (keys[i] >> (1 + x_bits + y_bits))
+    return x, y, t, p
+
+
+class EventSimulator:
+    """Turns a sequence of linear-radiance frames into events.
+
+    The sensor sees log(I + log_epsilon), linear in time between frames. A pixel fires when this differs from its
+    reference by its contrast threshold. Without a refractory period the reference then moves by exactly that
+    threshold; with one, the pixel is blind until the period ends and takes the log-intensity of that moment as its
+    new reference, as Robust e-NeRF models it.
+
+    Args:
+        width: pixel columns.
+        height: pixel rows.
+        sensor: contrast thresholds, refractory period and Bayer pattern. When the period is not zero, the initial
+            reference times are random, uniform in [0, refractory period) after the first frame.
+        contrast_threshold_spread: standard deviation of the static per-pixel thresholds, drawn once from
+            N(C, spread) and clipped at 0.01.
+        log_epsilon: added to the intensity before the logarithm.
+        seed: of the thresholds and of the initial reference times.
+
+    Raises:
+        ValueError: on a size, spread or epsilon outside its range.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        sensor: SensorModel,
+        *,
+        contrast_threshold_spread: float = 0.0,
+        log_epsilon: float = 1e-3,
+        seed: int = 0,
+    ) -> None:
+        if not (0 < width <= 65536 and 0 < height <= 65536):
+            raise ValueError(f"width and height must be in 1..65536, got {width} x {height}")
+        if not 0.0 < log_epsilon < math.inf:
+            raise ValueError(f"log_epsilon must be positive, got {log_epsilon}")
+        if not 0.0 <= contrast_threshold_spread < math.inf:
+            raise ValueError(f"contrast_threshold_spread must not be negative, got {contrast_threshold_spread}")
+        self.width, self.height = width, height
+        self.sensor = sensor
+        self.log_epsilon = log_epsilon
+        self._rng = np.random.default_rng(seed)
+        spread = contrast_threshold_spread
+        self.positive_contrast_threshold = self._draw_thresholds(sensor.positive_contrast_threshold, spread)
+        self.negative_contrast_threshold = self._draw_thresholds(sensor.negative_contrast_threshold, spread)
+        self._log_intensity: NDArray[np.float64] | None = None
+        self._time_ns = 0
+
+    def __call__(self, image: ArrayLike, time_ns: int) -> Events:
+        """Show the sensor the next frame.
+
+        Args:
+            image: linear radiance, (H, W) for a monochrome sensor or (H, W, 3) linear RGB. A monochrome sensor takes
+                the Rec. 709 luminance of RGB, a colour sensor needs RGB.
+            time_ns: of the frame, in nanoseconds, later than the previous one.
+
+        Returns:
+            x (N,) uint16, y (N,) uint16, t (N,) int64 in nanoseconds, p (N,) int8 of +1 or -1: the events in
+            (previous frame, this frame], ordered by time, then by pixel. None for the first frame.
+
+        Raises:
+            ValueError: on a wrong shape, a negative or non-finite radiance, or a time that does not increase.
+        """
+        log_intensity = self._to_log_intensity(np.asarray(image))
+        time_ns = int(time_ns)
+        if self._log_intensity is None:
+            self._reference_log = log_intensity.copy()
+            self._reference_time = np.full(log_intensity.shape, time_ns, np.int64)
+            if self.sensor.refractory_period > 0:
+                self._reference_time += self._rng.integers(0, self.sensor.refractory_period, log_intensity.shape)
+            keys = np.empty(0, np.int64)
+        else:
+            longest = np.iinfo(np.int64).max >> (_bits(self.width) + _bits(self.height) + 1)
+            if not 0 < time_ns - self._time_ns <= longest:
+                raise ValueError(
+                    f"frame times must increase, by at most {longest} ns: got {time_ns} ns after {self._time_ns} ns"
+                )
+            keys = _frame_events(
+                self._log_intensity,
+                log_intensity,
+                self._time_ns,
+                time_ns,
+                self._reference_log,
+                self._reference_time,
+                self.positive_contrast_threshold,
+                self.negative_contrast_threshold,
+                self.sensor.refractory_period,
+            )
+            keys.sort()
+        events = _unpack(keys, self._time_ns, self.height, self.width)
+        self._log_intensity, self._time_ns = log_intensity, time_ns
+        return events
+
+    def _draw_thresholds(self, mean: float, spread: float) -> NDArray[np.float64]:
+        thresholds = self._rng.normal(mean, spread, (self.height, self.width))
+        return np.maximum(thresholds, MINIMUM_CONTRAST_THRESHOLD)
+
+    def _to_log_intensity(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
+        size = (self.height, self.width)
+        if image.shape == (*size, 3):
+            weights = np.broadcast_to(LUMINANCE, (2, 2, 3))
+            if self.sensor.bayer_pattern:
+                weights = np.eye(3)[RGGB]
+        elif image.shape == size and not self.sensor.bayer_pattern:
+            image, weights = image[..., None], np.ones((2, 2, 1))
+        else:
+            wanted = f"{(*size, 3)}" if self.sensor.bayer_pattern else f"{size} or {(*size, 3)}"
+            raise ValueError(f"image must have shape {wanted}, got {image.shape}")
+        intensity = np.empty(size)
+        if image.dtype != np.float32:  # what renderers give, and not worth a copy; anything else shares one version
+            image = image.astype(np.float64)
+        image = np.ascontiguousarray(image)
+        invalid = _filter(image, np.ascontiguousarray(weights, np.float64), intensity)
+        if invalid:
+            raise ValueError(f"radiance must be finite and not negative, got {invalid} other values")
+        # NumPy's logarithm is vectorised, numba's is not.
+        return np.log(intensity + self.log_epsilon)

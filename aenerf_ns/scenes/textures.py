@@ -1,0 +1,216 @@
+"""Procedural textures: seeded, tileable, linear albedo within [0.03, 0.92].
+
+A texture is a float32 array (N, N, 3), N a power of two. Its column is the surface coordinate u, its row the
+surface coordinate v, upwards for pictures. Colours are given as sRGB hexadecimal strings, as one picks them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Texture = NDArray[np.float32]
+
+ALBEDO_RANGE = (0.03, 0.92)
+
+
+def linear_colour(colour: str) -> Array:
+    """Linear RGB (3,) of an sRGB colour "rrggbb" (IEC 61966-2-1)."""
+    encoded = np.array([int(colour[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def spectral_noise(
+    size: int, rng: np.random.Generator, exponent: float = 1.1, stretch: tuple[float, float] = (1.0, 1.0)
+) -> Array:
+    """Tileable noise (N, N) of zero mean and unit deviation, with amplitude 1 / frequency ** exponent.
+
+    ``stretch`` elongates its features along u and along v.
+    """
+    frequency = np.fft.fftfreq(size) * size
+    radius = np.hypot(frequency[None, :] * stretch[0], frequency[:, None] * stretch[1])
+    radius[0, 0] = 1.0
+    spectrum = np.fft.fft2(rng.standard_normal((size, size))) / np.maximum(radius, 1.0) ** exponent
+    spectrum[0, 0] = 0.0
+    noise = np.fft.ifft2(spectrum).real
+    return noise / noise.std()
+
+
+def mip_pyramid(texture: Texture) -> list[Texture]:
+    """The texture and its successive halvings by 2 x 2 means, down to one texel."""
+    levels = [texture]
+    while len(levels[-1]) > 1:
+        top = levels[-1]
+        levels.append(((top[0::2, 0::2] + top[1::2, 0::2] + top[0::2, 1::2] + top[1::2, 1::2]) / 4).astype(np.float32))
+    return levels
+
+
+def mottled(size: int, rng: np.random.Generator, colours: Sequence[str], contrast: float = 0.08) -> Texture:
+    """Clouds that pass through all the colours, under a finer grain: plaster, stone, marble."""
+    blend = _blend(colours, 0.5 + 0.24 * spectral_noise(size, rng, 1.5))
+    return _albedo(blend, contrast * spectral_noise(size, rng, 0.9))
+
+
+def wood(size: int, rng: np.random.Generator, colours: Sequence[str]) -> Texture:
+    """Grain along u: warped year rings and stretched fibres."""
+    warp = spectral_noise(size, rng, 1.8, (4.0, 1.0))
+    rings = np.sin(2 * np.pi * (5 * _coordinate(size)[:, None] + 0.55 * warp))
+    fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
+    return _albedo(_blend(colours, 0.5 + 0.22 * rings + 0.10 * fibres), 0.06 * fibres)
+
+
+def planks(size: int, rng: np.random.Generator, colours: Sequence[str], rows: int = 8, columns: int = 2) -> Texture:
+    """Floorboards along u, each of its own tone, with staggered joints."""
+    row, column, edge = _bond(size, rows, columns, rng.random(rows))
+    tone = rng.random((rows, columns))[row, column]
+    fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
+    board = _blend(colours, tone + 0.14 * fibres)
+    return _albedo(board * (0.6 + 0.4 * _smooth_step(edge, 0.002, 0.009))[..., None], 0.06 * fibres)
+
+
+def bricks(
+    size: int, rng: np.random.Generator, colours: Sequence[str], mortar: str, rows: int = 12, columns: int = 4
+) -> Texture:
+    """Running bond, each brick of its own tone, with soft mortar joints."""
+    row, column, edge = _bond(size, rows, columns, 0.5 * (np.arange(rows) % 2) / columns)
+    grain = spectral_noise(size, rng, 0.8)
+    brick = _blend(colours, rng.random((rows, columns))[row, column] + 0.12 * grain)
+    mix = _smooth_step(edge + 0.0012 * grain, 0.006, 0.014)[..., None]
+    return _albedo(mix * brick + (1 - mix) * linear_colour(mortar), 0.06 * grain)
+
+
+def striped_wallpaper(size: int, rng: np.random.Generator, colours: Sequence[str], stripes: int = 6) -> Texture:
+    """Upright stripes that cycle through the colours, with diamonds on every other one."""
+    u, v = _coordinate(size)[None, :] * stripes, _coordinate(size)[:, None] * stripes
+    palette = np.array([linear_colour(colour) for colour in colours])
+    index = np.floor(u).astype(int) % stripes
+    inside = _smooth_step(0.5 - np.abs(u % 1 - 0.5), 0.02, 0.06)
+    paper = inside[..., None] * palette[index % len(palette)] + (1 - inside[..., None]) * palette[-1]
+    diamond = _smooth_step(0.26 - np.abs(u % 1 - 0.5) - np.abs((v + 0.5 * (index // 2 % 2)) % 1 - 0.5) * 0.7, 0.0, 0.05)
+    diamond = (diamond * (index % 2 == 0))[..., None]
+    paper = (1 - 0.7 * diamond) * paper + 0.7 * diamond * palette[1 % len(palette)]
+    return _albedo(paper, 0.05 * spectral_noise(size, rng, 1.0))
+
+
+def leafy_wallpaper(
+    size: int, rng: np.random.Generator, ground: str, colours: Sequence[str], sprigs: int = 110
+) -> Texture:
+    """Leaves of several colours strewn over a mottled ground."""
+    paper = _blend([ground, ground], np.zeros((size, size)))
+    u, v = _coordinate(size)[None, :], _coordinate(size)[:, None]
+    for _ in range(sprigs):
+        angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(0.035, 0.075)
+        du, dv = (u - rng.random() + 0.5) % 1 - 0.5, (v - rng.random() + 0.5) % 1 - 0.5
+        along, across = du * np.cos(angle) + dv * np.sin(angle), dv * np.cos(angle) - du * np.sin(angle)
+        width = 0.36 * length * (1 - (along / length) ** 2)
+        leaf = _smooth_step(width - np.abs(across), 0.0, 0.006)
+        vein = 1 - 0.35 * _smooth_step(0.005 - np.abs(across), 0.0, 0.004)
+        colour = linear_colour(colours[rng.integers(len(colours))]) * rng.uniform(0.8, 1.15)
+        paper = paper * (1 - leaf[..., None]) + leaf[..., None] * vein[..., None] * colour
+    return _albedo(paper, 0.06 * spectral_noise(size, rng, 1.1))
+
+
+def checker(size: int, rng: np.random.Generator, colours: Sequence[str], cells: int = 4) -> Texture:
+    """Soft-edged squares of two colours."""
+    wave = np.sin(np.pi * cells * _coordinate(size))
+    squares = np.clip(6 * wave[None, :] * wave[:, None], -0.5, 0.5)
+    return _albedo(_blend(colours, 0.5 + squares), 0.06 * spectral_noise(size, rng, 1.0))
+
+
+def fabric(size: int, rng: np.random.Generator, colours: Sequence[str], threads: int = 24) -> Texture:
+    """A plain weave with uneven threads, and a wide check."""
+    coordinate = _coordinate(size)
+    wave = np.sin(2 * np.pi * threads * coordinate)
+    check = np.sin(2 * np.pi * 2 * coordinate)
+    tone = 0.5 + 0.10 * wave[None, :] * wave[:, None] + 0.16 * (check[None, :] + check[:, None])
+    uneven = spectral_noise(size, rng, 0.9, (6.0, 1.0)) + spectral_noise(size, rng, 0.9, (1.0, 6.0))
+    return _albedo(_blend(colours, tone + 0.08 * uneven), 0.05 * uneven)
+
+
+def rug(size: int, rng: np.random.Generator, colours: Sequence[str]) -> Texture:
+    """One woven rug: borders around a field of nested diamonds. Four colours: ground, field, accent, light."""
+    ground, field, accent, light = (linear_colour(colour) for colour in colours)
+    u, v = np.abs(_coordinate(size) - 0.5)[None, :], np.abs(_coordinate(size) - 0.5)[:, None]
+    reach = np.maximum(u, v)
+    diamonds = np.sin(2 * np.pi * 6.5 * (u + v)) * np.cos(2 * np.pi * 4 * (u - v))
+    picture = field + (accent - field) * _smooth_step(diamonds, 0.1, 0.3)[..., None]
+    picture = picture + (light - picture) * _smooth_step(-diamonds, 0.62, 0.8)[..., None]
+    teeth = 0.012 * np.abs(((u - v) * 24) % 2 - 1)
+    for inner, colour in ((0.36, ground), (0.385, light), (0.40, accent), (0.445, light), (0.46, ground)):
+        picture = picture + (colour - picture) * _smooth_step(reach - inner + teeth, 0.0, 0.006)[..., None]
+    pile = spectral_noise(size, rng, 0.5, (3.0, 1.0))
+    return _albedo(picture, 0.06 * pile)
+
+
+def book_spine(size: int, rng: np.random.Generator) -> Texture:
+    """A pale spine, to be tinted: bands across it, and marks where a title stands."""
+    v, u = _coordinate(size)[:, None], _coordinate(size)[None, :]
+    tone = np.full((size, size), 0.62)
+    for height, width in ((0.08, 0.012), (0.12, 0.006), (0.86, 0.012), (0.90, 0.006)):
+        tone += 0.28 * _smooth_step(width - np.abs(v - height), -0.006, 0.006)
+    letters = _smooth_step(spectral_noise(size, rng, 0.6, (1.0, 5.0)), 0.2, 0.6)
+    title = _smooth_step(0.16 - np.abs(v - 0.55), 0.0, 0.01) * _smooth_step(0.22 - np.abs((u * 4) % 1 - 0.5), 0.0, 0.06)
+    tone += 0.25 * letters * title
+    return _albedo(np.repeat(tone[..., None], 3, axis=-1), 0.06 * spectral_noise(size, rng, 1.2))
+
+
+def landscape(size: int, rng: np.random.Generator, sky: Sequence[str], hills: Sequence[str]) -> Texture:
+    """A picture of ridges, one before the other, under a clouded sky."""
+    v = _coordinate(size)[:, None]
+    picture = _blend(sky, 1.5 * v - 0.45 + 0.10 * spectral_noise(size, rng, 1.5, (2.5, 1.0)))
+    for depth, colour in enumerate(hills):
+        profile = spectral_noise(size, rng, 1.9)[0] * 0.05 / (1 + 0.3 * depth)
+        ridge = 0.60 - 0.50 * (depth + 0.4) / len(hills) + profile[None, :]
+        shade = (0.85 + 0.3 * np.clip((ridge - v) * 3, 0, 1) + 0.12 * spectral_noise(size, rng, 1.0))[..., None]
+        mix = _smooth_step(ridge - v, 0.0, 0.006)[..., None]
+        picture = (1 - mix) * picture + mix * linear_colour(colour) * shade
+    return _albedo(picture, 0.05 * spectral_noise(size, rng, 0.8))
+
+
+def abstract(size: int, rng: np.random.Generator, ground: str, colours: Sequence[str], shapes: int = 16) -> Texture:
+    """A picture of overlapping discs and bars."""
+    u, v = _coordinate(size)[None, :], _coordinate(size)[:, None]
+    picture = _blend([ground, ground], np.zeros((size, size)))
+    for shape in range(shapes):
+        centre, radius, angle = rng.uniform(0.15, 0.85, 2), rng.uniform(0.05, 0.2), rng.uniform(0, np.pi)
+        du, dv = u - centre[0], v - centre[1]
+        along, across = du * np.cos(angle) + dv * np.sin(angle), dv * np.cos(angle) - du * np.sin(angle)
+        bar = np.maximum(np.abs(along) - 1.5 * radius, np.abs(across) - 0.25 * radius)
+        distance = np.hypot(du, dv) - radius if shape % 2 else bar
+        colour = linear_colour(colours[shape % len(colours)])
+        picture += 0.85 * _smooth_step(-distance, -0.003, 0.005)[..., None] * (colour - picture)
+    return _albedo(picture, 0.08 * spectral_noise(size, rng, 0.9))
+
+
+def _coordinate(size: int) -> Array:
+    return (np.arange(size) + 0.5) / size
+
+
+def _smooth_step(value: Array, low: float, high: float) -> Array:
+    fraction = np.clip((value - low) / (high - low), 0.0, 1.0)
+    return fraction * fraction * (3 - 2 * fraction)
+
+
+def _blend(colours: Sequence[str], position: Array) -> Array:
+    """Colours at position 0 to 1 along the sequence, interpolated."""
+    palette = np.array([linear_colour(colour) for colour in colours])
+    knots = np.linspace(0, 1, len(palette))
+    return np.stack([np.interp(position, knots, channel) for channel in palette.T], axis=-1)
+
+
+def _bond(size: int, rows: int, columns: int, shift: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Of each texel: the row and column of its brick, and its distance to the brick's edge in tiles."""
+    v = np.repeat(_coordinate(size)[:, None], size, axis=1)
+    row = np.floor(v * rows).astype(np.int64)
+    u = (_coordinate(size)[None, :] + shift[row]) % 1
+    column = np.floor(u * columns).astype(np.int64)
+    edge_u = (0.5 - np.abs(u * columns % 1 - 0.5)) / columns
+    edge_v = (0.5 - np.abs(v * rows % 1 - 0.5)) / rows
+    return row, column, np.minimum(edge_u, edge_v)
+
+
+def _albedo(colour: Array, relative_noise: Array) -> Texture:
+    return np.clip(colour * np.exp(relative_noise)[..., None], *ALBEDO_RANGE).astype(np.float32)

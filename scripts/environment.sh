@@ -1,0 +1,21 @@
+# Sourced by the other scripts: makes the virtual environment .venv at the project's root, with the project and the
+# extras named in $1 installed, and activates it.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+if [ ! -d .venv ]; then
+  "${PYTHON:-python3}" -m venv .venv
+fi
+# shellcheck disable=SC1091
+source .venv/bin/activate
+# Installed once, and again whenever what is to be installed changes.
+wanted="$1 $(cksum pyproject.toml)"
+if [ "$(cat .venv/installed 2>/dev/null)" != "$wanted" ]; then
+  echo "Installing (a few minutes and several GB the first time) ..."
+  python -m pip install --quiet --upgrade pip
+  python -m pip install --quiet --editable ".[$1]"
+  echo "$wanted" > .venv/installed
+fi
+# PyTorch's threads wait for each other on small machines that do something else as well; see docs/nerfstudio.md.
+if [ "$(nproc 2>/dev/null || echo 2)" -le 4 ]; then
+  export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
+fi

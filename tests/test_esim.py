@@ -1,0 +1,266 @@
+"""The simulator against closed forms and against a slow reference that follows the sensor's definition."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from aenerf_ns.events.esim import EventSimulator
+from aenerf_ns.events.sensor import BayerPattern, SensorModel
+
+WIDTH, HEIGHT = 7, 6
+LOG_EPSILON = 1e-3
+
+
+def make_simulator(
+    width: int,
+    height: int,
+    *,
+    positive_contrast_threshold: float,
+    negative_contrast_threshold: float,
+    refractory_period: int = 0,
+    bayer_pattern: BayerPattern = "",
+    **rest: float,
+) -> EventSimulator:
+    sensor = SensorModel(positive_contrast_threshold, negative_contrast_threshold, refractory_period, bayer_pattern)
+    return EventSimulator(width, height, sensor, **rest)  # type: ignore[arg-type]
+
+
+def simulate(simulator: EventSimulator, images: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, ...]:
+    parts = [simulator(image, int(time)) for image, time in zip(images, times, strict=True)]
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def random_log_frames(rng: np.random.Generator, frames: int, step: float) -> np.ndarray:
+    return np.cumsum(rng.normal(0, step, (frames, HEIGHT, WIDTH)), axis=0) - 1.0
+
+
+def to_images(log_frames: np.ndarray) -> np.ndarray:
+    return np.exp(log_frames) + 1.0 - LOG_EPSILON
+
+
+def log_of(images: np.ndarray) -> np.ndarray:
+    return np.log(images + LOG_EPSILON)
+
+
+def reference_events(
+    log_frames: np.ndarray, times: np.ndarray, positive: float, negative: float, refractory: int, start: int
+) -> list[tuple[int, int]]:
+    """Times and polarities of one pixel, by walking along its piecewise-linear signal from one deed to the next."""
+
+    def signal(time: int) -> float:
+        return float(np.interp(time, times, log_frames))
+
+    events: list[tuple[int, int]] = []
+    if start >= times[-1]:
+        return events
+    reference, now = signal(start), start
+    for k in range(len(times) - 1):
+        t0, t1, l0, l1 = int(times[k]), int(times[k + 1]), float(log_frames[k]), float(log_frames[k + 1])
+        while now < t1 and l1 != l0:
+            level = reference + positive if l1 > l0 else reference - negative
+            if (level > l1) if l1 > l0 else (level < l1):
+                break
+            time = max(round(t0 + (level - l0) / (l1 - l0) * (t1 - t0)), max(now, t0) + 1)
+            events.append((time, 1 if l1 > l0 else -1))
+            if refractory:
+                now = time + refractory
+                if now < times[-1]:
+                    reference = signal(now)
+            else:
+                reference = level
+    return events
+
+
+@pytest.mark.parametrize(("positive", "negative"), [(0.25, 0.25), (0.31, 0.17)])
+def test_every_pair_is_one_threshold_apart(positive: float, negative: float) -> None:
+    rng = np.random.default_rng(1)
+    times = np.cumsum(rng.integers(20_000_000, 60_000_000, 40))
+    images = to_images(random_log_frames(rng, len(times), 1.0))
+    simulator = make_simulator(
+        WIDTH, HEIGHT, positive_contrast_threshold=positive, negative_contrast_threshold=negative
+    )
+    x, y, t, p = simulate(simulator, images, times)
+    log_frames = log_of(images)
+    pairs = 0
+    for row in range(HEIGHT):
+        for column in range(WIDTH):
+            mine = (x == column) & (y == row)
+            level = np.interp(t[mine], times, log_frames[:, row, column])
+            expected = np.where(p[mine] > 0, positive, -negative)
+            # From the very first frame on: a drift of the reference would add up.
+            np.testing.assert_allclose(level - log_frames[0, row, column], np.cumsum(expected), atol=1e-6)
+            np.testing.assert_allclose(np.diff(level), expected[1:], atol=1e-6)
+            # Nothing is missed either: what remains is below the threshold.
+            rest = log_frames[-1, row, column] - (log_frames[0, row, column] + expected.sum())
+            assert -negative < rest < positive
+            pairs += len(level) - 1
+    assert pairs > 1000
+
+
+def test_ramp_fires_at_the_crossings() -> None:
+    simulator = make_simulator(1, 1, positive_contrast_threshold=0.25, negative_contrast_threshold=0.5)
+    simulator([[1.0 - LOG_EPSILON]], 1000)
+    x, y, t, p = simulator([[math.exp(1.1) - LOG_EPSILON]], 1000 + 1_100_000)
+    np.testing.assert_array_equal(t, 1000 + 250_000 * np.arange(1, 5))
+    np.testing.assert_array_equal(p, 1)
+    x, y, t, p = simulator([[1.0 - LOG_EPSILON]], 1000 + 2_200_000)
+    np.testing.assert_array_equal(t, 1000 + np.array([1_700_000, 2_200_000]))
+    np.testing.assert_array_equal(p, -1)
+    assert (x.dtype, y.dtype, t.dtype, p.dtype) == (np.uint16, np.uint16, np.int64, np.int8)
+
+
+@pytest.mark.parametrize("refractory", [0, 3_000, 400_000, 2_500_000])
+def test_agrees_with_slow_reference(refractory: int) -> None:
+    rng = np.random.default_rng(2)
+    times = 10_000_000_000 + np.cumsum(rng.integers(200_000, 900_000, 60))
+    images = to_images(random_log_frames(rng, len(times), 0.5))
+    settings = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.3, "refractory_period": refractory}
+    simulator = make_simulator(WIDTH, HEIGHT, contrast_threshold_spread=0.05, seed=4, **settings)
+    positive, negative = simulator.positive_contrast_threshold, simulator.negative_contrast_threshold
+    simulator(images[0], times[0])
+    starts = simulator._reference_time.copy()
+    x, y, t, p = simulate(simulator, images[1:], times[1:])
+    log_frames = log_of(images)
+    total = 0
+    for row in range(HEIGHT):
+        for column in range(WIDTH):
+            mine = (x == column) & (y == row)
+            expected = reference_events(
+                log_frames[:, row, column],
+                times,
+                positive[row, column],
+                negative[row, column],
+                refractory,
+                int(starts[row, column]),
+            )
+            np.testing.assert_allclose(t[mine], [time for time, _ in expected], atol=1, rtol=0)
+            np.testing.assert_array_equal(p[mine], [polarity for _, polarity in expected])
+            if refractory:
+                assert np.all(np.diff(t[mine]) > refractory)
+            total += len(expected)
+    assert total == len(t) > 100
+
+
+def test_initial_reference_times_fill_the_refractory_period() -> None:
+    simulator = make_simulator(
+        60, 50, positive_contrast_threshold=0.1, negative_contrast_threshold=0.1, refractory_period=1_000_000
+    )
+    simulator(np.ones((50, 60)), 0)
+    # A steady rise of one threshold each 2 ms: a pixel fires exactly 2 ms after it took its reference.
+    _, _, t, _ = simulator(np.exp(0.5) * (1 + LOG_EPSILON) * np.ones((50, 60)) - LOG_EPSILON, 10_000_000)
+    first = np.sort(t)[:3000] - 2_000_000
+    assert 0 <= first.min() < 10_000
+    assert 990_000 < first.max() < 1_000_000
+    assert abs(first.mean() - 500_000) < 25_000
+
+
+def test_stream_order_and_range() -> None:
+    rng = np.random.default_rng(3)
+    simulator = make_simulator(WIDTH, HEIGHT, positive_contrast_threshold=0.01, negative_contrast_threshold=0.01)
+    simulator(rng.uniform(0, 1, (HEIGHT, WIDTH)), 0)
+    x, y, t, _ = simulator(rng.uniform(0, 1, (HEIGHT, WIDTH)), 50)  # far more events than time stamps
+    assert len(t) > 1000
+    assert t.min() > 0
+    assert t.max() <= 50
+    pixel = y.astype(np.int64) * WIDTH + x
+    np.testing.assert_array_equal(np.lexsort((pixel, t)), np.arange(len(t)))
+
+
+def test_colour_filters_and_luminance() -> None:
+    thresholds = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.2}
+    before, after = np.ones((4, 6, 3)), np.ones((4, 6, 3))
+    for channel, pixels in enumerate(
+        ([(0, 0)], [(0, 1), (1, 0)], [(1, 1)])  # (y, x) modulo 2 behind red, green and blue filters
+    ):
+        after[:] = before
+        after[..., channel] = 1.3
+        colour = make_simulator(6, 4, bayer_pattern="RGGB", **thresholds)
+        colour(before, 0)
+        x, y, _, _ = colour(after, 1000)
+        assert sorted(set(zip((y % 2).tolist(), (x % 2).tolist(), strict=True))) == pixels
+        assert len(x) == 6 * len(pixels)
+    gray, luminance = make_simulator(6, 4, **thresholds), make_simulator(6, 4, **thresholds)
+    rgb = np.random.default_rng(0).uniform(0, 3, (2, 4, 6, 3))
+    weights = np.array([0.2126, 0.7152, 0.0722])
+    from_rgb = simulate(gray, rgb, np.array([0, 10**6]))
+    from_luminance = simulate(luminance, (rgb * weights).sum(-1), np.array([0, 10**6]))
+    assert len(from_rgb[0]) > 20
+    np.testing.assert_allclose(from_rgb[2], from_luminance[2], atol=1, rtol=0)
+
+
+def test_threshold_spread() -> None:
+    simulator = make_simulator(
+        200, 200, positive_contrast_threshold=0.25, negative_contrast_threshold=0.1, contrast_threshold_spread=0.05
+    )
+    positive, negative = simulator.positive_contrast_threshold, simulator.negative_contrast_threshold
+    assert abs(positive.mean() - 0.25) < 1e-3
+    assert abs(positive.std() - 0.05) < 1e-3
+    assert negative.min() == 0.01
+    assert abs(np.mean(negative == 0.01) - 0.0359) < 0.005  # the normal distribution below -1.8 deviations
+    assert abs(np.corrcoef(positive.ravel(), negative.ravel())[0, 1]) < 0.02
+
+
+def test_seed_decides_everything() -> None:
+    rng = np.random.default_rng(5)
+    images, times = rng.uniform(0, 1, (5, HEIGHT, WIDTH)), np.arange(5) * 10**6
+    streams = []
+    for seed in (1, 1, 2):
+        simulator = make_simulator(
+            WIDTH,
+            HEIGHT,
+            positive_contrast_threshold=0.2,
+            negative_contrast_threshold=0.2,
+            contrast_threshold_spread=0.02,
+            refractory_period=1000,
+            seed=seed,
+        )
+        streams.append(b"".join(column.tobytes() for column in simulate(simulator, images, times)))
+    assert streams[0] == streams[1] != streams[2]
+
+
+def test_single_precision_frames_are_accepted_as_they_are() -> None:
+    image = np.random.default_rng(0).uniform(0, 1, (2, HEIGHT, WIDTH)).astype(np.float32)
+    streams = []
+    for frames in (image, image.astype(np.float64)):
+        simulator = make_simulator(WIDTH, HEIGHT, positive_contrast_threshold=0.2, negative_contrast_threshold=0.2)
+        streams.append(simulate(simulator, frames, np.array([0, 1000])))
+    for single, double in zip(*streams, strict=True):
+        np.testing.assert_array_equal(single, double)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"contrast_threshold_spread": -0.1}, "contrast_threshold_spread must not be negative, got -0.1"),
+        ({"log_epsilon": 0.0}, "log_epsilon must be positive, got 0.0"),
+        ({"width": 0}, "width and height must be in 1..65536, got 0 x 6"),
+    ],
+)
+def test_bad_settings(change: dict[str, object], message: str) -> None:
+    settings: dict[str, object] = {"width": WIDTH, "height": HEIGHT}
+    settings |= {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.2}
+    with pytest.raises(ValueError, match=message):
+        make_simulator(**(settings | change))  # type: ignore[arg-type]
+
+
+def test_bad_frames() -> None:
+    thresholds = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.2}
+    simulator = make_simulator(WIDTH, HEIGHT, **thresholds)
+    good = np.ones((HEIGHT, WIDTH))
+    simulator(good, 5)
+    with pytest.raises(ValueError, match=r"must increase.*got 5 ns after 5 ns"):
+        simulator(good, 5)
+    with pytest.raises(ValueError, match=r"shape .* got \(7, 6\)"):
+        simulator(good.T, 6)
+    for value in (np.nan, np.inf, -1e-9):
+        bad = good.copy()
+        bad[2, 3] = value
+        with pytest.raises(ValueError, match="finite and not negative, got 1 other"):
+            simulator(bad, 6)
+    with pytest.raises(ValueError, match=r"shape \(6, 7, 3\), got \(6, 7\)"):
+        make_simulator(WIDTH, HEIGHT, bayer_pattern="RGGB", **thresholds)(good, 0)
+    # A refused frame leaves no trace.
+    assert len(simulator(good, 7)[0]) == 0

@@ -1,0 +1,247 @@
+"""The path a user goes, through the real commands: simulate, train, resume, evaluate, render, view."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+# Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.
+STEPS = 300
+PSNR_MARGIN = 3.0
+CPU = ("--machine.device-type", "cpu")
+
+
+def run(*command: str | Path, cwd: Path, fails: bool = False) -> str:
+    """Runs a console script of this environment and returns its output, without terminal formatting."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200", "CUDA_VISIBLE_DEVICES": ""}
+    script = Path(sys.executable).parent / str(command[0])
+    done = subprocess.run(
+        [script, *command[1:]], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    output = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", done.stdout + done.stderr)
+    assert (done.returncode != 0) == fails, output[-3000:]
+    return output
+
+
+def simulate(folder: Path, *options: str) -> Path:
+    size = ("--width", "48", "--height", "36", "--train-images", "4", "--validation-views", "4", "--test-views", "3")
+    run("aenerf", "simulate", "--output", folder, *size, *options, cwd=folder.parent)
+    return folder
+
+
+def newest_config(folder: Path) -> Path:
+    return max(folder.rglob("config.yml"), key=lambda path: path.stat().st_mtime)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("workspace")
+
+
+@pytest.fixture(scope="module")
+def trained(workspace: Path) -> Path:
+    """config.yml of a run on a tiny simulated room, whose events are gone since."""
+    data = simulate(workspace / "room")
+    run(
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", str(STEPS),
+        "--steps-per-save", "200", "--data", data,
+        cwd=workspace,
+    )  # fmt: skip
+    (data / "events.h5").rename(data / "events.gone")
+    return newest_config(workspace / "outputs")
+
+
+def evaluate(config: Path, workspace: Path, name: str) -> dict:
+    output = workspace / f"{name}.json"
+    pictures = workspace / f"{name}_pictures"
+    run("ns-eval", "--load-config", config, "--output-path", output, "--render-output-path", pictures, cwd=workspace)
+    assert len(list(pictures.glob("eval_img_*.png"))) == 3
+    return json.loads(output.read_text())["results"]
+
+
+def test_simulated_dataset_is_seeded(workspace: Path) -> None:
+    options = ("--speed", "hard", "--pose-noise-degrees", "1", "--pose-noise-translation", "0.05", "--pose-rate", "50")
+    first = simulate(workspace / "first", *options, "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03")
+    again = simulate(workspace / "again", *options, "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03")
+    files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
+    assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
+    for name in files:
+        assert (first / name).read_bytes() == (again / name).read_bytes(), name
+    estimated, truth = (np.loadtxt(first / f"trajectory_{name}.txt") for name in ("estimated", "ground_truth"))
+    np.testing.assert_array_equal(estimated[:, 0], truth[:, 0])
+    error = np.linalg.norm(estimated[:, 1:4] - truth[:, 1:4], axis=1)
+    assert np.sqrt((error**2).mean()) == pytest.approx(0.05, rel=1e-6)
+    assert "folder exists already" in run("aenerf", "simulate", "--output", first, cwd=workspace, fails=True)
+
+
+def test_training_beats_an_untrained_field_on_held_out_views(trained: Path, workspace: Path) -> None:
+    results = evaluate(trained, workspace, "trained")
+    assert results["color_correction"] == "affine, fitted on 4 validation views"
+    assert results["num_views"] == 3
+    assert results["lpips"] is None
+    assert results["lpips_absent"]
+    data = workspace / "room"
+    (data / "events.gone").rename(data / "events.h5")
+    run(
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "1", "--data", data,
+        "--experiment-name", "untrained", cwd=workspace,
+    )  # fmt: skip
+    (data / "events.h5").rename(data / "events.gone")
+    untrained = evaluate(newest_config(workspace / "outputs" / "untrained"), workspace, "untrained")
+    assert results["psnr"] > untrained["psnr"] + PSNR_MARGIN
+    assert results["ssim"] > untrained["ssim"]
+
+
+def test_resuming_continues_from_the_checkpoint(trained: Path, workspace: Path) -> None:
+    data = workspace / "room"
+    (data / "events.gone").rename(data / "events.h5")
+    run(
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "5", "--data", data,
+        "--experiment-name", "resumed", "--load-dir", trained.parent / "nerfstudio_models", cwd=workspace,
+    )  # fmt: skip
+    (data / "events.h5").rename(data / "events.gone")
+    (checkpoint,) = (workspace / "outputs" / "resumed").rglob("*.ckpt")
+    assert checkpoint.name == f"step-{STEPS + 4:09d}.ckpt"
+    before = torch.load(next(trained.parent.rglob("*.ckpt")), weights_only=True)
+    after = torch.load(checkpoint, weights_only=True)
+    key = "_model.field.density_network.layers.0.weight"
+    change = (after["pipeline"][key] - before["pipeline"][key]).abs()
+    # A few steps on from there, at the learning rate of the end of the run: not a new start.
+    assert 0 < change.max() < 0.05
+    assert after["schedulers"]["networks"]["last_epoch"] == STEPS + 5
+    assert after["optimizers"]["networks"]["state"][0]["step"] == STEPS + 5
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        ("interpolate", "--interpolation-steps", "2"),
+        ("spiral", "--seconds", "0.2"),
+    ],
+    ids=lambda mode: mode[0],
+)
+def test_rendering_a_video(mode: tuple[str, ...], trained: Path, workspace: Path) -> None:
+    video = workspace / f"{mode[0]}.mp4"
+    run("ns-render", *mode, "--load-config", trained, "--output-path", video, cwd=workspace)
+    frames = imageio.imread(video, plugin="pyav")
+    assert len(frames) >= 3
+    assert frames.shape[1:] == (36, 48, 3)
+    assert frames.std() > 5
+
+
+def test_rendering_a_camera_path_of_the_viewer(trained: Path, workspace: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = (0.1, 0.0, 0.1)
+    # What the viewer's render tab writes.
+    path = {
+        "default_fov": 75.0,
+        "default_transition_sec": 2.0,
+        "keyframes": [],
+        "camera_type": "perspective",
+        "render_height": 36,
+        "render_width": 48,
+        "fps": 2,
+        "seconds": 1.0,
+        "is_cycle": False,
+        "smoothness_value": 0.0,
+        "camera_path": [{"camera_to_world": pose.flatten().tolist(), "fov": 75.0, "aspect": 4 / 3}] * 2,
+    }
+    (workspace / "path.json").write_text(json.dumps(path))
+    run(
+        "ns-render", "camera-path", "--load-config", trained, "--camera-path-filename", workspace / "path.json",
+        "--output-path", workspace / "path", "--output-format", "images", cwd=workspace,
+    )  # fmt: skip
+    frames = [imageio.imread(file) for file in sorted((workspace / "path").glob("*.jpg"))]
+    assert [frame.shape for frame in frames] == [(36, 48, 3)] * 2
+
+
+def test_rendering_the_dataset(trained: Path, workspace: Path) -> None:
+    run(
+        "ns-render", "dataset", "--load-config", trained, "--output-path", workspace / "dataset", "--split", "test",
+        "--rendered-output-names", "rgb", "gt-rgb", "depth", "accumulation", "raw-log_radiance", cwd=workspace,
+    )  # fmt: skip
+    names = {path.relative_to(workspace / "dataset" / "test").parts[0] for path in (workspace / "dataset").rglob("*.*")}
+    assert names == {"rgb", "gt-rgb", "depth", "accumulation", "raw-log_radiance"}
+    assert len(list((workspace / "dataset").rglob("*.jpg"))) == 3 * 4
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+def test_the_viewer_serves_a_trained_run(trained: Path, workspace: Path) -> None:
+    port = free_port()
+    viewer = subprocess.Popen(
+        [Path(sys.executable).parent / "ns-viewer", "--load-config", trained, "--viewer.websocket-port", str(port)],
+        cwd=workspace,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while True:
+            assert viewer.poll() is None
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as answer:
+                    assert b"<!doctype html>" in answer.read().lower()
+                    break
+            except OSError:
+                assert time.monotonic() < deadline
+                time.sleep(0.5)
+    finally:
+        viewer.terminate()
+        viewer.wait(timeout=30)
+
+
+def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Path) -> None:
+    output = run(
+        "ns-train",
+        "aenerf-small",
+        *CPU,
+        "--vis",
+        "tensorboard",
+        "--data",
+        workspace / "nothing",
+        cwd=workspace,
+        fails=True,
+    )
+    assert "Traceback" not in output
+    errors = [line for line in output.splitlines() if line.startswith("Error: ")]
+    assert len(errors) == 1
+    assert "nothing/transforms.json: there is no such file" in errors[0]
+
+
+def test_a_recording_without_reference_views_trains_and_says_so_at_evaluation(trained: Path, workspace: Path) -> None:
+    none = ("--train-images", "0", "--validation-views", "0", "--test-views", "0")
+    data = simulate(workspace / "bare", *none, "--scene", "object")
+    run(
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "3", "--data", data,
+        cwd=workspace,
+    )  # fmt: skip
+    config = newest_config(workspace / "outputs" / "bare")
+    output = run(
+        "ns-eval", "--load-config", config, "--output-path", workspace / "none.json", cwd=workspace, fails=True
+    )
+    assert "Error: " in output
+    assert "the test split has no reference images to evaluate on" in output
+    video = workspace / "bare.mp4"
+    run(
+        "ns-render", "interpolate", "--pose-source", "train", "--interpolation-steps", "1", "--load-config", config,
+        "--output-path", video, "--downscale-factor", "4", cwd=workspace,
+    )  # fmt: skip
+    assert video.stat().st_size > 0

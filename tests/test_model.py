@@ -1,0 +1,207 @@
+"""The event ray sampler and the model: rays, rendering, losses and colour correction on small exact cases."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from conftest import make_stream
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.model import AENeRFModel, AENeRFModelConfig
+from aenerf_ns.ray_sampler import EventRaySampler
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+CAMERA = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
+EPOCH = 1_600_000_000_000_000_000
+
+
+def make_sampler(random_poses: torch.Tensor, sensor: SensorModel, camera: EventCamera = CAMERA) -> EventRaySampler:
+    rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
+    stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
+    pairs = pair_events([stream], refractory_period=sensor.refractory_period)
+    trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
+    return EventRaySampler(lambda: pairs, camera, sensor, trajectory, num_rays_per_batch=40)
+
+
+def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> None:
+    sensor = SensorModel(refractory_period=1_000)
+    sampler = make_sampler(random_poses, sensor)
+    rays, batch = sampler.sample()
+    assert rays.origins.shape == (40, 3)
+    assert rays.directions.dtype == torch.float32
+    assert rays.times is not None
+    starts, ends = (torch.round(rays.times[:, 0] * 1e9).long() + EPOCH).chunk(2)
+    pixel_directions, _ = CAMERA.pixel_directions()
+    known = {
+        (EPOCH + 6_000, EPOCH + 250_000_000): ((3, 1), -1),
+        (EPOCH + 101_000, EPOCH + 600_000_000): ((0, 2), -1),
+        (EPOCH + 250_001_000, EPOCH + 10**9): ((3, 1), 1),
+    }
+    seen = set()
+    for i, interval in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+        (x, y), polarity = known[interval]
+        seen.add(interval)
+        assert batch["num_positive"][i] - batch["num_negative"][i] == polarity
+        for ray, time in ((i, interval[0]), (i + 20, interval[1])):
+            pose = sampler.trajectory.interpolate(time)
+            torch.testing.assert_close(rays.origins[ray], pose[:, 3].float())
+            direction = pose[:, :3] @ torch.from_numpy(pixel_directions[y, x])
+            torch.testing.assert_close(rays.directions[ray], direction.float(), rtol=0, atol=1e-6)
+    assert seen == set(known)
+
+
+def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel())
+    batches = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        batches.append(sampler.sample()[0].origins)
+    assert torch.equal(batches[0], batches[1])
+    assert not torch.equal(batches[0], batches[2])
+
+
+def test_the_colour_filter_is_that_of_the_raw_pixel(random_poses: torch.Tensor) -> None:
+    _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB")).sample()
+    # Pixel (3, 1) is blue and pixel (0, 2) red.
+    assert set(batch["channel"].tolist()) == {0, 2}
+
+
+def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) -> None:
+    # This lens model folds over towards the corners, pixel (0, 2) among them.
+    folded = EventCamera(4, 3, 1.2, 1.2, 3.0, 1.5, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
+    assert not folded.pixel_directions()[1][2, 0]
+    assert folded.pixel_directions()[1][1, 3]
+    _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB"), folded).sample()
+    assert set(batch["channel"].tolist()) == {2}
+
+
+def make_model(sensor: SensorModel | None = None, bounded: bool = False, **options: Any) -> AENeRFModel:
+    torch.manual_seed(0)
+    config = AENeRFModelConfig(
+        num_levels=4,
+        max_resolution=32,
+        log2_hashmap_size=10,
+        hidden_dim=16,
+        num_proposal_samples_per_ray=(16,),
+        num_nerf_samples_per_ray=12,
+        proposal_max_resolutions=(16,),
+        proposal_num_levels=2,
+        proposal_log2_hashmap_size=8,
+        **options,
+    )
+    metadata = {"sensor": sensor or SensorModel(0.2, 0.3), "image_encoding": "srgb", "bounded": bounded}
+    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    return config.setup(scene_box=box, num_train_data=1, metadata=metadata)
+
+
+def make_rays(count: int = 10, away: bool = False) -> RayBundle:
+    """Rays from z = 3 towards the scene box, or past it."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.tensor([0.0, 0.0, 1.0 if away else -1.0]) + 0.1 * torch.randn(count, 3, generator=generator)
+    return RayBundle(
+        origins=torch.tensor([0.0, 0.0, 3.0]).expand(count, 3),
+        directions=F.normalize(directions, dim=-1),
+        pixel_area=torch.ones(count, 1),
+        camera_indices=torch.zeros(count, 1, dtype=torch.long),
+    )
+
+
+def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
+    positive = (torch.arange(num_pairs) % 2).float()
+    return {
+        "num_positive": positive,
+        "num_negative": 1 - positive,
+        "channel": torch.zeros(num_pairs, dtype=torch.long),
+    }
+
+
+@pytest.mark.parametrize("contraction", ["l2", "linf", "none"])
+@pytest.mark.parametrize("bayer_pattern", ["", "RGGB"])
+def test_outputs_have_their_shapes_and_ranges(contraction: str, bayer_pattern: str) -> None:
+    model = make_model(SensorModel(bayer_pattern=bayer_pattern), scene_contraction=contraction).eval()
+    outputs = model(make_rays())
+    channels = 3 if bayer_pattern else 1
+    assert outputs["log_radiance"].shape == (10, channels)
+    assert outputs["rgb"].shape == (10, 3)
+    assert outputs["depth"].shape == outputs["accumulation"].shape == (10, 1)
+    assert (outputs["rgb"] >= 0).all()
+    assert (outputs["rgb"] <= 1).all()
+    assert all(torch.isfinite(value).all() for value in outputs.values())
+
+
+def test_losses_are_those_of_the_rendered_changes() -> None:
+    model = make_model(loss_coefficients={"reconstruction_loss": 2.0, "interlevel_loss": 0.0, "distortion_loss": 0.0})
+    outputs, batch = model(make_rays()), make_batch(5)
+    losses = model.get_loss_dict(outputs, batch)
+    change = outputs["log_radiance"][5:, 0] - outputs["log_radiance"][:5, 0]
+    target = torch.tensor([-0.3, 0.2, -0.3, 0.2, -0.3])
+    expected = 2.0 * ((change - target) ** 2).mean() / 0.25**2
+    torch.testing.assert_close(losses["reconstruction_loss"], expected)
+    assert losses["interlevel_loss"] == 0
+    assert losses["distortion_loss"] == 0
+
+
+def test_every_parameter_is_in_one_group_and_gets_a_gradient() -> None:
+    model = make_model(bounded=True)
+    # Denser than the proposals, or their loss has no gradient.
+    model.field.average_init_density = 5.0
+    losses = model.get_loss_dict(model(make_rays()), make_batch(5))
+    torch.stack(list(losses.values())).sum().backward()
+    groups = model.get_param_groups()
+    grouped = [parameter for group in groups.values() for parameter in group]
+    assert len(grouped) == len(set(grouped))
+    named = {name: parameter for name, parameter in model.named_parameters() if parameter.numel() > 0}
+    assert set(named.values()) == set(grouped)
+    for name, parameter in named.items():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.abs().max() > 0, name
+    # Weight decay is for network weights alone.
+    assert all(not name.endswith("hash_table") for name, p in named.items() if any(p is q for q in groups["networks"]))
+
+
+def test_rays_past_a_bounded_scene_see_the_background() -> None:
+    model = make_model(bounded=True).eval()
+    outputs = model(make_rays(away=True))
+    assert outputs["accumulation"].max() < 1e-3
+    assert model.raw_background is not None
+    expected = torch.log(F.softplus(model.raw_background) + 1e-3).expand(10, 1)
+    torch.testing.assert_close(outputs["log_radiance"], expected, atol=1e-3, rtol=0)
+    assert make_model(bounded=False).raw_background is None
+
+
+def test_the_picture_is_the_colour_corrected_one() -> None:
+    model = make_model().eval()
+    model.color_correction.scale.fill_(0.5)
+    model.color_correction.offset.fill_(-1.0)
+    outputs = model(make_rays())
+    linear = (torch.exp(0.5 * outputs["log_radiance"] - 1) - 1e-3).clamp(0, 1)
+    expected = torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    torch.testing.assert_close(outputs["rgb"], expected.expand(-1, 3))
+
+
+def test_image_metrics_compare_with_what_the_sensor_sees() -> None:
+    model = make_model().eval()
+    reference = torch.rand(16, 16, 3)
+    grey = model._display(model.reference_radiance(reference))
+    outputs = {"rgb": grey, "accumulation": torch.ones(16, 16, 1), "depth": torch.ones(16, 16, 1)}
+    metrics, images = model.get_image_metrics_and_images(outputs, {"image": reference})
+    assert metrics["psnr"] > 60
+    assert metrics["ssim"] == pytest.approx(1.0, abs=1e-4)
+    assert images["img"].shape == (16, 32, 3)
+
+
+def test_rendering_in_chunks_changes_nothing() -> None:
+    model = make_model(eval_num_rays_per_chunk=3).train()
+    rays = make_rays()
+    whole = make_model().eval()(make_rays())["log_radiance"]
+    torch.testing.assert_close(model.render_log_radiance([rays[:4], rays[4:]]), whole)
+    assert model.training
