@@ -34,7 +34,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     """
 
     config: EventDataManagerConfig
-    train_pixel_sampler: EventRaySampler | None  # type: ignore[assignment]
+    train_pixel_sampler: EventRaySampler | None
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         except DataError as error:
             raise SystemExit(f"Error: {error}") from None
 
-    def create_eval_dataset(self) -> EventDataset | None:  # type: ignore[override]
+    def create_eval_dataset(self) -> EventDataset | None:
         """The reference views, or None where there are none."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
         if not outputs.image_filenames:

@@ -77,16 +77,15 @@ class EventCamera:
         columns, rows = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
         pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
         matrix, distortion = self._opencv_matrix, np.array(self.distortion)
-        no_rotation, no_translation = np.zeros(3), np.zeros(3)
         if self.lens_model == "fisheye":
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
             plane = cv2.fisheye.undistortPoints(pixels, matrix, distortion, criteria=criteria)
             projected = cv2.fisheye.distortPoints(plane, matrix, distortion)
         else:
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-            plane = cv2.undistortPointsIter(pixels, matrix, distortion, None, None, criteria)
+            plane = cv2.undistortPointsIter(pixels, matrix, distortion, np.eye(3), np.eye(3), criteria)
             points = np.concatenate([plane, np.ones_like(plane[..., :1])], -1)
-            projected = cv2.projectPoints(points, no_rotation, no_translation, matrix, distortion)[0]
+            projected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0]
         error = np.linalg.norm(projected - pixels, axis=-1).reshape(self.height, self.width)
         plane = plane.reshape(self.height, self.width, 2)
         directions = np.stack([plane[..., 0], -plane[..., 1], np.full(plane.shape[:2], -1.0)], -1)

@@ -185,7 +185,7 @@ class AENeRFModel(Model):
             ),
         ]
 
-    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Renders rays.
 
         Returns:

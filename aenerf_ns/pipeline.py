@@ -37,7 +37,7 @@ class AENeRFPipeline(VanillaPipeline):
     datamanager: EventDataManager
     model: AENeRFModel
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
         """Loads a checkpoint, all of it: the framework would drop what does not fit without a word.
 
         Raises:

@@ -62,7 +62,7 @@ class NativeDataParser(EventDataParser):
         trajectory = read_tum_trajectory(folder / "trajectory_estimated.txt")
         frames = meta.get("frames", list, [])
         sensor = self._sensor(block)
-        encoding: ImageEncoding = meta.get("image_encoding", str, "srgb")  # type: ignore[assignment]
+        encoding: ImageEncoding = meta.get("image_encoding", str, "srgb")
         if encoding not in ("srgb", "linear"):
             raise DataError(meta.path, f'image_encoding is "{encoding}"', 'use "srgb" or "linear"')
         box = meta.get("scene_box", list, None)
@@ -165,9 +165,12 @@ def _camera(meta: _Metadata, width: str, height: str) -> EventCamera:
         return EventCamera(
             meta.get(width, int),
             meta.get(height, int),
-            *(meta.get(name, float) for name in ("fl_x", "fl_y", "cx", "cy")),
-            lens,
-            tuple(meta.get(name, float, 0.0) for name in names),
+            fx=meta.get("fl_x", float),
+            fy=meta.get("fl_y", float),
+            cx=meta.get("cx", float),
+            cy=meta.get("cy", float),
+            lens_model=lens,
+            distortion=tuple(meta.get(name, float, 0.0) for name in names),
         )
     except DataError:
         raise

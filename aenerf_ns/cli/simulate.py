@@ -106,12 +106,10 @@ class Simulate:
                 # The picture shows what is true; the pose beside it is what the user of the dataset is given.
                 pose = homogeneous(estimated.interpolate(time))
                 writer.add_image("train", simulation.reference_image(simulation.pose(time)), pose, time)
-            for split, poses in (
-                ("val", scene.validation_views(self.validation_views)),
-                ("test", scene.test_views(self.test_views, self.seed)),
-            ):
-                for pose in torch.from_numpy(poses):
-                    writer.add_image(split, simulation.reference_image(pose), pose)
+            for pose in torch.from_numpy(scene.validation_views(self.validation_views)):
+                writer.add_image("val", simulation.reference_image(pose), pose)
+            for pose in torch.from_numpy(scene.test_views(self.test_views, self.seed)):
+                writer.add_image("test", simulation.reference_image(pose), pose)
         seconds = (truth.end - truth.start) * 1e-9
         CONSOLE.print(
             f"{self.output}: {num_events:,} events in {seconds:.2f} s, {len(truth)} poses, {self.train_images} train, "

@@ -128,7 +128,7 @@ def pair_events(
     """
     dtypes = (np.uint16, np.uint16, np.int64, np.int64, np.uint8, np.uint8)
     # numpy.empty only reserves addresses: memory is used as the pairs are written.
-    records = [np.empty(expected_events or 0, dtype) for dtype in dtypes]
+    records: list[NDArray] = [np.empty(expected_events or 0, dtype) for dtype in dtypes]
     size = total = outside = first = merged = refractory = 0
     last_time = last_record = None
     source: object = "events"
@@ -169,5 +169,17 @@ def pair_events(
             f"none of its {total} events lies between {start} and {end} ns, the span of the poses and the time window",
             "check that events and poses share one clock and one unit of time",
         )
-    columns = [r[:size] for r in records]
-    return EventPairs(*columns, total, outside, first, merged, refractory)
+    x, y, previous_time, time, num_positive, num_negative = (record[:size] for record in records)
+    return EventPairs(
+        x=x,
+        y=y,
+        previous_time=previous_time,
+        time=time,
+        num_positive=num_positive,
+        num_negative=num_negative,
+        num_events=total,
+        num_outside=outside,
+        num_first=first,
+        num_merged=merged,
+        num_within_refractory_period=refractory,
+    )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import i0, iv  # type: ignore[import-untyped]
+from scipy.special import i0, iv
 
 Array = NDArray[np.float64]
 

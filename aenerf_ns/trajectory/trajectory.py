@@ -40,6 +40,8 @@ class Trajectory(nn.Module):
 
     times: Tensor
     camera_to_worlds: Tensor
+    _rotation_steps: Tensor
+    _translation_steps: Tensor
 
     def __init__(self, times: ArrayLike | Tensor, camera_to_worlds: Tensor, source: str | Path = "trajectory") -> None:
         super().__init__()

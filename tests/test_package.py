@@ -1,0 +1,90 @@
+"""What is installed: the wheel's content, the entry points, and the cost of importing the package."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    folder = tmp_path_factory.mktemp("wheel")
+    # Built by the backend itself, in a process of its own: no network, and no build folder in the source tree.
+    build = (
+        "import sys, setuptools.build_meta as backend;"
+        "sys.argv = ['build'];"
+        f"backend.build_wheel({str(folder)!r}, {{'--build-option': ['--bdist-dir', {str(folder / 'files')!r}]}})"
+    )
+    subprocess.run([sys.executable, "-c", build], cwd=ROOT, check=True, capture_output=True)
+    return zipfile.ZipFile(next(folder.glob("*.whl")))
+
+
+def test_the_wheel_holds_the_package_and_nothing_generic(wheel: zipfile.ZipFile) -> None:
+    names = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert {name.split("/")[0] for name in names} == {"aenerf_ns"}
+    sources = {
+        f"aenerf_ns/{path.relative_to(ROOT / folder).as_posix()}"
+        if folder == "aenerf_ns"
+        else f"aenerf_ns/{folder}/{path.relative_to(ROOT / folder).as_posix()}"
+        for folder in ("aenerf_ns", "dataparsers", "method_configs")
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    assert names == sources | {"aenerf_ns/py.typed"}
+    assert any(name.endswith("LICENSE") for name in wheel.namelist())
+
+
+def test_the_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
+    text = next(wheel.read(name).decode() for name in wheel.namelist() if name.endswith("entry_points.txt"))
+    targets = [line.split("=")[1].strip() for line in text.splitlines() if "=" in line]
+    assert len(targets) == 5
+    for target in targets:
+        module, attribute = target.split(":")
+        assert attribute in wheel.read(module.replace(".", "/") + ".py").decode()
+
+
+def test_the_dataparsers_are_registered() -> None:
+    names = {point.name for point in entry_points(group="nerfstudio.dataparser_configs")}
+    assert {"aenerf-data", "ecd-data"} <= names
+
+
+def test_importing_the_package_costs_nothing() -> None:
+    # Nerfstudio imports it at every command, whatever the method; so it must bring in none of the heavy packages.
+    code = "import sys, aenerf_ns; print({'torch', 'numba', 'numpy', 'cv2', 'h5py', 'nerfstudio'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd="/")
+    assert done.stdout.strip() == "set()"
+
+
+def test_lower_floors_import_none_above_them() -> None:
+    # Bottom up; each may import those before it.
+    floors = [
+        {"errors", "progress"},
+        {"events", "trajectory", "scenes", "image_encoding", "event_camera"},
+        {"field", "losses", "color_correction", "image_metrics"},
+        {"dataset", "simulation"},
+        {"ray_sampler"},
+        {"datamanager", "model"},
+        {"pipeline", "training", "ffmpeg"},
+        {"dataparsers", "method_configs"},
+        {"cli"},
+    ]
+    floor_of = {name: level for level, names in enumerate(floors) for name in names}
+    for folder, prefix in (("aenerf_ns", ""), ("dataparsers", "dataparsers."), ("method_configs", "method_configs.")):
+        for path in (ROOT / folder).rglob("*.py"):
+            module = prefix + ".".join(path.relative_to(ROOT / folder).with_suffix("").parts)
+            if module == "__init__":
+                continue
+            own = floor_of[module.split(".")[0]]
+            for line in path.read_text().splitlines():
+                words = line.split()
+                if words[:1] in (["from"], ["import"]) and words[1].startswith("aenerf_ns."):
+                    imported = words[1].split(".")[1]
+                    assert floor_of[imported] <= own, f"{path}: {line}"
+                    if folder == "aenerf_ns" and own < len(floors) - 1:
+                        assert imported not in ("dataparsers", "method_configs"), f"{path}: {line}"
