@@ -17,13 +17,14 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
-from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
+from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.misc import scale_dict
 from torch import Tensor, nn
 from torch.nn import Parameter
 
+from aenerf_ns.box_collider import BoxCollider
 from aenerf_ns.color_correction import AffineColorCorrection
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.field import EventRadianceField
@@ -108,7 +109,7 @@ class AENeRFModel(Model):
         distortion = {"l2": SceneContraction(), "linf": SceneContraction(order=float("inf")), "none": None}[contraction]
         self.collider: nn.Module
         if distortion is None:
-            self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)
+            self.collider = BoxCollider(self.scene_box, near_plane=config.near_plane)
         else:
             self.collider = NearFarCollider(config.near_plane, config.far_plane)
 

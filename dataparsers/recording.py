@@ -26,7 +26,7 @@ from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homoge
 Split = Literal["train", "val", "test"]
 
 # Training cameras are only there to be seen: the framework's viewer and its start-up slow down with their number.
-_MAX_SHOWN = 100
+_MAX_SHOWN = 24
 
 
 @dataclass(frozen=True)

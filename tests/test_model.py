@@ -175,6 +175,8 @@ def test_rays_past_a_bounded_scene_see_the_background() -> None:
     assert model.raw_background is not None
     expected = torch.log(F.softplus(model.raw_background) + 1e-3).expand(10, 1)
     torch.testing.assert_close(outputs["log_radiance"], expected, atol=1e-3, rtol=0)
+    # From z = 3, so behind the box: the viewer hides what lies behind a pixel's depth.
+    torch.testing.assert_close(outputs["depth"], torch.full((10, 1), 3 + 12**0.5), atol=1e-3, rtol=0)
     assert make_model(bounded=False).raw_background is None
 
 

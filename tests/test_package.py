@@ -65,7 +65,7 @@ def test_lower_floors_import_none_above_them() -> None:
     # Bottom up; each may import those before it.
     floors = [
         {"errors", "progress"},
-        {"events", "trajectory", "scenes", "image_encoding", "event_camera"},
+        {"events", "trajectory", "scenes", "image_encoding", "event_camera", "box_collider"},
         {"field", "losses", "color_correction", "image_metrics"},
         {"dataset", "simulation"},
         {"ray_sampler"},

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 # Display value of a pixel without events, and what one positive or negative event adds to it.
 _GREY = 118
-_POSITIVE_STEP = np.array([45, -25, -45])
-_NEGATIVE_STEP = np.array([-45, -25, 45])
+_POSITIVE_STEP = np.array([90, -60, -90])
+_NEGATIVE_STEP = np.array([-90, -60, 90])
 
 
 def polarity_picture(

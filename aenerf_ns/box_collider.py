@@ -1,0 +1,30 @@
+"""Where rays enter and leave a bounded scene."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider
+
+# The framework leaves rays that miss the box with an interval of this length, up to rounding.
+_MISSED = 1e-5
+
+
+class BoxCollider(AABBBoxCollider):
+    """The framework's box collider, with rays that miss the box ending behind it.
+
+    The framework lets such rays end anywhere, often at the camera. Their depth, which is that end, would then hide
+    whatever the viewer draws behind: the training cameras around an object.
+    """
+
+    def set_nears_and_fars(self, ray_bundle: RayBundle) -> RayBundle:
+        """Fills in ``nears`` and ``fars`` (N, 1), distances in scene units."""
+        ray_bundle = super().set_nears_and_fars(ray_bundle)
+        nears, fars = ray_bundle.nears, ray_bundle.fars
+        aabb = self.scene_box.aabb.to(nears)
+        to_center = (ray_bundle.origins - aabb.mean(0)).norm(dim=-1, keepdim=True)
+        behind = to_center + (aabb[1] - aabb[0]).norm()
+        missed = fars - nears < _MISSED
+        ray_bundle.nears = torch.where(missed, behind, nears)
+        ray_bundle.fars = torch.where(missed, behind + _MISSED, fars)
+        return ray_bundle
