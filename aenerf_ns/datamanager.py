@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 
 from aenerf_ns.dataset import EventDataset
 from aenerf_ns.errors import DataError
@@ -35,6 +36,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     config: EventDataManagerConfig
     train_pixel_sampler: EventRaySampler | None
+    has_reference_views: bool
 
     def __init__(
         self,
@@ -49,16 +51,16 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             raise SystemExit(f"Error: {error}") from None
 
     def create_eval_dataset(self) -> EventDataset | None:
-        """The reference views, or None where there are none."""
+        """The reference views. Where there are none, none while training, and else the places on the trajectory, so
+        that the framework's renderers have cameras to start from."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
-        if not outputs.image_filenames:
-            return None
-        return self.dataset_type(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
+        self.has_reference_views = bool(outputs.image_filenames)
+        if self.has_reference_views:
+            return self.dataset_type(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
+        return None if self.test_mode == "val" else self.train_dataset
 
     def setup_train(self) -> None:
         """Reads the events for training. A trained run is opened without them."""
-        if self.test_mode == "val":
-            _ = self.train_dataset.pairs
         metadata = self.train_dataset.metadata
         self.train_pixel_sampler = EventRaySampler(
             lambda: self.train_dataset.pairs,
@@ -67,6 +69,14 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             deepcopy(metadata["trajectory"]).to(self.device),
             self.config.train_num_rays_per_batch,
         )
+        if self.test_mode == "val":
+            self.train_pixel_sampler.prepare()
+
+    def setup_eval(self) -> None:
+        """Only what gives whole reference views: no pixels are sampled from them."""
+        options = {"input_dataset": self.eval_dataset, "device": self.device, "num_workers": self.world_size * 4}
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**options)
+        self.eval_dataloader = RandIndicesEvalDataloader(**options)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """A batch of pairs; see :meth:`EventRaySampler.sample`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -10,10 +11,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pairs import EventPairs, pair_events
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.progress import progress_bar
+
+if TYPE_CHECKING:
+    from aenerf_ns.events.pairs import EventPairs
 
 # Events in a picture, as a share of the sensor's pixels: enough to show edges, few enough not to smear them.
 _PICTURE_DENSITY = 0.25
@@ -29,6 +32,9 @@ class EventDataset(InputDataset):
         Raises:
             DataError: the event file is missing or malformed, or no event lies in the time window.
         """
+        # Late, for every command of every method would wait for numba.
+        from aenerf_ns.events.pairs import pair_events
+
         event_file: EventFile = self.metadata["event_file"]
         start, end = self.metadata["time_window"]
         count = event_file.count()

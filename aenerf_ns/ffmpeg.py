@@ -15,9 +15,9 @@ def provide_ffmpeg() -> None:
     """
     if shutil.which("ffmpeg") is not None:
         return
-    import imageio_ffmpeg
-
     try:
+        import imageio_ffmpeg
+
         binary = Path(imageio_ffmpeg.get_ffmpeg_exe())
         # The shipped file has another name, so it needs a link; the folder's name is that of its version.
         folder = Path.home() / ".cache" / "aenerf-ns" / binary.stem
@@ -26,8 +26,10 @@ def provide_ffmpeg() -> None:
         if not link.exists() or not link.samefile(binary):
             # Replaced in one step, for another process may be starting at the same time.
             new = folder / f"ffmpeg.{os.getpid()}"
+            new.unlink(missing_ok=True)
             new.symlink_to(binary)
             new.replace(link)
-    except (OSError, RuntimeError):
+    except Exception:
+        # Whatever it is, it must not break the commands of all methods.
         return
     os.environ["PATH"] = f"{os.environ.get('PATH', '')}{os.pathsep}{folder}"

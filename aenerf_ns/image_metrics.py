@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
-from torchmetrics import Metric
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+from torch import Tensor, nn
 
 
 class ImageMetrics:
@@ -22,7 +20,7 @@ class ImageMetrics:
 
     def __init__(self, with_lpips: bool) -> None:
         self._with_lpips = with_lpips
-        self._lpips: Metric | None = None
+        self._lpips: nn.Module | None = None
         self.lpips_absent: str | None = None if with_lpips else "not asked for (--pipeline.model.lpips True)"
 
     def __call__(self, predicted: Tensor, reference: Tensor) -> dict[str, float]:
@@ -32,6 +30,9 @@ class ImageMetrics:
             predicted: (H, W, 3).
             reference: (H, W, 3).
         """
+        # Late, for every command of every method would wait for it.
+        from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
         predicted, reference = (image.moveaxis(-1, 0)[None].float() for image in (predicted, reference))
         metrics = {
             "psnr": float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)),

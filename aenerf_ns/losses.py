@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -20,6 +21,25 @@ def log_radiance_change(
         (N,) changes.
     """
     return num_positive * positive_threshold - num_negative * negative_threshold
+
+
+def temporal_loss(rate: Tensor, change: Tensor, interval: Tensor) -> Tensor:
+    """ℓ_g (paper, eq. 12): the mean relative error |(G_gt − G_pred) / G_gt|, with G_gt = change / interval.
+
+    Written so that no interval, however short, overflows. Pairs whose merged events cancel have no G_gt to be
+    relative to, and are left out.
+
+    Args:
+        rate: (N,) G_pred, rendered rates of log-radiance per second.
+        change: (N,) changes that the events tell of.
+        interval: (N,) seconds.
+
+    Returns:
+        The loss, a scalar: 1 for a constant field.
+    """
+    usable = change != 0
+    relative = 1 - rate * interval / torch.where(usable, change, torch.ones_like(change))
+    return (relative.abs() * usable).sum() / usable.sum().clamp_min(1)
 
 
 def reconstruction_loss(predicted: Tensor, target: Tensor, mean_contrast_threshold: float) -> Tensor:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
-from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.configs.config_utils import to_immutable_dict
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
@@ -30,7 +30,12 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.field import EventRadianceField
 from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
-from aenerf_ns.losses import log_radiance_change, reconstruction_loss
+from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
+from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.temporal import log_radiance_rate
+
+# ε of the paper's appendix "Model Architecture": the least radiance that can be rendered.
+_RADIANCE_EPSILON = 1e-3
 
 
 @dataclass
@@ -77,21 +82,23 @@ class AENeRFModelConfig(ModelConfig):
     proposal_weights_anneal_iterations: int = 1000
     """Steps over which sampling turns from broad to following the proposal weights."""
     loss_coefficients: dict[str, float] = to_immutable_dict(
-        {"reconstruction_loss": 1.0, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
+        {"reconstruction_loss": 1.0, "temporal_loss": 1e-3, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
     )
-    """Weights of the losses (paper, eq. 14: alpha, gamma, eta). A weight of 0 turns a loss off."""
+    """Weights of the losses (paper, eq. 14: alpha, beta, gamma, eta). A weight of 0 turns a loss off."""
+    camera_optimizer: PoseCorrectionConfig = field(default_factory=PoseCorrectionConfig)
+    """Pose correction."""
     color_correction_num_rays: int = 16384
     """Pixels, spread over all validation views, on which the colour correction is fitted."""
     lpips: bool = False
     """Also report LPIPS. It needs the AlexNet weights of torchvision, which are downloaded on first use."""
-    eval_num_rays_per_chunk: int = 1 << 15
+    eval_num_rays_per_chunk: int = 1 << 13
     """Rays rendered at once outside training."""
 
 
 class AENeRFModel(Model):
     """Renders radiance along event rays and compares its logarithm with the events.
 
-    Needs the dataparser's metadata: ``sensor``, ``image_encoding``, ``bounded``.
+    Needs the dataparser's metadata: ``sensor``, ``trajectory``, ``camera_times``, ``image_encoding``, ``bounded``.
     """
 
     config: AENeRFModelConfig
@@ -111,7 +118,7 @@ class AENeRFModel(Model):
         if distortion is None:
             self.collider = BoxCollider(self.scene_box, near_plane=config.near_plane)
         else:
-            self.collider = NearFarCollider(config.near_plane, config.far_plane)
+            self.collider = NearFarCollider(config.near_plane, config.far_plane, reset_near_plane=False)
 
         self.field = EventRadianceField(
             self.scene_box.aabb,
@@ -151,6 +158,12 @@ class AENeRFModel(Model):
         self.raw_background = (
             Parameter(torch.full((self.sensor.num_channels,), 0.54)) if background == "learned" else None
         )
+        self.camera_optimizer: PoseCorrection = config.camera_optimizer.setup(
+            num_cameras=self.num_train_data,
+            device=self.kwargs.get("device", "cpu"),
+            trajectory=deepcopy(metadata["trajectory"]),
+            camera_times=metadata["camera_times"],
+        )
         self.color_correction = AffineColorCorrection(self.sensor.num_channels)
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
@@ -164,6 +177,7 @@ class AENeRFModel(Model):
                 groups["encodings" if name.endswith("hash_table") else "networks"].append(parameter)
         if self.raw_background is not None:
             groups["encodings"].append(self.raw_background)
+        self.camera_optimizer.get_param_groups(groups)
         return groups
 
     def get_training_callbacks(
@@ -186,38 +200,64 @@ class AENeRFModel(Model):
             ),
         ]
 
+    @property
+    def uses_temporal_loss(self) -> bool:
+        """Whether training batches must hold a third ray for each pair."""
+        return self.config.loss_coefficients.get("temporal_loss", 0) > 0
+
+    def forward(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        """Renders rays; those with times, of pairs of events, from the corrected poses."""
+        if ray_bundle.times is not None:
+            self.camera_optimizer.apply_to_raybundle(ray_bundle)
+        return super().forward(ray_bundle)
+
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Renders rays.
 
         Returns:
             ``rgb`` (N, 3) colour-corrected display values, ``log_radiance`` (N, channels) the raw log L̂,
             ``accumulation`` (N, 1), ``depth`` (N, 1) median distance along the ray in scene units; and, while
-            training, the samples and weights of both stages.
+            training, the samples and weights of both stages, and the ``log_radiance_rate`` (pairs, channels) of the
+            last third of the rays.
         """
         samples, weights_list, samples_list = self.proposal_sampler(
             ray_bundle, density_fns=[network.density_fn for network in self.proposal_networks]
         )
-        field_outputs = self.field(samples)
-        weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
+        outputs: dict[str, Any] = {}
+        if self.training and self.uses_temporal_loss and ray_bundle.times is not None:
+            within = slice(2 * len(ray_bundle) // 3, None)
+            moving = ray_bundle[within]
+            ends, weights_of_ends = self._composite(samples[: within.start])
+            log_radiance, outputs["log_radiance_rate"], weights = log_radiance_rate(
+                self._composite,
+                samples[within],
+                (moving.origins, moving.directions),
+                self.camera_optimizer.ray_rates(moving),
+            )
+            log_radiance, weights = torch.cat([ends, log_radiance]), torch.cat([weights_of_ends, weights])
+        else:
+            log_radiance, weights = self._composite(samples)
         weights_list.append(weights)
         samples_list.append(samples)
-        accumulation = self.renderer_accumulation(weights)
-        # Not the framework's RGBRenderer, which clips to [0, 1] outside training: radiance has no upper bound.
-        radiance = (weights * field_outputs[FieldHeadNames.RGB]).sum(-2)
-        if self.raw_background is not None:
-            radiance = radiance + (1 - accumulation) * F.softplus(self.raw_background)
-        log_radiance = torch.log(radiance + _RADIANCE_EPSILON)
-        outputs = {
-            "rgb": self._display(self.color_correction(log_radiance.detach())),
-            "log_radiance": log_radiance,
-            "accumulation": accumulation,
-        }
+        outputs["rgb"] = self._display(self.color_correction(log_radiance.detach()))
+        outputs["log_radiance"] = log_radiance
+        outputs["accumulation"] = self.renderer_accumulation(weights)
         with torch.no_grad():
             outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
         if self.training:
             outputs["weights_list"] = weights_list
             outputs["ray_samples_list"] = samples_list
         return outputs
+
+    def _composite(self, samples: RaySamples) -> tuple[Tensor, Tensor]:
+        """Log-radiance (N, channels) and weights (N, samples, 1); in plain operations, for every differentiation."""
+        field_outputs = self.field(samples)
+        weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
+        # Not the framework's RGBRenderer, which clips to [0, 1] outside training: radiance has no upper bound.
+        radiance = (weights * field_outputs[FieldHeadNames.RGB]).sum(-2)
+        if self.raw_background is not None:
+            radiance = radiance + (1 - weights.sum(-2)) * F.softplus(self.raw_background)
+        return torch.log(radiance + _RADIANCE_EPSILON), weights
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
@@ -227,19 +267,25 @@ class AENeRFModel(Model):
         predicted, target = self._log_radiance_changes(outputs, batch)
         losses = {"reconstruction_loss": reconstruction_loss(predicted, target, mean_threshold)}
         if self.training:
+            if "log_radiance_rate" in outputs:
+                rate = outputs["log_radiance_rate"].gather(1, batch["channel"][:, None])[:, 0]
+                losses["temporal_loss"] = temporal_loss(rate, target, batch["interval"])
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             losses["interlevel_loss"] = interlevel_loss(weights, samples) / mean_threshold**2
             losses["distortion_loss"] = distortion_loss(weights, samples)
+            self.camera_optimizer.get_loss_dict(losses)
         return scale_dict(losses, self.config.loss_coefficients)
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """How far the rendered changes of log-radiance agree with the events."""
         predicted, target = self._log_radiance_changes(outputs, batch)
-        return {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
+        metrics = {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
 
     def _log_radiance_changes(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Rendered and true changes (N,) over the intervals of a batch, each of its pixel's channel."""
-        start, end = outputs["log_radiance"].chunk(2)
+        start, end = outputs["log_radiance"].split(len(batch["channel"]))[:2]
         predicted = (end - start).gather(1, batch["channel"][:, None])[:, 0]
         target = log_radiance_change(
             batch["num_positive"],
@@ -257,6 +303,10 @@ class AENeRFModel(Model):
         """Display values (..., 3) of linear radiance (..., channels)."""
         return encode(radiance, self.image_encoding).expand(*radiance.shape[:-1], 3)
 
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Display values and opacity (..., 4): exporters leave out what is transparent."""
+        return torch.cat([outputs[output_name], outputs["accumulation"].clamp(0, 1)], dim=-1)
+
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
@@ -271,18 +321,11 @@ class AENeRFModel(Model):
         return self.image_metrics(predicted, reference), images
 
     @torch.no_grad()
-    def render_log_radiance(self, ray_bundles: Sequence[RayBundle]) -> Tensor:
+    def render_log_radiance(self, rays: RayBundle) -> Tensor:
         """Log-radiance (N, channels) of rays, in evaluation mode and whatever the number of rays."""
         was_training = self.training
         self.eval()
-        rendered = [
-            self(bundle[begin : begin + self.config.eval_num_rays_per_chunk])["log_radiance"]
-            for bundle in ray_bundles
-            for begin in range(0, len(bundle), self.config.eval_num_rays_per_chunk)
-        ]
+        chunk = self.config.eval_num_rays_per_chunk
+        rendered = [self(rays[begin : begin + chunk])["log_radiance"] for begin in range(0, len(rays), chunk)]
         self.train(was_training)
         return torch.cat(rendered)
-
-
-# ε of the paper's appendix "Model Architecture": the least radiance that can be rendered.
-_RADIANCE_EPSILON = 1e-3

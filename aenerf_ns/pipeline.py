@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.misc import step_check
 from torch import Tensor
 
 from aenerf_ns.datamanager import EventDataManager
-from aenerf_ns.dataset import EventDataset
 from aenerf_ns.model import AENeRFModel
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
@@ -37,6 +38,11 @@ class AENeRFPipeline(VanillaPipeline):
     datamanager: EventDataManager
     model: AENeRFModel
 
+    def __init__(self, config: AENeRFPipelineConfig, device: str, **kwargs: Any) -> None:
+        super().__init__(config, device, **kwargs)
+        if self.datamanager.train_pixel_sampler is not None:
+            self.datamanager.train_pixel_sampler.with_time_within = self.model.uses_temporal_loss
+
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
         """Loads a checkpoint, all of it: the framework would drop what does not fit without a word.
 
@@ -53,7 +59,8 @@ class AENeRFPipeline(VanillaPipeline):
         assert trainer is not None
         # The dataparser has resolved the time window by now: opening the run again must give the same cameras without
         # reading the events.
-        trainer.config.save_config()
+        if trainer.local_rank == 0:
+            trainer.config.save_config()
         last_step = trainer._start_step + trainer.config.max_num_iterations - 1
 
         def fit(step: int) -> None:
@@ -74,32 +81,36 @@ class AENeRFPipeline(VanillaPipeline):
         Args:
             share: of the configured number of pixels to fit it on.
         """
-        views = self.datamanager.eval_dataset
-        num_rays = round(share * self.model.config.color_correction_num_rays)
-        if views is None:
-            log_radiance, _ = self._sample_pixels(self.datamanager.train_dataset, num_rays, with_images=False)
+        rays, reference = self._pixels
+        count = max(round(share * len(rays)), 1)
+        log_radiance = self.model.render_log_radiance(rays[:count])
+        if reference is None:
             self.model.color_correction.stretch(log_radiance)
-            return
-        log_radiance, image = self._sample_pixels(views, num_rays, with_images=True)
-        self.model.color_correction.fit(log_radiance, self.model.reference_radiance(image), len(views))
+        else:
+            self.model.color_correction.fit(log_radiance, reference[:count], len(self.datamanager.eval_dataset))
 
-    def _sample_pixels(self, views: EventDataset, num_rays: int, with_images: bool) -> tuple[Tensor, Tensor]:
-        """Rendered log-radiance (N, channels) and image values (N, 3) of random pixels of all views, the same pixels
-        at every call."""
+    @cached_property
+    def _pixels(self) -> tuple[RayBundle, Tensor | None]:
+        """Rays through random pixels of all validation views, the same in every run, and the radiance (N, channels)
+        of the references there; without references, of all training cameras, and None."""
+        views = self.datamanager.eval_dataset or self.datamanager.train_dataset
         generator = torch.Generator().manual_seed(0)
-        cameras = views.cameras.to(self.device)
-        count = max(num_rays // len(views), 1)
-        bundles, values = [], []
-        for index in range(len(views)):
-            size = (int(cameras.height[index]), int(cameras.width[index]))
-            rows, columns = (torch.randint(extent, (count,), generator=generator) for extent in size)
-            coordinates = torch.stack([rows, columns], -1) + 0.5
-            view = torch.full((count, 1), index)
-            bundles.append(cameras.generate_rays(view.to(self.device), coords=coordinates.to(self.device)))
-            if with_images:
-                values.append(views.get_image_float32(index)[rows, columns, :3])
-        image = torch.cat(values).to(self.device) if with_images else torch.zeros(0, 3)
-        return self.model.render_log_radiance(bundles), image
+        cameras = views.cameras
+        count = max(self.model.config.color_correction_num_rays, len(views))
+        # Every view as often as the others, in random order: any part of it is spread over the views, too.
+        index = (torch.arange(count) % len(views))[torch.randperm(count, generator=generator)]
+        size = torch.cat([cameras.height, cameras.width], -1)[index]
+        pixels = (torch.rand(count, 2, generator=generator) * size).long()
+        rays = cameras.to(self.device).generate_rays(
+            index[:, None].to(self.device), coords=(pixels + 0.5).to(self.device)
+        )
+        if self.datamanager.eval_dataset is None:
+            return rays, None
+        image = torch.zeros(count, 3)
+        for view in range(len(views)):
+            rows, columns = pixels[index == view].T
+            image[index == view] = views.get_image_float32(view)[rows, columns, :3]
+        return rays, self.model.reference_radiance(image).to(self.device)
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -109,7 +120,7 @@ class AENeRFPipeline(VanillaPipeline):
         Raises:
             SystemExit: there are no reference views.
         """
-        if self.datamanager.eval_dataset is None:
+        if not self.datamanager.has_reference_views:
             raise SystemExit(
                 f"Error: {self.datamanager.get_datapath()}: the {self.datamanager.test_split} split has no reference "
                 "images to evaluate on; ns-render shows what was reconstructed"

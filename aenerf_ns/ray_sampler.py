@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
-from aenerf_ns.events.pairs import EventPairs
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.trajectory.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from aenerf_ns.events.pairs import EventPairs
+
+# t_sam: a truncated normal distribution over the interval.
+_WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
 
 
 class EventRaySampler:
@@ -28,7 +36,11 @@ class EventRaySampler:
         camera: the lens, for the exact direction of each raw pixel.
         sensor: for the refractory period and the pixels' colour filters.
         trajectory: camera-to-world poses, OpenGL camera axes; on the device of the rays.
-        num_rays_per_batch: rays of a batch; a pair takes two.
+        num_rays_per_batch: rays of a batch; a pair takes two, or three with a time within its interval.
+
+    Attributes:
+        with_time_within: whether batches for training have a third ray for each pair, at a random time t_sam within
+            its interval, for the temporal loss.
     """
 
     def __init__(
@@ -47,7 +59,8 @@ class EventRaySampler:
             CONSOLE.print(
                 f"[yellow]The lens model gives {(~has_direction).sum()} pixels no direction; their events are left out"
             )
-        self._has_direction = has_direction
+        self.with_time_within = False
+        self._has_direction = None if has_direction.all() else has_direction
         self._directions = torch.from_numpy(directions).to(trajectory.times.device)
         # Area of a pixel at distance one from the camera.
         self._pixel_area = 1 / (camera.fx * camera.fy)
@@ -57,46 +70,73 @@ class EventRaySampler:
         """Draws a batch.
 
         Args:
-            num_pairs: number of pairs, by default as many as a batch holds.
+            num_pairs: number of pairs to draw without a time within their intervals; by default as many as a batch
+                for training holds.
 
         Returns:
-            2 N rays, those at the starts of the intervals followed by those at their ends, with ``times`` in float64
-            seconds since the trajectory's start; and for each pair ``num_positive`` and ``num_negative`` (N,) counts
-            of events at its end and the ``channel`` (N,) of its pixel's filter.
+            The rays at the starts of the N intervals, then those at their ends, then those at t_sam if there are any:
+            with ``times`` in float64 seconds since the trajectory's start, and with the ``camera_directions`` among
+            their metadata in the camera's frame. And for each pair ``num_positive`` and ``num_negative`` (N,) counts
+            of events at its end, the ``interval`` (N,) in seconds, and the ``channel`` (N,) of its pixel's filter.
         """
-        num_pairs = num_pairs or max(self.num_rays_per_batch // 2, 1)
+        with_time_within = self.with_time_within and num_pairs is None
+        rays_per_pair = 3 if with_time_within else 2
+        num_pairs = num_pairs or max(self.num_rays_per_batch // rays_per_pair, 1)
         pairs, device = self._pairs(), self._directions.device
         index = self._draw(pairs, num_pairs)
         x, y = pairs.x[index].astype(np.int64), pairs.y[index].astype(np.int64)
         starts = pairs.previous_time[index] + self.sensor.refractory_period
-        times = torch.from_numpy(np.concatenate([starts, pairs.time[index]])).to(device)
-        seconds = self.trajectory.seconds(times)[:, None]
+        start, end = (self.trajectory.seconds(torch.from_numpy(t).to(device)) for t in (starts, pairs.time[index]))
+        interval = torch.from_numpy((pairs.time[index] - starts) * 1e-9).to(device)
+        times = [start, end]
+        if with_time_within:
+            within = torch.empty(num_pairs, dtype=torch.float64)
+            nn.init.trunc_normal_(within, mean=_WITHIN_MEAN, std=_WITHIN_DEVIATION, a=0.0, b=1.0)
+            times.append(start + within.to(device) * interval)
+        seconds = torch.cat(times)
         rows, columns = torch.from_numpy(y).to(device), torch.from_numpy(x).to(device)
-        origins, directions = world_rays(
-            self.trajectory.pose(seconds[:, 0]), self._directions[rows, columns].repeat(2, 1)
-        )
+        in_camera = self._directions[rows, columns].repeat(rays_per_pair, 1)
+        origins, directions = world_rays(self.trajectory.pose(seconds), in_camera)
         rays = RayBundle(
             origins=origins.float(),
             directions=directions.float(),
-            pixel_area=torch.full((2 * num_pairs, 1), self._pixel_area, device=device),
-            camera_indices=torch.zeros((2 * num_pairs, 1), dtype=torch.long, device=device),
-            times=seconds,
+            pixel_area=torch.full((len(seconds), 1), self._pixel_area, device=device),
+            camera_indices=torch.zeros((len(seconds), 1), dtype=torch.long, device=device),
+            times=seconds[:, None],
+            metadata={"camera_directions": in_camera},
         )
         batch = {
             "num_positive": torch.from_numpy(pairs.num_positive[index].astype(np.float32)).to(device),
             "num_negative": torch.from_numpy(pairs.num_negative[index].astype(np.float32)).to(device),
+            "interval": interval.float(),
             "channel": torch.from_numpy(self.sensor.channel(x, y)).to(device),
         }
         return rays, batch
 
-    def _draw(self, pairs: EventPairs, num_pairs: int) -> np.ndarray:
-        """Uniform indices of pairs whose pixel has a direction, by rejection: a copy of the pairs would be costly."""
-        drawn = np.empty(0, dtype=np.int64)
-        while len(drawn) < num_pairs:
-            index = torch.randint(len(pairs), (num_pairs - len(drawn),)).numpy()
-            keep = self._has_direction[pairs.y[index], pairs.x[index]]
-            drawn = np.concatenate([drawn, index[keep]])
-        return drawn
+    @cached_property
+    def _usable(self) -> NDArray[np.int64] | None:
+        """Indices of the pairs whose pixel has a direction, or None when all have."""
+        if self._has_direction is None:
+            return None
+        pairs = self._pairs()
+        usable = np.flatnonzero(self._has_direction[pairs.y, pairs.x])
+        if len(usable) == 0:
+            raise DataError("the lens model", "no event lies on a pixel with a direction", "check the distortion")
+        return usable
+
+    def prepare(self) -> None:
+        """Reads the events now rather than with the first batch.
+
+        Raises:
+            DataError: the events cannot be used.
+        """
+        _ = self._pairs(), self._usable
+
+    def _draw(self, pairs: EventPairs, num_pairs: int) -> NDArray[np.int64]:
+        """Uniform indices of usable pairs."""
+        if self._usable is None:
+            return torch.randint(len(pairs), (num_pairs,)).numpy()
+        return self._usable[torch.randint(len(self._usable), (num_pairs,)).numpy()]
 
 
 def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

@@ -64,6 +64,9 @@ class Simulation:
             width, height, sensor, contrast_threshold_spread=contrast_threshold_spread, seed=seed
         )
         self._frames = frame_parameters(scene.scene, scene.path, self._intrinsics, width, height, max_displacement)
+        self._times = _nanoseconds(self._profile.time(self._frames))
+        if (np.diff(self._times) <= 0).any():
+            raise ValueError(f"duration must be long enough to tell its frames apart, not {easy_duration} s")
 
     @property
     def _intrinsics(self) -> tuple[float, float, float, float]:
@@ -94,11 +97,9 @@ class Simulation:
     def events(self) -> Iterator[EventStream]:
         """Renders the path densely and yields the events from frame to frame, once."""
         camera = self._camera
-        times = _nanoseconds(self._profile.time(self._frames))
+        frames = zip(self._frames, self._times, strict=True)
         with progress_bar() as progress:
-            for parameter, time in progress.track(
-                zip(self._frames, times, strict=True), total=len(times), description="Simulating events"
-            ):
+            for parameter, time in progress.track(frames, total=len(self._frames), description="Simulating events"):
                 image = self._render(self._scene.path(float(parameter)), _EVENT_SAMPLES)
                 yield EventStream(*self._simulator(image, int(time)), camera.width, camera.height, "simulation")
 

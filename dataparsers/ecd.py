@@ -62,7 +62,8 @@ class EcdEventFile(EventFile):
         for name, column, good, remedy in checks:
             if not good.all():
                 row = int(np.argmin(good))
-                raise DataError(self.path, f"line {lines_before + row + 1} has {name} {table[row, column]:g}", remedy)
+                line = [i for i, text in enumerate(block) if _is_row(text.encode("ascii", "replace"))][row]
+                raise DataError(self.path, f"line {lines_before + line + 1} has {name} {table[row, column]:g}", remedy)
         return EventStream(
             table[:, 1].astype(np.uint16),
             table[:, 2].astype(np.uint16),
@@ -76,15 +77,19 @@ class EcdEventFile(EventFile):
     def time_span(self) -> tuple[int, int]:
         self.require()
         with self.path.open("rb") as file:
-            first = file.readline()
+            first = next((line for line in file if _is_row(line)), b"")
             file.seek(0, 2)
             file.seek(max(file.tell() - _TAIL_BYTES, 0))
-            tail = file.read().splitlines()
-        ends = [first.decode("ascii", "replace"), tail[-1].decode("ascii", "replace")] if tail else []
-        if not ends or not first.strip():
+            last = next((line for line in reversed(file.read().splitlines()) if _is_row(line)), b"")
+        if not first or not last:
             raise self.empty_error()
-        span = [self._parse([line], 0).t for line in ends]
-        return int(span[0][0]), int(span[1][0])
+        start, end = (int(self._parse([line.decode("ascii", "replace")], 0).t[0]) for line in (first, last))
+        return start, end
+
+
+def _is_row(line: bytes) -> bool:
+    """Whether a line is neither empty nor a comment."""
+    return bool(line.split(b"#", 1)[0].strip())
 
 
 def _is_pixel(values: np.ndarray, size: int) -> np.ndarray:

@@ -53,12 +53,12 @@ class Hdf5EventFile(EventFile):
         if len(set(lengths.values())) > 1:
             raise DataError(self.path, f"its columns have lengths {lengths}", "store all four with the same length")
         attributes = file["events"].attrs
-        unit, offset = attributes.get("time_unit", "ns"), attributes.get("time_offset", 0)
+        unit, offset = (_scalar(attributes.get(*item)) for item in (("time_unit", "ns"), ("time_offset", 0)))
         unit = unit.decode() if isinstance(unit, bytes) else unit
-        if unit not in _NANOSECONDS:
+        if not isinstance(unit, str) or unit not in _NANOSECONDS:
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_NANOSECONDS)}")
-        if offset != int(offset):
-            raise DataError(self.path, f"its time offset is {offset}", "use a whole number in the unit of the times")
+        if not isinstance(offset, (int, np.integer)):
+            raise DataError(self.path, f"its time offset is {offset!r}", "use an integer in the unit of the times")
         return columns, _NANOSECONDS[unit], int(offset) * _NANOSECONDS[unit]
 
     def _read(self, column: h5py.Dataset, index: slice | int) -> Any:
@@ -90,6 +90,11 @@ class Hdf5EventFile(EventFile):
     def count(self) -> int:
         with self._open() as file:
             return len(self._columns(file)[0]["t"])
+
+
+def _scalar(attribute: Any) -> Any:
+    """The one value of an attribute, which some writers store as an array of one."""
+    return attribute.item() if isinstance(attribute, np.ndarray) and attribute.size == 1 else attribute
 
 
 class Hdf5EventWriter:

@@ -87,6 +87,8 @@ class NativeDatasetWriter:
     def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
         try:
             self.events.__exit__()
+            if error_type is None and not (self._partial / "trajectory_estimated.txt").exists():
+                raise ValueError("the dataset has no trajectory: call add_trajectories before leaving the block")
             if error_type is None:
                 # A JSON number has all the digits that it is written with, but Python writes none with those of a
                 # nanosecond.

@@ -97,7 +97,6 @@ class EventDataParser(DataParser):
     """
 
     config: EventDataParserConfig
-    downscale_factor: int | None = None
 
     @abstractmethod
     def read_recording(self) -> Recording:

@@ -35,8 +35,12 @@ aenerf = MethodSpecification(
                 "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
+            "camera_opt": {
+                "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
+                "scheduler": RelativeMultiStepSchedulerConfig(),
+            },
         },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
         vis="viewer",
     ),
     description="AE-NeRF: event camera to radiance field, on hash grids.",

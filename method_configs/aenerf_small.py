@@ -34,7 +34,6 @@ aenerf_small = MethodSpecification(
                 proposal_num_levels=4,
                 proposal_log2_hashmap_size=14,
                 proposal_weights_anneal_iterations=200,
-                eval_num_rays_per_chunk=1 << 13,
             ),
         ),
     ),

@@ -3,7 +3,12 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 if [ ! -d .venv ]; then
-  "${PYTHON:-python3}" -m venv .venv
+  python="${PYTHON:-python3}"
+  if ! "$python" -c "import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))"; then
+    echo "Error: $("$python" --version) cannot be used; name a Python 3.10, 3.11 or 3.12 as PYTHON=..." >&2
+    exit 1
+  fi
+  "$python" -m venv .venv
 fi
 # shellcheck disable=SC1091
 source .venv/bin/activate

@@ -10,7 +10,7 @@ import torch
 from aenerf_ns.color_correction import AffineColorCorrection
 from aenerf_ns.image_encoding import decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
-from aenerf_ns.losses import log_radiance_change, reconstruction_loss
+from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
 
 
 def test_changes_count_positive_and_negative_events() -> None:
@@ -24,6 +24,17 @@ def test_reconstruction_loss_by_hand() -> None:
     assert reconstruction_loss(predicted, target, 0.35).item() == pytest.approx(expected)
     # A field that does not change misses each event by one threshold.
     assert reconstruction_loss(torch.zeros(2), torch.tensor([0.3, -0.3]), 0.3).item() == pytest.approx(1.0)
+
+
+def test_temporal_loss_by_hand() -> None:
+    rate, change = torch.tensor([30.0, -10.0, 5.0]), torch.tensor([0.2, -0.5, 0.0])
+    interval = torch.tensor([0.01, 0.1, 0.3])
+    # G_gt is 20 and -5; the third pair's events cancel.
+    assert temporal_loss(rate, change, interval).item() == pytest.approx((10 / 20 + 5 / 5) / 2)
+    assert temporal_loss(torch.zeros(2), torch.tensor([0.3, -0.3]), torch.tensor([1e-9, 1.0])).item() == pytest.approx(
+        1
+    )
+    assert temporal_loss(torch.zeros(1), torch.zeros(1), torch.ones(1)).item() == 0
 
 
 def test_srgb_encoding_has_the_standards_values_and_inverts() -> None:

@@ -11,12 +11,16 @@ import torch.nn.functional as F
 from conftest import make_stream
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.model_components.losses import interlevel_loss
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.pairs import pair_events
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.model import AENeRFModel, AENeRFModelConfig
+from aenerf_ns.pose_correction import PoseCorrectionConfig
 from aenerf_ns.ray_sampler import EventRaySampler
+from aenerf_ns.trajectory.rotation import rotation_from_vector
 from aenerf_ns.trajectory.trajectory import Trajectory
 
 CAMERA = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
@@ -58,6 +62,24 @@ def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> N
     assert seen == set(known)
 
 
+def test_a_third_ray_lies_within_each_interval(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel())
+    sampler.num_rays_per_batch = 6000
+    sampler.with_time_within = True
+    rays, batch = sampler.sample()
+    assert rays.times is not None
+    start, end, within = rays.times[:, 0].chunk(3)
+    torch.testing.assert_close(batch["interval"], (end - start).float())
+    part = (within - start) / (end - start)
+    assert part.min() >= 0
+    assert part.max() <= 1
+    # A normal distribution of mean 0.5 and deviation 0.25, cut at two deviations, has the deviation 0.22.
+    assert part.mean().item() == pytest.approx(0.5, abs=0.02)
+    assert part.std().item() == pytest.approx(0.22, abs=0.01)
+    # A batch to log the loss on has none.
+    assert len(sampler.sample(5)[0]) == 10
+
+
 def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
     sampler = make_sampler(random_poses, SensorModel())
     batches = []
@@ -76,6 +98,9 @@ def test_the_colour_filter_is_that_of_the_raw_pixel(random_poses: torch.Tensor) 
 
 def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) -> None:
     # This lens model folds over towards the corners, pixel (0, 2) among them.
+    nowhere = EventCamera(4, 3, 0.1, 0.1, 30.0, 1.5, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(DataError, match="no event lies on a pixel with a direction"):
+        make_sampler(random_poses, SensorModel(), nowhere).prepare()
     folded = EventCamera(4, 3, 1.2, 1.2, 3.0, 1.5, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
     assert not folded.pixel_directions()[1][2, 0]
     assert folded.pixel_directions()[1][1, 3]
@@ -97,20 +122,33 @@ def make_model(sensor: SensorModel | None = None, bounded: bool = False, **optio
         proposal_log2_hashmap_size=8,
         **options,
     )
-    metadata = {"sensor": sensor or SensorModel(0.2, 0.3), "image_encoding": "srgb", "bounded": bounded}
+    ends = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    ends[:, 2, 3] = 3
+    ends[:, 0, 3] = torch.tensor([-0.3, 0.3])
+    ends[1, :3, :3] = rotation_from_vector(torch.tensor([0.03, -0.06, 0.1], dtype=torch.float64))
+    metadata = {
+        "sensor": sensor or SensorModel(0.2, 0.3),
+        "image_encoding": "srgb",
+        "bounded": bounded,
+        "trajectory": Trajectory([0, 10**9], ends),
+        "camera_times": torch.tensor([0]),
+    }
     box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
     return config.setup(scene_box=box, num_train_data=1, metadata=metadata)
 
 
-def make_rays(count: int = 10, away: bool = False) -> RayBundle:
+def make_rays(count: int = 10, away: bool = False, with_times: bool = False) -> RayBundle:
     """Rays from z = 3 towards the scene box, or past it."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.tensor([0.0, 0.0, 1.0 if away else -1.0]) + 0.1 * torch.randn(count, 3, generator=generator)
+    directions = F.normalize(directions, dim=-1)
     return RayBundle(
         origins=torch.tensor([0.0, 0.0, 3.0]).expand(count, 3),
-        directions=F.normalize(directions, dim=-1),
+        directions=directions,
         pixel_area=torch.ones(count, 1),
         camera_indices=torch.zeros(count, 1, dtype=torch.long),
+        times=torch.rand(count, 1, generator=generator, dtype=torch.float64) if with_times else None,
+        metadata={"camera_directions": directions.double()} if with_times else {},
     )
 
 
@@ -119,6 +157,7 @@ def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
     return {
         "num_positive": positive,
         "num_negative": 1 - positive,
+        "interval": torch.full((num_pairs,), 1e-3),
         "channel": torch.zeros(num_pairs, dtype=torch.long),
     }
 
@@ -137,6 +176,16 @@ def test_outputs_have_their_shapes_and_ranges(contraction: str, bayer_pattern: s
     assert all(torch.isfinite(value).all() for value in outputs.values())
 
 
+def test_proposal_loss_is_normalised_by_the_mean_threshold() -> None:
+    model = make_model(loss_coefficients={"interlevel_loss": 3.0})
+    model.field.average_init_density = 5.0
+    outputs = model(make_rays())
+    losses = model.get_loss_dict(outputs, make_batch(5))
+    expected = 3.0 * interlevel_loss(outputs["weights_list"], outputs["ray_samples_list"]) / 0.25**2
+    assert expected > 0
+    torch.testing.assert_close(losses["interlevel_loss"], expected)
+
+
 def test_losses_are_those_of_the_rendered_changes() -> None:
     model = make_model(loss_coefficients={"reconstruction_loss": 2.0, "interlevel_loss": 0.0, "distortion_loss": 0.0})
     outputs, batch = model(make_rays()), make_batch(5)
@@ -150,10 +199,13 @@ def test_losses_are_those_of_the_rendered_changes() -> None:
 
 
 def test_every_parameter_is_in_one_group_and_gets_a_gradient() -> None:
-    model = make_model(bounded=True)
+    model = make_model(bounded=True, camera_optimizer=PoseCorrectionConfig(mode="spline"))
     # Denser than the proposals, or their loss has no gradient.
     model.field.average_init_density = 5.0
-    losses = model.get_loss_dict(model(make_rays()), make_batch(5))
+    losses = model.get_loss_dict(model(make_rays(15, with_times=True)), make_batch(5))
+    assert set(losses) == {
+        "reconstruction_loss", "temporal_loss", "interlevel_loss", "distortion_loss", "pose_correction_penalty"
+    }  # fmt: skip
     torch.stack(list(losses.values())).sum().backward()
     groups = model.get_param_groups()
     grouped = [parameter for group in groups.values() for parameter in group]
@@ -205,5 +257,5 @@ def test_rendering_in_chunks_changes_nothing() -> None:
     model = make_model(eval_num_rays_per_chunk=3).train()
     rays = make_rays()
     whole = make_model().eval()(make_rays())["log_radiance"]
-    torch.testing.assert_close(model.render_log_radiance([rays[:4], rays[4:]]), whole)
+    torch.testing.assert_close(model.render_log_radiance(rays), whole)
     assert model.training

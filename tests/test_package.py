@@ -66,9 +66,10 @@ def test_lower_floors_import_none_above_them() -> None:
     floors = [
         {"errors", "progress"},
         {"events", "trajectory", "scenes", "image_encoding", "event_camera", "box_collider"},
-        {"field", "losses", "color_correction", "image_metrics"},
+        {"field", "temporal", "losses", "color_correction", "image_metrics"},
         {"dataset", "simulation"},
         {"ray_sampler"},
+        {"pose_correction"},
         {"datamanager", "model"},
         {"pipeline", "training", "ffmpeg"},
         {"dataparsers", "method_configs"},

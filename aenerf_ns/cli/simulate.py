@@ -67,6 +67,11 @@ class Simulate:
 
     def main(self) -> None:
         """Renders the scene along its path and writes the dataset."""
+        if self.output.exists():
+            raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
+        counts = (self.train_images, self.validation_views, self.test_views)
+        if min(counts) < 0:
+            raise DataError("aenerf simulate", f"numbers of images {counts}", "they must not be negative")
         try:
             scene = built_in_scene(self.scene, self.seed)
             camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))

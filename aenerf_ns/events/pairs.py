@@ -144,7 +144,9 @@ def pair_events(
             last_record = np.full(chunk.width * chunk.height, -1, dtype=np.int64)
         if size + len(chunk) > len(records[0]):
             capacity = max(size + len(chunk), 3 * len(records[0]) // 2)
-            records = [np.concatenate([r[:size], np.empty(capacity - size, r.dtype)]) for r in records]
+            # One at a time: the old and the new of all would be too much at once.
+            for column, record in enumerate(records):
+                records[column] = np.concatenate([record[:size], np.empty(capacity - size, record.dtype)])
         new_size, chunk_first, chunk_merged, chunk_refractory = _pair_chunk(
             (chunk.x, chunk.y, chunk.t, chunk.p),
             chunk.width,

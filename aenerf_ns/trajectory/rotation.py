@@ -27,10 +27,15 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
     b = torch.where(
         small, (1 - squared / 12 * (1 - squared / 30 * (1 - squared / 56))) / 2, (1 - torch.cos(angle)) / safe
     )
+    cross = cross_matrix(vector)
+    return torch.eye(3, dtype=vector.dtype, device=vector.device) + a * cross + b * (cross @ cross)
+
+
+def cross_matrix(vector: Tensor) -> Tensor:
+    """Matrices (..., 3, 3) whose product with any vector is the cross product of ``vector`` (..., 3) with it."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    return torch.eye(3, dtype=vector.dtype, device=vector.device) + a * cross + b * (cross @ cross)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
 def vector_from_quaternion(quaternion: Tensor) -> Tensor:
@@ -82,3 +87,32 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
     quaternion = torch.take_along_dim(candidates, best[..., None, None], -2).squeeze(-2)
     quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
     return torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+
+
+def motion_from_twist(twist: Tensor) -> Tensor:
+    """The exponential of se(3).
+
+    Args:
+        twist: (..., 6) translation part ρ, then rotation part ω in radians.
+
+    Returns:
+        (..., 4, 4) rigid motions [exp(ω), V(ω) ρ; 0, 1]. Both the value and all derivatives are finite at zero.
+    """
+    translation, vector = twist[..., :3, None], twist[..., 3:]
+    squared = (vector * vector).sum(-1)[..., None, None]
+    small = squared < _SMALL
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    b = torch.where(
+        small, (1 - squared / 12 * (1 - squared / 30 * (1 - squared / 56))) / 2, (1 - torch.cos(angle)) / safe
+    )
+    c = torch.where(
+        small,
+        (1 - squared / 20 * (1 - squared / 42 * (1 - squared / 72))) / 6,
+        (angle - torch.sin(angle)) / (safe * angle),
+    )
+    cross = cross_matrix(vector)
+    moved = translation + b * (cross @ translation) + c * (cross @ (cross @ translation))
+    bottom = torch.zeros_like(twist[..., None, :4])
+    bottom[..., 3] = 1
+    return torch.cat([torch.cat([rotation_from_vector(vector), moved], -1), bottom], -2)

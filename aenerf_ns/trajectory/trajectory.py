@@ -46,7 +46,7 @@ class Trajectory(nn.Module):
     def __init__(self, times: ArrayLike | Tensor, camera_to_worlds: Tensor, source: str | Path = "trajectory") -> None:
         super().__init__()
         self.source = source
-        times = torch.as_tensor(np.asarray(times), dtype=torch.int64)
+        times = _as_times(times)
         poses = camera_to_worlds.detach().to(torch.float64)[:, :3, :4]
         if len(times) != len(poses) or len(times) < 2:
             raise DataError(source, f"{len(times)} times and {len(poses)} poses", "give at least two timed poses")
@@ -122,7 +122,7 @@ class Trajectory(nn.Module):
         Raises:
             DataError: a time lies outside the span of the knots.
         """
-        times = torch.as_tensor(np.asarray(times), dtype=torch.int64, device=self.times.device)
+        times = _as_times(times).to(self.times.device)
         outside = (times < self.start) | (times > self.end)
         if outside.any():
             raise DataError(
@@ -154,10 +154,15 @@ class Trajectory(nn.Module):
         return Trajectory(self.times, function(homogeneous(self.camera_to_worlds)), self.source)
 
 
+def _as_times(times: ArrayLike | Tensor) -> Tensor:
+    # NumPy cannot see a tensor on a GPU, and torch takes no list of NumPy's integers.
+    return torch.as_tensor(times if isinstance(times, Tensor) else np.asarray(times), dtype=torch.int64)
+
+
 def require_rigid(poses: Tensor, source: str | Path) -> None:
     """Raises a DataError unless the (N, 3 or 4, 4) poses are rotations and translations."""
     rotations = poses[:, :3, :3]
-    error = (rotations @ rotations.mT - torch.eye(3, dtype=poses.dtype)).abs().amax((1, 2))
+    error = (rotations @ rotations.mT - torch.eye(3, dtype=poses.dtype, device=poses.device)).abs().amax((1, 2))
     error = torch.maximum(error, (torch.linalg.det(rotations) - 1).abs())
     if error.max() > _MAX_RIGIDITY_ERROR:
         raise DataError(

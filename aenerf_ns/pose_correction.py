@@ -1,0 +1,208 @@
+"""ψ: corrections of the estimated trajectory in continuous time, as Nerfstudio's camera optimizer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+import torch.nn.functional as F
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.field_components.encodings import NeRFEncoding
+from torch import Tensor, nn
+
+from aenerf_ns.ray_sampler import world_rays
+from aenerf_ns.trajectory.rotation import motion_from_twist
+from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
+
+
+@dataclass
+class PoseCorrectionConfig(CameraOptimizerConfig):
+    """Pose correction along the trajectory."""
+
+    _target: type = field(default_factory=lambda: PoseCorrection)
+    mode: Literal["off", "network", "spline"] = "off"
+    """The paper's network, a cubic B-spline of twists, or none."""
+    trans_l2_penalty: float = 1e-2
+    """Weight of the mean squared translation of the corrections, in scene units."""
+    rot_l2_penalty: float = 1e-2
+    """Weight of the mean squared rotation of the corrections, in radians."""
+    knot_interval: float = 0.1
+    """Seconds between the knots of the spline: it can correct errors that change more slowly."""
+    num_frequencies: int = 3
+    """Frequencies of the network's sinusoidal encoding."""
+
+
+class PoseCorrection(CameraOptimizer):
+    """A twist ξ(t) for every time, so that the corrected pose is base pose(t) · exp(ξ(t)) (paper, eq. 6).
+
+    ξ is zero at first, with gradients that are not.
+
+    Args:
+        config: the kind of correction and its regularisation.
+        num_cameras: training cameras.
+        device: of the parameters.
+        trajectory: the estimated trajectory, camera-to-world, OpenGL camera axes, in scene units.
+        camera_times: (num_cameras,) times of the training cameras in nanoseconds, for :meth:`forward`.
+    """
+
+    config: PoseCorrectionConfig
+    _camera_seconds: Tensor
+
+    def __init__(
+        self,
+        config: PoseCorrectionConfig,
+        num_cameras: int,
+        device: torch.device | str,
+        trajectory: Trajectory,
+        camera_times: Tensor,
+    ) -> None:
+        nn.Module.__init__(self)
+        self.config = config
+        self.num_cameras = num_cameras
+        self.device = device
+        self.trajectory = trajectory
+        self.register_buffer("_camera_seconds", trajectory.seconds(camera_times), persistent=False)
+        self._duration = (trajectory.end - trajectory.start) * 1e-9
+        self.twists: nn.Module | None = None
+        if config.mode == "network":
+            self.twists = TwistNetwork(trajectory, config.num_frequencies)
+        elif config.mode == "spline":
+            self.twists = TwistSpline(self._duration, config.knot_interval)
+
+    def pose(self, seconds: Tensor) -> Tensor:
+        """Corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
+        base = self.trajectory.pose(seconds)
+        if self.twists is None:
+            return base
+        return homogeneous(base)[:, :3] @ motion_from_twist(self.twists(seconds, base).double())
+
+    def forward(self, indices: Tensor) -> Tensor:
+        """The framework's contract: (N, 3, 4) motions that the training cameras' poses are multiplied with."""
+        seconds = self._camera_seconds[indices]
+        base = homogeneous(self.trajectory.pose(seconds))
+        return (torch.linalg.inv(base) @ homogeneous(self.pose(seconds)))[:, :3].float()
+
+    def apply_to_raybundle(self, raybundle: RayBundle) -> None:
+        """Moves the rays of a training batch, which have times, to the corrected poses."""
+        if self.twists is None:
+            return
+        assert raybundle.times is not None
+        origins, directions = world_rays(self.pose(raybundle.times[:, 0]), raybundle.metadata["camera_directions"])
+        raybundle.origins, raybundle.directions = origins.to(raybundle.origins), directions.to(raybundle.directions)
+
+    def ray_rates(self, raybundle: RayBundle) -> tuple[Tensor, Tensor]:
+        """Derivatives of the corrected rays' origins and directions (N, 3) with respect to time, per second."""
+        assert raybundle.times is not None
+        with forward_ad.dual_level():
+            seconds = raybundle.times[:, 0]
+            moving = self.pose(forward_ad.make_dual(seconds, torch.ones_like(seconds)))
+            rays = world_rays(moving, raybundle.metadata["camera_directions"])
+            origin_rates, direction_rates = (
+                forward_ad.unpack_dual(value).tangent.to(raybundle.origins.dtype) for value in rays
+            )
+        return origin_rates, direction_rates
+
+    def get_loss_dict(self, loss_dict: dict[str, Tensor]) -> None:
+        """Adds the mean squared size of the corrections over the run, so that good poses stay as they are."""
+        if self.twists is None:
+            return
+        twist = self._sampled_twists()
+        loss_dict["pose_correction_penalty"] = (
+            self.config.trans_l2_penalty * twist[:, :3].square().sum(-1).mean()
+            + self.config.rot_l2_penalty * twist[:, 3:].square().sum(-1).mean()
+        )
+
+    def get_metrics_dict(self, metrics_dict: dict[str, Any]) -> None:
+        """Adds the root mean square size of the corrections."""
+        if self.twists is None:
+            return
+        with torch.no_grad():
+            size = self._sampled_twists().unflatten(-1, (2, 3)).square().sum(-1).mean(0).sqrt()
+        metrics_dict["pose_correction_translation"] = size[0]
+        metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
+
+    def _sampled_twists(self) -> Tensor:
+        """Twists at 256 times spread over the trajectory."""
+        assert self.twists is not None
+        seconds = torch.linspace(0, self._duration, 256, dtype=torch.float64, device=self._camera_seconds.device)
+        return self.twists(seconds, self.trajectory.pose(seconds))
+
+    def get_param_groups(self, param_groups: dict[str, list[nn.Parameter]]) -> None:
+        """Adds the parameters as the group ``camera_opt``, where there are any."""
+        if self.twists is not None:
+            param_groups["camera_opt"] = list(self.parameters())
+
+
+class TwistNetwork(nn.Module):
+    """The paper's pose correction network (appendix, algorithm 1; softplus as in its text).
+
+    Args:
+        trajectory: estimated trajectory, for the span of its times and positions.
+        num_frequencies: of the sinusoidal encoding.
+    """
+
+    def __init__(self, trajectory: Trajectory, num_frequencies: int) -> None:
+        super().__init__()
+        self._duration = (trajectory.end - trajectory.start) * 1e-9
+        width = 256
+        self.pose_embedding = nn.Linear(12, width)
+        self.time_embedding = nn.Linear(1, width)
+        self.encoding = NeRFEncoding(
+            in_dim=width,
+            num_frequencies=num_frequencies,
+            min_freq_exp=0.0,
+            max_freq_exp=num_frequencies - 1.0,
+            include_input=True,
+            implementation="torch",
+        )
+        layers: list[nn.Module] = []
+        size = self.encoding.get_out_dim()
+        for _ in range(4):
+            layers += [nn.Linear(size, width), nn.Softplus()]
+            size = width
+        self.hidden = nn.Sequential(*layers)
+        self.output = nn.Linear(width, 6)
+        # No correction at first; the gradient of these weights is not zero.
+        nn.init.zeros_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
+
+    def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
+        """Twists (N, 6) at (N,) seconds, where the estimated poses are (N, 3, 4)."""
+        dtype = self.output.weight.dtype
+        time = (2 * seconds / self._duration - 1).to(dtype)[:, None]
+        embedded = F.softplus(self.pose_embedding(base.flatten(1).to(dtype))) + F.softplus(self.time_embedding(time))
+        return self.output(self.hidden(self.encoding(embedded)))
+
+
+class TwistSpline(nn.Module):
+    """A uniform cubic B-spline of twists.
+
+    Args:
+        duration: seconds it spans.
+        knot_interval: seconds between knots.
+    """
+
+    def __init__(self, duration: float, knot_interval: float) -> None:
+        super().__init__()
+        self._segments = max(math.ceil(duration / knot_interval), 1)
+        self._interval = duration / self._segments
+        self.control_twists = nn.Parameter(torch.zeros(self._segments + 3, 6))
+
+    def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
+        """Twists (N, 6) at (N,) seconds; the poses play no part."""
+        position = seconds / self._interval
+        segment = position.detach().floor().long().clamp(0, self._segments - 1)
+        u = (position - segment)[:, None]
+        # https://en.wikipedia.org/wiki/B-spline, the uniform cubic basis.
+        basis = (
+            torch.cat([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], dim=-1).to(
+                self.control_twists.dtype
+            )
+            / 6
+        )
+        near = segment[:, None] + torch.arange(4, device=segment.device)
+        return (basis[..., None] * self.control_twists[near]).sum(1)

@@ -1,0 +1,42 @@
+"""The derivative of rendered log-radiance along the camera's motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch.autograd.forward_ad as forward_ad
+from nerfstudio.cameras.rays import RaySamples
+from torch import Tensor
+
+
+def log_radiance_rate(
+    render: Callable[[RaySamples], tuple[Tensor, Tensor]],
+    samples: RaySamples,
+    rays: tuple[Tensor, Tensor],
+    ray_rates: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """G_pred of the paper (before eq. 12): the total derivative d log L̂ / dt while the rays move.
+
+    Exact, by forward-mode automatic differentiation through the field and the compositing; gradients flow on to the
+    parameters of both the field and the rays' motion with one ordinary backward pass. The samples' distances along
+    the ray are held constant.
+
+    Args:
+        render: gives log-radiance (N, channels) and weights (N, samples, 1) of ray samples.
+        samples: samples along the N rays.
+        rays: origins and directions (N, 3).
+        ray_rates: their derivatives with respect to time (N, 3), per second.
+
+    Returns:
+        Log-radiance (N, channels), its rate (N, channels) per second, and the weights.
+    """
+    with forward_ad.dual_level():
+        origins, directions = (
+            forward_ad.make_dual(value.contiguous(), rate)[:, None].expand_as(samples.frustums.origins)
+            for value, rate in zip(rays, ray_rates, strict=True)
+        )
+        moving = replace(samples, frustums=replace(samples.frustums, origins=origins, directions=directions))
+        log_radiance, weights = render(moving)
+        primal, rate = forward_ad.unpack_dual(log_radiance)
+        return primal, rate, forward_ad.unpack_dual(weights).primal
