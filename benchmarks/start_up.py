@@ -37,8 +37,8 @@ class StartUp:
     """config.yml of the run, of a dataset in the native format."""
     output: Path
     """JSON file to write."""
-    repeats: int = 3
-    """Times that each is run; the median counts."""
+    repeats: int = 5
+    """Times that each is run."""
 
     def main(self) -> None:
         """Measures and writes the figures."""
@@ -53,28 +53,39 @@ class StartUp:
                 "--camera-path-filename", path, "--output-path", Path(folder) / "out", "--output-format", "images",
             ]  # fmt: skip
             importing = [sys.executable, "-c", "import nerfstudio.scripts.render"]
-            seconds = {
-                "import_of_ns_render": self._median(importing),
-                "ns_render_one_tiny_picture": self._median(render),
-            }
             hidden = events.with_suffix(".hidden")
-            events.rename(hidden)
-            try:
-                seconds["ns_render_without_the_event_file"] = self._median(render)
-            finally:
-                hidden.rename(events)
+            seconds: dict[str, list[float]] = {
+                "import_of_ns_render": [],
+                "ns_render_one_tiny_picture": [],
+                "ns_render_without_the_event_file": [],
+            }
+            # In turns, so that whatever else the machine does slows all of them alike.
+            for _ in range(self.repeats):
+                seconds["import_of_ns_render"].append(_time(importing))
+                seconds["ns_render_one_tiny_picture"].append(_time(render))
+                events.rename(hidden)
+                try:
+                    seconds["ns_render_without_the_event_file"].append(_time(render))
+                finally:
+                    hidden.rename(events)
             size = events.stat().st_size
-        result = {"seconds": seconds, "event_file_bytes": size, "repeats": self.repeats, **environment()}
+        result = {
+            "seconds": {
+                name: {"median": sorted(times)[len(times) // 2], "least": min(times), "most": max(times)}
+                for name, times in seconds.items()
+            },
+            "event_file_bytes": size,
+            "repeats": self.repeats,
+            **environment(),
+        }
         self.output.write_text(json.dumps(result, indent=2) + "\n")
         print(json.dumps(result, indent=2))
 
-    def _median(self, command: list) -> float:
-        times = []
-        for _ in range(self.repeats):
-            begin = time.perf_counter()
-            subprocess.run(command, check=True, capture_output=True)
-            times.append(time.perf_counter() - begin)
-        return sorted(times)[len(times) // 2]
+
+def _time(command: list) -> float:
+    begin = time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True)
+    return time.perf_counter() - begin
 
 
 if __name__ == "__main__":

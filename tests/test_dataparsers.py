@@ -199,6 +199,12 @@ def test_nothing_is_left_of_a_dataset_that_could_not_be_completed(tmp_path: Path
     with pytest.raises(RuntimeError), NativeDatasetWriter(tmp_path / "made", CAMERA, SENSOR, "srgb"):
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
+    with (
+        pytest.raises(ValueError, match="no trajectory"),
+        NativeDatasetWriter(tmp_path / "made", CAMERA, SENSOR, "srgb"),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []
     write_native(tmp_path / "made")
     with pytest.raises(DataError, match="made: the folder exists already"):
         NativeDatasetWriter(tmp_path / "made", CAMERA, SENSOR, "srgb")
@@ -256,6 +262,18 @@ def test_ecd_text_reads(tmp_path: Path) -> None:
     # Images at 0.05 and 0.25 s validate, 0.15 s tests, 0.35 s is after the last event.
     assert len(parse(config, "val").image_filenames) == 2
     assert len(parse(config, "test").image_filenames) == 1
+
+
+def test_ecd_text_may_hold_comments_and_empty_lines(tmp_path: Path) -> None:
+    folder = write_ecd(tmp_path / "made")
+    events = folder / "events.txt"
+    events.write_text("# t x y p\n\n" + events.read_text() + "\n\n")
+    dataset = EventDataset(parse(EcdDataParserConfig(data=folder)))
+    assert dataset.metadata["time_window"] == (10_000_000, 310_000_000)
+    assert dataset.pairs.num_events == 4
+    replace_line("events.txt", 4, "0.03 9 3 1")(folder)
+    with pytest.raises(DataError, match="line 5 has x 9"):
+        list(dataset.metadata["event_file"].chunks())
 
 
 def test_the_real_recording_reads(slider_depth: Path) -> None:
@@ -369,9 +387,12 @@ def empty_events(folder: Path) -> None:
         replace_column(name, np.zeros(0, dtype))(folder)
 
 
-def set_time_unit(folder: Path) -> None:
-    with h5py.File(folder / "events.h5", "r+") as file:
-        file["events"].attrs["time_unit"] = "fortnight"
+def set_attribute(name: str, value: object) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        with h5py.File(folder / "events.h5", "r+") as file:
+            file["events"].attrs[name] = value
+
+    return change
 
 
 NATIVE_FAULTS = {
@@ -422,7 +443,9 @@ NATIVE_FAULTS = {
     "wrong dtype": (replace_column("t", np.zeros(200)), "/events/t has type float64 .*int64"),
     "short column": (replace_column("x", np.zeros(3, np.uint16)), "its columns have lengths"),
     "empty stream": (empty_events, "events.h5: the file holds no events"),
-    "unknown unit": (set_time_unit, "its time unit is 'fortnight'; use one of ns, us, ms"),
+    "fractional offset": (set_attribute("time_offset", 0.5), "its time offset is 0.5"),
+    "offset is NaN": (set_attribute("time_offset", np.nan), "its time offset is nan"),
+    "unknown unit": (set_attribute("time_unit", "fortnight"), "its time unit is 'fortnight'; use one of ns, us, ms"),
     "polarity 0": (replace_column("p", np.zeros(200, np.int8)), r"event 0 has polarity 0; .*2 \* p - 1"),
     "pixel outside": (replace_column("x", np.full(200, 6, np.uint16)), "event 0 has x = 6 on a sensor of width 6"),
     "unsorted": (replace_column("t", START + 10**9 - np.arange(200)), "sort the events by time"),
@@ -447,7 +470,8 @@ def test_times_in_other_units_with_an_offset(tmp_path: Path) -> None:
         for name, dtype in (("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
             file[f"events/{name}"] = np.ones(3, dtype)
         file["events/t"] = np.array([1, 2, 5])
-        file["events"].attrs["time_unit"] = "us"
+        # As some writers store a string.
+        file["events"].attrs["time_unit"] = np.array([b"us"])
         file["events"].attrs["time_offset"] = 1000
     events = Hdf5EventFile(tmp_path / "events.h5", 2, 2)
     (chunk,) = events.chunks()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import zipfile
@@ -9,6 +10,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+
+from aenerf_ns.ffmpeg import provide_ffmpeg
 
 ROOT = Path(__file__).parents[1]
 
@@ -59,6 +62,39 @@ def test_importing_the_package_costs_nothing() -> None:
     code = "import sys, aenerf_ns; print({'torch', 'numba', 'numpy', 'cv2', 'h5py', 'nerfstudio'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd="/")
     assert done.stdout.strip() == "set()"
+
+
+def test_the_registered_modules_leave_the_heaviest_imports_for_later() -> None:
+    # What the framework itself imports at every command is no cost of ours.
+    code = (
+        "import sys, nerfstudio.configs.method_configs as framework;"
+        "assert 'aenerf' in framework.all_methods and 'aenerf-small' in framework.all_methods;"
+        "print({'numba', 'torchmetrics', 'pycolmap'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd="/")
+    assert done.stdout.strip().splitlines()[-1] == "set()"
+
+
+def test_a_missing_ffmpeg_package_breaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    provide_ffmpeg()
+    assert os.environ["PATH"] == ""
+
+
+def test_ffmpeg_is_provided_where_there_is_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    provide_ffmpeg()
+    done = subprocess.run(["ffmpeg", "-version"], capture_output=True, text=True, check=True, env=dict(os.environ))
+    assert "ffmpeg version" in done.stdout
+    # A link that leads nowhere is replaced.
+    (link,) = tmp_path.rglob("ffmpeg")
+    link.unlink()
+    link.symlink_to(tmp_path / "gone")
+    os.environ["PATH"] = ""
+    provide_ffmpeg()
+    assert link.exists()
 
 
 def test_lower_floors_import_none_above_them() -> None:
