@@ -24,6 +24,7 @@ from aenerf_ns.trajectory.rotation import rotation_from_vector
 from aenerf_ns.trajectory.trajectory import Trajectory
 
 CAMERA = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
+ALL_LOSSES = {"reconstruction_loss": 1.0, "temporal_loss": 1e-3, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
 EPOCH = 1_600_000_000_000_000_000
 
 
@@ -199,7 +200,7 @@ def test_losses_are_those_of_the_rendered_changes() -> None:
 
 
 def test_every_parameter_is_in_one_group_and_gets_a_gradient() -> None:
-    model = make_model(bounded=True, camera_optimizer=PoseCorrectionConfig(mode="spline"))
+    model = make_model(bounded=True, camera_optimizer=PoseCorrectionConfig(mode="spline"), loss_coefficients=ALL_LOSSES)
     # Denser than the proposals, or their loss has no gradient.
     model.field.average_init_density = 5.0
     losses = model.get_loss_dict(model(make_rays(15, with_times=True)), make_batch(5))

@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
-from test_model import make_batch, make_model, make_rays
+from test_model import ALL_LOSSES, make_batch, make_model, make_rays
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.losses import temporal_loss
@@ -23,7 +23,9 @@ from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 def exact_model(mode: str, **options: Any) -> AENeRFModel:
     """A float64 model whose field and pose correction are far from trivial."""
     sensor = SensorModel(0.2, 0.3, bayer_pattern="RGGB")
-    model = make_model(sensor, camera_optimizer=PoseCorrectionConfig(mode=mode), **options)
+    model = make_model(
+        sensor, camera_optimizer=PoseCorrectionConfig(mode=mode), loss_coefficients=ALL_LOSSES, **options
+    )
     torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
     model.field.average_init_density = 2.0
     for name, parameter in model.camera_optimizer.named_parameters():
@@ -92,7 +94,7 @@ def test_the_rate_is_exact_along_the_whole_chain(mode: str, contraction: str) ->
 
 
 def test_the_third_ray_takes_part_in_the_framework_s_losses() -> None:
-    model = make_model()
+    model = make_model(loss_coefficients=ALL_LOSSES)
     outputs = model(make_rays(15, with_times=True))
     assert [len(weights) for weights in outputs["weights_list"]] == [15, 15]
     assert outputs["log_radiance"].shape == (15, 1)
@@ -102,7 +104,7 @@ def test_the_third_ray_takes_part_in_the_framework_s_losses() -> None:
 
 
 def test_without_the_temporal_loss_there_is_no_third_ray() -> None:
-    model = make_model(loss_coefficients={"temporal_loss": 0.0})
+    model = make_model()
     assert not model.uses_temporal_loss
     outputs = model(make_rays(10, with_times=True))
     assert "temporal_loss" not in model.get_loss_dict(outputs, make_batch(5))
