@@ -19,6 +19,8 @@ import pytest
 import torch
 import websockets.sync.client
 
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+
 # Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.
 STEPS = 300
 PSNR_MARGIN = 3.0
@@ -124,6 +126,20 @@ def test_resuming_continues_from_the_checkpoint(trained: Path, workspace: Path) 
     assert 0 < change.max() < 0.05
     assert after["schedulers"]["networks"]["last_epoch"] == STEPS + 5
     assert after["optimizers"]["networks"]["state"][0]["step"] == STEPS + 5
+
+
+def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspace: Path) -> None:
+    given = read_tum_trajectory(workspace / "room" / "trajectory_estimated.txt")
+    for options, times in (((), given.times), (("--rate", "100"), torch.arange(0, given.end + 1, 10_000_000))):
+        output = workspace / "poses.txt"
+        run("aenerf", "export-trajectory", "--load-config", trained, "--output", output, *options, cwd=workspace)
+        exported = read_tum_trajectory(output)
+        assert torch.equal(exported.times, times)
+        # Without pose correction they are the given ones, but for the framework's float32 transform.
+        difference = exported.camera_to_worlds - given.interpolate(times)
+        assert difference.abs().max() < 1e-6
+    missing = ("aenerf", "export-trajectory", "--load-config", "nothing.yml", "--output", output)
+    assert "nothing.yml: there is no such file" in run(*missing, cwd=workspace, fails=True)
 
 
 @pytest.mark.parametrize(
