@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 
-with suppress(ImportError):
-    # Registers Blosc and other compression filters with h5py, where the extra is installed.
-    import hdf5plugin  # noqa: F401
+if TYPE_CHECKING:
+    import h5py
 
 _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 _NANOSECONDS = {"ns": 1, "us": 1_000, "ms": 1_000_000}
@@ -31,6 +29,12 @@ class Hdf5EventFile(EventFile):
     """
 
     def _open(self) -> h5py.File:
+        # Late, for every command of every method would wait for it.
+        import h5py
+
+        with suppress(ImportError):
+            # Registers Blosc and other compression filters, where the extra is installed.
+            import hdf5plugin  # noqa: F401
         self.require()
         try:
             return h5py.File(self.path, "r")
@@ -41,7 +45,7 @@ class Hdf5EventFile(EventFile):
         """The four columns, the nanoseconds of a tick, and the offset in nanoseconds."""
         columns = {name: file.get(f"events/{name}") for name in _DTYPES}
         for name, column in columns.items():
-            if not isinstance(column, h5py.Dataset):
+            if not hasattr(column, "dtype"):
                 raise DataError(self.path, f"there is no dataset /events/{name}", "see the dataset format in the docs")
             if column.dtype != _DTYPES[name] or column.ndim != 1:
                 raise DataError(
@@ -105,6 +109,8 @@ class Hdf5EventWriter:
     """
 
     def __init__(self, path: Path) -> None:
+        import h5py
+
         self._file = h5py.File(path, "w")
         group = self._file.create_group("events")
         group.attrs["time_unit"] = "ns"
