@@ -7,6 +7,7 @@ import platform
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import torch
 
@@ -23,8 +24,14 @@ def environment() -> dict:
             **{name: version(name) for name in ("aenerf-ns", "nerfstudio", "torch", "numpy", "numba")},
         },
         "commit": commit.stdout.strip() + ("+changes" if changed.stdout.strip() else ""),
-        "command": " ".join(["python", *sys.argv]),
+        "command": " ".join(["python", *map(_portable, sys.argv)]),
     }
+
+
+def _portable(argument: str) -> str:
+    """An argument without the folders of this machine."""
+    path = Path(argument)
+    return str(Path("...", *path.parts[-3:])) if path.is_absolute() else argument
 
 
 def _cpu() -> str:

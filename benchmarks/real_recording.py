@@ -1,6 +1,7 @@
-"""How well a field trained on a real recording agrees with the recording's own frames, which training never saw.
+r"""How well a field trained on a real recording agrees with the recording's own frames, which training never saw.
 
-    ns-train aenerf-small --machine.device-type cpu --vis tensorboard --data RECORDING ecd-data
+    ns-train aenerf-small --machine.device-type cpu --vis tensorboard --max-num-iterations 1500 \
+        --pipeline.model.near-plane 0.25 --pipeline.model.far-plane 20 --data slider_depth ecd-data
     python benchmarks/real_recording.py --load-config outputs/.../config.yml --output benchmarks/results/NAME.json
 
 Reports the correlation of rendered log-radiance with the log-intensity of each held-out frame at the frame's pose, and
