@@ -78,7 +78,7 @@ class PoseCorrection(CameraOptimizer):
         base = self.trajectory.pose(seconds)
         if self.twists is None:
             return base
-        return homogeneous(base)[:, :3] @ motion_from_twist(self.twists(seconds, base).double())
+        return base @ motion_from_twist(self.twists(seconds, base).double())
 
     def forward(self, indices: Tensor) -> Tensor:
         """The framework's contract: (N, 3, 4) motions that the training cameras' poses are multiplied with."""

@@ -11,7 +11,6 @@ the reconstruction loss over many pairs (1 for a constant field), for the traine
 from __future__ import annotations
 
 import json
-from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,7 +40,7 @@ class RealRecording:
         trained = self._measure(pipeline)
         torch.manual_seed(0)
         fresh = config.pipeline.setup(device=pipeline.device, test_mode="inference").model.state_dict()
-        pipeline.model.load_state_dict(deepcopy(fresh))
+        pipeline.model.load_state_dict(fresh)
         result = {
             "recording": pipeline.datamanager.get_datapath().name,
             "method": config.method_name,

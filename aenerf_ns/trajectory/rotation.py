@@ -18,6 +18,13 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
     Returns:
         (..., 3, 3) rotation matrices. Both the value and all derivatives are finite at zero.
     """
+    a, b, _ = _exponential_coefficients(vector)
+    cross = cross_matrix(vector)
+    return torch.eye(3, dtype=vector.dtype, device=vector.device) + a * cross + b * (cross @ cross)
+
+
+def _exponential_coefficients(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³ of the angle θ of ``vector`` (..., 3), each (..., 1, 1)."""
     squared = (vector * vector).sum(-1)[..., None, None]
     small = squared < _SMALL
     # The unused branch of torch.where must stay finite too, or its gradient is NaN.
@@ -27,8 +34,12 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
     b = torch.where(
         small, (1 - squared / 12 * (1 - squared / 30 * (1 - squared / 56))) / 2, (1 - torch.cos(angle)) / safe
     )
-    cross = cross_matrix(vector)
-    return torch.eye(3, dtype=vector.dtype, device=vector.device) + a * cross + b * (cross @ cross)
+    c = torch.where(
+        small,
+        (1 - squared / 20 * (1 - squared / 42 * (1 - squared / 72))) / 6,
+        (angle - torch.sin(angle)) / (safe * angle),
+    )
+    return a, b, c
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
@@ -99,18 +110,7 @@ def motion_from_twist(twist: Tensor) -> Tensor:
         (..., 4, 4) rigid motions [exp(ω), V(ω) ρ; 0, 1]. Both the value and all derivatives are finite at zero.
     """
     translation, vector = twist[..., :3, None], twist[..., 3:]
-    squared = (vector * vector).sum(-1)[..., None, None]
-    small = squared < _SMALL
-    safe = torch.where(small, torch.ones_like(squared), squared)
-    angle = safe.sqrt()
-    b = torch.where(
-        small, (1 - squared / 12 * (1 - squared / 30 * (1 - squared / 56))) / 2, (1 - torch.cos(angle)) / safe
-    )
-    c = torch.where(
-        small,
-        (1 - squared / 20 * (1 - squared / 42 * (1 - squared / 72))) / 6,
-        (angle - torch.sin(angle)) / (safe * angle),
-    )
+    _, b, c = _exponential_coefficients(vector)
     cross = cross_matrix(vector)
     moved = translation + b * (cross @ translation) + c * (cross @ (cross @ translation))
     bottom = torch.zeros_like(twist[..., None, :4])
