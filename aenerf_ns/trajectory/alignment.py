@@ -1,0 +1,104 @@
+"""How far one trajectory is from another, once the frame that neither can know is taken out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """A map x -> scale · rotation · x + translation between two worlds, float64.
+
+    Attributes:
+        scale: factor on lengths.
+        rotation: (3, 3).
+        translation: (3,), in the units of the target.
+    """
+
+    scale: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    def __call__(self, poses: Tensor) -> Tensor:
+        """Poses (..., 3, 4) of cameras, camera-to-world, in the target's world."""
+        rotations = self.rotation @ poses[..., :3]
+        positions = self.scale * poses[..., 3] @ self.rotation.mT + self.translation
+        return torch.cat([rotations, positions[..., None]], -1)
+
+    def inverse(self) -> Similarity:
+        """The map back."""
+        rotation, scale = self.rotation.mT, 1 / self.scale
+        return Similarity(scale, rotation, -scale * (rotation @ self.translation))
+
+
+def align(
+    poses: Tensor, reference: Tensor, with_scale: bool = True, with_orientations: bool = True
+) -> Similarity:
+    """Least-squares map of poses onto reference poses of the same cameras at the same times.
+
+    Positions alone leave the rotation uncertain, and on a straight line undetermined. So each camera contributes its
+    position, in units of the root mean square distance of all reference positions from their mean, and with equal
+    weight the three axes of its orientation.
+
+    Args:
+        poses: (N, 3, 4) camera-to-world.
+        reference: (N, 3, 4) camera-to-world, with the same camera axes.
+        with_scale: Sim(3) if true, else SE(3).
+        with_orientations: if false, positions alone count (Umeyama 1991), as is usual for the absolute trajectory
+            error.
+    """
+    poses, reference = poses.double(), reference.double()
+    mean, reference_mean = poses[..., 3].mean(0), reference[..., 3].mean(0)
+    centered, reference_centered = poses[..., 3] - mean, reference[..., 3] - reference_mean
+    correlation = reference_centered.mT @ centered
+    if with_orientations:
+        spread = (reference_centered.norm() * centered.norm()).clamp_min(1e-30) / len(poses)
+        correlation = correlation / spread + (reference[..., :3] @ poses[..., :3].mT).sum(0)
+    u, _, vh = torch.linalg.svd(correlation)
+    sign = torch.ones(3, dtype=torch.float64, device=poses.device)
+    sign[2] = torch.linalg.det(u @ vh).sign()
+    rotation = u @ (sign[:, None] * vh)
+    scale = torch.ones((), dtype=torch.float64, device=poses.device)
+    if with_scale:
+        scale = (reference_centered * (centered @ rotation.mT)).sum() / centered.square().sum().clamp_min(1e-30)
+    return Similarity(scale, rotation, reference_mean - scale * (rotation @ mean))
+
+
+def pose_errors(poses: Tensor, reference: Tensor) -> dict[str, float]:
+    """Errors of poses against reference poses of the same cameras at the same times.
+
+    Args:
+        poses: (N, 3, 4) camera-to-world.
+        reference: (N, 3, 4) camera-to-world, with the same camera axes.
+
+    Returns:
+        After alignment by :func:`align` with positions and orientations: means over the poses
+        ``rotation_error_degrees`` and ``translation_error`` after Sim(3), and the same names with ``_se3`` after
+        SE(3); ``translation_error_percent``, the former in per cent of the length of the reference trajectory; and the
+        absolute trajectory error, the root mean square of the position errors after alignment of positions alone,
+        ``ate_rmse_sim3`` and ``ate_rmse_se3``. Translation errors are in the units of the reference.
+    """
+    poses, reference = poses.double(), reference.double()
+    errors = {}
+    for name, with_scale in (("", True), ("_se3", False)):
+        aligned = align(poses, reference, with_scale)(poses)
+        errors[f"rotation_error_degrees{name}"] = torch.rad2deg(rotation_angle(aligned, reference)).mean()
+        errors[f"translation_error{name}"] = (aligned - reference)[..., 3].norm(dim=-1).mean()
+    length = reference[..., 3].diff(dim=0).norm(dim=-1).sum()
+    errors["translation_error_percent"] = 100 * errors["translation_error"] / length
+    for name, with_scale in (("sim3", True), ("se3", False)):
+        aligned = align(poses, reference, with_scale, with_orientations=False)(poses)
+        errors[f"ate_rmse_{name}"] = (aligned - reference)[..., 3].square().sum(-1).mean().sqrt()
+    return dict(zip(errors, torch.stack(list(errors.values())).tolist(), strict=True))
+
+
+def rotation_angle(poses: Tensor, reference: Tensor) -> Tensor:
+    """Angles (N,) in radians between the orientations of (N, 3, 4) poses; exact also where it is small."""
+    relative = reference[..., :3].mT @ poses[..., :3]
+    # Of the difference to the identity, sqrt(2) · 2 sin(angle / 2): no cancellation at small angles.
+    identity = torch.eye(3, dtype=poses.dtype, device=poses.device)
+    chord = (relative - identity).flatten(-2).norm(dim=-1) / 8**0.5
+    return 2 * torch.asin(chord.clamp(max=1))
