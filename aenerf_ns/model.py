@@ -13,7 +13,6 @@ from nerfstudio.configs.config_utils import to_immutable_dict
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
-from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
@@ -27,7 +26,7 @@ from torch.nn import Parameter
 from aenerf_ns.box_collider import BoxCollider
 from aenerf_ns.color_correction import AffineColorCorrection
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.field import EventRadianceField
+from aenerf_ns.field import EventRadianceField, ProposalNetwork
 from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
@@ -134,7 +133,7 @@ class AENeRFModel(Model):
             average_init_density=config.average_init_density,
         )
         self.proposal_networks = nn.ModuleList(
-            HashMLPDensityField(
+            ProposalNetwork(
                 self.scene_box.aabb,
                 spatial_distortion=distortion,
                 num_levels=config.proposal_num_levels,
@@ -142,7 +141,6 @@ class AENeRFModel(Model):
                 log2_hashmap_size=config.proposal_log2_hashmap_size,
                 hidden_dim=config.proposal_hidden_dim,
                 average_init_density=config.average_init_density,
-                implementation="torch",
             )
             for resolution in config.proposal_max_resolutions
         )
