@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.configs.config_utils import to_immutable_dict
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
@@ -32,6 +34,7 @@ from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
 from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.sensor_parameters import SensorParameters
 from aenerf_ns.temporal import log_radiance_rate
 
 # ε of the paper's appendix "Model Architecture": the least radiance that can be rendered.
@@ -86,6 +89,11 @@ class AENeRFModelConfig(ModelConfig):
     )
     """Weights of the losses (paper, eq. 14: alpha, beta, gamma, eta). A weight of 0 turns a loss off. The paper's beta
     is 0.001; on hash grids it has lowered quality so far."""
+    learn_contrast_threshold_ratio: bool = False
+    """Learn C+ / C-, from the dataset's values; C- stays."""
+    learn_refractory_period: bool = False
+    """Learn the time for which a pixel is blind after each event, from the dataset's value. At most the shortest
+    interval between two events of a pixel."""
     camera_optimizer: PoseCorrectionConfig = field(default_factory=PoseCorrectionConfig)
     """Pose correction."""
     color_correction_num_rays: int = 16384
@@ -99,7 +107,8 @@ class AENeRFModelConfig(ModelConfig):
 class AENeRFModel(Model):
     """Renders radiance along event rays and compares its logarithm with the events.
 
-    Needs the dataparser's metadata: ``sensor``, ``trajectory``, ``camera_times``, ``image_encoding``, ``bounded``.
+    Needs the dataparser's metadata: ``sensor``, ``trajectory``, ``ground_truth``, ``camera_times``,
+    ``image_encoding``, ``bounded``.
     """
 
     config: AENeRFModelConfig
@@ -164,6 +173,10 @@ class AENeRFModel(Model):
             device=self.kwargs.get("device", "cpu"),
             trajectory=deepcopy(metadata["trajectory"]),
             camera_times=metadata["camera_times"],
+            ground_truth=deepcopy(metadata["ground_truth"]),
+        )
+        self.sensor_parameters = SensorParameters(
+            self.sensor, config.learn_contrast_threshold_ratio, config.learn_refractory_period
         )
         self.color_correction = AffineColorCorrection(self.sensor.num_channels)
         self.renderer_accumulation = AccumulationRenderer()
@@ -179,6 +192,9 @@ class AENeRFModel(Model):
         if self.raw_background is not None:
             groups["encodings"].append(self.raw_background)
         self.camera_optimizer.get_param_groups(groups)
+        learned = list(self.sensor_parameters.parameters())
+        if learned:
+            groups["sensor"] = learned
         return groups
 
     def get_training_callbacks(
@@ -208,9 +224,26 @@ class AENeRFModel(Model):
 
     def forward(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Renders rays; those with times, of pairs of events, from the corrected poses."""
+        learned: dict[str, Tensor] = {}
         if ray_bundle.times is not None:
+            # Here and not with the losses, for what the losses alone used would have no gradient on several processes.
+            ratio = self.sensor_parameters.contrast_threshold_ratio
+            if ratio is not None:
+                learned["positive_contrast_threshold"] = ratio * self.sensor.negative_contrast_threshold
+            period = self.sensor_parameters.refractory_period
+            if period is not None:
+                learned["interval_change"] = self.sensor.refractory_period * 1e-9 - period
+                num_pairs = len(ray_bundle) // (3 if self.training and self.uses_temporal_loss else 2)
+                # Intervals start at the end of the refractory period.
+                starts = torch.arange(len(ray_bundle), device=ray_bundle.times.device) < num_pairs
+                ray_bundle.times = ray_bundle.times - starts[:, None] * learned["interval_change"]
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
-        return super().forward(ray_bundle)
+        return super().forward(ray_bundle) | learned
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Renders a camera; one of a reference image from where it is in the frame of the corrected poses."""
+        moved = replace(camera, camera_to_worlds=self.camera_optimizer.apply_to_camera(camera))
+        return super().get_outputs_for_camera(moved, obb_box)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Renders rays.
@@ -240,7 +273,7 @@ class AENeRFModel(Model):
             log_radiance, weights = self._composite(samples)
         weights_list.append(weights)
         samples_list.append(samples)
-        outputs["rgb"] = self._display(self.color_correction(log_radiance.detach()))
+        outputs["rgb"] = self.display(log_radiance.detach())
         outputs["log_radiance"] = log_radiance
         outputs["accumulation"] = self.renderer_accumulation(weights)
         with torch.no_grad():
@@ -264,13 +297,14 @@ class AENeRFModel(Model):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
         """The weighted terms of the paper's total loss (eq. 14) on a batch of the event ray sampler."""
-        mean_threshold = self.sensor.mean_contrast_threshold
+        mean_threshold = (self._positive_contrast_threshold(outputs) + self.sensor.negative_contrast_threshold) / 2
         predicted, target = self._log_radiance_changes(outputs, batch)
         losses = {"reconstruction_loss": reconstruction_loss(predicted, target, mean_threshold)}
         if self.training:
             if "log_radiance_rate" in outputs:
                 rate = outputs["log_radiance_rate"].gather(1, batch["channel"][:, None])[:, 0]
-                losses["temporal_loss"] = temporal_loss(rate, target, batch["interval"])
+                interval = batch["interval"] + outputs.get("interval_change", 0.0)
+                losses["temporal_loss"] = temporal_loss(rate, target, interval)
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             losses["interlevel_loss"] = interlevel_loss(weights, samples) / mean_threshold**2
             losses["distortion_loss"] = distortion_loss(weights, samples)
@@ -282,6 +316,11 @@ class AENeRFModel(Model):
         predicted, target = self._log_radiance_changes(outputs, batch)
         metrics = {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
         self.camera_optimizer.get_metrics_dict(metrics)
+        if "positive_contrast_threshold" in outputs:
+            threshold = outputs["positive_contrast_threshold"].detach()
+            metrics["contrast_threshold_ratio"] = threshold / self.sensor.negative_contrast_threshold
+        if "interval_change" in outputs:
+            metrics["refractory_period_ns"] = self.sensor.refractory_period - 1e9 * outputs["interval_change"].detach()
         return metrics
 
     def _log_radiance_changes(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
@@ -291,17 +330,28 @@ class AENeRFModel(Model):
         target = log_radiance_change(
             batch["num_positive"],
             batch["num_negative"],
-            self.sensor.positive_contrast_threshold,
+            self._positive_contrast_threshold(outputs),
             self.sensor.negative_contrast_threshold,
         )
         return predicted, target
+
+    def _positive_contrast_threshold(self, outputs: dict[str, Any]) -> Tensor | float:
+        """C+, learned or given."""
+        return outputs.get("positive_contrast_threshold", self.sensor.positive_contrast_threshold)
 
     def reference_radiance(self, image: Tensor) -> Tensor:
         """Linear radiance (..., channels), as the sensor sees it, of reference image values (..., 3)."""
         return to_channels(decode(image[..., :3], self.image_encoding), self.sensor.num_channels)
 
-    def _display(self, radiance: Tensor) -> Tensor:
-        """Display values (..., 3) of linear radiance (..., channels)."""
+    def reference_display(self, image: Tensor) -> Tensor:
+        """Display values (..., 3), as the sensor sees it, of reference image values (..., 3)."""
+        return self._encode(self.reference_radiance(image))
+
+    def display(self, log_radiance: Tensor) -> Tensor:
+        """Colour-corrected display values (..., 3) of rendered log-radiance (..., channels)."""
+        return self._encode(self.color_correction(log_radiance))
+
+    def _encode(self, radiance: Tensor) -> Tensor:
         return encode(radiance, self.image_encoding).expand(*radiance.shape[:-1], 3)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
@@ -313,7 +363,7 @@ class AENeRFModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM (and LPIPS) of the display values against the reference, as the sensor sees it, side by side."""
         predicted = outputs["rgb"]
-        reference = self._display(self.reference_radiance(batch["image"].to(predicted.device)))
+        reference = self.reference_display(batch["image"].to(predicted.device))
         images = {
             "img": torch.cat([reference, predicted], dim=1),
             "accumulation": colormaps.apply_colormap(outputs["accumulation"]),

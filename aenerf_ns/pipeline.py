@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,16 @@ from torch import Tensor
 
 from aenerf_ns.datamanager import EventDataManager
 from aenerf_ns.model import AENeRFModel
+from aenerf_ns.pose_refinement import NUM_STEPS, refine_camera
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.trajectory.alignment import pose_errors
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, homogeneous
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
 _ROUGH_FIT_SHARE = 1 / 8
+# Steps between the errors of the corrected poses in the log, where true ones are known.
+_POSE_ERROR_INTERVAL = 100
 
 
 @dataclass
@@ -40,8 +46,11 @@ class AENeRFPipeline(VanillaPipeline):
 
     def __init__(self, config: AENeRFPipelineConfig, device: str, **kwargs: Any) -> None:
         super().__init__(config, device, **kwargs)
+        self._refined_test_poses = False
         if self.datamanager.train_pixel_sampler is not None:
             self.datamanager.train_pixel_sampler.with_time_within = self.model.uses_temporal_loss
+        if self.test_mode == "val" and self.model.config.learn_refractory_period:
+            self.model.sensor_parameters.bound_refractory_period(self.datamanager.train_dataset.pairs.shortest_interval)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
         """Loads a checkpoint, all of it: the framework would drop what does not fit without a word.
@@ -112,6 +121,55 @@ class AENeRFPipeline(VanillaPipeline):
             image[index == view] = views.get_image_float32(view)[rows, columns, :3]
         return rays, self.model.reference_radiance(image).to(self.device)
 
+    def in_recording(self, poses: Tensor) -> Tensor:
+        """(N, 3, 4) poses with OpenCV axes, in the world and the units of the recording, of (N, 3, 4) ones with OpenGL
+        axes in the scene's."""
+        outputs = self.datamanager.train_dataparser_outputs
+        to_scene = homogeneous(outputs.dataparser_transform.double())
+        poses = homogeneous(poses.cpu())
+        poses[:, :3, 3] /= outputs.dataparser_scale
+        return (torch.linalg.inv(to_scene) @ poses @ OPENCV_TO_OPENGL)[:, :3]
+
+    def pose_errors(self) -> dict[str, dict[str, float]] | None:
+        """Errors of the ``estimated`` and the ``corrected`` poses against the true ones, in the units of the recording
+        (see :func:`~aenerf_ns.trajectory.alignment.pose_errors`); None where these are not known."""
+        correction = self.model.camera_optimizer
+        if not correction.has_ground_truth:
+            return None
+        estimated, corrected, reference = (self.in_recording(poses) for poses in correction.compared_poses())
+        return {"estimated": pose_errors(estimated, reference), "corrected": pose_errors(corrected, reference)}
+
+    def refine_test_poses(self) -> None:
+        """Refines the poses of the reference views photometrically, for all evaluation from now on."""
+        views = self.datamanager.fixed_indices_eval_dataloader
+        self.eval()
+        with progress_bar() as progress:
+            refined = [
+                refine_camera(self.model, camera, batch["image"][..., :3]).camera_to_worlds
+                for camera, batch in progress.track(views, total=len(views), description="Refining test poses")
+            ]
+        self.train()
+        views.cameras = replace(views.cameras, camera_to_worlds=torch.cat(refined), metadata={})
+        self._refined_test_poses = True
+
+    @property
+    def _test_poses(self) -> str:
+        """How the reference views' cameras were placed."""
+        if self.model.camera_optimizer.has_ground_truth:
+            placed = "Sim(3) of the corrected to the true trajectory"
+        else:
+            placed = "corrected pose at the time of the view, else Sim(3) of the corrected to the estimated trajectory"
+        return f"photometric refinement, {NUM_STEPS} steps, from: {placed}" if self._refined_test_poses else placed
+
+    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
+        """Adds the errors of the corrected poses to what is logged, now and then."""
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
+            errors = self.pose_errors()
+            if errors is not None:
+                metrics |= errors["corrected"]
+        return outputs, losses, metrics
+
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
@@ -135,6 +193,9 @@ class AENeRFPipeline(VanillaPipeline):
                 f"affine, fitted on {num_views} validation views" if num_views else "percentile stretch, no references"
             )
             metrics["num_views"] = len(self.datamanager.eval_dataset)
+            metrics["pose_correction"] = self.model.config.camera_optimizer.mode
+            metrics["pose_errors"] = self.pose_errors()
+            metrics["test_poses"] = self._test_poses
             if self.model.image_metrics.lpips_absent is not None:
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent

@@ -40,6 +40,9 @@ def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> N
     sensor = SensorModel(refractory_period=1_000)
     sampler = make_sampler(random_poses, sensor)
     rays, batch = sampler.sample()
+    PoseCorrectionConfig(mode="off").setup(
+        num_cameras=0, device="cpu", trajectory=sampler.trajectory, camera_times=torch.zeros(0, dtype=torch.int64)
+    ).apply_to_raybundle(rays)
     assert rays.origins.shape == (40, 3)
     assert rays.directions.dtype == torch.float32
     assert rays.times is not None
@@ -86,7 +89,7 @@ def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
     batches = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
-        batches.append(sampler.sample()[0].origins)
+        batches.append(sampler.sample()[0].times)
     assert torch.equal(batches[0], batches[1])
     assert not torch.equal(batches[0], batches[2])
 
@@ -132,6 +135,7 @@ def make_model(sensor: SensorModel | None = None, bounded: bool = False, **optio
         "image_encoding": "srgb",
         "bounded": bounded,
         "trajectory": Trajectory([0, 10**9], ends),
+        "ground_truth": None,
         "camera_times": torch.tensor([0]),
     }
     box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
@@ -246,7 +250,7 @@ def test_the_picture_is_the_colour_corrected_one() -> None:
 def test_image_metrics_compare_with_what_the_sensor_sees() -> None:
     model = make_model().eval()
     reference = torch.rand(16, 16, 3)
-    grey = model._display(model.reference_radiance(reference))
+    grey = model.reference_display(reference)
     outputs = {"rgb": grey, "accumulation": torch.ones(16, 16, 1), "depth": torch.ones(16, 16, 1)}
     metrics, images = model.get_image_metrics_and_images(outputs, {"image": reference})
     assert metrics["psnr"] > 60
