@@ -114,8 +114,8 @@ class PoseCorrection(CameraOptimizer):
     def apply_to_camera(self, camera: Cameras) -> Tensor:
         """Poses (N, 3, 4) in the scene of cameras.
 
-        Those of reference images are moved from the reference frame to that of the corrected poses: with ground truth by
-        the Sim(3) that best maps the corrected trajectory to the true one; without it as the corrected pose at the
+        Those of reference images are moved from the reference frame to that of the corrected poses: with ground truth
+        by the Sim(3) that best maps the corrected trajectory to the true one; without it as the corrected pose at the
         time the image was taken, and images not taken on the trajectory by the Sim(3) to the estimated one. All other
         cameras are in the scene's frame and stay.
         """

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
@@ -74,10 +74,11 @@ class EventRaySampler:
                 for training holds.
 
         Returns:
-            The rays at the starts of the N intervals, then those at their ends, then those at t_sam if there are any,
-            in the camera's frame: pose correction moves them to the world. With ``times`` in float64 seconds since the
-            trajectory's start, and float64 directions as ``camera_directions`` among their metadata. And for each pair ``num_positive`` and ``num_negative`` (N,) counts
-            of events at its end, the ``interval`` (N,) in seconds, and the ``channel`` (N,) of its pixel's filter.
+            The rays at the starts of the N intervals, then those at their ends, then those at t_sam if there are any.
+            They are in the camera's frame: pose correction moves them to the world by their ``times``, in float64
+            seconds since the trajectory's start, and the ``camera_directions`` among their metadata, in float64. And
+            for each pair ``num_positive`` and ``num_negative`` (N,) counts of events at its end, the ``interval``
+            (N,) in seconds, and the ``channel`` (N,) of its pixel's filter.
         """
         with_time_within = self.with_time_within and num_pairs is None
         rays_per_pair = 3 if with_time_within else 2

@@ -1,4 +1,4 @@
-"""What is learned of the sensor together with the scene: the ratio of its contrast thresholds, its refractory period."""
+"""What is learned of the sensor with the scene: the ratio of its contrast thresholds, and its refractory period."""
 
 from __future__ import annotations
 

@@ -74,7 +74,9 @@ class NativeDataParser(EventDataParser):
             sensor=sensor,
             trajectory=trajectory,
             frame_camera=_camera(meta, "w", "h") if frames else event_camera,
-            reference_views=_reference_views(meta, frames, trajectory if ground_truth is None else ground_truth, block.matrix("T_frame_event")),
+            reference_views=_reference_views(
+                meta, frames, trajectory if ground_truth is None else ground_truth, block.matrix("T_frame_event")
+            ),
             image_encoding=encoding,
             scene_box=None if box is None else _scene_box(meta, box),
             ground_truth=ground_truth,

@@ -35,6 +35,10 @@ aenerf = MethodSpecification(
                 "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
+            "sensor": {
+                "optimizer": AdamOptimizerConfig(lr=0.05),
+                "scheduler": RelativeMultiStepSchedulerConfig(),
+            },
             "camera_opt": {
                 "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
                 "scheduler": RelativeMultiStepSchedulerConfig(),

@@ -54,6 +54,7 @@ def test_their_gradients_are_those_of_finite_differences() -> None:
 
     def loss() -> torch.Tensor:
         rays = make_rays(10, with_times=True)
+        rays.origins, rays.directions = rays.origins.double(), rays.directions.double()
         outputs = model(rays)
         return model.get_loss_dict(outputs, batch)["reconstruction_loss"]
 
