@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import tyro
-from nerfstudio.engine.schedulers import MultiStepScheduler, SchedulerConfig
+from nerfstudio.engine.schedulers import MultiStepScheduler, Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
 
 @dataclass
@@ -31,10 +33,46 @@ class RelativeMultiStepSchedulerConfig(SchedulerConfig):
 
 
 @dataclass
+class RelativeExponentialSchedulerConfig(SchedulerConfig):
+    """Learning rate that waits, rises linearly, and falls exponentially, at times given as parts of the run.
+
+    For pose correction. While the field is still taking shape its gradients would move good poses away, so it waits;
+    and a single batch tells little of a pose, so the noise of the gradients is averaged out by a rate that ends low.
+    """
+
+    _target: type = field(default_factory=lambda: RelativeExponentialScheduler)
+    delay: float = 0.05
+    """Part of the run in which nothing is learned."""
+    warm_up: float = 0.05
+    """Part of the run in which the rate then rises."""
+    final_factor: float = 0.01
+    """Factor at the end of the run. The rate falls towards it from the start on."""
+    max_steps: tyro.conf.Suppress[int] = 0
+    """Length of the run, which the trainer's configuration fills in."""
+
+
+class RelativeExponentialScheduler(Scheduler):
+    """Not the framework's exponential decay, whose checkpoints current torch refuses to load."""
+
+    config: RelativeExponentialSchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
+        """The schedule of an optimizer whose learning rate is ``lr_init``."""
+        config = self.config
+
+        def factor(step: int) -> float:
+            progress = min(step / max(config.max_steps, 1), 1.0)
+            risen = (progress - config.delay) / config.warm_up if config.warm_up else float(progress >= config.delay)
+            return min(max(risen, 0.0), 1.0) * config.final_factor**progress
+
+        return LambdaLR(optimizer, factor)
+
+
+@dataclass
 class AENeRFTrainerConfig(TrainerConfig):
     """A trainer that tells the schedules how long the run is."""
 
     def __post_init__(self) -> None:
         for group in self.optimizers.values():
-            if isinstance(group["scheduler"], RelativeMultiStepSchedulerConfig):
+            if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, RelativeExponentialSchedulerConfig)):
                 group["scheduler"].max_steps = self.max_num_iterations

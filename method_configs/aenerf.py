@@ -11,7 +11,11 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.ffmpeg import provide_ffmpeg
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipelineConfig
-from aenerf_ns.training import AENeRFTrainerConfig, RelativeMultiStepSchedulerConfig
+from aenerf_ns.training import (
+    AENeRFTrainerConfig,
+    RelativeExponentialSchedulerConfig,
+    RelativeMultiStepSchedulerConfig,
+)
 
 # Every ns-* command imports this module, ns-render among them.
 provide_ffmpeg()
@@ -41,7 +45,7 @@ aenerf = MethodSpecification(
             },
             "camera_opt": {
                 "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
-                "scheduler": RelativeMultiStepSchedulerConfig(),
+                "scheduler": RelativeExponentialSchedulerConfig(),
             },
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
