@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from aenerf_ns.box_collider import BoxCollider
-from aenerf_ns.color_correction import AffineColorCorrection
+from aenerf_ns.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.field import EventRadianceField
 from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
@@ -88,8 +88,12 @@ class AENeRFModelConfig(ModelConfig):
     is 0.001; on hash grids it has lowered quality so far."""
     camera_optimizer: PoseCorrectionConfig = field(default_factory=PoseCorrectionConfig)
     """Pose correction."""
+    color_correction: ColorCorrectionProtocol = "affine"
+    """How log-radiance becomes a picture: by an affine map per channel fitted on the validation views, or on the test
+    views themselves (only to compare with figures that were made so), by a network fitted on the validation views
+    (paper, eq. 15), or as it is."""
     color_correction_num_rays: int = 16384
-    """Pixels, spread over all validation views, on which the colour correction is fitted."""
+    """Pixels, spread over all reference views it is fitted on, on which the colour correction is fitted."""
     lpips: bool = False
     """Also report LPIPS. It needs the AlexNet weights of torchvision, which are downloaded on first use."""
     eval_num_rays_per_chunk: int = 1 << 13
@@ -165,7 +169,7 @@ class AENeRFModel(Model):
             trajectory=deepcopy(metadata["trajectory"]),
             camera_times=metadata["camera_times"],
         )
-        self.color_correction = AffineColorCorrection(self.sensor.num_channels)
+        self.color_correction = self.new_color_correction(config.color_correction)
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
@@ -240,7 +244,7 @@ class AENeRFModel(Model):
             log_radiance, weights = self._composite(samples)
         weights_list.append(weights)
         samples_list.append(samples)
-        outputs["rgb"] = self._display(self.color_correction(log_radiance.detach()))
+        outputs["rgb"] = _grey_to_rgb(self.color_correction(log_radiance.detach()))
         outputs["log_radiance"] = log_radiance
         outputs["accumulation"] = self.renderer_accumulation(weights)
         with torch.no_grad():
@@ -296,13 +300,17 @@ class AENeRFModel(Model):
         )
         return predicted, target
 
+    def new_color_correction(self, protocol: ColorCorrectionProtocol) -> ColorCorrection:
+        """A colour correction for this model's pictures, not yet fitted."""
+        return COLOR_CORRECTIONS[protocol](self.sensor.num_channels, self.image_encoding)
+
     def reference_radiance(self, image: Tensor) -> Tensor:
         """Linear radiance (..., channels), as the sensor sees it, of reference image values (..., 3)."""
         return to_channels(decode(image[..., :3], self.image_encoding), self.sensor.num_channels)
 
     def _display(self, radiance: Tensor) -> Tensor:
         """Display values (..., 3) of linear radiance (..., channels)."""
-        return encode(radiance, self.image_encoding).expand(*radiance.shape[:-1], 3)
+        return _grey_to_rgb(encode(radiance, self.image_encoding))
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Display values and opacity (..., 4): exporters leave out what is transparent."""
@@ -330,3 +338,8 @@ class AENeRFModel(Model):
         rendered = [self(rays[begin : begin + chunk])["log_radiance"] for begin in range(0, len(rays), chunk)]
         self.train(was_training)
         return torch.cat(rendered)
+
+
+def _grey_to_rgb(values: Tensor) -> Tensor:
+    """(..., 3) of (..., channels), 1 or 3."""
+    return values.expand(*values.shape[:-1], 3)

@@ -1,21 +1,22 @@
-"""The pipeline: colour correction on the validation views, and honest loading and evaluation."""
+"""The pipeline: colour correction on reference views, and honest loading and evaluation."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.misc import step_check
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from aenerf_ns.color_correction import ColorCorrectionProtocol, NoColorCorrection
 from aenerf_ns.datamanager import EventDataManager
 from aenerf_ns.model import AENeRFModel
 
@@ -42,6 +43,9 @@ class AENeRFPipeline(VanillaPipeline):
         super().__init__(config, device, **kwargs)
         if self.datamanager.train_pixel_sampler is not None:
             self.datamanager.train_pixel_sampler.with_time_within = self.model.uses_temporal_loss
+        # Made once: a fit every so many steps would read the images again.
+        self._pixels_of_split: dict[str, tuple[RayBundle, Tensor | None, int]] = {}
+        self._warn_of_test_views()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
         """Loads a checkpoint, all of it: the framework would drop what does not fit without a word.
@@ -73,27 +77,46 @@ class AENeRFPipeline(VanillaPipeline):
         callback = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], fit, update_every_num_iters=1)
         return [*super().get_training_callbacks(training_callback_attributes), callback]
 
+    def replace_color_correction(self, protocol: ColorCorrectionProtocol) -> None:
+        """Replaces the run's colour correction by that of another protocol, fitted anew on the run's data."""
+        self.model.color_correction = self.model.new_color_correction(protocol).to(self.device)
+        self._warn_of_test_views()
+        self.fit_color_correction()
+
     @torch.no_grad()
     def fit_color_correction(self, share: float = 1.0) -> None:
-        """Fits the colour correction on the validation views (protocol "affine"), or where there are none stretches
-        what the training cameras see over the display's range.
+        """Fits the colour correction on its protocol's reference views, or where there are none stretches what the
+        training cameras see over the display's range.
 
         Args:
-            share: of the configured number of pixels to fit it on.
+            share: of the configured number of pixels to fit it on. Less than all makes a rough fit.
         """
-        rays, reference = self._pixels
+        correction = self.model.color_correction
+        if isinstance(correction, NoColorCorrection):
+            return
+        if correction.split not in self._pixels_of_split:
+            self._pixels_of_split[correction.split] = self._pixels(correction.split)
+        rays, reference, num_views = self._pixels_of_split[correction.split]
         count = max(round(share * len(rays)), 1)
         log_radiance = self.model.render_log_radiance(rays[:count])
         if reference is None:
-            self.model.color_correction.stretch(log_radiance)
+            correction.stretch(log_radiance)
         else:
-            self.model.color_correction.fit(log_radiance, reference[:count], len(self.datamanager.eval_dataset))
+            correction.fit(log_radiance, reference[:count], num_views, rough=share < 1)
 
-    @cached_property
-    def _pixels(self) -> tuple[RayBundle, Tensor | None]:
-        """Rays through random pixels of all validation views, the same in every run, and the radiance (N, channels)
-        of the references there; without references, of all training cameras, and None."""
-        views = self.datamanager.eval_dataset or self.datamanager.train_dataset
+    def _warn_of_test_views(self) -> None:
+        if self.model.color_correction.protocol == "affine-test":
+            CONSOLE.print(
+                "[yellow]Colour correction affine-test is fitted on the test views themselves: only to compare with "
+                "figures that were made so."
+            )
+
+    def _pixels(self, split: Literal["val", "test"]) -> tuple[RayBundle, Tensor | None, int]:
+        """Rays through random pixels of all reference views of a split, the same in every run, the radiance
+        (N, channels) of the references there, and the number of views; without references, rays of all training
+        cameras, None, and 0."""
+        references = self.datamanager.reference_views(split)
+        views = references or self.datamanager.train_dataset
         generator = torch.Generator().manual_seed(0)
         cameras = views.cameras
         count = max(self.model.config.color_correction_num_rays, len(views))
@@ -104,13 +127,13 @@ class AENeRFPipeline(VanillaPipeline):
         rays = cameras.to(self.device).generate_rays(
             index[:, None].to(self.device), coords=(pixels + 0.5).to(self.device)
         )
-        if self.datamanager.eval_dataset is None:
-            return rays, None
+        if references is None:
+            return rays, None, 0
         image = torch.zeros(count, 3)
         for view in range(len(views)):
             rows, columns = pixels[index == view].T
             image[index == view] = views.get_image_float32(view)[rows, columns, :3]
-        return rays, self.model.reference_radiance(image).to(self.device)
+        return rays, self.model.reference_radiance(image).to(self.device), len(views)
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -130,10 +153,7 @@ class AENeRFPipeline(VanillaPipeline):
         metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
         if self.test_mode == "test":
             # The trainer's log, in the other mode, takes numbers only.
-            num_views = int(self.model.color_correction.num_views)
-            metrics["color_correction"] = (
-                f"affine, fitted on {num_views} validation views" if num_views else "percentile stretch, no references"
-            )
+            metrics["color_correction"] = self.model.color_correction.description
             metrics["num_views"] = len(self.datamanager.eval_dataset)
             if self.model.image_metrics.lpips_absent is not None:
                 metrics["lpips"] = None
