@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from aenerf_ns.box_collider import BoxCollider
-from aenerf_ns.color_correction import AffineColorCorrection
+from aenerf_ns.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.field import EventRadianceField
 from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
@@ -96,8 +96,12 @@ class AENeRFModelConfig(ModelConfig):
     interval between two events of a pixel."""
     camera_optimizer: PoseCorrectionConfig = field(default_factory=PoseCorrectionConfig)
     """Pose correction."""
+    color_correction: ColorCorrectionProtocol = "affine"
+    """How log-radiance becomes a picture: by an affine map per channel fitted on the validation views, or on the test
+    views themselves (only to compare with figures that were made so), by a network fitted on the validation views
+    (paper, eq. 15), or as it is."""
     color_correction_num_rays: int = 16384
-    """Pixels, spread over all validation views, on which the colour correction is fitted."""
+    """Pixels, spread over all reference views it is fitted on, on which the colour correction is fitted."""
     lpips: bool = False
     """Also report LPIPS. It needs the AlexNet weights of torchvision, which are downloaded on first use."""
     eval_num_rays_per_chunk: int = 1 << 13
@@ -178,7 +182,7 @@ class AENeRFModel(Model):
         self.sensor_parameters = SensorParameters(
             self.sensor, config.learn_contrast_threshold_ratio, config.learn_refractory_period
         )
-        self.color_correction = AffineColorCorrection(self.sensor.num_channels)
+        self.color_correction = self.new_color_correction(config.color_correction)
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
@@ -339,20 +343,21 @@ class AENeRFModel(Model):
         """C+, learned or given."""
         return outputs.get("positive_contrast_threshold", self.sensor.positive_contrast_threshold)
 
+    def new_color_correction(self, protocol: ColorCorrectionProtocol) -> ColorCorrection:
+        """A colour correction for this model's pictures, not yet fitted."""
+        return COLOR_CORRECTIONS[protocol](self.sensor.num_channels, self.image_encoding)
+
     def reference_radiance(self, image: Tensor) -> Tensor:
         """Linear radiance (..., channels), as the sensor sees it, of reference image values (..., 3)."""
         return to_channels(decode(image[..., :3], self.image_encoding), self.sensor.num_channels)
 
     def reference_display(self, image: Tensor) -> Tensor:
         """Display values (..., 3), as the sensor sees it, of reference image values (..., 3)."""
-        return self._encode(self.reference_radiance(image))
+        return _grey_to_rgb(encode(self.reference_radiance(image), self.image_encoding))
 
     def display(self, log_radiance: Tensor) -> Tensor:
         """Colour-corrected display values (..., 3) of rendered log-radiance (..., channels)."""
-        return self._encode(self.color_correction(log_radiance))
-
-    def _encode(self, radiance: Tensor) -> Tensor:
-        return encode(radiance, self.image_encoding).expand(*radiance.shape[:-1], 3)
+        return _grey_to_rgb(self.color_correction(log_radiance))
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Display values and opacity (..., 4): exporters leave out what is transparent."""
@@ -380,3 +385,8 @@ class AENeRFModel(Model):
         rendered = [self(rays[begin : begin + chunk])["log_radiance"] for begin in range(0, len(rays), chunk)]
         self.train(was_training)
         return torch.cat(rendered)
+
+
+def _grey_to_rgb(values: Tensor) -> Tensor:
+    """(..., 3) of (..., channels), 1 or 3."""
+    return values.expand(*values.shape[:-1], 3)

@@ -108,6 +108,29 @@ def test_training_beats_an_untrained_field_on_held_out_views(trained: Path, work
     assert results["ssim"] > untrained["ssim"]
 
 
+def test_another_colour_correction_is_fitted_at_evaluation(trained: Path, workspace: Path) -> None:
+    checkpoint = next(trained.parent.rglob("*.ckpt"))
+    before = (trained.read_bytes(), checkpoint.read_bytes())
+    output, pictures = workspace / "network" / "metrics.json", workspace / "network" / "pictures"
+    options = ("--color-correction", "network", "--render-output", pictures)
+    run("aenerf", "evaluate", "--load-config", trained, "--output", output, *options, cwd=workspace)
+    written = json.loads(output.read_text())
+    of_run = json.loads((workspace / "trained.json").read_text())
+    # The layout of ns-eval, and what it was computed with.
+    assert written.pop("protocol") == {"color_correction": "network", "color_correction_of_run": "affine"}
+    assert {key: value for key, value in written.items() if key != "results"} == {
+        key: value for key, value in of_run.items() if key != "results"
+    }
+    assert written["results"].keys() == of_run["results"].keys()
+    assert written["results"]["color_correction"] == "network, fitted on 4 validation views"
+    # The same pictures in other colours.
+    assert 0 < abs(written["results"]["psnr"] - of_run["results"]["psnr"]) < 2
+    assert len(list(pictures.glob("eval_img_*.png"))) == 3
+    assert (trained.read_bytes(), checkpoint.read_bytes()) == before
+    missing = ("aenerf", "evaluate", "--load-config", "nothing.yml", "--output", output)
+    assert "nothing.yml: there is no such file" in run(*missing, cwd=workspace, fails=True)
+
+
 def test_resuming_continues_from_the_checkpoint(trained: Path, workspace: Path) -> None:
     data = workspace / "room"
     (data / "events.gone").rename(data / "events.h5")
