@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import ClassVar, Literal
 
 import torch
@@ -150,7 +151,7 @@ class NetworkColorCorrection(AffineColorCorrection):
         self.register_buffer("input_mean", torch.zeros(num_channels))
         self.register_buffer("input_deviation", torch.ones(num_channels))
         widths = (num_channels, *_HIDDEN, num_channels)
-        for layer, (num_inputs, num_outputs) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+        for layer, (num_inputs, num_outputs) in enumerate(pairwise(widths)):
             self.register_buffer(f"weight_{layer}", torch.zeros(num_outputs, num_inputs))
             self.register_buffer(f"bias_{layer}", torch.zeros(num_outputs))
 

@@ -119,9 +119,7 @@ class AENeRFPipeline(VanillaPipeline):
         pixels = self._pixels_of_split[correction.split]
         count = max(round(share * len(pixels.view)), 1)
         # The views move with the corrected poses.
-        cameras = replace(
-            pixels.cameras, camera_to_worlds=self.model.camera_optimizer.apply_to_camera(pixels.cameras)
-        )
+        cameras = replace(pixels.cameras, camera_to_worlds=self.model.camera_optimizer.apply_to_camera(pixels.cameras))
         rays = cameras.generate_rays(pixels.view[:count], coords=pixels.coordinates[:count])
         log_radiance = self.model.render_log_radiance(rays)
         if pixels.radiance is None:

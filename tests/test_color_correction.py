@@ -26,6 +26,7 @@ from aenerf_ns.image_encoding import encode
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipeline, AENeRFPipelineConfig
 from aenerf_ns.trajectory.trajectory import Trajectory
+
 FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
 
 
@@ -190,7 +191,8 @@ def test_each_protocol_is_fitted_on_its_own_views(test_mode: Literal["test", "va
         "affine-test": ("affine-test, fitted on the 3 test views themselves", orange),
         "network": ("network, fitted on 2 validation views", grey),
     }
-    rays, _, _ = pipeline._pixels("test")
+    pixels = pipeline._pixels("test")
+    rays = pixels.cameras.generate_rays(pixels.view, coords=pixels.coordinates)
     for protocol, (description, color) in expected.items():
         pipeline.replace_color_correction(protocol)
         assert pipeline.model.color_correction.description == description
