@@ -243,7 +243,12 @@ class TwistNetwork(nn.Module):
         layers: list[nn.Module] = []
         size = self.encoding.get_out_dim()
         for _ in range(4):
-            layers += [nn.Linear(size, width), nn.Softplus()]
+            linear = nn.Linear(size, width)
+            # With PyTorch's initialisation and a blunt softplus hardly any of the input's variation reaches the output:
+            # all that such a network learns for long is one correction for all times.
+            nn.init.kaiming_normal_(linear.weight)
+            nn.init.zeros_(linear.bias)
+            layers += [linear, nn.Softplus(beta=100)]
             size = width
         self.hidden = nn.Sequential(*layers)
         self.output = nn.Linear(width, 6)

@@ -112,11 +112,17 @@ def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) 
     assert set(batch["channel"].tolist()) == {2}
 
 
-def make_model(sensor: SensorModel | None = None, bounded: bool = False, **options: Any) -> AENeRFModel:
+def make_model(
+    sensor: SensorModel | None = None,
+    bounded: bool = False,
+    max_resolution: int = 32,
+    trajectory: Trajectory | None = None,
+    **options: Any,
+) -> AENeRFModel:
     torch.manual_seed(0)
     config = AENeRFModelConfig(
         num_levels=4,
-        max_resolution=32,
+        max_resolution=max_resolution,
         log2_hashmap_size=10,
         hidden_dim=16,
         num_proposal_samples_per_ray=(16,),
@@ -134,7 +140,7 @@ def make_model(sensor: SensorModel | None = None, bounded: bool = False, **optio
         "sensor": sensor or SensorModel(0.2, 0.3),
         "image_encoding": "srgb",
         "bounded": bounded,
-        "trajectory": Trajectory([0, 10**9], ends),
+        "trajectory": trajectory or Trajectory([0, 10**9], ends),
         "ground_truth": None,
         "camera_times": torch.tensor([0]),
     }

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from test_model import make_model
 
 from aenerf_ns.errors import DataError
@@ -204,3 +205,54 @@ def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor)
     errors = pose_errors(noisy.camera_to_worlds, truth.camera_to_worlds)
     flipped = [t.mapped(lambda poses: poses @ OPENCV_TO_OPENGL).camera_to_worlds for t in (noisy, truth)]
     assert pose_errors(*flipped) == pytest.approx(errors, rel=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["network", "spline"])
+def test_in_a_known_scene_the_correction_finds_the_true_poses(mode: str) -> None:
+    times = np.linspace(0, SECOND, 60).astype(np.int64)
+    path = torch.eye(4, dtype=torch.float64).repeat(60, 1, 1)
+    path[:, 2, 3] = 2.2
+    path[:, 0, 3] = torch.linspace(-0.5, 0.5, 60)
+    truth = Trajectory(times, path)
+    estimated = perturb(truth, rotation_degrees=2.0, translation=0.05, correlation_time=0.3, seed=0)
+    config = PoseCorrectionConfig(mode=mode)
+    model = make_model(bounded=True, camera_optimizer=config, max_resolution=16, trajectory=estimated)
+    torch.nn.init.uniform_(model.field.encoding.hash_table, -0.5, 0.5)
+    model.field.average_init_density = 3.0
+    reference = PoseCorrectionConfig(mode="off").setup(
+        num_cameras=0, device="cpu", trajectory=truth, camera_times=torch.zeros(0, dtype=torch.int64)
+    )
+    correction = model.camera_optimizer
+    generator = torch.Generator().manual_seed(0)
+
+    def errors() -> torch.Tensor:
+        # Not aligned: the scene holds the frame.
+        seconds = torch.linspace(0, 1, 50, dtype=torch.float64)
+        with torch.no_grad():
+            poses, true = correction.pose(seconds), reference.pose(seconds)
+        return torch.stack([rotation_angle(poses, true).mean(), (poses - true)[..., 3].norm(dim=-1).mean()])
+
+    before = errors()
+    optimizer = torch.optim.Adam(correction.parameters(), lr=3e-3 if mode == "spline" else 5e-4)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 150)
+    for _ in range(150):
+        directions = torch.randn(256, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.3, 0.3, 0.0])
+        directions = torch.nn.functional.normalize(directions - torch.tensor([0.0, 0.0, 1.0]), dim=-1)
+        seconds = torch.rand(256, 1, generator=generator, dtype=torch.float64)
+        rendered = []
+        for source in (correction, reference):
+            rays = RayBundle(
+                origins=torch.zeros(256, 3),
+                directions=directions.float(),
+                pixel_area=torch.ones(256, 1),
+                times=seconds,
+                metadata={"camera_directions": directions},
+            )
+            source.apply_to_raybundle(rays)
+            rays.times = None
+            rendered.append(model.eval()(rays)["log_radiance"])
+        optimizer.zero_grad()
+        (rendered[0] - rendered[1].detach()).square().mean().backward()
+        optimizer.step()
+        schedule.step()
+    assert (errors() < before / 3).all(), (before, errors())
