@@ -23,6 +23,9 @@ from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
 # Poses at which trajectories are compared: enough for any metric, and quick enough to be logged.
 _MAX_COMPARED = 2000
+# A step of the optimizer changes hundreds of weights behind each number of a network's twist, and one behind a spline's.
+# With this factor on the network's output both move about as far at one learning rate.
+_NETWORK_OUTPUT_SCALE = 2e-3
 
 
 @dataclass
@@ -261,7 +264,7 @@ class TwistNetwork(nn.Module):
         dtype = self.output.weight.dtype
         time = (2 * seconds / self._duration - 1).to(dtype)[:, None]
         embedded = F.softplus(self.pose_embedding(base.flatten(1).to(dtype))) + F.softplus(self.time_embedding(time))
-        return self.output(self.hidden(self.encoding(embedded)))
+        return _NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))
 
 
 class TwistSpline(nn.Module):

@@ -233,7 +233,7 @@ def test_in_a_known_scene_the_correction_finds_the_true_poses(mode: str) -> None
         return torch.stack([rotation_angle(poses, true).mean(), (poses - true)[..., 3].norm(dim=-1).mean()])
 
     before = errors()
-    optimizer = torch.optim.Adam(correction.parameters(), lr=3e-3 if mode == "spline" else 5e-4)
+    optimizer = torch.optim.Adam(correction.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 150)
     for _ in range(150):
         directions = torch.randn(256, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.3, 0.3, 0.0])

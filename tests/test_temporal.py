@@ -31,7 +31,7 @@ def exact_model(mode: str, **options: Any) -> AENeRFModel:
         if name.endswith("control_twists"):
             torch.nn.init.normal_(parameter, std=0.03)
         elif name.endswith("output.weight"):
-            torch.nn.init.normal_(parameter, std=0.003)
+            torch.nn.init.normal_(parameter, std=1.5)
     return model.double()
 
 
