@@ -23,8 +23,8 @@ from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
 # Poses at which trajectories are compared: enough for any metric, and quick enough to be logged.
 _MAX_COMPARED = 2000
-# A step of the optimizer changes hundreds of weights behind each number of a network's twist, and one behind a spline's.
-# With this factor on the network's output both move about as far at one learning rate.
+# A step of the optimizer changes hundreds of weights behind each number of a network's twist, and few behind a
+# spline's. With this factor on the network's output both move about as far at one learning rate.
 _NETWORK_OUTPUT_SCALE = 2e-3
 
 

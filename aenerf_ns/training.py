@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import tyro
@@ -33,37 +34,39 @@ class RelativeMultiStepSchedulerConfig(SchedulerConfig):
 
 
 @dataclass
-class RelativeExponentialSchedulerConfig(SchedulerConfig):
-    """Learning rate that waits, rises linearly, and falls exponentially, at times given as parts of the run.
+class DelayedCosineSchedulerConfig(SchedulerConfig):
+    """Learning rate that waits, rises linearly, and falls as half a cosine until the end of the run.
 
-    For pose correction. While the field is still taking shape its gradients would move good poses away, so it waits;
-    and a single batch tells little of a pose, so the noise of the gradients is averaged out by a rate that ends low.
+    For pose correction. In its first steps the field is worse than a constant one, and its gradients would move good
+    poses away, so the correction waits; and a single batch tells little of a pose, so the noise of the gradients is
+    averaged out by a rate that ends low.
     """
 
-    _target: type = field(default_factory=lambda: RelativeExponentialScheduler)
-    delay: float = 0.05
-    """Part of the run in which nothing is learned."""
-    warm_up: float = 0.05
-    """Part of the run in which the rate then rises."""
+    _target: type = field(default_factory=lambda: DelayedCosineScheduler)
+    delay: int = 500
+    """Steps in which nothing is learned."""
+    warm_up: int = 100
+    """Steps in which the rate then rises."""
     final_factor: float = 0.01
-    """Factor at the end of the run. The rate falls towards it from the start on."""
+    """Factor at the end of the run."""
     max_steps: tyro.conf.Suppress[int] = 0
     """Length of the run, which the trainer's configuration fills in."""
 
 
-class RelativeExponentialScheduler(Scheduler):
-    """Not the framework's exponential decay, whose checkpoints current torch refuses to load."""
+class DelayedCosineScheduler(Scheduler):
+    """Not the framework's cosine decay, whose NumPy numbers current torch refuses to load from checkpoints."""
 
-    config: RelativeExponentialSchedulerConfig
+    config: DelayedCosineSchedulerConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """The schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
 
         def factor(step: int) -> float:
-            progress = min(step / max(config.max_steps, 1), 1.0)
-            risen = (progress - config.delay) / config.warm_up if config.warm_up else float(progress >= config.delay)
-            return min(max(risen, 0.0), 1.0) * config.final_factor**progress
+            since = max(step - config.delay, 0)
+            progress = min(since / max(config.max_steps - config.delay, 1), 1.0)
+            falling = config.final_factor + (1 - config.final_factor) * (1 + math.cos(math.pi * progress)) / 2
+            return min(since / max(config.warm_up, 1), 1.0) * falling
 
         return LambdaLR(optimizer, factor)
 
@@ -74,5 +77,5 @@ class AENeRFTrainerConfig(TrainerConfig):
 
     def __post_init__(self) -> None:
         for group in self.optimizers.values():
-            if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, RelativeExponentialSchedulerConfig)):
+            if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, DelayedCosineSchedulerConfig)):
                 group["scheduler"].max_steps = self.max_num_iterations
