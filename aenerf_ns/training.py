@@ -43,9 +43,9 @@ class DelayedCosineSchedulerConfig(SchedulerConfig):
     """
 
     _target: type = field(default_factory=lambda: DelayedCosineScheduler)
-    delay: int = 500
+    delay: int = 150
     """Steps in which nothing is learned."""
-    warm_up: int = 100
+    warm_up: int = 50
     """Steps in which the rate then rises."""
     final_factor: float = 0.01
     """Factor at the end of the run."""
