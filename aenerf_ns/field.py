@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.field_components.encodings import HashEncoding, NeRFEncoding
+from nerfstudio.field_components.encodings import NeRFEncoding
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import Field
+from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
+
+from aenerf_ns.hash_encoding import HashEncoding
 
 # Larger exponents overflow half precision; the framework's trunc_exp cuts gradients at the same value, but is a custom
 # function without forward-mode derivatives.
@@ -61,7 +66,6 @@ class EventRadianceField(Field):
             min_res=base_resolution,
             max_res=max_resolution,
             log2_hashmap_size=log2_hashmap_size,
-            implementation="torch",
         )
         self.direction_encoding = NeRFEncoding(
             in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True, implementation="torch"
@@ -103,6 +107,24 @@ class EventRadianceField(Field):
     ) -> dict[FieldHeadNames, Tensor]:
         """Radiance (..., num_channels), positive and unbounded, under the framework's name for colour."""
         assert density_embedding is not None
-        directions = self.direction_encoding(ray_samples.frustums.directions)
+        # All samples of a ray have its direction.
+        directions = self.direction_encoding(ray_samples.frustums.directions[..., :1, :])
         directions = directions.expand(*density_embedding.shape[:-1], -1)
         return {FieldHeadNames.RGB: self.radiance_network(torch.cat([directions, density_embedding], -1))}
+
+
+class ProposalNetwork(HashMLPDensityField):
+    """Nerfstudio's proposal network on this package's hash encoding.
+
+    Args:
+        aabb: (2, 3) scene box.
+        num_levels: levels of the hash grid.
+        max_res: cells along an axis on the finest level.
+        log2_hashmap_size: binary logarithm of the entries of a level.
+        options: the framework's others.
+    """
+
+    def __init__(self, aabb: Tensor, num_levels: int, max_res: int, log2_hashmap_size: int, **options: Any) -> None:
+        grid = {"num_levels": num_levels, "max_res": max_res, "log2_hashmap_size": log2_hashmap_size}
+        super().__init__(aabb, implementation="torch", **grid, **options)
+        self.encoding = self.mlp_base[0] = HashEncoding(**grid)

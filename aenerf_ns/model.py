@@ -15,7 +15,6 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
-from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
@@ -29,7 +28,7 @@ from torch.nn import Parameter
 from aenerf_ns.box_collider import BoxCollider
 from aenerf_ns.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.field import EventRadianceField
+from aenerf_ns.field import EventRadianceField, ProposalNetwork
 from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
@@ -147,7 +146,7 @@ class AENeRFModel(Model):
             average_init_density=config.average_init_density,
         )
         self.proposal_networks = nn.ModuleList(
-            HashMLPDensityField(
+            ProposalNetwork(
                 self.scene_box.aabb,
                 spatial_distortion=distortion,
                 num_levels=config.proposal_num_levels,
@@ -155,7 +154,6 @@ class AENeRFModel(Model):
                 log2_hashmap_size=config.proposal_log2_hashmap_size,
                 hidden_dim=config.proposal_hidden_dim,
                 average_init_density=config.average_init_density,
-                implementation="torch",
             )
             for resolution in config.proposal_max_resolutions
         )

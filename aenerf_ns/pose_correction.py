@@ -97,7 +97,10 @@ class PoseCorrection(CameraOptimizer):
 
     def pose(self, seconds: Tensor) -> Tensor:
         """Corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
-        base = self.trajectory.pose(seconds)
+        return self._corrected(seconds, self.trajectory.pose(seconds))
+
+    def _corrected(self, seconds: Tensor, base: Tensor) -> Tensor:
+        """Corrected poses where the estimated ones are ``base`` (N, 3, 4)."""
         if self.twists is None:
             return base
         return base @ motion_from_twist(self.twists(seconds, base).double())
@@ -151,14 +154,17 @@ class PoseCorrection(CameraOptimizer):
     def ray_rates(self, raybundle: RayBundle) -> tuple[Tensor, Tensor]:
         """Derivatives of the corrected rays' origins and directions (N, 3) with respect to time, per second."""
         assert raybundle.times is not None
-        with forward_ad.dual_level():
-            seconds = raybundle.times[:, 0]
-            moving = self.pose(forward_ad.make_dual(seconds, torch.ones_like(seconds)))
-            rays = world_rays(moving, raybundle.metadata["camera_directions"])
-            origin_rates, direction_rates = (
-                forward_ad.unpack_dual(value).tangent.to(raybundle.origins.dtype) for value in rays
-            )
-        return origin_rates, direction_rates
+        seconds = raybundle.times[:, 0]
+        pose, rate = self.trajectory.pose_and_rate(seconds)
+        if self.twists is not None:
+            with forward_ad.dual_level():
+                moving = self._corrected(
+                    forward_ad.make_dual(seconds, torch.ones_like(seconds)), forward_ad.make_dual(pose, rate)
+                )
+                rate = forward_ad.unpack_dual(moving).tangent
+        # Rays are linear in the pose.
+        origin_rates, direction_rates = world_rays(rate, raybundle.metadata["camera_directions"])
+        return origin_rates.to(raybundle.origins), direction_rates.to(raybundle.origins)
 
     def get_loss_dict(self, loss_dict: dict[str, Tensor]) -> None:
         """Adds the mean squared size of the corrections over the run, so that good poses stay as they are."""

@@ -101,7 +101,7 @@ def test_lower_floors_import_none_above_them() -> None:
     # Bottom up; each may import those before it.
     floors = [
         {"errors", "progress"},
-        {"events", "trajectory", "scenes", "image_encoding", "event_camera", "box_collider"},
+        {"events", "trajectory", "scenes", "image_encoding", "event_camera", "box_collider", "hash_encoding"},
         {"field", "temporal", "losses", "color_correction", "image_metrics"},
         {"dataset", "simulation"},
         {"ray_sampler"},

@@ -85,6 +85,15 @@ def test_the_pose_is_differentiable_in_time(random_poses: torch.Tensor) -> None:
     assert torch.autograd.gradcheck(trajectory.pose, seconds)
 
 
+def test_the_rate_is_the_derivative_of_the_pose(random_poses: torch.Tensor) -> None:
+    trajectory = Trajectory(10**9 * np.arange(8), random_poses)
+    seconds = torch.tensor([0.0, 0.3, 2.0, 4.7], dtype=torch.float64)
+    pose, rate = trajectory.pose_and_rate(seconds)
+    assert torch.equal(pose, trajectory.pose(seconds))
+    _, expected = torch.func.jvp(trajectory.pose, (seconds,), (torch.ones_like(seconds),))
+    torch.testing.assert_close(rate, expected, rtol=0, atol=1e-13)
+
+
 def test_outside_the_span_is_an_error(random_poses: torch.Tensor) -> None:
     trajectory = Trajectory(100 + 10 * np.arange(8), random_poses, "poses.txt")
     for time in (99, 171):

@@ -10,7 +10,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.trajectory.rotation import quaternion_from_rotation, rotation_from_vector, vector_from_quaternion
+from aenerf_ns.trajectory.rotation import (
+    cross_matrix,
+    quaternion_from_rotation,
+    rotation_from_vector,
+    vector_from_quaternion,
+)
 
 # Multiplying by it from the right turns OpenCV camera axes (x right, y down, z forward) into OpenGL ones, which
 # Nerfstudio uses (x right, y up, z backward), and back.
@@ -101,14 +106,38 @@ class Trajectory(nn.Module):
         Returns:
             (..., 3, 4) float64 camera-to-world poses.
         """
-        knots = self.seconds(self.times)
-        segment = (torch.searchsorted(knots, seconds.detach(), right=True) - 1).clamp(0, len(knots) - 2)
-        begin = knots[segment]
-        weight = ((seconds - begin) / (knots[segment + 1] - begin))[..., None]
+        segment, _, weight = self._segment(seconds)
         pose = self.camera_to_worlds[segment]
         rotation = pose[..., :3] @ rotation_from_vector(weight * self._rotation_steps[segment])
         translation = pose[..., 3] + weight * self._translation_steps[segment]
         return torch.cat([rotation, translation[..., None]], -1)
+
+    def pose_and_rate(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses as :meth:`pose` gives them, and their derivatives with respect to time.
+
+        In closed form, at a fraction of the cost of differentiating :meth:`pose`. At a knot the rate is that of the
+        segment after it.
+
+        Args:
+            seconds: (...) float64 seconds since ``start``.
+
+        Returns:
+            (..., 3, 4) float64 poses and (..., 3, 4) float64 rates per second.
+        """
+        segment, duration, _ = self._segment(seconds)
+        pose = self.pose(seconds)
+        # The camera turns about one axis at one speed, so that its angular velocity is the same in all its frames.
+        spin = pose[..., :3] @ cross_matrix(self._rotation_steps[segment])
+        rate = torch.cat([spin, self._translation_steps[segment][..., None]], -1)
+        return pose, rate / duration[..., None, None]
+
+    def _segment(self, seconds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Indices (...) of the knots ahead of given times, the seconds (...) to the next ones, and the parts (..., 1)
+        of the ways."""
+        knots = self.seconds(self.times)
+        segment = (torch.searchsorted(knots, seconds.detach(), right=True) - 1).clamp(0, len(knots) - 2)
+        duration = knots[segment + 1] - knots[segment]
+        return segment, duration, ((seconds - knots[segment]) / duration)[..., None]
 
     def interpolate(self, times: ArrayLike | Tensor) -> Tensor:
         """Poses at given times.
