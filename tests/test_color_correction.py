@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import make_stream
+from nerfstudio.cameras.rays import RayBundle
 
 from aenerf_ns.color_correction import (
     COLOR_CORRECTIONS,
@@ -25,6 +26,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.image_encoding import encode
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipeline, AENeRFPipelineConfig
+from aenerf_ns.pose_correction import PoseCorrectionConfig
 from aenerf_ns.trajectory.trajectory import Trajectory
 
 FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
@@ -153,8 +155,10 @@ def test_checkpoints_of_the_affine_protocol_hold_these_buffers() -> None:
     assert set(AffineColorCorrection(3, "srgb").state_dict()) == {"scale", "offset", "num_views"}
 
 
-def make_pipeline(folder: Path, test_mode: Literal["test", "val"], num_views: int = 2) -> AENeRFPipeline:
-    """A small untrained model of a colour sensor: grey validation views, and one more test view that are orange."""
+def make_pipeline(
+    folder: Path, test_mode: Literal["test", "val"], num_views: int = 2, pose_correction: str = "off"
+) -> AENeRFPipeline:
+    """A small untrained model of a colour sensor: grey validation views, and one test view more, orange."""
     if not folder.exists():
         camera = EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
         poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
@@ -176,6 +180,7 @@ def make_pipeline(folder: Path, test_mode: Literal["test", "val"], num_views: in
         proposal_num_levels=2,
         proposal_log2_hashmap_size=8,
         color_correction_num_rays=64,
+        camera_optimizer=PoseCorrectionConfig(mode=pose_correction),
     )
     torch.manual_seed(0)
     datamanager = EventDataManagerConfig(dataparser=NativeDataParserConfig(data=folder))
@@ -191,8 +196,8 @@ def test_each_protocol_is_fitted_on_its_own_views(test_mode: Literal["test", "va
         "affine-test": ("affine-test, fitted on the 3 test views themselves", orange),
         "network": ("network, fitted on 2 validation views", grey),
     }
-    pixels = pipeline._pixels("test")
-    rays = pixels.cameras.generate_rays(pixels.view, coords=pixels.coordinates)
+    camera = pipeline.datamanager.reference_views("test").cameras[0:1]
+    rays = camera.generate_rays(0, keep_shape=False)
     for protocol, (description, color) in expected.items():
         pipeline.replace_color_correction(protocol)
         assert pipeline.model.color_correction.description == description
@@ -225,3 +230,26 @@ def test_a_rough_fit_leaves_the_network_out(tmp_path: Path) -> None:
     # What the framework asks an optimizer for is what it was.
     names = {name for name, _ in pipeline.model.named_parameters()}
     assert not any("color_correction" in name for name in names)
+
+
+def test_reference_views_are_placed_by_the_poses_of_the_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "val", pose_correction="spline")
+    seen: list[torch.Tensor] = []
+    render = pipeline.model.render_log_radiance
+
+    def spy(rays: RayBundle) -> torch.Tensor:
+        seen.append(rays.origins)
+        return render(rays)
+
+    monkeypatch.setattr(pipeline.model, "render_log_radiance", spy)
+    pipeline.fit_color_correction()
+    correction = pipeline.model.camera_optimizer
+    assert correction.twists is not None
+    with torch.no_grad():
+        # The whole scene moves 0.5 along the camera's y axis.
+        correction.twists.control_twists[:, 1] = 0.5
+    pipeline.fit_color_correction()
+    before, after = seen
+    expected = correction.apply_to_camera(pipeline.datamanager.reference_views("val").cameras)[0, :, 3]
+    torch.testing.assert_close(after, expected.expand_as(after))
+    torch.testing.assert_close((after - before).norm(dim=-1), torch.full((64,), 0.5))
