@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 
 import pytest
 import torch
@@ -24,7 +25,7 @@ def test_the_pose_correction_s_rate_waits_rises_and_falls() -> None:
     # Half way between the delay and the end.
     assert rates[150] == pytest.approx(0.2 * 0.505)
     assert rates[250] == pytest.approx(0.002)
-    assert all(later <= earlier for earlier, later in zip(rates[60:-1], rates[61:], strict=True))
+    assert all(later <= earlier for earlier, later in pairwise(rates[60:]))
     # Current torch loads nothing but plain numbers and tensors.
     file = io.BytesIO()
     torch.save(scheduler.state_dict(), file)
