@@ -186,9 +186,9 @@ class PoseCorrection(CameraOptimizer):
         metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
 
     def _sampled_twists(self) -> Tensor:
-        """Twists at 256 times spread over the trajectory."""
+        """Twists at 64 times spread over the trajectory."""
         assert self.twists is not None
-        seconds = torch.linspace(0, self._duration, 256, dtype=torch.float64, device=self._camera_seconds.device)
+        seconds = torch.linspace(0, self._duration, 64, dtype=torch.float64, device=self._camera_seconds.device)
         return self.twists(seconds, self.trajectory.pose(seconds))
 
     def get_param_groups(self, param_groups: dict[str, list[nn.Parameter]]) -> None:
