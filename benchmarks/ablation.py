@@ -26,7 +26,6 @@ from measuring import environment
 # Root mean square of the pose noise: degrees and metres. What COLMAP left on a room walked through at constant and at
 # changing speed was about 0.7 and 2.3 degrees, 0.3 and 2.1 % of the extent.
 _NOISE = {"exact": (0.0, 0.0), "small": (0.7, 0.02), "middle": (2.0, 0.05), "large": (4.0, 0.1)}
-_MODES = ("off", "network", "spline")
 _LOSSES = {
     "l_p + l_r": {"temporal_loss": 0.0, "distortion_loss": 0.0},
     "l_p + l_r + l_g": {"temporal_loss": 1e-3, "distortion_loss": 0.0},
@@ -62,6 +61,8 @@ class Ablation:
     """Options of aenerf simulate."""
     noise: tuple[str, ...] = field(default_factory=lambda: tuple(_NOISE))
     """Sizes of pose noise of table 3."""
+    modes: tuple[str, ...] = ("off", "network", "spline")
+    """Kinds of pose correction of table 3."""
     seed: int = 42
     """Seed of the trainings."""
     jobs: int = 1
@@ -99,7 +100,7 @@ class Ablation:
         return [
             _Row(f"{noise}, {mode}", noise, ("--pipeline.model.camera-optimizer.mode", mode, *self._rays(2)))
             for noise in self.noise
-            for mode in _MODES
+            for mode in self.modes
         ]
 
     def _rays(self, rays_per_pair: int) -> tuple[str, str]:
