@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components.encodings import NeRFEncoding
@@ -17,8 +18,8 @@ from torch import Tensor, nn
 
 from aenerf_ns.hash_encoding import HashEncoding
 
-# Larger exponents overflow half precision; the framework's trunc_exp cuts gradients at the same value, but is a custom
-# function without forward-mode derivatives.
+# The framework's trunc_exp cuts gradients at the same value, but is a custom function without forward-mode derivatives,
+# and overflows.
 _MAX_LOG_DENSITY = 15.0
 
 
@@ -84,37 +85,32 @@ class EventRadianceField(Field):
             layer_width=hidden_dim,
             out_dim=num_channels,
             activation=nn.Softplus(beta=100),
-            out_activation=nn.Softplus(),
             implementation="torch",
         )
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
         """Density (..., 1) and the feature (..., geometry_feature_dim) for the radiance."""
-        positions = ray_samples.frustums.get_positions()
-        if self.spatial_distortion is not None:
-            positions = (self.spatial_distortion(positions) + 2) / 4
-        else:
-            positions = SceneBox.get_normalized_positions(positions, self.aabb)
-        inside = ((positions > 0) & (positions < 1)).all(-1, keepdim=True)
-        encoded = self.encoding((positions * inside).flatten(0, -2))
-        raw = self.density_network(encoded).unflatten(0, positions.shape[:-1])
-        log_density, feature = raw[..., :1], raw[..., 1:]
-        density = self.average_init_density * torch.exp(log_density.clamp(max=_MAX_LOG_DENSITY))
-        return density * inside, feature
+        positions, inside = _unit_positions(self, ray_samples)
+        raw = self.density_network(self.encoding(positions.flatten(0, -2))).unflatten(0, positions.shape[:-1])
+        return _density(raw[..., :1].to(positions.dtype), self.average_init_density) * inside, raw[..., 1:]
 
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Tensor | None = None
     ) -> dict[FieldHeadNames, Tensor]:
-        """Radiance (..., num_channels), positive and unbounded, under the framework's name for colour."""
+        """Radiance (rays, samples, num_channels), positive and unbounded, under the framework's name for colour."""
         assert density_embedding is not None
         # All samples of a ray have its direction.
         directions = self.direction_encoding(ray_samples.frustums.directions[..., :1, :])
-        directions = directions.expand(*density_embedding.shape[:-1], -1)
-        return {FieldHeadNames.RGB: self.radiance_network(torch.cat([directions, density_embedding], -1))}
+        raw = self.radiance_network(
+            torch.cat([directions.expand(*density_embedding.shape[:-1], -1), density_embedding], -1)
+        )
+        return {FieldHeadNames.RGB: F.softplus(raw.to(directions.dtype))}
 
 
 class ProposalNetwork(HashMLPDensityField):
-    """Nerfstudio's proposal network on this package's hash encoding.
+    """Nerfstudio's proposal network on this package's hash encoding, with the density of the field.
+
+    The framework's density is an exponential that overflows, with gradients that are then not finite.
 
     Args:
         aabb: (2, 3) scene box.
@@ -128,3 +124,25 @@ class ProposalNetwork(HashMLPDensityField):
         grid = {"num_levels": num_levels, "max_res": max_res, "log2_hashmap_size": log2_hashmap_size}
         super().__init__(aabb, implementation="torch", **grid, **options)
         self.encoding = self.mlp_base[0] = HashEncoding(**grid)
+
+    def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, None]:
+        """Density (..., 1), and no feature."""
+        positions, inside = _unit_positions(self, ray_samples)
+        raw = self.mlp_base(positions.flatten(0, -2)).unflatten(0, positions.shape[:-1])
+        return _density(raw.to(positions.dtype), self.average_init_density) * inside, None
+
+
+def _unit_positions(field: EventRadianceField | ProposalNetwork, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
+    """Positions (..., 3) of samples in the unit cube, 0 for those outside the scene, and which (..., 1) are inside."""
+    positions = ray_samples.frustums.get_positions()
+    if field.spatial_distortion is not None:
+        positions = (field.spatial_distortion(positions) + 2) / 4
+    else:
+        positions = SceneBox.get_normalized_positions(positions, field.aabb)
+    inside = ((positions > 0) & (positions < 1)).all(-1, keepdim=True)
+    return positions * inside, inside
+
+
+def _density(raw: Tensor, average_init_density: float) -> Tensor:
+    """Density of a network's output, which must not be in half precision: its exponential would overflow."""
+    return average_init_density * torch.exp(raw.clamp(max=_MAX_LOG_DENSITY))

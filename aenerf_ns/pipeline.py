@@ -75,10 +75,27 @@ class AENeRFPipeline(VanillaPipeline):
         """
         super().load_state_dict(state_dict, strict=True)
 
+    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
+        """Outputs, weighted losses and metrics of a training batch; now and then with the errors of the corrected poses
+        among the metrics.
+
+        Raises:
+            SystemExit: a loss is not finite.
+        """
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        # With mixed precision, too: the scaler would skip every step from now on without a word.
+        _require_finite(losses, "loss", step)
+        if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
+            errors = self.pose_errors()
+            if errors is not None:
+                metrics |= errors["corrected"]
+        return outputs, losses, metrics
+
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Adds the colour correction's to those of datamanager and model."""
+        """Adds the colour correction's to those of datamanager and model, and a look at the gradients to every
+        optimizer."""
         trainer = training_callback_attributes.trainer
         assert trainer is not None
         # The dataparser has resolved the time window by now: opening the run again must give the same cameras without
@@ -93,6 +110,11 @@ class AENeRFPipeline(VanillaPipeline):
             elif step_check(step, _ROUGH_FIT_INTERVAL, run_at_zero=True):
                 self.fit_color_correction(_ROUGH_FIT_SHARE)
 
+        for optimizer in trainer.optimizers.optimizers.values():
+            # Called by mixed precision's scaler only when it has found the gradients finite.
+            optimizer.register_step_pre_hook(
+                lambda optimizer, *_: self._require_finite_gradients(optimizer, trainer.step)
+            )
         # After every step, since the trainer saves its last checkpoint before its callbacks for the end of training.
         callback = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], fit, update_every_num_iters=1)
         return [*super().get_training_callbacks(training_callback_attributes), callback]
@@ -102,6 +124,14 @@ class AENeRFPipeline(VanillaPipeline):
         self.model.color_correction = self.model.new_color_correction(protocol).to(self.device)
         self._warn_of_test_views()
         self.fit_color_correction()
+
+    def _require_finite_gradients(self, optimizer: torch.optim.Optimizer, step: int) -> None:
+        """Raises SystemExit when an optimizer is about to make weights not finite."""
+        names = {parameter: name for name, parameter in self.model.named_parameters()}
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        # A norm that overflows is more than Adam can square.
+        norms = {names[p]: p.grad.norm() for p in parameters if p.grad is not None}
+        _require_finite(norms, "gradient", step)
 
     @torch.no_grad()
     def fit_color_correction(self, share: float = 1.0) -> None:
@@ -204,15 +234,6 @@ class AENeRFPipeline(VanillaPipeline):
             placed = "corrected pose at the time of the view, else Sim(3) of the corrected to the estimated trajectory"
         return f"photometric refinement, {NUM_STEPS} steps, from: {placed}" if self._refined_test_poses else placed
 
-    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
-        """Adds the errors of the corrected poses to what is logged, now and then."""
-        outputs, losses, metrics = super().get_train_loss_dict(step)
-        if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
-            errors = self.pose_errors()
-            if errors is not None:
-                metrics |= errors["corrected"]
-        return outputs, losses, metrics
-
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
@@ -236,3 +257,20 @@ class AENeRFPipeline(VanillaPipeline):
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent
         return metrics
+
+
+def _require_finite(values: Mapping[str, Tensor], what: str, step: int) -> None:
+    """Raises SystemExit unless all scalar ``values`` are finite.
+
+    A GPU's queue runs dry here, once a call however many values there are. That is the price of stopping ahead of the
+    first weight that would be lost.
+    """
+    finite = torch.stack([value.detach() for value in values.values()]).isfinite().tolist()
+    if all(finite):
+        return
+    bad = ", ".join(f"{name} {value:g}" for (name, value), ok in zip(values.items(), finite, strict=True) if not ok)
+    raise SystemExit(
+        f"Error: step {step}: {what} not finite ({bad}), training stopped before this reached the weights; "
+        "go on from the last checkpoint or start again, with lower learning rates, without --mixed-precision if on"
+        ", and with poses of sensible scale"
+    )

@@ -269,8 +269,11 @@ class TwistNetwork(nn.Module):
         """Twists (N, 6) at (N,) seconds, where the estimated poses are (N, 3, 4)."""
         dtype = self.output.weight.dtype
         time = (2 * seconds / self._duration - 1).to(dtype)[:, None]
-        embedded = F.softplus(self.pose_embedding(base.flatten(1).to(dtype))) + F.softplus(self.time_embedding(time))
-        return _NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))
+        # Half precision cannot tell the two ends of an interval apart.
+        with torch.autocast(time.device.type, enabled=False):
+            pose = self.pose_embedding(base.flatten(1).to(dtype))
+            embedded = F.softplus(pose) + F.softplus(self.time_embedding(time))
+            return _NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))
 
 
 class TwistSpline(nn.Module):

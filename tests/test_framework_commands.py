@@ -354,6 +354,18 @@ def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Pa
     assert "nothing/transforms.json: there is no such file" in errors[0]
 
 
+def test_training_that_diverges_ends_with_one_line(workspace: Path) -> None:
+    data = simulate(workspace / "diverging")
+    output = run(
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "20", "--data", data,
+        "--optimizers.networks.optimizer.lr", "1e30",
+        cwd=workspace, fails=True,
+    )  # fmt: skip
+    assert "Traceback" not in output
+    (error,) = [line for line in output.splitlines() if line.startswith("Error: ")]
+    assert re.match(r"Error: step \d+: (loss|gradient) not finite \(", error)
+
+
 def test_a_recording_without_reference_views_trains_and_says_so_at_evaluation(trained: Path, workspace: Path) -> None:
     none = ("--train-images", "0", "--validation-views", "0", "--test-views", "0")
     data = simulate(workspace / "bare", *none, "--scene", "object")

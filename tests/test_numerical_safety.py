@@ -1,0 +1,260 @@
+"""No NaN and no infinity reaches a weight: extreme scenes and batches, mixed precision, and the guard behind them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from test_model import ALL_LOSSES, make_batch, make_model, make_rays, make_sampler
+from torch import Tensor, nn
+
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.model import AENeRFModel
+from aenerf_ns.pipeline import AENeRFPipeline
+from aenerf_ns.pose_correction import PoseCorrectionConfig
+from aenerf_ns.temporal import log_radiance_rate
+
+
+def set_output(network: nn.Module, value: float) -> None:
+    """Makes a network's first output the same everywhere."""
+    layer = network.layers[-1]
+    with torch.no_grad():
+        layer.weight[0] = 0
+        layer.bias[0] = value
+
+
+def set_density(model: AENeRFModel, exponent: float) -> None:
+    set_output(model.field.density_network, exponent)
+    set_output(model.proposal_networks[0].mlp_base[1], exponent)
+
+
+def set_radiance(model: AENeRFModel, raw: float) -> None:
+    set_output(model.field.radiance_network, raw)
+    if model.raw_background is not None:
+        torch.nn.init.constant_(model.raw_background, raw)
+
+
+def moved_to(position: float) -> Callable[[RayBundle], RayBundle]:
+    return lambda rays: replace(rays, origins=torch.full((len(rays), 3), position))
+
+
+def turned_away(rays: RayBundle) -> RayBundle:
+    camera_directions = -rays.metadata["camera_directions"]
+    return replace(rays, directions=-rays.directions, metadata={"camera_directions": camera_directions})
+
+
+def counts(positive: float, negative: float) -> Callable[[dict], dict]:
+    return lambda batch: {
+        **batch,
+        "num_positive": torch.full_like(batch["num_positive"], positive),
+        "num_negative": torch.full_like(batch["num_negative"], negative),
+    }
+
+
+def interval(seconds: float) -> Callable[[dict], dict]:
+    return lambda batch: {**batch, "interval": torch.full_like(batch["interval"], seconds)}
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "an interval of one nanosecond": {"batch": interval(1e-9)},
+    "an interval of no length": {"batch": interval(0.0)},
+    "an interval of a day": {"batch": interval(86400.0)},
+    "events that cancel": {"batch": counts(3, 2)},
+    "pairs of no events": {"batch": counts(0, 0)},
+    "a thousand merged events": {"batch": counts(1000, 0)},
+    "no density": {"model": lambda model: set_density(model, -1e4)},
+    "density that underflows": {"model": lambda model: set_density(model, -100.0)},
+    "density that overflows": {"model": lambda model: set_density(model, 1e4)},
+    "density of proposals that overflows": {
+        "model": lambda model: set_output(model.proposal_networks[0].mlp_base[1], 100.0)
+    },
+    "radiance that underflows": {"model": lambda model: set_radiance(model, -200.0)},
+    "huge radiance": {"model": lambda model: set_radiance(model, 1e30)},
+    "rays from afar": {"rays": moved_to(50.0)},
+    "rays from the centre": {"rays": moved_to(0.0)},
+    "rays that miss": {"rays": turned_away},
+    "a single pair": {"pairs": 1},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("bounded", [False, True])
+@pytest.mark.parametrize(("mode", "temporal"), [("off", False), ("off", True), ("network", True), ("spline", True)])
+def test_losses_and_gradients_are_finite(case: str, bounded: bool, mode: str, temporal: bool) -> None:
+    options = CASES[case]
+    pairs = options.get("pairs", 5)
+    model = make_model(
+        SensorModel(0.2, 0.3),
+        bounded=bounded,
+        camera_optimizer=PoseCorrectionConfig(mode=mode),
+        loss_coefficients={**ALL_LOSSES, "temporal_loss": 1e-3 * temporal},
+    )
+    options.get("model", lambda model: None)(model)
+    rays = make_rays((3 if temporal else 2) * pairs, with_times=True)
+    rays = options.get("rays", lambda rays: rays)(rays)
+    losses = model.get_loss_dict(model(rays), options.get("batch", lambda batch: batch)(make_batch(pairs)))
+    assert ("temporal_loss" in losses) == temporal
+    for name, loss in losses.items():
+        assert torch.isfinite(loss), name
+    torch.stack(list(losses.values())).sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is None or torch.isfinite(parameter.grad).all(), name
+
+
+def losses_and_gradients(model: AENeRFModel, precision: torch.dtype | None) -> tuple[dict, dict]:
+    model.zero_grad()
+    torch.manual_seed(0)
+    with torch.autocast("cpu", precision or torch.bfloat16, enabled=precision is not None):
+        outputs = model(make_rays(300, with_times=True))
+        losses = model.get_loss_dict(outputs, make_batch(100))
+    for name in ("log_radiance", "log_radiance_rate", "accumulation"):
+        assert outputs[name].dtype == torch.float32
+    # As the trainer's scaler does: without it, gradients of the proposals underflow in float16.
+    scale = 2.0**16
+    (scale * torch.stack(list(losses.values())).sum()).backward()
+    gradients = {name: p.grad / scale for name, p in model.named_parameters() if p.grad is not None}
+    return losses, gradients
+
+
+# Unit roundoff is 2⁻⁸ and 2⁻¹¹.
+@pytest.mark.parametrize(("precision", "tolerance"), [(torch.bfloat16, 1e-2), (torch.float16, 2e-3)])
+@pytest.mark.parametrize("mode", ["network", "spline"])
+def test_mixed_precision_is_near_full_precision(mode: str, precision: torch.dtype, tolerance: float) -> None:
+    model = make_model(camera_optimizer=PoseCorrectionConfig(mode=mode), loss_coefficients=ALL_LOSSES)
+    torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
+    torch.nn.init.uniform_(model.proposal_networks[0].encoding.hash_table, -1, 1)
+    # Denser than the proposals, or their loss has no gradient.
+    model.field.average_init_density = 5.0
+    expected_losses, expected = losses_and_gradients(model, None)
+    losses, gradients = losses_and_gradients(model, precision)
+    for name, loss in losses.items():
+        torch.testing.assert_close(loss, expected_losses[name], rtol=tolerance, atol=0)
+    assert set(gradients) == set(expected)
+    for name, gradient in gradients.items():
+        assert torch.isfinite(gradient).all(), name
+        # Those of biases are sums that cancel.
+        if not name.endswith("bias"):
+            assert (gradient - expected[name]).norm() <= 5 * tolerance * expected[name].norm(), name
+
+
+def test_the_pose_correction_keeps_full_precision() -> None:
+    # In half precision the ends of a short interval would get one correction, and no rate of change.
+    model = make_model(camera_optimizer=PoseCorrectionConfig(mode="network"))
+    torch.nn.init.normal_(model.camera_optimizer.twists.output.weight, std=0.01)
+    seconds = torch.tensor([0.5, 0.5001], dtype=torch.float64)
+    with torch.autocast("cpu", torch.bfloat16):
+        pose = model.camera_optimizer.pose(seconds)
+    torch.testing.assert_close(pose, model.camera_optimizer.pose(seconds), rtol=0, atol=0)
+
+
+def make_samples(model: AENeRFModel, rays: RayBundle) -> RaySamples:
+    densities = [network.density_fn for network in model.proposal_networks]
+    return model.proposal_sampler(model.collider(rays), density_fns=densities)[0]
+
+
+def test_the_rate_keeps_full_precision() -> None:
+    model = make_model()
+    rays = make_rays(20)
+    samples = make_samples(model, rays)
+    # So fast that rates of features exceed the range of half precision.
+    rates = torch.randn(2, 20, 3) * 1e8
+    values = []
+    for enabled in (False, True):
+        with torch.autocast("cpu", torch.float16, enabled=enabled):
+            values.append(
+                log_radiance_rate(model._composite, samples, (rays.origins, rays.directions), tuple(rates))[1]
+            )
+    assert values[0].abs().max() > 1e3
+    assert torch.equal(*values)
+
+
+def test_density_does_not_overflow_in_mixed_precision() -> None:
+    model = make_model()
+    # Its exponential is beyond the range of float16.
+    set_density(model, 13.0)
+    samples = make_samples(model, make_rays(20))
+    with torch.autocast("cpu", torch.float16):
+        for network in (model.field, *model.proposal_networks):
+            density, _ = network.get_density(samples)
+            assert density.max().item() == pytest.approx(network.average_init_density * math.exp(13), rel=1e-4)
+
+
+@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16])
+def test_training_in_mixed_precision_reaches_the_loss_of_full_precision(
+    random_poses: Tensor, precision: torch.dtype
+) -> None:
+    def train(precision: torch.dtype | None) -> float:
+        sensor = SensorModel(0.2, 0.3)
+        sampler = make_sampler(random_poses, sensor)
+        sampler.with_time_within, sampler.num_rays_per_batch = True, 120
+        model = make_model(sensor, loss_coefficients=ALL_LOSSES)
+        optimizer = torch.optim.Adam(model.parameters(), lr=1e-2, eps=1e-15)
+        scaler = torch.amp.GradScaler("cpu", enabled=precision == torch.float16)
+        history = []
+        for _ in range(60):
+            optimizer.zero_grad()
+            with torch.autocast("cpu", precision or torch.bfloat16, enabled=precision is not None):
+                rays, batch = sampler.sample()
+                losses = model.get_loss_dict(model(rays), batch)
+            scaler.scale(torch.stack(list(losses.values())).sum()).backward()
+            scaler.step(optimizer)
+            scaler.update()
+            history.append(float(losses["reconstruction_loss"]))
+        return sum(history[-10:]) / 10
+
+    full = train(None)
+    assert full < 0.3
+    assert train(precision) == pytest.approx(full, abs=0.1)
+
+
+def make_pipeline(model: AENeRFModel, rays: RayBundle) -> tuple[AENeRFPipeline, Any]:
+    """A pipeline whose every batch is the same, and its only optimizer."""
+    pipeline = AENeRFPipeline.__new__(AENeRFPipeline)
+    nn.Module.__init__(pipeline)
+    pipeline._model = model
+    batches = SimpleNamespace(
+        next_train=lambda step: (rays, make_batch(len(rays) // 2)), get_training_callbacks=lambda attributes: []
+    )
+    pipeline.__dict__["datamanager"] = batches
+    optimizer = torch.optim.Adam(model.parameters())
+    trainer = SimpleNamespace(
+        local_rank=1, _start_step=0, step=7, config=SimpleNamespace(max_num_iterations=10),
+        optimizers=SimpleNamespace(optimizers={"all": optimizer}),
+    )  # fmt: skip
+    pipeline.get_training_callbacks(SimpleNamespace(trainer=trainer))
+    return pipeline, optimizer
+
+
+def test_a_loss_that_is_not_finite_ends_training_with_its_name() -> None:
+    model = make_model()
+    pipeline, _ = make_pipeline(model, make_rays(10, with_times=True))
+    _, losses, _ = pipeline.get_train_loss_dict(6)
+    assert all(torch.isfinite(loss) for loss in losses.values())
+    with torch.no_grad():
+        model.field.radiance_network.layers[-1].bias.fill_(float("nan"))
+    with pytest.raises(SystemExit) as stop:
+        pipeline.get_train_loss_dict(7)
+    message = str(stop.value)
+    assert message.startswith("Error: step 7: loss not finite (reconstruction_loss nan), ")
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
+def test_a_gradient_that_is_not_finite_does_not_reach_the_weights(value: float) -> None:
+    model = make_model()
+    pipeline, optimizer = make_pipeline(model, make_rays(10, with_times=True))
+    losses = pipeline.get_train_loss_dict(0)[1]
+    torch.stack(list(losses.values())).sum().backward()
+    optimizer.step()
+    before = [parameter.clone() for parameter in model.parameters()]
+    # Of 1e30 the square, which Adam takes, overflows.
+    model.field.encoding.hash_table.grad[3, 1] = value
+    with pytest.raises(SystemExit, match=r"^Error: step 7: gradient not finite \(field.encoding.hash_table "):
+        optimizer.step()
+    assert all(torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
