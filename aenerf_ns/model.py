@@ -13,8 +13,10 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.configs.config_utils import to_immutable_dict
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.encodings import NeRFEncoding
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from nerfstudio.field_components.spatial_distortions import SceneContraction
+from nerfstudio.field_components.spatial_distortions import SceneContraction, SpatialDistortion
+from nerfstudio.fields.base_field import Field
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
@@ -28,7 +30,8 @@ from torch.nn import Parameter
 from aenerf_ns.box_collider import BoxCollider
 from aenerf_ns.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.field import EventRadianceField, ProposalNetwork
+from aenerf_ns.field import DensityField, EventRadianceField, ProposalNetwork
+from aenerf_ns.hash_encoding import HashEncoding
 from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
@@ -42,7 +45,7 @@ _RADIANCE_EPSILON = 1e-3
 
 @dataclass
 class AENeRFModelConfig(ModelConfig):
-    """AE-NeRF on hash grids."""
+    """AE-NeRF. Options that begin with "hash:" or "mlp:" have no effect on the other backbone."""
 
     _target: type = field(default_factory=lambda: AENeRFModel)
     scene_contraction: Literal["auto", "l2", "linf", "none"] = "auto"
@@ -55,14 +58,21 @@ class AENeRFModelConfig(ModelConfig):
     background: Literal["auto", "learned", "none"] = "auto"
     """Whether rays that pass the scene see a uniform background of learned radiance. "auto" is "learned" for a dataset
     that states a scene box and "none" for others."""
+    backbone: Literal["hash", "mlp"] = "hash"
+    """What field and proposal networks are: small networks on hash grids, with exponential density, or the paper's
+    large networks on sinusoidal encodings, with softplus density."""
     num_levels: int = 16
-    """Levels of the field's hash grid."""
+    """hash: levels of the field's grid."""
     base_resolution: int = 16
-    """Cells along an axis on its coarsest level."""
+    """hash: cells along an axis on its coarsest level."""
     max_resolution: int = 2048
-    """Cells along an axis on its finest level."""
+    """hash: cells along an axis on its finest level."""
     log2_hashmap_size: int = 19
-    """Binary logarithm of the entries of a level."""
+    """hash: binary logarithm of the entries of a level."""
+    num_frequencies: int = 10
+    """mlp: frequencies of the position's encoding, in octaves from one period across the box or contracted space."""
+    num_hidden_layers: int = 1
+    """Hidden layers of the field from the encoded position to density and feature."""
     hidden_dim: int = 64
     """Width of the field's hidden layers."""
     geometry_feature_dim: int = 15
@@ -70,17 +80,19 @@ class AENeRFModelConfig(ModelConfig):
     average_init_density: float = 0.01
     """Density before training."""
     num_proposal_samples_per_ray: tuple[int, ...] = (256, 96)
-    """Samples of each proposal network."""
+    """Samples of each round of proposals: of each hash proposal network, or of each evaluation of the one mlp."""
     num_nerf_samples_per_ray: int = 48
     """Samples of the field."""
     proposal_max_resolutions: tuple[int, ...] = (128, 256)
-    """Cells along an axis on the finest level of each proposal network's hash grid; its length is their number."""
+    """hash: cells along an axis on the finest level of each proposal network's grid; its length is their number."""
     proposal_num_levels: int = 5
-    """Levels of the proposal networks' hash grids."""
+    """hash: levels of the proposal networks' grids."""
     proposal_log2_hashmap_size: int = 17
-    """Binary logarithm of the entries of a level there."""
+    """hash: binary logarithm of the entries of a level there."""
+    proposal_num_hidden_layers: int = 1
+    """Hidden layers of the proposal networks."""
     proposal_hidden_dim: int = 16
-    """Width of the proposal networks' hidden layer."""
+    """Width of the proposal networks' hidden layers."""
     proposal_weights_anneal_iterations: int = 1000
     """Steps over which sampling turns from broad to following the proposal weights."""
     loss_coefficients: dict[str, float] = to_immutable_dict(
@@ -133,34 +145,16 @@ class AENeRFModel(Model):
         else:
             self.collider = NearFarCollider(config.near_plane, config.far_plane, reset_near_plane=False)
 
-        self.field = EventRadianceField(
-            self.scene_box.aabb,
-            num_channels=self.sensor.num_channels,
-            spatial_distortion=distortion,
-            num_levels=config.num_levels,
-            base_resolution=config.base_resolution,
-            max_resolution=config.max_resolution,
-            log2_hashmap_size=config.log2_hashmap_size,
-            hidden_dim=config.hidden_dim,
-            geometry_feature_dim=config.geometry_feature_dim,
-            average_init_density=config.average_init_density,
-        )
-        self.proposal_networks = nn.ModuleList(
-            ProposalNetwork(
-                self.scene_box.aabb,
-                spatial_distortion=distortion,
-                num_levels=config.proposal_num_levels,
-                max_res=resolution,
-                log2_hashmap_size=config.proposal_log2_hashmap_size,
-                hidden_dim=config.proposal_hidden_dim,
-                average_init_density=config.average_init_density,
-            )
-            for resolution in config.proposal_max_resolutions
-        )
+        build = {"hash": self._hash_networks, "mlp": self._mlp_networks}[config.backbone]
+        self.field, proposal_networks = build(distortion)
+        self.proposal_networks = nn.ModuleList(proposal_networks)
+        self.density_fns = [network.density_fn for network in proposal_networks]
+        if config.backbone == "mlp":
+            self.density_fns *= len(config.num_proposal_samples_per_ray)
         self.proposal_sampler = ProposalNetworkSampler(
             num_nerf_samples_per_ray=config.num_nerf_samples_per_ray,
             num_proposal_samples_per_ray=config.num_proposal_samples_per_ray,
-            num_proposal_network_iterations=len(self.proposal_networks),
+            num_proposal_network_iterations=len(self.density_fns),
             single_jitter=True,
             # In a bounded scene samples are spread evenly; else the framework's default, evenly and then in disparity.
             initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
@@ -185,14 +179,90 @@ class AENeRFModel(Model):
         self.renderer_depth = DepthRenderer(method="median")
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
 
+    def _hash_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, list[Field]]:
+        """The field on a hash grid, and the framework's proposal networks."""
+        config = self.config
+        radiance_field = EventRadianceField(
+            self.scene_box.aabb,
+            num_channels=self.sensor.num_channels,
+            spatial_distortion=distortion,
+            encoding=HashEncoding(
+                num_levels=config.num_levels,
+                min_res=config.base_resolution,
+                max_res=config.max_resolution,
+                log2_hashmap_size=config.log2_hashmap_size,
+            ),
+            num_hidden_layers=config.num_hidden_layers,
+            hidden_dim=config.hidden_dim,
+            geometry_feature_dim=config.geometry_feature_dim,
+            radiance_num_hidden_layers=2,
+            radiance_hidden_dim=config.hidden_dim,
+            density_activation="exp",
+            average_init_density=config.average_init_density,
+        )
+        return radiance_field, [
+            ProposalNetwork(
+                self.scene_box.aabb,
+                spatial_distortion=distortion,
+                num_levels=config.proposal_num_levels,
+                max_res=resolution,
+                log2_hashmap_size=config.proposal_log2_hashmap_size,
+                num_layers=config.proposal_num_hidden_layers + 1,
+                hidden_dim=config.proposal_hidden_dim,
+                average_init_density=config.average_init_density,
+            )
+            for resolution in config.proposal_max_resolutions
+        ]
+
+    def _mlp_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, list[Field]]:
+        """The paper's vanilla e-NeRF, and its one proposal e-NeRF (appendix "Model Architecture")."""
+        config = self.config
+        # On a position in [0, 1], which the framework's encoding multiplies by 2π: NeRF's frequencies on [-1, 1].
+        encoding = NeRFEncoding(
+            in_dim=3,
+            num_frequencies=config.num_frequencies,
+            min_freq_exp=0.0,
+            max_freq_exp=config.num_frequencies - 1.0,
+            include_input=True,
+            implementation="torch",
+        )
+        radiance_field = EventRadianceField(
+            self.scene_box.aabb,
+            num_channels=self.sensor.num_channels,
+            spatial_distortion=distortion,
+            encoding=encoding,
+            num_hidden_layers=config.num_hidden_layers,
+            hidden_dim=config.hidden_dim,
+            geometry_feature_dim=config.geometry_feature_dim,
+            # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
+            radiance_num_hidden_layers=1,
+            radiance_hidden_dim=128,
+            density_activation="softplus",
+            average_init_density=config.average_init_density,
+        )
+        proposal_network = DensityField(
+            self.scene_box.aabb,
+            spatial_distortion=distortion,
+            encoding=encoding,
+            num_hidden_layers=config.proposal_num_hidden_layers,
+            hidden_dim=config.proposal_hidden_dim,
+            feature_dim=0,
+            density_activation="softplus",
+            average_init_density=config.average_init_density,
+        )
+        return radiance_field, [proposal_network]
+
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Hash tables (and the background) apart from the networks, which alone get weight decay."""
+        """Hash tables (and the background), if there are any, apart from the networks, which alone get weight decay."""
         groups: dict[str, list[Parameter]] = {"encodings": [], "networks": []}
         for module in (self.field, self.proposal_networks):
             for name, parameter in module.named_parameters():
                 groups["encodings" if name.endswith("hash_table") else "networks"].append(parameter)
         if self.raw_background is not None:
             groups["encodings"].append(self.raw_background)
+        if not groups["encodings"]:
+            # torch.optim refuses a group without parameters.
+            del groups["encodings"]
         self.camera_optimizer.get_param_groups(groups)
         learned = list(self.sensor_parameters.parameters())
         if learned:
@@ -256,9 +326,7 @@ class AENeRFModel(Model):
             training, the samples and weights of both stages, and the ``log_radiance_rate`` (pairs, channels) of the
             last third of the rays.
         """
-        samples, weights_list, samples_list = self.proposal_sampler(
-            ray_bundle, density_fns=[network.density_fn for network in self.proposal_networks]
-        )
+        samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
         outputs: dict[str, Any] = {}
         if self.training and self.uses_temporal_loss and ray_bundle.times is not None:
             within = slice(2 * len(ray_bundle) // 3, None)

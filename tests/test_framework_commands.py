@@ -309,28 +309,37 @@ def test_neither_images_nor_ground_truth_are_trained_on(trained: Path, workspace
     assert not torch.equal(*(w["_model.color_correction.offset"] for w in weights))
 
 
-def test_the_method_for_gpus_trains_too(trained: Path, workspace: Path) -> None:
+@pytest.mark.parametrize(
+    ("method", "small"),
+    [
+        ("aenerf", ("--pipeline.model.log2-hashmap-size", "12")),
+        ("aenerf-mlp", ("--pipeline.model.hidden-dim", "32", "--pipeline.model.proposal-hidden-dim", "16")),
+    ],
+)
+def test_the_methods_for_gpus_train_too(trained: Path, workspace: Path, method: str, small: tuple[str, ...]) -> None:
     data = workspace / "original"
-    small = ("--pipeline.datamanager.train-num-rays-per-batch", "60", "--pipeline.model.log2-hashmap-size", "12")
     run(
         "ns-train",
-        "aenerf",
+        method,
         *CPU,
         "--vis",
         "tensorboard",
         "--max-num-iterations",
         "2",
+        "--pipeline.datamanager.train-num-rays-per-batch",
+        "60",
         *small,
         "--data",
         data,
         cwd=workspace,
     )
-    assert len(list((workspace / "outputs" / "original" / "aenerf").rglob("*.ckpt"))) == 1
+    assert len(list((workspace / "outputs" / "original" / method).rglob("*.ckpt"))) == 1
 
 
 def test_the_framework_lists_the_methods_and_its_own_still_work(workspace: Path) -> None:
     output = run("ns-train", "--help", cwd=workspace)
     assert "aenerf " in output
+    assert "aenerf-mlp" in output
     assert "aenerf-small" in output
     assert "nerfacto" in output
     assert "ecd-data" in run("ns-train", "nerfacto", "--help", cwd=workspace)
