@@ -26,6 +26,7 @@ aenerf_mlp = MethodSpecification(
             model=replace(
                 _base.pipeline.model,
                 backbone="mlp",
+                average_init_density=0.3,
                 num_hidden_layers=8,
                 hidden_dim=1024,
                 geometry_feature_dim=256,
@@ -40,7 +41,7 @@ aenerf_mlp = MethodSpecification(
             **_base.optimizers,
             "networks": {
                 # PyTorch's defaults but for rate and decay, as in the paper.
-                "optimizer": AdamOptimizerConfig(lr=1e-2, weight_decay=1e-6),
+                "optimizer": AdamOptimizerConfig(lr=5e-4, weight_decay=1e-6),
                 "scheduler": _base.optimizers["networks"]["scheduler"],
             },
         },
