@@ -1,46 +1,102 @@
-"""From log-radiance, which events determine up to an affine map, to a picture."""
+"""From log-radiance, which events determine up to an affine map at best, to a picture: four named protocols."""
 
 from __future__ import annotations
 
+from itertools import pairwise
+from typing import ClassVar, Literal
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
+
+from aenerf_ns.image_encoding import ImageEncoding, encode
+
+ColorCorrectionProtocol = Literal["affine", "affine-test", "network", "none"]
 
 # Added to radiance in [0, 1] before the logarithm, so that black reference pixels are finite.
 _EPSILON = 1e-3
 # Without reference images: the share of pixels that may clip at either end, and the radiance the ends are mapped to.
 _CLIPPED = 0.01
 _DARK, _BRIGHT = 0.02, 0.9
+# The network's hidden layers and how it is fitted.
+_HIDDEN = (64, 64)
+_STEPS = 300
+_LEARNING_RATE = 1e-2
 
 
-class AffineColorCorrection(nn.Module):
-    """Per-channel affine map of log-radiance (paper, "Color Correction of Synthesized Views"), kept in checkpoints.
+class NoColorCorrection(nn.Module):
+    """Protocol ``none``: radiance is shown as it was rendered.
 
     Args:
         num_channels: radiance channels, 1 or 3.
+        encoding: of the display values.
     """
 
+    protocol: ClassVar[ColorCorrectionProtocol] = "none"
+
+    def __init__(self, num_channels: int, encoding: ImageEncoding) -> None:
+        super().__init__()
+        self.encoding = encoding
+
+    def forward(self, log_radiance: Tensor) -> Tensor:
+        """Display values in [0, 1], (..., channels), of rendered log-radiance (..., channels)."""
+        return encode(torch.exp(log_radiance), self.encoding)
+
+    @property
+    def description(self) -> str:
+        """The protocol and what it was fitted on, in words."""
+        return self.protocol
+
+
+class AffineColorCorrection(nn.Module):
+    """Protocol ``affine``: per-channel affine map of log-radiance (paper, "Color Correction of Synthesized Views"),
+    kept in checkpoints.
+
+    Args:
+        num_channels: radiance channels, 1 or 3.
+        encoding: of the display values.
+    """
+
+    protocol: ClassVar[ColorCorrectionProtocol] = "affine"
+    split: ClassVar[Literal["val", "test"]] = "val"
+    """The reference views to fit on."""
     scale: Tensor
     offset: Tensor
     num_views: Tensor
 
-    def __init__(self, num_channels: int) -> None:
+    def __init__(self, num_channels: int, encoding: ImageEncoding) -> None:
         super().__init__()
+        self.encoding = encoding
         self.register_buffer("scale", torch.ones(num_channels))
         self.register_buffer("offset", torch.zeros(num_channels))
         # Reference views the map was fitted on; 0 for the percentile stretch.
         self.register_buffer("num_views", torch.zeros((), dtype=torch.int64))
 
     def forward(self, log_radiance: Tensor) -> Tensor:
-        """Linear radiance (..., channels), of reference scale, of rendered log-radiance (..., channels)."""
-        return torch.exp(self.scale * log_radiance + self.offset) - _EPSILON
+        """Display values in [0, 1], (..., channels), of rendered log-radiance (..., channels)."""
+        return encode(torch.exp(self.scale * log_radiance + self.offset) - _EPSILON, self.encoding)
 
-    def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int) -> None:
+    @property
+    def description(self) -> str:
+        """The protocol and what it was fitted on, in words."""
+        if self.num_views == 0:
+            name = {"val": "validation", "test": "test"}[self.split]
+            return f"percentile stretch, no {name} views (protocol {self.protocol})"
+        return f"{self.protocol}, fitted on {self._fitted_on}"
+
+    @property
+    def _fitted_on(self) -> str:
+        return f"{int(self.num_views)} validation views"
+
+    @torch.no_grad()
+    def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
         """Least squares of log(reference + ε) against log-radiance, per channel, in float64.
 
         Args:
             log_radiance: (N, channels) rendered.
             reference: (N, channels) linear radiance in [0, 1] of the same pixels.
             num_views: number of reference views these pixels are from.
+            rough: do only what takes next to no time. This fit never takes longer.
         """
         x, y = log_radiance.double(), torch.log(reference.double() + _EPSILON)
         x_mean, y_mean = x.mean(0), y.mean(0)
@@ -50,6 +106,7 @@ class AffineColorCorrection(nn.Module):
         self.offset.copy_(y_mean - scale * x_mean)
         self.num_views.fill_(num_views)
 
+    @torch.no_grad()
     def stretch(self, log_radiance: Tensor) -> None:
         """Without reference images: maps the 1st and 99th percentile over all channels to dark and bright.
 
@@ -64,3 +121,116 @@ class AffineColorCorrection(nn.Module):
         self.scale.fill_(scale)
         self.offset.fill_(ends[0] - scale * low)
         self.num_views.zero_()
+
+
+class AffineTestColorCorrection(AffineColorCorrection):
+    """Protocol ``affine-test``: the affine map fitted on the very views that are evaluated, as Robust e-NeRF does. Only
+    to compare with figures that were made so."""
+
+    protocol = "affine-test"
+    split = "test"
+
+    @property
+    def _fitted_on(self) -> str:
+        return f"the {int(self.num_views)} test views themselves"
+
+
+class NetworkColorCorrection(AffineColorCorrection):
+    """Protocol ``network``: the paper's learned F (eq. 15), from the log-radiance of all channels of a pixel to its
+    display values. F is the affine map and a small network that is added to what it displays.
+
+    The network is learned in :meth:`fit` and not by training, so its weights are buffers and not parameters.
+    """
+
+    protocol = "network"
+    input_mean: Tensor
+    input_deviation: Tensor
+
+    def __init__(self, num_channels: int, encoding: ImageEncoding) -> None:
+        super().__init__(num_channels, encoding)
+        self.register_buffer("input_mean", torch.zeros(num_channels))
+        self.register_buffer("input_deviation", torch.ones(num_channels))
+        widths = (num_channels, *_HIDDEN, num_channels)
+        for layer, (num_inputs, num_outputs) in enumerate(pairwise(widths)):
+            self.register_buffer(f"weight_{layer}", torch.zeros(num_outputs, num_inputs))
+            self.register_buffer(f"bias_{layer}", torch.zeros(num_outputs))
+
+    def forward(self, log_radiance: Tensor) -> Tensor:
+        """Display values in [0, 1], (..., channels), of rendered log-radiance (..., channels)."""
+        return (super().forward(log_radiance) + self._residual(log_radiance, self._layers)).clamp(0, 1)
+
+    @property
+    def _fitted_on(self) -> str:
+        views = super()._fitted_on
+        return views if self._layers[-1][0].any() else f"{views}, its affine part only"
+
+    @property
+    def _layers(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.get_buffer(f"weight_{i}"), self.get_buffer(f"bias_{i}")) for i in range(len(_HIDDEN) + 1)]
+
+    def _residual(self, log_radiance: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
+        hidden = (log_radiance - self.input_mean) / self.input_deviation
+        for weight, bias in layers[:-1]:
+            # Bounded, so that radiance that no reference view showed is not sent astray.
+            hidden = torch.tanh(F.linear(hidden, weight, bias))
+        return F.linear(hidden, *layers[-1])
+
+    @torch.no_grad()
+    def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
+        """Fits the affine map, and then the network to what is left: least squares of display values, with Adam.
+
+        Args:
+            log_radiance: (N, channels) rendered.
+            reference: (N, channels) linear radiance in [0, 1] of the same pixels.
+            num_views: number of reference views these pixels are from.
+            rough: fit the affine map only.
+        """
+        super().fit(log_radiance, reference, num_views)
+        self._reset_network()
+        if rough:
+            return
+        log_radiance = log_radiance.detach()
+        self.input_mean.copy_(log_radiance.mean(0))
+        self.input_deviation.copy_(log_radiance.std(0, unbiased=False).clamp_min(1e-6))
+        missing = encode(reference, self.encoding) - super().forward(log_radiance)
+        with torch.enable_grad():
+            learned = [(w.clone().requires_grad_(), b.clone().requires_grad_()) for w, b in self._layers]
+            optimizer = torch.optim.Adam([tensor for layer in learned for tensor in layer], lr=_LEARNING_RATE)
+            scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS)
+            for _ in range(_STEPS):
+                optimizer.zero_grad()
+                F.mse_loss(self._residual(log_radiance, learned), missing).backward()
+                optimizer.step()
+                scheduler.step()
+        for stored, layer in zip(self._layers, learned, strict=True):
+            for buffer, tensor in zip(stored, layer, strict=True):
+                buffer.copy_(tensor)
+
+    @torch.no_grad()
+    def stretch(self, log_radiance: Tensor) -> None:
+        """Without reference images: the percentile stretch alone.
+
+        Args:
+            log_radiance: (N, channels) rendered.
+        """
+        super().stretch(log_radiance)
+        self._reset_network()
+
+    def _reset_network(self) -> None:
+        """Random hidden layers, the same every time, and an output of zero: the affine map alone."""
+        # Its own generator: which protocol is chosen must not change what training draws.
+        generator = torch.Generator().manual_seed(0)
+        for weight, bias in self._layers:
+            weight.copy_(torch.randn(weight.shape, generator=generator) / weight.shape[1] ** 0.5)
+            bias.zero_()
+        self._layers[-1][0].zero_()
+
+
+ColorCorrection = NoColorCorrection | AffineColorCorrection
+
+COLOR_CORRECTIONS: dict[ColorCorrectionProtocol, type[ColorCorrection]] = {
+    "affine": AffineColorCorrection,
+    "affine-test": AffineTestColorCorrection,
+    "network": NetworkColorCorrection,
+    "none": NoColorCorrection,
+}

@@ -53,11 +53,18 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     def create_eval_dataset(self) -> EventDataset | None:
         """The reference views. Where there are none, none while training, and else the places on the trajectory, so
         that the framework's renderers have cameras to start from."""
-        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
-        self.has_reference_views = bool(outputs.image_filenames)
-        if self.has_reference_views:
-            return self.dataset_type(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
-        return None if self.test_mode == "val" else self.train_dataset
+        views = self.reference_views(self.test_split)
+        self.has_reference_views = views is not None
+        if views is None and self.test_mode != "val":
+            return self.train_dataset
+        return views
+
+    def reference_views(self, split: Literal["val", "test"]) -> EventDataset | None:
+        """The reference views of a split, whichever one the run was opened with; None where there are none."""
+        outputs = self.dataparser.get_dataparser_outputs(split=split)
+        if not outputs.image_filenames:
+            return None
+        return self.dataset_type(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
 
     def setup_train(self) -> None:
         """Reads the events for training. A trained run is opened without them."""

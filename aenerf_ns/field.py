@@ -1,14 +1,15 @@
-"""The event radiance field: density and unbounded positive radiance on a hash grid."""
+"""The event radiance field, density and unbounded positive radiance, and a field of density alone."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.field_components.encodings import NeRFEncoding
+from nerfstudio.field_components.encodings import Encoding, NeRFEncoding
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SpatialDistortion
@@ -22,25 +23,26 @@ from aenerf_ns.hash_encoding import HashEncoding
 # and overflows.
 _MAX_LOG_DENSITY = 15.0
 
+# The hidden layer whose output the encoding is joined to (NeRF, https://arxiv.org/abs/2003.08934, fig. 7).
+_SKIP_LAYER = 5
 
-class EventRadianceField(Field):
-    """F_θ of the paper (eq. 1), with a hash grid for γ_x.
 
-    Differentiable as often as the hash grid is: hidden units are softplus with β = 100, which is smooth but as sharp
-    as a rectifier, and the view direction's encoding is sinusoidal (the framework's spherical harmonics run without
-    gradients).
+class DensityField(Field):
+    """Density of space: an encoding of the position (γ_x of the paper, eq. 1) and a network.
+
+    Differentiable as often as the encoding is: hidden units are softplus with β = 100, which is smooth but as sharp
+    as a rectifier. Weights start as PyTorch's own linear layers do.
 
     Args:
         aabb: (2, 3) scene box, which bounds the scene where there is no spatial distortion.
-        num_channels: radiance channels of the sensor, 1 or 3.
         spatial_distortion: contraction of space to a ball or cube of radius 2, or None for a bounded scene.
-        num_levels: levels of the hash grid.
-        base_resolution: cells along an axis on the coarsest level.
-        max_resolution: cells along an axis on the finest level.
-        log2_hashmap_size: binary logarithm of the entries of a level.
+        encoding: of positions in the contracted space or box, which is scaled to [0, 1] along each axis.
+        num_hidden_layers: hidden layers of the network. Where there are more than five, the encoding is joined to
+            the output of the fifth, as in NeRF.
         hidden_dim: width of the hidden layers.
-        geometry_feature_dim: length of the feature handed from density to radiance.
-        average_init_density: density before training.
+        feature_dim: length of the feature handed on with the density, 0 for none.
+        density_activation: of the network's output; "exp" is cut off at large exponents.
+        average_init_density: density where the network's output is 0, as it nearly is before training.
     """
 
     aabb: Tensor
@@ -48,51 +50,102 @@ class EventRadianceField(Field):
     def __init__(
         self,
         aabb: Tensor,
-        num_channels: int,
         spatial_distortion: SpatialDistortion | None,
-        num_levels: int,
-        base_resolution: int,
-        max_resolution: int,
-        log2_hashmap_size: int,
+        encoding: Encoding,
+        num_hidden_layers: int,
         hidden_dim: int,
-        geometry_feature_dim: int,
+        feature_dim: int,
+        density_activation: Literal["exp", "softplus"],
         average_init_density: float,
     ) -> None:
         super().__init__()
         self.register_buffer("aabb", aabb)
         self.spatial_distortion = spatial_distortion
+        self.density_activation = density_activation
         self.average_init_density = average_init_density
-        self.encoding = HashEncoding(
-            num_levels=num_levels,
-            min_res=base_resolution,
-            max_res=max_resolution,
-            log2_hashmap_size=log2_hashmap_size,
-        )
-        self.direction_encoding = NeRFEncoding(
-            in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True, implementation="torch"
-        )
+        self.encoding = encoding
         self.density_network = MLP(
-            in_dim=self.encoding.get_out_dim(),
-            num_layers=2,
+            in_dim=encoding.get_out_dim(),
+            num_layers=num_hidden_layers + 1,
             layer_width=hidden_dim,
-            out_dim=1 + geometry_feature_dim,
-            activation=nn.Softplus(beta=100),
-            implementation="torch",
-        )
-        self.radiance_network = MLP(
-            in_dim=self.direction_encoding.get_out_dim() + geometry_feature_dim,
-            num_layers=3,
-            layer_width=hidden_dim,
-            out_dim=num_channels,
+            out_dim=1 + feature_dim,
+            skip_connections=(_SKIP_LAYER,) if num_hidden_layers > _SKIP_LAYER else None,
             activation=nn.Softplus(beta=100),
             implementation="torch",
         )
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
-        """Density (..., 1) and the feature (..., geometry_feature_dim) for the radiance."""
+        """Density (..., 1), zero outside the box of a bounded scene, and the feature (..., feature_dim)."""
         positions, inside = _unit_positions(self, ray_samples)
         raw = self.density_network(self.encoding(positions.flatten(0, -2))).unflatten(0, positions.shape[:-1])
-        return _density(raw[..., :1].to(positions.dtype), self.average_init_density) * inside, raw[..., 1:]
+        raw_density, feature = raw[..., :1].to(positions.dtype), raw[..., 1:]
+        if self.density_activation == "exp":
+            density = _exponential_density(raw_density, self.average_init_density)
+        else:
+            density = F.softplus(raw_density + math.log(math.expm1(self.average_init_density)))
+        return density * inside, feature
+
+    def get_outputs(
+        self, ray_samples: RaySamples, density_embedding: Tensor | None = None
+    ) -> dict[FieldHeadNames, Tensor]:
+        """Nothing besides the density."""
+        return {}
+
+
+class EventRadianceField(DensityField):
+    """F_θ of the paper (eq. 1).
+
+    The view direction's encoding is sinusoidal: the framework's spherical harmonics run without gradients.
+
+    Args:
+        aabb: see :class:`DensityField`.
+        num_channels: radiance channels of the sensor, 1 or 3.
+        spatial_distortion: see :class:`DensityField`.
+        encoding: see :class:`DensityField`.
+        num_hidden_layers: see :class:`DensityField`.
+        hidden_dim: see :class:`DensityField`.
+        geometry_feature_dim: length of the feature handed from density to radiance.
+        radiance_num_hidden_layers: hidden layers from feature and view direction to radiance.
+        radiance_hidden_dim: their width.
+        density_activation: see :class:`DensityField`.
+        average_init_density: see :class:`DensityField`.
+    """
+
+    def __init__(
+        self,
+        aabb: Tensor,
+        num_channels: int,
+        spatial_distortion: SpatialDistortion | None,
+        encoding: Encoding,
+        num_hidden_layers: int,
+        hidden_dim: int,
+        geometry_feature_dim: int,
+        radiance_num_hidden_layers: int,
+        radiance_hidden_dim: int,
+        density_activation: Literal["exp", "softplus"],
+        average_init_density: float,
+    ) -> None:
+        super().__init__(
+            aabb,
+            spatial_distortion,
+            encoding,
+            num_hidden_layers,
+            hidden_dim,
+            geometry_feature_dim,
+            density_activation,
+            average_init_density,
+        )
+        self.direction_encoding = NeRFEncoding(
+            in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True, implementation="torch"
+        )
+        self.radiance_network = MLP(
+            in_dim=self.direction_encoding.get_out_dim() + geometry_feature_dim,
+            num_layers=radiance_num_hidden_layers + 1,
+            layer_width=radiance_hidden_dim,
+            out_dim=num_channels,
+            activation=nn.Softplus(beta=100),
+            implementation="torch",
+        )
 
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Tensor | None = None
@@ -129,10 +182,10 @@ class ProposalNetwork(HashMLPDensityField):
         """Density (..., 1), and no feature."""
         positions, inside = _unit_positions(self, ray_samples)
         raw = self.mlp_base(positions.flatten(0, -2)).unflatten(0, positions.shape[:-1])
-        return _density(raw.to(positions.dtype), self.average_init_density) * inside, None
+        return _exponential_density(raw.to(positions.dtype), self.average_init_density) * inside, None
 
 
-def _unit_positions(field: EventRadianceField | ProposalNetwork, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
+def _unit_positions(field: DensityField | ProposalNetwork, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
     """Positions (..., 3) of samples in the unit cube, 0 for those outside the scene, and which (..., 1) are inside."""
     positions = ray_samples.frustums.get_positions()
     if field.spatial_distortion is not None:
@@ -143,6 +196,6 @@ def _unit_positions(field: EventRadianceField | ProposalNetwork, ray_samples: Ra
     return positions * inside, inside
 
 
-def _density(raw: Tensor, average_init_density: float) -> Tensor:
+def _exponential_density(raw: Tensor, average_init_density: float) -> Tensor:
     """Density of a network's output, which must not be in half precision: its exponential would overflow."""
     return average_init_density * torch.exp(raw.clamp(max=_MAX_LOG_DENSITY))

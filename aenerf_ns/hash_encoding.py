@@ -46,5 +46,6 @@ class HashEncoding(FrameworkHashEncoding):
         # Spelled out for both features: torch is slow at broadcasting along a short last axis.
         weights = (scaled - lower)[..., None].expand(*scaled.shape, 2).contiguous()
         for weight in weights:
-            features = torch.lerp(*features.unbind(0), weight)
+            near, far = features.unbind(0)
+            features = torch.lerp(near, far, weight)
         return features.transpose(0, 1).flatten(1)

@@ -7,14 +7,14 @@ from torch import Tensor
 
 
 def log_radiance_change(
-    num_positive: Tensor, num_negative: Tensor, positive_threshold: float, negative_threshold: float
+    num_positive: Tensor, num_negative: Tensor, positive_threshold: Tensor | float, negative_threshold: float
 ) -> Tensor:
     """Change of log-radiance that a pair of events tells of: Δ = n+ C+ − n− C− (paper, eq. 5).
 
     Args:
         num_positive: (N,) positive events at the later time, one but for merged events.
         num_negative: (N,) negative events at the later time.
-        positive_threshold: C+.
+        positive_threshold: C+; a scalar in the graph when it is learned.
         negative_threshold: C−.
 
     Returns:
@@ -42,7 +42,7 @@ def temporal_loss(rate: Tensor, change: Tensor, interval: Tensor) -> Tensor:
     return (relative.abs() * usable).sum() / usable.sum().clamp_min(1)
 
 
-def reconstruction_loss(predicted: Tensor, target: Tensor, mean_contrast_threshold: float) -> Tensor:
+def reconstruction_loss(predicted: Tensor, target: Tensor, mean_contrast_threshold: Tensor | float) -> Tensor:
     """ℓ_r (paper, eq. 11): the mean squared error of log-radiance changes, in units of the mean contrast threshold.
 
     Args:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.configs.config_utils import to_immutable_dict
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.encodings import NeRFEncoding
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from nerfstudio.field_components.spatial_distortions import SceneContraction
+from nerfstudio.field_components.spatial_distortions import SceneContraction, SpatialDistortion
+from nerfstudio.fields.base_field import Field
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
@@ -24,13 +28,15 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from aenerf_ns.box_collider import BoxCollider
-from aenerf_ns.color_correction import AffineColorCorrection
+from aenerf_ns.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.field import EventRadianceField, ProposalNetwork
+from aenerf_ns.field import DensityField, EventRadianceField, ProposalNetwork
+from aenerf_ns.hash_encoding import HashEncoding
 from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
 from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.sensor_parameters import SensorParameters
 from aenerf_ns.temporal import log_radiance_rate
 
 # ε of the paper's appendix "Model Architecture": the least radiance that can be rendered.
@@ -39,7 +45,7 @@ _RADIANCE_EPSILON = 1e-3
 
 @dataclass
 class AENeRFModelConfig(ModelConfig):
-    """AE-NeRF on hash grids."""
+    """AE-NeRF. Options that begin with "hash:" or "mlp:" have no effect on the other backbone."""
 
     _target: type = field(default_factory=lambda: AENeRFModel)
     scene_contraction: Literal["auto", "l2", "linf", "none"] = "auto"
@@ -52,14 +58,21 @@ class AENeRFModelConfig(ModelConfig):
     background: Literal["auto", "learned", "none"] = "auto"
     """Whether rays that pass the scene see a uniform background of learned radiance. "auto" is "learned" for a dataset
     that states a scene box and "none" for others."""
+    backbone: Literal["hash", "mlp"] = "hash"
+    """What field and proposal networks are: small networks on hash grids, with exponential density, or the paper's
+    large networks on sinusoidal encodings, with softplus density."""
     num_levels: int = 16
-    """Levels of the field's hash grid."""
+    """hash: levels of the field's grid."""
     base_resolution: int = 16
-    """Cells along an axis on its coarsest level."""
+    """hash: cells along an axis on its coarsest level."""
     max_resolution: int = 2048
-    """Cells along an axis on its finest level."""
+    """hash: cells along an axis on its finest level."""
     log2_hashmap_size: int = 19
-    """Binary logarithm of the entries of a level."""
+    """hash: binary logarithm of the entries of a level."""
+    num_frequencies: int = 10
+    """mlp: frequencies of the position's encoding, in octaves from one period across the box or contracted space."""
+    num_hidden_layers: int = 1
+    """Hidden layers of the field from the encoded position to density and feature."""
     hidden_dim: int = 64
     """Width of the field's hidden layers."""
     geometry_feature_dim: int = 15
@@ -67,17 +80,19 @@ class AENeRFModelConfig(ModelConfig):
     average_init_density: float = 0.01
     """Density before training."""
     num_proposal_samples_per_ray: tuple[int, ...] = (256, 96)
-    """Samples of each proposal network."""
+    """Samples of each round of proposals: of each hash proposal network, or of each evaluation of the one mlp."""
     num_nerf_samples_per_ray: int = 48
     """Samples of the field."""
     proposal_max_resolutions: tuple[int, ...] = (128, 256)
-    """Cells along an axis on the finest level of each proposal network's hash grid; its length is their number."""
+    """hash: cells along an axis on the finest level of each proposal network's grid; its length is their number."""
     proposal_num_levels: int = 5
-    """Levels of the proposal networks' hash grids."""
+    """hash: levels of the proposal networks' grids."""
     proposal_log2_hashmap_size: int = 17
-    """Binary logarithm of the entries of a level there."""
+    """hash: binary logarithm of the entries of a level there."""
+    proposal_num_hidden_layers: int = 1
+    """Hidden layers of the proposal networks."""
     proposal_hidden_dim: int = 16
-    """Width of the proposal networks' hidden layer."""
+    """Width of the proposal networks' hidden layers."""
     proposal_weights_anneal_iterations: int = 1000
     """Steps over which sampling turns from broad to following the proposal weights."""
     loss_coefficients: dict[str, float] = to_immutable_dict(
@@ -85,10 +100,19 @@ class AENeRFModelConfig(ModelConfig):
     )
     """Weights of the losses (paper, eq. 14: alpha, beta, gamma, eta). A weight of 0 turns a loss off. The paper's beta
     is 0.001; on hash grids it has lowered quality so far."""
+    learn_contrast_threshold_ratio: bool = False
+    """Learn C+ / C-, from the dataset's values; C- stays."""
+    learn_refractory_period: bool = False
+    """Learn the time for which a pixel is blind after each event, from the dataset's value. At most the shortest
+    interval between two events of a pixel."""
     camera_optimizer: PoseCorrectionConfig = field(default_factory=PoseCorrectionConfig)
     """Pose correction."""
+    color_correction: ColorCorrectionProtocol = "affine"
+    """How log-radiance becomes a picture: by an affine map per channel fitted on the validation views, or on the test
+    views themselves (only to compare with figures that were made so), by a network fitted on the validation views
+    (paper, eq. 15), or as it is."""
     color_correction_num_rays: int = 16384
-    """Pixels, spread over all validation views, on which the colour correction is fitted."""
+    """Pixels, spread over all reference views it is fitted on, on which the colour correction is fitted."""
     lpips: bool = False
     """Also report LPIPS. It needs the AlexNet weights of torchvision, which are downloaded on first use."""
     eval_num_rays_per_chunk: int = 1 << 13
@@ -98,7 +122,8 @@ class AENeRFModelConfig(ModelConfig):
 class AENeRFModel(Model):
     """Renders radiance along event rays and compares its logarithm with the events.
 
-    Needs the dataparser's metadata: ``sensor``, ``trajectory``, ``camera_times``, ``image_encoding``, ``bounded``.
+    Needs the dataparser's metadata: ``sensor``, ``trajectory``, ``ground_truth``, ``camera_times``,
+    ``image_encoding``, ``bounded``.
     """
 
     config: AENeRFModelConfig
@@ -120,34 +145,16 @@ class AENeRFModel(Model):
         else:
             self.collider = NearFarCollider(config.near_plane, config.far_plane, reset_near_plane=False)
 
-        self.field = EventRadianceField(
-            self.scene_box.aabb,
-            num_channels=self.sensor.num_channels,
-            spatial_distortion=distortion,
-            num_levels=config.num_levels,
-            base_resolution=config.base_resolution,
-            max_resolution=config.max_resolution,
-            log2_hashmap_size=config.log2_hashmap_size,
-            hidden_dim=config.hidden_dim,
-            geometry_feature_dim=config.geometry_feature_dim,
-            average_init_density=config.average_init_density,
-        )
-        self.proposal_networks = nn.ModuleList(
-            ProposalNetwork(
-                self.scene_box.aabb,
-                spatial_distortion=distortion,
-                num_levels=config.proposal_num_levels,
-                max_res=resolution,
-                log2_hashmap_size=config.proposal_log2_hashmap_size,
-                hidden_dim=config.proposal_hidden_dim,
-                average_init_density=config.average_init_density,
-            )
-            for resolution in config.proposal_max_resolutions
-        )
+        build = {"hash": self._hash_networks, "mlp": self._mlp_networks}[config.backbone]
+        self.field, proposal_networks = build(distortion)
+        self.proposal_networks = nn.ModuleList(proposal_networks)
+        self.density_fns = [network.density_fn for network in proposal_networks]
+        if config.backbone == "mlp":
+            self.density_fns *= len(config.num_proposal_samples_per_ray)
         self.proposal_sampler = ProposalNetworkSampler(
             num_nerf_samples_per_ray=config.num_nerf_samples_per_ray,
             num_proposal_samples_per_ray=config.num_proposal_samples_per_ray,
-            num_proposal_network_iterations=len(self.proposal_networks),
+            num_proposal_network_iterations=len(self.density_fns),
             single_jitter=True,
             # In a bounded scene samples are spread evenly; else the framework's default, evenly and then in disparity.
             initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
@@ -162,21 +169,104 @@ class AENeRFModel(Model):
             device=self.kwargs.get("device", "cpu"),
             trajectory=deepcopy(metadata["trajectory"]),
             camera_times=metadata["camera_times"],
+            ground_truth=deepcopy(metadata["ground_truth"]),
         )
-        self.color_correction = AffineColorCorrection(self.sensor.num_channels)
+        self.sensor_parameters = SensorParameters(
+            self.sensor, config.learn_contrast_threshold_ratio, config.learn_refractory_period
+        )
+        self.color_correction = self.new_color_correction(config.color_correction)
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
 
+    def _hash_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, list[Field]]:
+        """The field on a hash grid, and the framework's proposal networks."""
+        config = self.config
+        radiance_field = EventRadianceField(
+            self.scene_box.aabb,
+            num_channels=self.sensor.num_channels,
+            spatial_distortion=distortion,
+            encoding=HashEncoding(
+                num_levels=config.num_levels,
+                min_res=config.base_resolution,
+                max_res=config.max_resolution,
+                log2_hashmap_size=config.log2_hashmap_size,
+            ),
+            num_hidden_layers=config.num_hidden_layers,
+            hidden_dim=config.hidden_dim,
+            geometry_feature_dim=config.geometry_feature_dim,
+            radiance_num_hidden_layers=2,
+            radiance_hidden_dim=config.hidden_dim,
+            density_activation="exp",
+            average_init_density=config.average_init_density,
+        )
+        return radiance_field, [
+            ProposalNetwork(
+                self.scene_box.aabb,
+                spatial_distortion=distortion,
+                num_levels=config.proposal_num_levels,
+                max_res=resolution,
+                log2_hashmap_size=config.proposal_log2_hashmap_size,
+                num_layers=config.proposal_num_hidden_layers + 1,
+                hidden_dim=config.proposal_hidden_dim,
+                average_init_density=config.average_init_density,
+            )
+            for resolution in config.proposal_max_resolutions
+        ]
+
+    def _mlp_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, list[Field]]:
+        """The paper's vanilla e-NeRF, and its one proposal e-NeRF (appendix "Model Architecture")."""
+        config = self.config
+        # On a position in [0, 1], which the framework's encoding multiplies by 2π: NeRF's frequencies on [-1, 1].
+        encoding = NeRFEncoding(
+            in_dim=3,
+            num_frequencies=config.num_frequencies,
+            min_freq_exp=0.0,
+            max_freq_exp=config.num_frequencies - 1.0,
+            include_input=True,
+            implementation="torch",
+        )
+        radiance_field = EventRadianceField(
+            self.scene_box.aabb,
+            num_channels=self.sensor.num_channels,
+            spatial_distortion=distortion,
+            encoding=encoding,
+            num_hidden_layers=config.num_hidden_layers,
+            hidden_dim=config.hidden_dim,
+            geometry_feature_dim=config.geometry_feature_dim,
+            # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
+            radiance_num_hidden_layers=1,
+            radiance_hidden_dim=128,
+            density_activation="softplus",
+            average_init_density=config.average_init_density,
+        )
+        proposal_network = DensityField(
+            self.scene_box.aabb,
+            spatial_distortion=distortion,
+            encoding=encoding,
+            num_hidden_layers=config.proposal_num_hidden_layers,
+            hidden_dim=config.proposal_hidden_dim,
+            feature_dim=0,
+            density_activation="softplus",
+            average_init_density=config.average_init_density,
+        )
+        return radiance_field, [proposal_network]
+
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Hash tables (and the background) apart from the networks, which alone get weight decay."""
+        """Hash tables (and the background), if there are any, apart from the networks, which alone get weight decay."""
         groups: dict[str, list[Parameter]] = {"encodings": [], "networks": []}
         for module in (self.field, self.proposal_networks):
             for name, parameter in module.named_parameters():
                 groups["encodings" if name.endswith("hash_table") else "networks"].append(parameter)
         if self.raw_background is not None:
             groups["encodings"].append(self.raw_background)
+        if not groups["encodings"]:
+            # torch.optim refuses a group without parameters.
+            del groups["encodings"]
         self.camera_optimizer.get_param_groups(groups)
+        learned = list(self.sensor_parameters.parameters())
+        if learned:
+            groups["sensor"] = learned
         return groups
 
     def get_training_callbacks(
@@ -206,9 +296,26 @@ class AENeRFModel(Model):
 
     def forward(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Renders rays; those with times, of pairs of events, from the corrected poses."""
+        learned: dict[str, Tensor] = {}
         if ray_bundle.times is not None:
+            # Here and not with the losses, for what the losses alone used would have no gradient on several processes.
+            ratio = self.sensor_parameters.contrast_threshold_ratio
+            if ratio is not None:
+                learned["positive_contrast_threshold"] = ratio * self.sensor.negative_contrast_threshold
+            period = self.sensor_parameters.refractory_period
+            if period is not None:
+                learned["interval_change"] = self.sensor.refractory_period * 1e-9 - period
+                num_pairs = len(ray_bundle) // (3 if self.training and self.uses_temporal_loss else 2)
+                # Intervals start at the end of the refractory period.
+                starts = torch.arange(len(ray_bundle), device=ray_bundle.times.device) < num_pairs
+                ray_bundle.times = ray_bundle.times - starts[:, None] * learned["interval_change"]
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
-        return super().forward(ray_bundle)
+        return super().forward(ray_bundle) | learned
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Renders a camera; one of a reference image from where it is in the frame of the corrected poses."""
+        moved = replace(camera, camera_to_worlds=self.camera_optimizer.apply_to_camera(camera))
+        return super().get_outputs_for_camera(moved, obb_box)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Renders rays.
@@ -219,9 +326,7 @@ class AENeRFModel(Model):
             training, the samples and weights of both stages, and the ``log_radiance_rate`` (pairs, channels) of the
             last third of the rays.
         """
-        samples, weights_list, samples_list = self.proposal_sampler(
-            ray_bundle, density_fns=[network.density_fn for network in self.proposal_networks]
-        )
+        samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
         outputs: dict[str, Any] = {}
         if self.training and self.uses_temporal_loss and ray_bundle.times is not None:
             within = slice(2 * len(ray_bundle) // 3, None)
@@ -238,7 +343,7 @@ class AENeRFModel(Model):
             log_radiance, weights = self._composite(samples)
         weights_list.append(weights)
         samples_list.append(samples)
-        outputs["rgb"] = self._display(self.color_correction(log_radiance.detach()))
+        outputs["rgb"] = self.display(log_radiance.detach())
         outputs["log_radiance"] = log_radiance
         outputs["accumulation"] = self.renderer_accumulation(weights)
         with torch.no_grad():
@@ -262,13 +367,14 @@ class AENeRFModel(Model):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
         """The weighted terms of the paper's total loss (eq. 14) on a batch of the event ray sampler."""
-        mean_threshold = self.sensor.mean_contrast_threshold
+        mean_threshold = (self._positive_contrast_threshold(outputs) + self.sensor.negative_contrast_threshold) / 2
         predicted, target = self._log_radiance_changes(outputs, batch)
         losses = {"reconstruction_loss": reconstruction_loss(predicted, target, mean_threshold)}
         if self.training:
             if "log_radiance_rate" in outputs:
                 rate = outputs["log_radiance_rate"].gather(1, batch["channel"][:, None])[:, 0]
-                losses["temporal_loss"] = temporal_loss(rate, target, batch["interval"])
+                interval = batch["interval"] + outputs.get("interval_change", 0.0)
+                losses["temporal_loss"] = temporal_loss(rate, target, interval)
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             losses["interlevel_loss"] = interlevel_loss(weights, samples) / mean_threshold**2
             losses["distortion_loss"] = distortion_loss(weights, samples)
@@ -280,6 +386,11 @@ class AENeRFModel(Model):
         predicted, target = self._log_radiance_changes(outputs, batch)
         metrics = {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
         self.camera_optimizer.get_metrics_dict(metrics)
+        if "positive_contrast_threshold" in outputs:
+            threshold = outputs["positive_contrast_threshold"].detach()
+            metrics["contrast_threshold_ratio"] = threshold / self.sensor.negative_contrast_threshold
+        if "interval_change" in outputs:
+            metrics["refractory_period_ns"] = self.sensor.refractory_period - 1e9 * outputs["interval_change"].detach()
         return metrics
 
     def _log_radiance_changes(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
@@ -289,18 +400,30 @@ class AENeRFModel(Model):
         target = log_radiance_change(
             batch["num_positive"],
             batch["num_negative"],
-            self.sensor.positive_contrast_threshold,
+            self._positive_contrast_threshold(outputs),
             self.sensor.negative_contrast_threshold,
         )
         return predicted, target
+
+    def _positive_contrast_threshold(self, outputs: dict[str, Any]) -> Tensor | float:
+        """C+, learned or given."""
+        return outputs.get("positive_contrast_threshold", self.sensor.positive_contrast_threshold)
+
+    def new_color_correction(self, protocol: ColorCorrectionProtocol) -> ColorCorrection:
+        """A colour correction for this model's pictures, not yet fitted."""
+        return COLOR_CORRECTIONS[protocol](self.sensor.num_channels, self.image_encoding)
 
     def reference_radiance(self, image: Tensor) -> Tensor:
         """Linear radiance (..., channels), as the sensor sees it, of reference image values (..., 3)."""
         return to_channels(decode(image[..., :3], self.image_encoding), self.sensor.num_channels)
 
-    def _display(self, radiance: Tensor) -> Tensor:
-        """Display values (..., 3) of linear radiance (..., channels)."""
-        return encode(radiance, self.image_encoding).expand(*radiance.shape[:-1], 3)
+    def reference_display(self, image: Tensor) -> Tensor:
+        """Display values (..., 3), as the sensor sees it, of reference image values (..., 3)."""
+        return _grey_to_rgb(encode(self.reference_radiance(image), self.image_encoding))
+
+    def display(self, log_radiance: Tensor) -> Tensor:
+        """Colour-corrected display values (..., 3) of rendered log-radiance (..., channels)."""
+        return _grey_to_rgb(self.color_correction(log_radiance))
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Display values and opacity (..., 4): exporters leave out what is transparent."""
@@ -311,7 +434,7 @@ class AENeRFModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM (and LPIPS) of the display values against the reference, as the sensor sees it, side by side."""
         predicted = outputs["rgb"]
-        reference = self._display(self.reference_radiance(batch["image"].to(predicted.device)))
+        reference = self.reference_display(batch["image"].to(predicted.device))
         images = {
             "img": torch.cat([reference, predicted], dim=1),
             "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
@@ -328,3 +451,8 @@ class AENeRFModel(Model):
         rendered = [self(rays[begin : begin + chunk])["log_radiance"] for begin in range(0, len(rays), chunk)]
         self.train(was_training)
         return torch.cat(rendered)
+
+
+def _grey_to_rgb(values: Tensor) -> Tensor:
+    """(..., 3) of (..., channels), 1 or 3."""
+    return values.expand(*values.shape[:-1], 3)

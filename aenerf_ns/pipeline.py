@@ -1,27 +1,34 @@
-"""The pipeline: colour correction on the validation views, and honest loading and evaluation."""
+"""The pipeline: colour correction on reference views, and honest loading and evaluation."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.misc import step_check
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from aenerf_ns.color_correction import ColorCorrectionProtocol, NoColorCorrection
 from aenerf_ns.datamanager import EventDataManager
 from aenerf_ns.model import AENeRFModel
+from aenerf_ns.pose_refinement import NUM_STEPS, refine_camera
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.trajectory.alignment import pose_errors
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, homogeneous
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
 _ROUGH_FIT_SHARE = 1 / 8
+# Steps between the errors of the corrected poses in the log, where true ones are known.
+_POSE_ERROR_INTERVAL = 100
 
 
 @dataclass
@@ -29,6 +36,17 @@ class AENeRFPipelineConfig(VanillaPipelineConfig):
     """Pipeline of an event datamanager and an AE-NeRF model."""
 
     _target: type = field(default_factory=lambda: AENeRFPipeline)
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Pixels to fit a colour correction on: the cameras, the (N, 1) index of each one's camera, its (N, 2) row and
+    column, and the (N, channels) radiance there, None where there are no references."""
+
+    cameras: Cameras
+    view: Tensor
+    coordinates: Tensor
+    radiance: Tensor | None = None
 
 
 class AENeRFPipeline(VanillaPipeline):
@@ -40,8 +58,14 @@ class AENeRFPipeline(VanillaPipeline):
 
     def __init__(self, config: AENeRFPipelineConfig, device: str, **kwargs: Any) -> None:
         super().__init__(config, device, **kwargs)
+        self._refined_test_poses = False
         if self.datamanager.train_pixel_sampler is not None:
             self.datamanager.train_pixel_sampler.with_time_within = self.model.uses_temporal_loss
+        if self.test_mode == "val" and self.model.config.learn_refractory_period:
+            self.model.sensor_parameters.bound_refractory_period(self.datamanager.train_dataset.pairs.shortest_interval)
+        # Made once: a fit every so many steps would read the images again.
+        self._pixels_of_split: dict[str, _Pixels] = {}
+        self._warn_of_test_views()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
         """Loads a checkpoint, all of it: the framework would drop what does not fit without a word.
@@ -51,8 +75,9 @@ class AENeRFPipeline(VanillaPipeline):
         """
         super().load_state_dict(state_dict, strict=True)
 
-    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
-        """Outputs, weighted losses and metrics of a training batch.
+    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
+        """Outputs, weighted losses and metrics of a training batch; now and then with the errors of the corrected poses
+        among the metrics.
 
         Raises:
             SystemExit: a loss is not finite.
@@ -60,6 +85,10 @@ class AENeRFPipeline(VanillaPipeline):
         outputs, losses, metrics = super().get_train_loss_dict(step)
         # With mixed precision, too: the scaler would skip every step from now on without a word.
         _require_finite(losses, "loss", step)
+        if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
+            errors = self.pose_errors()
+            if errors is not None:
+                metrics |= errors["corrected"]
         return outputs, losses, metrics
 
     def get_training_callbacks(
@@ -90,6 +119,12 @@ class AENeRFPipeline(VanillaPipeline):
         callback = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], fit, update_every_num_iters=1)
         return [*super().get_training_callbacks(training_callback_attributes), callback]
 
+    def replace_color_correction(self, protocol: ColorCorrectionProtocol) -> None:
+        """Replaces the run's colour correction by that of another protocol, fitted anew on the run's data."""
+        self.model.color_correction = self.model.new_color_correction(protocol).to(self.device)
+        self._warn_of_test_views()
+        self.fit_color_correction()
+
     def _require_finite_gradients(self, optimizer: torch.optim.Optimizer, step: int) -> None:
         """Raises SystemExit when an optimizer is about to make weights not finite."""
         names = {parameter: name for name, parameter in self.model.named_parameters()}
@@ -100,25 +135,40 @@ class AENeRFPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def fit_color_correction(self, share: float = 1.0) -> None:
-        """Fits the colour correction on the validation views (protocol "affine"), or where there are none stretches
-        what the training cameras see over the display's range.
+        """Fits the colour correction on its protocol's reference views, or where there are none stretches what the
+        training cameras see over the display's range.
 
         Args:
-            share: of the configured number of pixels to fit it on.
+            share: of the configured number of pixels to fit it on. Less than all makes a rough fit.
         """
-        rays, reference = self._pixels
-        count = max(round(share * len(rays)), 1)
-        log_radiance = self.model.render_log_radiance(rays[:count])
-        if reference is None:
-            self.model.color_correction.stretch(log_radiance)
+        correction = self.model.color_correction
+        if isinstance(correction, NoColorCorrection):
+            return
+        if correction.split not in self._pixels_of_split:
+            self._pixels_of_split[correction.split] = self._pixels(correction.split)
+        pixels = self._pixels_of_split[correction.split]
+        count = max(round(share * len(pixels.view)), 1)
+        # The views move with the corrected poses.
+        cameras = replace(pixels.cameras, camera_to_worlds=self.model.camera_optimizer.apply_to_camera(pixels.cameras))
+        rays = cameras.generate_rays(pixels.view[:count], coords=pixels.coordinates[:count])
+        log_radiance = self.model.render_log_radiance(rays)
+        if pixels.radiance is None:
+            correction.stretch(log_radiance)
         else:
-            self.model.color_correction.fit(log_radiance, reference[:count], len(self.datamanager.eval_dataset))
+            correction.fit(log_radiance, pixels.radiance[:count], len(cameras), rough=share < 1)
 
-    @cached_property
-    def _pixels(self) -> tuple[RayBundle, Tensor | None]:
-        """Rays through random pixels of all validation views, the same in every run, and the radiance (N, channels)
-        of the references there; without references, of all training cameras, and None."""
-        views = self.datamanager.eval_dataset or self.datamanager.train_dataset
+    def _warn_of_test_views(self) -> None:
+        if self.model.color_correction.protocol == "affine-test":
+            CONSOLE.print(
+                "[yellow]Colour correction affine-test is fitted on the test views themselves: only to compare with "
+                "figures that were made so."
+            )
+
+    def _pixels(self, split: Literal["val", "test"]) -> _Pixels:
+        """Random pixels of all reference views of a split, the same in every run; without references, of all training
+        cameras."""
+        references = self.datamanager.reference_views(split)
+        views = references or self.datamanager.train_dataset
         generator = torch.Generator().manual_seed(0)
         cameras = views.cameras
         count = max(self.model.config.color_correction_num_rays, len(views))
@@ -126,16 +176,63 @@ class AENeRFPipeline(VanillaPipeline):
         index = (torch.arange(count) % len(views))[torch.randperm(count, generator=generator)]
         size = torch.cat([cameras.height, cameras.width], -1)[index]
         pixels = (torch.rand(count, 2, generator=generator) * size).long()
-        rays = cameras.to(self.device).generate_rays(
-            index[:, None].to(self.device), coords=(pixels + 0.5).to(self.device)
-        )
-        if self.datamanager.eval_dataset is None:
-            return rays, None
+        device = self.device
+        chosen = _Pixels(cameras.to(device), index[:, None].to(device), (pixels + 0.5).to(device))
+        if references is None:
+            return chosen
         image = torch.zeros(count, 3)
         for view in range(len(views)):
             rows, columns = pixels[index == view].T
             image[index == view] = views.get_image_float32(view)[rows, columns, :3]
-        return rays, self.model.reference_radiance(image).to(self.device)
+        return replace(chosen, radiance=self.model.reference_radiance(image).to(device))
+
+    def in_recording(self, poses: Tensor) -> Tensor:
+        """(N, 3, 4) poses with OpenCV axes, in the world and the units of the recording, of (N, 3, 4) ones with OpenGL
+        axes in the scene's."""
+        outputs = self.datamanager.train_dataparser_outputs
+        to_scene = homogeneous(outputs.dataparser_transform.double())
+        poses = homogeneous(poses.cpu())
+        poses[:, :3, 3] /= outputs.dataparser_scale
+        return (torch.linalg.inv(to_scene) @ poses @ OPENCV_TO_OPENGL)[:, :3]
+
+    def pose_errors(self) -> dict[str, dict[str, float]] | None:
+        """Errors of the ``estimated`` and the ``corrected`` poses against the true ones, in the units of the recording
+        (see :func:`~aenerf_ns.trajectory.alignment.pose_errors`); None where these are not known."""
+        correction = self.model.camera_optimizer
+        if not correction.has_ground_truth:
+            return None
+        estimated, corrected, reference = (self.in_recording(poses) for poses in correction.compared_poses())
+        return {"estimated": pose_errors(estimated, reference), "corrected": pose_errors(corrected, reference)}
+
+    def refine_test_poses(self) -> None:
+        """Refines the poses of the reference views photometrically, for all evaluation from now on."""
+        self._require_reference_views()
+        views = self.datamanager.fixed_indices_eval_dataloader
+        self.eval()
+        with progress_bar() as progress:
+            refined = [
+                refine_camera(self.model, camera, batch["image"][..., :3]).camera_to_worlds
+                for camera, batch in progress.track(views, total=len(views), description="Refining test poses")
+            ]
+        self.train()
+        views.cameras = replace(views.cameras, camera_to_worlds=torch.cat(refined), metadata={})
+        self._refined_test_poses = True
+
+    def _require_reference_views(self) -> None:
+        if not self.datamanager.has_reference_views:
+            raise SystemExit(
+                f"Error: {self.datamanager.get_datapath()}: the {self.datamanager.test_split} split has no reference "
+                "images to evaluate on; ns-render shows what was reconstructed"
+            )
+
+    @property
+    def _test_poses(self) -> str:
+        """How the reference views' cameras were placed."""
+        if self.model.camera_optimizer.has_ground_truth:
+            placed = "Sim(3) of the corrected to the true trajectory"
+        else:
+            placed = "corrected pose at the time of the view, else Sim(3) of the corrected to the estimated trajectory"
+        return f"photometric refinement, {NUM_STEPS} steps, from: {placed}" if self._refined_test_poses else placed
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -145,21 +242,17 @@ class AENeRFPipeline(VanillaPipeline):
         Raises:
             SystemExit: there are no reference views.
         """
-        if not self.datamanager.has_reference_views:
-            raise SystemExit(
-                f"Error: {self.datamanager.get_datapath()}: the {self.datamanager.test_split} split has no reference "
-                "images to evaluate on; ns-render shows what was reconstructed"
-            )
+        self._require_reference_views()
         metrics: dict[str, Any] = super().get_average_eval_image_metrics(step, output_path, get_std)
         # A single view has no standard deviation, and NaN is no JSON.
         metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
         if self.test_mode == "test":
             # The trainer's log, in the other mode, takes numbers only.
-            num_views = int(self.model.color_correction.num_views)
-            metrics["color_correction"] = (
-                f"affine, fitted on {num_views} validation views" if num_views else "percentile stretch, no references"
-            )
+            metrics["color_correction"] = self.model.color_correction.description
             metrics["num_views"] = len(self.datamanager.eval_dataset)
+            metrics["pose_correction"] = self.model.config.camera_optimizer.mode
+            metrics["pose_errors"] = self.pose_errors()
+            metrics["test_poses"] = self._test_poses
             if self.model.image_metrics.lpips_absent is not None:
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent

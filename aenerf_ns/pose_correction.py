@@ -10,13 +10,22 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 import torch.nn.functional as F
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.encodings import NeRFEncoding
 from torch import Tensor, nn
 
-from aenerf_ns.ray_sampler import world_rays
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import REFERENCE_SECONDS
+from aenerf_ns.trajectory.alignment import Similarity, align
 from aenerf_ns.trajectory.rotation import motion_from_twist
 from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
+
+# Poses at which trajectories are compared: enough for any metric, and quick enough to be logged.
+_MAX_COMPARED = 2000
+# A step of the optimizer changes hundreds of weights behind each number of a network's twist, and few behind a
+# spline's. With this factor on the network's output both move about as far at one learning rate.
+_NETWORK_OUTPUT_SCALE = 2e-3
 
 
 @dataclass
@@ -41,16 +50,23 @@ class PoseCorrection(CameraOptimizer):
 
     ξ is zero at first, with gradients that are not.
 
+    The scene is reconstructed in the frame of the corrected poses, while reference images have poses in the frame of
+    the true trajectory or, where that is not known, of the estimated one. :meth:`apply_to_camera` carries their cameras
+    over.
+
     Args:
         config: the kind of correction and its regularisation.
         num_cameras: training cameras.
         device: of the parameters.
         trajectory: the estimated trajectory, camera-to-world, OpenGL camera axes, in scene units.
         camera_times: (num_cameras,) times of the training cameras in nanoseconds, for :meth:`forward`.
+        ground_truth: the true trajectory, if it is known; likewise. It never enters a loss.
     """
 
     config: PoseCorrectionConfig
     _camera_seconds: Tensor
+    _compared_seconds: Tensor
+    _reference_poses: Tensor
 
     def __init__(
         self,
@@ -59,6 +75,7 @@ class PoseCorrection(CameraOptimizer):
         device: torch.device | str,
         trajectory: Trajectory,
         camera_times: Tensor,
+        ground_truth: Trajectory | None = None,
     ) -> None:
         nn.Module.__init__(self)
         self.config = config
@@ -66,6 +83,11 @@ class PoseCorrection(CameraOptimizer):
         self.device = device
         self.trajectory = trajectory
         self.register_buffer("_camera_seconds", trajectory.seconds(camera_times), persistent=False)
+        times = _compared_times(trajectory, ground_truth)
+        reference = trajectory if ground_truth is None else ground_truth
+        self.has_ground_truth = ground_truth is not None
+        self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
+        self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
         self._duration = (trajectory.end - trajectory.start) * 1e-9
         self.twists: nn.Module | None = None
         if config.mode == "network":
@@ -90,12 +112,44 @@ class PoseCorrection(CameraOptimizer):
         return (torch.linalg.inv(base) @ homogeneous(self.pose(seconds)))[:, :3].float()
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
-        """Moves the rays of a training batch, which have times, to the corrected poses."""
-        if self.twists is None:
-            return
+        """Moves the rays of a training batch, which have times, from the camera's frame to the corrected poses."""
         assert raybundle.times is not None
         origins, directions = world_rays(self.pose(raybundle.times[:, 0]), raybundle.metadata["camera_directions"])
         raybundle.origins, raybundle.directions = origins.to(raybundle.origins), directions.to(raybundle.directions)
+
+    def apply_to_camera(self, camera: Cameras) -> Tensor:
+        """Poses (N, 3, 4) in the scene of cameras.
+
+        Those of reference images are moved from the reference frame to that of the corrected poses: with ground truth
+        by the Sim(3) that best maps the corrected trajectory to the true one; without it as the corrected pose at the
+        time the image was taken, and images not taken on the trajectory by the Sim(3) to the estimated one. All other
+        cameras are in the scene's frame and stay.
+        """
+        poses = camera.camera_to_worlds
+        if REFERENCE_SECONDS not in (camera.metadata or {}):
+            return poses
+        with torch.no_grad():
+            carried = self.alignment().inverse()(poses.double())
+            if not self.has_ground_truth:
+                seconds = camera.metadata[REFERENCE_SECONDS][..., 0]
+                on_trajectory = seconds.isfinite()
+                taken = seconds.nan_to_num(0.0)
+                motion = homogeneous(self.pose(taken)) @ torch.linalg.inv(homogeneous(self.trajectory.pose(taken)))
+                moved = (motion @ homogeneous(poses.double()))[:, :3]
+                carried = torch.where(on_trajectory[:, None, None], moved, carried)
+            return carried.to(poses)
+
+    def alignment(self) -> Similarity:
+        """The Sim(3) that best maps the corrected trajectory to the true one, or where that is not known to the
+        estimated one."""
+        with torch.no_grad():
+            return align(self.pose(self._compared_seconds), self._reference_poses)
+
+    def compared_poses(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Estimated, corrected and reference poses (N, 3, 4) at the same times, in scene units."""
+        with torch.no_grad():
+            estimated, corrected = (source.pose(self._compared_seconds) for source in (self.trajectory, self))
+        return estimated, corrected, self._reference_poses
 
     def ray_rates(self, raybundle: RayBundle) -> tuple[Tensor, Tensor]:
         """Derivatives of the corrected rays' origins and directions (N, 3) with respect to time, per second."""
@@ -132,15 +186,45 @@ class PoseCorrection(CameraOptimizer):
         metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
 
     def _sampled_twists(self) -> Tensor:
-        """Twists at 256 times spread over the trajectory."""
+        """Twists at 64 times spread over the trajectory."""
         assert self.twists is not None
-        seconds = torch.linspace(0, self._duration, 256, dtype=torch.float64, device=self._camera_seconds.device)
+        seconds = torch.linspace(0, self._duration, 64, dtype=torch.float64, device=self._camera_seconds.device)
         return self.twists(seconds, self.trajectory.pose(seconds))
 
     def get_param_groups(self, param_groups: dict[str, list[nn.Parameter]]) -> None:
         """Adds the parameters as the group ``camera_opt``, where there are any."""
         if self.twists is not None:
             param_groups["camera_opt"] = list(self.parameters())
+
+
+def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Origins and unit directions (N, 3) in the world of rays in the camera's frame.
+
+    Args:
+        poses: (N, 3, 4) camera-to-world.
+        directions: (N, 3) unit vectors in the camera's frame.
+    """
+    return poses[:, :, 3], (poses[:, :, :3] @ directions[..., None])[..., 0]
+
+
+def _compared_times(trajectory: Trajectory, ground_truth: Trajectory | None) -> Tensor:
+    """Times in nanoseconds of at most _MAX_COMPARED knots, evenly thinned out, that the ground truth covers.
+
+    Raises:
+        DataError: there are fewer than two.
+    """
+    times = trajectory.times
+    if ground_truth is not None:
+        times = times[(times >= ground_truth.start) & (times <= ground_truth.end)]
+        if len(times) < 2:
+            raise DataError(
+                ground_truth.source,
+                f"its poses from {ground_truth.start} to {ground_truth.end} ns do not cover two of the estimated ones, "
+                f"from {trajectory.start} to {trajectory.end} ns",
+                "give ground truth on the clock of the estimated poses, or remove the file",
+            )
+    count = min(len(times), _MAX_COMPARED)
+    return times[torch.linspace(0, len(times) - 1, count, dtype=torch.float64).round().long()]
 
 
 class TwistNetwork(nn.Module):
@@ -168,7 +252,12 @@ class TwistNetwork(nn.Module):
         layers: list[nn.Module] = []
         size = self.encoding.get_out_dim()
         for _ in range(4):
-            layers += [nn.Linear(size, width), nn.Softplus()]
+            linear = nn.Linear(size, width)
+            # With PyTorch's initialisation and a blunt softplus hardly any of the input's variation reaches the output:
+            # all that such a network learns for long is one correction for all times.
+            nn.init.kaiming_normal_(linear.weight)
+            nn.init.zeros_(linear.bias)
+            layers += [linear, nn.Softplus(beta=100)]
             size = width
         self.hidden = nn.Sequential(*layers)
         self.output = nn.Linear(width, 6)
@@ -184,7 +273,7 @@ class TwistNetwork(nn.Module):
         with torch.autocast(time.device.type, enabled=False):
             pose = self.pose_embedding(base.flatten(1).to(dtype))
             embedded = F.softplus(pose) + F.softplus(self.time_embedding(time))
-            return self.output(self.hidden(self.encoding(embedded)))
+            return _NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))
 
 
 class TwistSpline(nn.Module):

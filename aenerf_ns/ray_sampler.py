@@ -11,7 +11,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
@@ -35,7 +35,7 @@ class EventRaySampler:
         pairs: gives the pairs to sample from, which stay in host memory; asked when the first batch is drawn.
         camera: the lens, for the exact direction of each raw pixel.
         sensor: for the refractory period and the pixels' colour filters.
-        trajectory: camera-to-world poses, OpenGL camera axes; on the device of the rays.
+        trajectory: whose start times count from; on the device of the rays.
         num_rays_per_batch: rays of a batch; a pair takes two, or three with a time within its interval.
 
     Attributes:
@@ -74,10 +74,11 @@ class EventRaySampler:
                 for training holds.
 
         Returns:
-            The rays at the starts of the N intervals, then those at their ends, then those at t_sam if there are any:
-            with ``times`` in float64 seconds since the trajectory's start, and with the ``camera_directions`` among
-            their metadata in the camera's frame. And for each pair ``num_positive`` and ``num_negative`` (N,) counts
-            of events at its end, the ``interval`` (N,) in seconds, and the ``channel`` (N,) of its pixel's filter.
+            The rays at the starts of the N intervals, then those at their ends, then those at t_sam if there are any.
+            They are in the camera's frame: pose correction moves them to the world by their ``times``, in float64
+            seconds since the trajectory's start, and the ``camera_directions`` among their metadata, in float64. And
+            for each pair ``num_positive`` and ``num_negative`` (N,) counts of events at its end, the ``interval``
+            (N,) in seconds, and the ``channel`` (N,) of its pixel's filter.
         """
         with_time_within = self.with_time_within and num_pairs is None
         rays_per_pair = 3 if with_time_within else 2
@@ -96,10 +97,9 @@ class EventRaySampler:
         seconds = torch.cat(times)
         rows, columns = torch.from_numpy(y).to(device), torch.from_numpy(x).to(device)
         in_camera = self._directions[rows, columns].repeat(rays_per_pair, 1)
-        origins, directions = world_rays(self.trajectory.pose(seconds), in_camera)
         rays = RayBundle(
-            origins=origins.float(),
-            directions=directions.float(),
+            origins=torch.zeros_like(in_camera).float(),
+            directions=in_camera.float(),
             pixel_area=torch.full((len(seconds), 1), self._pixel_area, device=device),
             camera_indices=torch.zeros((len(seconds), 1), dtype=torch.long, device=device),
             times=seconds[:, None],
@@ -137,13 +137,3 @@ class EventRaySampler:
         if self._usable is None:
             return torch.randint(len(pairs), (num_pairs,)).numpy()
         return self._usable[torch.randint(len(self._usable), (num_pairs,)).numpy()]
-
-
-def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Origins and unit directions (N, 3) in the world of rays in the camera's frame.
-
-    Args:
-        poses: (N, 3, 4) camera-to-world.
-        directions: (N, 3) unit vectors in the camera's frame.
-    """
-    return poses[:, :, 3], (poses[:, :, :3] @ directions[..., None])[..., 0]

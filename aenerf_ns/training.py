@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import tyro
-from nerfstudio.engine.schedulers import MultiStepScheduler, SchedulerConfig
+from nerfstudio.engine.schedulers import MultiStepScheduler, Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
 
 @dataclass
@@ -31,10 +34,48 @@ class RelativeMultiStepSchedulerConfig(SchedulerConfig):
 
 
 @dataclass
+class DelayedCosineSchedulerConfig(SchedulerConfig):
+    """Learning rate that waits, rises linearly, and falls as half a cosine until the end of the run.
+
+    For pose correction. In its first steps the field is worse than a constant one, and its gradients would move good
+    poses away, so the correction waits; and a single batch tells little of a pose, so the noise of the gradients is
+    averaged out by a rate that ends low.
+    """
+
+    _target: type = field(default_factory=lambda: DelayedCosineScheduler)
+    delay: int = 150
+    """Steps in which nothing is learned."""
+    warm_up: int = 50
+    """Steps in which the rate then rises."""
+    final_factor: float = 0.01
+    """Factor at the end of the run."""
+    max_steps: tyro.conf.Suppress[int] = 0
+    """Length of the run, which the trainer's configuration fills in."""
+
+
+class DelayedCosineScheduler(Scheduler):
+    """Not the framework's cosine decay, whose NumPy numbers current torch refuses to load from checkpoints."""
+
+    config: DelayedCosineSchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
+        """The schedule of an optimizer whose learning rate is ``lr_init``."""
+        config = self.config
+
+        def factor(step: int) -> float:
+            since = max(step - config.delay, 0)
+            progress = min(since / max(config.max_steps - config.delay, 1), 1.0)
+            falling = config.final_factor + (1 - config.final_factor) * (1 + math.cos(math.pi * progress)) / 2
+            return min(since / max(config.warm_up, 1), 1.0) * falling
+
+        return LambdaLR(optimizer, factor)
+
+
+@dataclass
 class AENeRFTrainerConfig(TrainerConfig):
     """A trainer that tells the schedules how long the run is."""
 
     def __post_init__(self) -> None:
         for group in self.optimizers.values():
-            if isinstance(group["scheduler"], RelativeMultiStepSchedulerConfig):
+            if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, DelayedCosineSchedulerConfig)):
                 group["scheduler"].max_steps = self.max_num_iterations

@@ -107,6 +107,9 @@ class EcdDataParserConfig(EventDataParserConfig):
     """C+: the dataset does not state it. It only sets the scale of the log-radiance, which colour correction finds."""
     negative_contrast_threshold: float = 0.5
     """C-: likewise; its ratio to C+ matters."""
+    trajectory: Path | None = None
+    """Estimated poses in the format of groundtruth.txt, to be used in its place. groundtruth.txt then only serves to
+    evaluate them."""
     refractory_period_ns: int = 0
     """Time for which a pixel is blind after each event, in nanoseconds."""
 
@@ -120,8 +123,9 @@ class EcdDataParser(EventDataParser):
         folder = Path(self.config.data)
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
-        trajectory = read_tum_trajectory(folder / "groundtruth.txt")
-        images = _read_images(folder, trajectory)
+        reference = read_tum_trajectory(folder / "groundtruth.txt")
+        given = self.config.trajectory
+        images = _read_images(folder, reference)
         camera = _read_calibration(folder / "calib.txt", _image_size(images[0].file if images else None))
         return Recording(
             event_file=EcdEventFile(folder / "events.txt", camera.width, camera.height),
@@ -131,7 +135,8 @@ class EcdDataParser(EventDataParser):
                 self.config.negative_contrast_threshold,
                 self.config.refractory_period_ns,
             ),
-            trajectory=trajectory,
+            trajectory=reference if given is None else read_tum_trajectory(given),
+            ground_truth=None if given is None else reference,
             frame_camera=camera,
             reference_views={"train": images, "val": images[::2], "test": images[1::2]},
             image_encoding="linear",

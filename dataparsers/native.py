@@ -60,6 +60,8 @@ class NativeDataParser(EventDataParser):
         block = meta.block("event_camera")
         event_camera = _camera(block, "width", "height")
         trajectory = read_tum_trajectory(folder / "trajectory_estimated.txt")
+        true_poses = folder / "trajectory_ground_truth.txt"
+        ground_truth = read_tum_trajectory(true_poses) if true_poses.exists() else None
         frames = meta.get("frames", list, [])
         sensor = self._sensor(block)
         encoding: ImageEncoding = meta.get("image_encoding", str, "srgb")
@@ -72,9 +74,12 @@ class NativeDataParser(EventDataParser):
             sensor=sensor,
             trajectory=trajectory,
             frame_camera=_camera(meta, "w", "h") if frames else event_camera,
-            reference_views=_reference_views(meta, frames, trajectory, block.matrix("T_frame_event")),
+            reference_views=_reference_views(
+                meta, frames, trajectory if ground_truth is None else ground_truth, block.matrix("T_frame_event")
+            ),
             image_encoding=encoding,
             scene_box=None if box is None else _scene_box(meta, box),
+            ground_truth=ground_truth,
         )
 
     def _sensor(self, block: _Metadata) -> SensorModel:
@@ -188,7 +193,7 @@ def _scene_box(meta: _Metadata, value: list) -> Tensor:
 def _reference_views(
     meta: _Metadata, frames: list, trajectory: Trajectory, frame_from_event: Tensor | None
 ) -> dict[Split, list[ReferenceView]]:
-    """The images of each split. A frame without a pose but with a time stamp gets that of the trajectory."""
+    """The images of each split. A frame without a pose but with a time stamp gets that of the reference trajectory."""
     if frame_from_event is None:
         frame_from_event = torch.eye(4, dtype=torch.float64)
     views: dict[str, ReferenceView] = {}

@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.event_camera import REFERENCE_SECONDS, EventCamera
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.image_encoding import ImageEncoding
@@ -35,7 +35,8 @@ class ReferenceView:
 
     Attributes:
         file: the image.
-        camera_to_world: (4, 4) float64 pose, OpenCV camera axes.
+        camera_to_world: (4, 4) float64 pose, OpenCV camera axes, in the world of the recording's
+            :attr:`~Recording.reference_trajectory`.
         time: in nanoseconds on the clock of the events, or None for an image that was not taken on the trajectory.
     """
 
@@ -58,6 +59,8 @@ class Recording:
         image_encoding: whether the images' values are sRGB or linear in radiance.
         scene_box: (2, 3) smallest and largest corner of a box that holds the whole scene, or None for a scene
             without bounds.
+        ground_truth: the true trajectory, camera-to-world, OpenCV camera axes, in a world of any position, orientation
+            and scale, or None where it is not known. It serves evaluation only.
     """
 
     event_file: EventFile
@@ -68,6 +71,12 @@ class Recording:
     reference_views: dict[Split, list[ReferenceView]]
     image_encoding: ImageEncoding
     scene_box: Tensor | None = None
+    ground_truth: Trajectory | None = None
+
+    @property
+    def reference_trajectory(self) -> Trajectory:
+        """The best there is to compare with: the true trajectory, or where it is not known the estimated one."""
+        return self.trajectory if self.ground_truth is None else self.ground_truth
 
 
 @dataclass
@@ -121,6 +130,9 @@ class EventDataParser(DataParser):
             return torch.cat([moved[..., :3], scale * moved[..., 3:]], -1)
 
         trajectory = trajectory.mapped(to_scene)
+        ground_truth = recording.ground_truth
+        if ground_truth is not None:
+            ground_truth = ground_truth.mapped(lambda poses: to_scene(poses @ OPENCV_TO_OPENGL))
         if split == "train":
             times, images = _training_views(trajectory, recording.reference_views["train"])
             cameras = recording.event_camera.cameras(trajectory.interpolate(times))
@@ -130,6 +142,7 @@ class EventDataParser(DataParser):
                 _check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
             cameras = recording.frame_camera.cameras(to_scene(poses @ OPENCV_TO_OPENGL))
+            cameras.metadata[REFERENCE_SECONDS] = _reference_seconds(views, trajectory)
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
         # The framework wants a name for every camera, also for one without an image.
         names = [images.get(index, Path(self.config.data) / f"camera_{index:05d}") for index in range(len(cameras))]
@@ -141,6 +154,7 @@ class EventDataParser(DataParser):
             dataparser_scale=scale,
             metadata={
                 "trajectory": trajectory,
+                "ground_truth": ground_truth,
                 "event_camera": recording.event_camera,
                 "event_file": recording.event_file,
                 "sensor": recording.sensor,
@@ -243,6 +257,14 @@ def _training_views(trajectory: Trajectory, views: list[ReferenceView]) -> tuple
     shown = _thin_out(sorted(taken))
     times = sorted({*_thin_out(trajectory.times.tolist()), *shown})
     return torch.tensor(times), {times.index(time): taken[time] for time in shown}
+
+
+def _reference_seconds(views: list[ReferenceView], trajectory: Trajectory) -> Tensor:
+    """(N, 1) float64 seconds since the trajectory's start at which views were taken; NaN for those not on it."""
+    times = torch.tensor([[trajectory.start if view.time is None else view.time] for view in views])
+    seconds = trajectory.seconds(times.reshape(-1, 1))
+    seconds[[view.time is None for view in views]] = torch.nan
+    return seconds
 
 
 def _thin_out(times: list[int]) -> list[int]:

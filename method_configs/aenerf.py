@@ -11,7 +11,11 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.ffmpeg import provide_ffmpeg
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipelineConfig
-from aenerf_ns.training import AENeRFTrainerConfig, RelativeMultiStepSchedulerConfig
+from aenerf_ns.training import (
+    AENeRFTrainerConfig,
+    DelayedCosineSchedulerConfig,
+    RelativeMultiStepSchedulerConfig,
+)
 
 # Every ns-* command imports this module, ns-render among them.
 provide_ffmpeg()
@@ -35,9 +39,13 @@ aenerf = MethodSpecification(
                 "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
+            "sensor": {
+                "optimizer": AdamOptimizerConfig(lr=0.05),
+                "scheduler": RelativeMultiStepSchedulerConfig(),
+            },
             "camera_opt": {
                 "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
-                "scheduler": RelativeMultiStepSchedulerConfig(),
+                "scheduler": DelayedCosineSchedulerConfig(),
             },
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),

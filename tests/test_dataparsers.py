@@ -23,9 +23,10 @@ from aenerf_ns.dataparsers.text import format_seconds, parse_seconds
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.dataset import EventDataset
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.event_camera import REFERENCE_SECONDS, EventCamera
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.trajectory.noise import perturb
 from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 
 CAMERA = EventCamera(6, 4, 5.0, 5.5, 3.0, 2.0, "radial_tangential", (0.01, 0.0, 0.001, 0.0, 0.0))
@@ -262,6 +263,28 @@ def test_ecd_text_reads(tmp_path: Path) -> None:
     # Images at 0.05 and 0.25 s validate, 0.15 s tests, 0.35 s is after the last event.
     assert len(parse(config, "val").image_filenames) == 2
     assert len(parse(config, "test").image_filenames) == 1
+
+
+def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
+    folder = write_ecd(tmp_path / "made")
+    truth = read_tum_trajectory(folder / "groundtruth.txt")
+    other = perturb(truth, rotation_degrees=2.0, translation=0.1, correlation_time=0.1, seed=0)
+    write_tum_trajectory(tmp_path / "other.txt", other)
+    config = EcdDataParserConfig(data=folder, trajectory=tmp_path / "other.txt")
+    outputs, as_given = parse(config), parse(EcdDataParserConfig(data=folder))
+    assert as_given.metadata["ground_truth"] is None
+    # In the scene's frame, which follows from the estimated poses; images have true ones.
+    to_scene = homogeneous(outputs.dataparser_transform.double())
+    for name, poses in (("ground_truth", truth), ("trajectory", other)):
+        times = outputs.metadata[name].times
+        expected = to_scene @ homogeneous(poses.interpolate(times)) @ OPENCV_TO_OPENGL
+        torch.testing.assert_close(outputs.metadata[name].camera_to_worlds, expected[:, :3], rtol=0, atol=1e-6)
+    views = parse(config, "test").cameras
+    expected = to_scene @ homogeneous(truth.interpolate([150_000_000])) @ OPENCV_TO_OPENGL
+    torch.testing.assert_close(views.camera_to_worlds, expected[:, :3].float(), rtol=0, atol=1e-6)
+    assert views.metadata is not None
+    taken = views.metadata[REFERENCE_SECONDS][0, 0].item()
+    assert taken == pytest.approx(0.15 - 1e-9 * outputs.metadata["trajectory"].start)
 
 
 def test_ecd_text_may_hold_comments_and_empty_lines(tmp_path: Path) -> None:

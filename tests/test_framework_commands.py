@@ -72,7 +72,13 @@ def evaluate(config: Path, workspace: Path, name: str) -> dict:
     pictures = workspace / f"{name}_pictures"
     run("ns-eval", "--load-config", config, "--output-path", output, "--render-output-path", pictures, cwd=workspace)
     assert len(list(pictures.glob("eval_img_*.png"))) == 3
-    return json.loads(output.read_text())["results"]
+    return json.loads(output.read_text())
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained: Path, workspace: Path) -> dict:
+    """What ns-eval says of the run that all tests look at."""
+    return evaluate(trained, workspace, "trained")
 
 
 def test_simulated_dataset_is_seeded(workspace: Path) -> None:
@@ -90,12 +96,15 @@ def test_simulated_dataset_is_seeded(workspace: Path) -> None:
     assert "folder exists already" in run("aenerf", "simulate", "--output", first, cwd=workspace, fails=True)
 
 
-def test_training_beats_an_untrained_field_on_held_out_views(trained: Path, workspace: Path) -> None:
-    results = evaluate(trained, workspace, "trained")
+def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, workspace: Path) -> None:
+    results = evaluated["results"]
     assert results["color_correction"] == "affine, fitted on 4 validation views"
     assert results["num_views"] == 3
     assert results["lpips"] is None
     assert results["lpips_absent"]
+    # The given poses are the true ones.
+    assert results["pose_errors"]["estimated"]["rotation_error_degrees"] < 1e-5
+    assert results["test_poses"] == "Sim(3) of the corrected to the true trajectory"
     data = workspace / "room"
     (data / "events.gone").rename(data / "events.h5")
     run(
@@ -103,9 +112,35 @@ def test_training_beats_an_untrained_field_on_held_out_views(trained: Path, work
         "--experiment-name", "untrained", cwd=workspace,
     )  # fmt: skip
     (data / "events.h5").rename(data / "events.gone")
-    untrained = evaluate(newest_config(workspace / "outputs" / "untrained"), workspace, "untrained")
+    untrained = evaluate(newest_config(workspace / "outputs" / "untrained"), workspace, "untrained")["results"]
     assert results["psnr"] > untrained["psnr"] + PSNR_MARGIN
     assert results["ssim"] > untrained["ssim"]
+
+
+def test_a_run_is_evaluated_under_other_protocols(trained: Path, evaluated: dict, workspace: Path) -> None:
+    checkpoint = next(trained.parent.rglob("*.ckpt"))
+    before = (trained.read_bytes(), checkpoint.read_bytes())
+    output, pictures = workspace / "network" / "metrics.json", workspace / "network" / "pictures"
+    options = ("--color-correction", "network", "--test-poses", "photometric", "--render-output", pictures)
+    run("aenerf", "evaluate", "--load-config", trained, "--output", output, *options, cwd=workspace)
+    written = json.loads(output.read_text())
+    # The layout of ns-eval, and what it was computed with.
+    assert written.pop("protocol") == {
+        "color_correction": "network",
+        "color_correction_of_run": "affine",
+        "test_poses": "photometric",
+    }
+    results, of_run = written.pop("results"), evaluated["results"]
+    assert written == {key: value for key, value in evaluated.items() if key != "results"}
+    assert results.keys() == of_run.keys()
+    assert results["color_correction"] == "network, fitted on 4 validation views"
+    assert results["test_poses"].startswith("photometric refinement, 100 steps, from: Sim(3)")
+    # The same pictures in other colours, from places that suit them better.
+    assert of_run["psnr"] < results["psnr"] < of_run["psnr"] + 3
+    assert len(list(pictures.glob("eval_img_*.png"))) == 3
+    assert (trained.read_bytes(), checkpoint.read_bytes()) == before
+    missing = ("aenerf", "evaluate", "--load-config", "nothing.yml", "--output", output)
+    assert "nothing.yml: there is no such file" in run(*missing, cwd=workspace, fails=True)
 
 
 def test_resuming_continues_from_the_checkpoint(trained: Path, workspace: Path) -> None:
@@ -130,12 +165,16 @@ def test_resuming_continues_from_the_checkpoint(trained: Path, workspace: Path) 
 
 def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspace: Path) -> None:
     given = read_tum_trajectory(workspace / "room" / "trajectory_estimated.txt")
-    for options, times in (((), given.times), (("--rate", "100"), torch.arange(0, given.end + 1, 10_000_000))):
+    for poses, rate, times in (
+        ("estimated", (), given.times),
+        ("ground-truth", ("--rate", "100"), torch.arange(0, given.end + 1, 10_000_000)),
+    ):
         output = workspace / "poses.txt"
+        options = ("--poses", poses, *rate)
         run("aenerf", "export-trajectory", "--load-config", trained, "--output", output, *options, cwd=workspace)
         exported = read_tum_trajectory(output)
         assert torch.equal(exported.times, times)
-        # Without pose correction they are the given ones, but for the framework's float32 transform.
+        # Both are the given ones, but for the framework's float32 transform.
         difference = exported.camera_to_worlds - given.interpolate(times)
         assert difference.abs().max() < 1e-6
     missing = ("aenerf", "export-trajectory", "--load-config", "nothing.yml", "--output", output)
@@ -242,7 +281,10 @@ def test_neither_images_nor_ground_truth_are_trained_on(trained: Path, workspace
     (changed / "events.gone").rename(changed / "events.h5")
     original = workspace / "original"
     shutil.copytree(changed, original)
-    (changed / "trajectory_ground_truth.txt").write_text("nothing\n")
+    # Other true poses, far from the estimated ones: they may change what is reported and nothing else.
+    truth = np.loadtxt(changed / "trajectory_ground_truth.txt")
+    truth[:, 1:4] = 3 * truth[::-1, 1:4]
+    np.savetxt(changed / "trajectory_ground_truth.txt", truth, fmt="%.9f")
     for image in changed.rglob("*.png"):
         imageio.imwrite(image, np.zeros_like(imageio.imread(image)))
     weights = []
@@ -267,28 +309,37 @@ def test_neither_images_nor_ground_truth_are_trained_on(trained: Path, workspace
     assert not torch.equal(*(w["_model.color_correction.offset"] for w in weights))
 
 
-def test_the_method_for_gpus_trains_too(trained: Path, workspace: Path) -> None:
+@pytest.mark.parametrize(
+    ("method", "small"),
+    [
+        ("aenerf", ("--pipeline.model.log2-hashmap-size", "12")),
+        ("aenerf-mlp", ("--pipeline.model.hidden-dim", "32", "--pipeline.model.proposal-hidden-dim", "16")),
+    ],
+)
+def test_the_methods_for_gpus_train_too(trained: Path, workspace: Path, method: str, small: tuple[str, ...]) -> None:
     data = workspace / "original"
-    small = ("--pipeline.datamanager.train-num-rays-per-batch", "60", "--pipeline.model.log2-hashmap-size", "12")
     run(
         "ns-train",
-        "aenerf",
+        method,
         *CPU,
         "--vis",
         "tensorboard",
         "--max-num-iterations",
         "2",
+        "--pipeline.datamanager.train-num-rays-per-batch",
+        "60",
         *small,
         "--data",
         data,
         cwd=workspace,
     )
-    assert len(list((workspace / "outputs" / "original" / "aenerf").rglob("*.ckpt"))) == 1
+    assert len(list((workspace / "outputs" / "original" / method).rglob("*.ckpt"))) == 1
 
 
 def test_the_framework_lists_the_methods_and_its_own_still_work(workspace: Path) -> None:
     output = run("ns-train", "--help", cwd=workspace)
     assert "aenerf " in output
+    assert "aenerf-mlp" in output
     assert "aenerf-small" in output
     assert "nerfacto" in output
     assert "ecd-data" in run("ns-train", "nerfacto", "--help", cwd=workspace)

@@ -1,4 +1,4 @@
-"""Loss values, colour correction and image encodings on cases worked out by hand."""
+"""Loss values, image metrics and image encodings on cases worked out by hand."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from aenerf_ns.color_correction import AffineColorCorrection
 from aenerf_ns.image_encoding import decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
@@ -49,37 +48,6 @@ def test_a_monochrome_sensor_sees_luminance() -> None:
     colours = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     torch.testing.assert_close(to_channels(colours, 1)[:, 0], torch.tensor([1.0, 0.2126, 0.7152]))
     assert torch.equal(to_channels(colours, 3), colours)
-
-
-def test_affine_fit_recovers_gain_and_exponent_of_each_channel() -> None:
-    generator = torch.Generator().manual_seed(0)
-    reference = torch.rand(5000, 3, generator=generator)
-    gain, exponent = torch.tensor([0.3, 2.0, 1.0]), torch.tensor([0.5, 1.0, 1.7])
-    log_radiance = exponent * torch.log(reference + 1e-3) + torch.log(gain)
-    correction = AffineColorCorrection(3)
-    correction.fit(log_radiance, reference, num_views=7)
-    torch.testing.assert_close(correction.scale, 1 / exponent)
-    torch.testing.assert_close(correction(log_radiance), reference, atol=1e-4, rtol=1e-4)
-    assert int(correction.num_views) == 7
-    restored = AffineColorCorrection(3)
-    restored.load_state_dict(correction.state_dict())
-    assert torch.equal(restored(log_radiance), correction(log_radiance))
-
-
-def test_affine_fit_of_a_constant_rendering_is_the_mean() -> None:
-    correction = AffineColorCorrection(1)
-    correction.fit(torch.full((4, 1), 0.7), torch.full((4, 1), 0.25), num_views=1)
-    torch.testing.assert_close(correction(torch.tensor([[0.7]])), torch.tensor([[0.25]]))
-
-
-def test_percentile_stretch_covers_the_display() -> None:
-    correction = AffineColorCorrection(1)
-    log_radiance = torch.linspace(-5, 3, 1001)[:, None]
-    correction.stretch(log_radiance)
-    shown = correction(log_radiance)
-    assert shown[10].item() == pytest.approx(0.02, rel=1e-3)
-    assert shown[990].item() == pytest.approx(0.9, rel=1e-3)
-    assert int(correction.num_views) == 0
 
 
 def test_psnr_by_hand_and_lpips_is_absent_unless_asked_for() -> None:

@@ -40,6 +40,9 @@ def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> N
     sensor = SensorModel(refractory_period=1_000)
     sampler = make_sampler(random_poses, sensor)
     rays, batch = sampler.sample()
+    PoseCorrectionConfig(mode="off").setup(
+        num_cameras=0, device="cpu", trajectory=sampler.trajectory, camera_times=torch.zeros(0, dtype=torch.int64)
+    ).apply_to_raybundle(rays)
     assert rays.origins.shape == (40, 3)
     assert rays.directions.dtype == torch.float32
     assert rays.times is not None
@@ -86,7 +89,7 @@ def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
     batches = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
-        batches.append(sampler.sample()[0].origins)
+        batches.append(sampler.sample()[0].times)
     assert torch.equal(batches[0], batches[1])
     assert not torch.equal(batches[0], batches[2])
 
@@ -109,20 +112,25 @@ def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) 
     assert set(batch["channel"].tolist()) == {2}
 
 
-def make_model(sensor: SensorModel | None = None, bounded: bool = False, **options: Any) -> AENeRFModel:
+def make_model(
+    sensor: SensorModel | None = None,
+    bounded: bool = False,
+    trajectory: Trajectory | None = None,
+    **options: Any,
+) -> AENeRFModel:
     torch.manual_seed(0)
-    config = AENeRFModelConfig(
-        num_levels=4,
-        max_resolution=32,
-        log2_hashmap_size=10,
-        hidden_dim=16,
-        num_proposal_samples_per_ray=(16,),
-        num_nerf_samples_per_ray=12,
-        proposal_max_resolutions=(16,),
-        proposal_num_levels=2,
-        proposal_log2_hashmap_size=8,
-        **options,
-    )
+    small: dict[str, Any] = {
+        "num_levels": 4,
+        "max_resolution": 32,
+        "log2_hashmap_size": 10,
+        "hidden_dim": 16,
+        "num_proposal_samples_per_ray": (16,),
+        "num_nerf_samples_per_ray": 12,
+        "proposal_max_resolutions": (16,),
+        "proposal_num_levels": 2,
+        "proposal_log2_hashmap_size": 8,
+    }
+    config = AENeRFModelConfig(**{**small, **options})
     ends = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     ends[:, 2, 3] = 3
     ends[:, 0, 3] = torch.tensor([-0.3, 0.3])
@@ -131,7 +139,8 @@ def make_model(sensor: SensorModel | None = None, bounded: bool = False, **optio
         "sensor": sensor or SensorModel(0.2, 0.3),
         "image_encoding": "srgb",
         "bounded": bounded,
-        "trajectory": Trajectory([0, 10**9], ends),
+        "trajectory": trajectory or Trajectory([0, 10**9], ends),
+        "ground_truth": None,
         "camera_times": torch.tensor([0]),
     }
     box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
@@ -163,10 +172,12 @@ def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
     }
 
 
+@pytest.mark.parametrize("backbone", ["hash", "mlp"])
 @pytest.mark.parametrize("contraction", ["l2", "linf", "none"])
 @pytest.mark.parametrize("bayer_pattern", ["", "RGGB"])
-def test_outputs_have_their_shapes_and_ranges(contraction: str, bayer_pattern: str) -> None:
-    model = make_model(SensorModel(bayer_pattern=bayer_pattern), scene_contraction=contraction).eval()
+def test_outputs_have_their_shapes_and_ranges(backbone: str, contraction: str, bayer_pattern: str) -> None:
+    sensor = SensorModel(bayer_pattern=bayer_pattern)
+    model = make_model(sensor, scene_contraction=contraction, backbone=backbone).eval()
     outputs = model(make_rays())
     channels = 3 if bayer_pattern else 1
     assert outputs["log_radiance"].shape == (10, channels)
@@ -199,8 +210,13 @@ def test_losses_are_those_of_the_rendered_changes() -> None:
     assert losses["distortion_loss"] == 0
 
 
-def test_every_parameter_is_in_one_group_and_gets_a_gradient() -> None:
-    model = make_model(bounded=True, camera_optimizer=PoseCorrectionConfig(mode="spline"), loss_coefficients=ALL_LOSSES)
+@pytest.mark.parametrize(
+    "backbone", [{}, {"backbone": "mlp", "num_hidden_layers": 6, "num_proposal_samples_per_ray": (16, 8)}]
+)
+@pytest.mark.parametrize("bounded", [True, False])
+def test_every_parameter_is_in_one_group_and_gets_a_gradient(backbone: dict[str, Any], bounded: bool) -> None:
+    correction = PoseCorrectionConfig(mode="spline")
+    model = make_model(bounded=bounded, camera_optimizer=correction, loss_coefficients=ALL_LOSSES, **backbone)
     # Denser than the proposals, or their loss has no gradient.
     model.field.average_init_density = 5.0
     losses = model.get_loss_dict(model(make_rays(15, with_times=True)), make_batch(5))
@@ -211,6 +227,8 @@ def test_every_parameter_is_in_one_group_and_gets_a_gradient() -> None:
     groups = model.get_param_groups()
     grouped = [parameter for group in groups.values() for parameter in group]
     assert len(grouped) == len(set(grouped))
+    # An optimizer without parameters is an error.
+    assert all(groups.values())
     named = {name: parameter for name, parameter in model.named_parameters() if parameter.numel() > 0}
     assert set(named.values()) == set(grouped)
     for name, parameter in named.items():
@@ -218,7 +236,44 @@ def test_every_parameter_is_in_one_group_and_gets_a_gradient() -> None:
         assert torch.isfinite(parameter.grad).all(), name
         assert parameter.grad.abs().max() > 0, name
     # Weight decay is for network weights alone.
-    assert all(not name.endswith("hash_table") for name, p in named.items() if any(p is q for q in groups["networks"]))
+    decayed = {name for name, parameter in named.items() if any(parameter is other for other in groups["networks"])}
+    assert decayed == {name for name in named if ".layers." in name}
+
+
+def test_the_mlps_are_those_of_the_paper() -> None:
+    model = make_model(
+        backbone="mlp",
+        num_hidden_layers=8,
+        hidden_dim=1024,
+        geometry_feature_dim=256,
+        num_proposal_samples_per_ray=(16, 8),
+        proposal_num_hidden_layers=4,
+        proposal_hidden_dim=256,
+    )
+    # Ten frequencies of sine and cosine, and the position itself.
+    encoded = 63
+    shapes = [tuple(layer.weight.shape) for layer in model.field.density_network.layers]
+    assert shapes == [
+        (1024, encoded), *[(1024, 1024)] * 4, (1024, 1024 + encoded), *[(1024, 1024)] * 2, (1 + 256, 1024)
+    ]  # fmt: skip
+    # One proposal network, evaluated twice.
+    (proposal_network,) = model.proposal_networks
+    shapes = [tuple(layer.weight.shape) for layer in proposal_network.density_network.layers]
+    assert shapes == [(256, encoded), *[(256, 256)] * 3, (1, 256)]
+    assert len(model.density_fns) == 2
+
+
+@pytest.mark.parametrize("contraction", ["l2", "linf", "none"])
+def test_the_mlp_density_is_softplus_and_ends_at_the_box(contraction: str) -> None:
+    model = make_model(backbone="mlp", scene_contraction=contraction, average_init_density=0.3)
+    with torch.no_grad():
+        model.field.density_network.layers[-1].weight.zero_()
+        model.field.density_network.layers[-1].bias.fill_(2.0)
+    positions = torch.tensor([[0.5, -0.2, 0.9], [0.5, -0.2, 1.1]])
+    # softplus(log(exp(d) - 1)) = d: the density where the network gives 0.
+    inside = torch.log1p(torch.exp(torch.tensor(2.0)) * torch.expm1(torch.tensor(0.3)))
+    expected = torch.stack([inside, inside * (contraction != "none")])[:, None]
+    torch.testing.assert_close(model.field.density_fn(positions), expected)
 
 
 def test_rays_past_a_bounded_scene_see_the_background() -> None:
@@ -246,7 +301,7 @@ def test_the_picture_is_the_colour_corrected_one() -> None:
 def test_image_metrics_compare_with_what_the_sensor_sees() -> None:
     model = make_model().eval()
     reference = torch.rand(16, 16, 3)
-    grey = model._display(model.reference_radiance(reference))
+    grey = model.reference_display(reference)
     outputs = {"rgb": grey, "accumulation": torch.ones(16, 16, 1), "depth": torch.ones(16, 16, 1)}
     metrics, images = model.get_image_metrics_and_images(outputs, {"image": reference})
     assert metrics["psnr"] > 60

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.dataparsers.tum_trajectory import write_tum_trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.pipeline import AENeRFPipeline
+from aenerf_ns.trajectory.trajectory import Trajectory
 
 
 @dataclass
@@ -25,10 +25,10 @@ class ExportTrajectory:
     """config.yml of the run."""
     output: Path
     """Text file to write."""
-    poses: Literal["corrected", "estimated"] = "corrected"
-    """After the run's pose correction, or as they were given (within the run's time window)."""
+    poses: Literal["corrected", "estimated", "ground-truth"] = "corrected"
+    """After the run's pose correction, as they were given, or the true ones (within the run's time window)."""
     rate: float | None = None
-    """Poses a second; by default at the times of the estimated poses."""
+    """Poses a second; by default at the times of the given poses."""
 
     def main(self) -> None:
         """Loads the run and writes its poses."""
@@ -37,22 +37,23 @@ class ExportTrajectory:
         if not self.load_config.is_file():
             raise DataError(self.load_config, "there is no such file", "give the config.yml of a trained run")
         _, pipeline, _, _ = eval_setup(self.load_config, test_mode="inference")
+        assert isinstance(pipeline, AENeRFPipeline)
         correction = pipeline.model.camera_optimizer
-        trajectory: Trajectory = correction.trajectory
+        estimated = correction.trajectory
+        trajectory = estimated
+        if self.poses == "ground-truth":
+            trajectory = pipeline.datamanager.train_dataset.metadata["ground_truth"]
+            if trajectory is None:
+                raise DataError(
+                    pipeline.datamanager.get_datapath(), "it has no true poses", "export corrected or estimated ones"
+                )
+            trajectory = trajectory.to(pipeline.device).between(estimated.start, estimated.end)
         times = trajectory.times
         if self.rate is not None:
             times = torch.arange(trajectory.start, trajectory.end + 1, round(1e9 / self.rate), device=times.device)
-        seconds = trajectory.seconds(times)
+        source = correction if self.poses == "corrected" else trajectory
         with torch.no_grad():
-            poses = (correction if self.poses == "corrected" else trajectory).pose(seconds)
-        written = Trajectory(times.cpu(), _in_world(poses.cpu(), pipeline.datamanager.train_dataparser_outputs))
+            poses = source.pose(trajectory.seconds(times))
+        written = Trajectory(times.cpu(), pipeline.in_recording(poses))
         write_tum_trajectory(self.output, written)
         CONSOLE.print(f"{self.output}: {len(written)} {self.poses} poses.")
-
-
-def _in_world(poses: torch.Tensor, outputs: DataparserOutputs) -> torch.Tensor:
-    """(N, 4, 4) poses with OpenCV axes in the recording's world of (N, 3, 4) ones with OpenGL axes in the scene's."""
-    poses = homogeneous(poses)
-    poses[:, :3, 3] /= outputs.dataparser_scale
-    to_scene = homogeneous(outputs.dataparser_transform.double())
-    return torch.linalg.inv(to_scene) @ poses @ OPENCV_TO_OPENGL

@@ -52,6 +52,11 @@ class EventPairs:
     def __len__(self) -> int:
         return len(self.time)
 
+    @property
+    def shortest_interval(self) -> int:
+        """Nanoseconds between the two events of the closest pair."""
+        return int((self.time - self.previous_time).min())
+
     def summary(self) -> str:
         """One line that accounts for every event of the stream."""
         return (

@@ -34,9 +34,7 @@ class Similarity:
         return Similarity(scale, rotation, -scale * (rotation @ self.translation))
 
 
-def align(
-    poses: Tensor, reference: Tensor, with_scale: bool = True, with_orientations: bool = True
-) -> Similarity:
+def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orientations: bool = True) -> Similarity:
     """Least-squares map of poses onto reference poses of the same cameras at the same times.
 
     Positions alone leave the rotation uncertain, and on a straight line undetermined. So each camera contributes its

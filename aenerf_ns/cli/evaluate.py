@@ -1,0 +1,65 @@
+"""``aenerf evaluate``: the metrics of ``ns-eval``, under the run's colour correction or another."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.color_correction import ColorCorrectionProtocol
+from aenerf_ns.errors import DataError
+from aenerf_ns.pipeline import AENeRFPipeline
+
+
+@dataclass
+class Evaluate:
+    """Compare a trained run's renderings with the test views, as ns-eval does and in the same JSON layout, optionally
+    under another protocol than the run's. Nothing in the run's folder changes."""
+
+    load_config: Path
+    """config.yml of the run."""
+    output: Path
+    """JSON file to write."""
+    color_correction: ColorCorrectionProtocol | None = None
+    """Fit this colour correction on the run's data and use it; by default the one that was stored with the run."""
+    test_poses: Literal["aligned", "photometric"] = "aligned"
+    """Render the test views from where their poses, carried into the frame of the corrected poses, put them; or let
+    each first be moved to where it fits its image best, which looks at the test images."""
+    render_output: Path | None = None
+    """Folder for pictures: truth beside reconstruction, accumulation, depth."""
+
+    def main(self) -> None:
+        """Loads the run, evaluates it and writes the metrics."""
+        if not self.load_config.is_file():
+            raise DataError(self.load_config, "there is no such file", "give the config.yml of a trained run")
+        config, pipeline, checkpoint, _ = eval_setup(self.load_config)
+        if not isinstance(pipeline, AENeRFPipeline):
+            raise DataError(self.load_config, f"the run is of method {config.method_name}", "use ns-eval")
+        of_run = pipeline.model.color_correction.protocol
+        used = self.color_correction or of_run
+        if used != of_run:
+            pipeline.replace_color_correction(used)
+        if self.test_poses == "photometric":
+            pipeline.refine_test_poses()
+        results = pipeline.get_average_eval_image_metrics(output_path=self.render_output, get_std=True)
+        evaluation = {
+            "experiment_name": config.experiment_name,
+            "method_name": config.method_name,
+            "checkpoint": str(checkpoint),
+            "protocol": {
+                "color_correction": used,
+                "color_correction_of_run": of_run,
+                "test_poses": self.test_poses,
+            },
+            "results": results,
+        }
+        self.output.parent.mkdir(parents=True, exist_ok=True)
+        self.output.write_text(json.dumps(evaluation, indent=2) + "\n", "utf8")
+        CONSOLE.print(
+            f"{self.output}: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.3f} over {results['num_views']} "
+            f"views; colour correction {results['color_correction']}."
+        )

@@ -1,0 +1,68 @@
+"""What is learned of the sensor with the scene: the ratio of its contrast thresholds, and its refractory period."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from aenerf_ns.events.sensor import SensorModel
+
+
+class SensorParameters(nn.Module):
+    """Contrast threshold C+ and refractory period τ, each a parameter or a constant.
+
+    Events leave the scale of log-radiance open, so of the thresholds only the ratio C+ / C− can be learned: C− stays as
+    it is given. The ratio is a softplus, hence positive. τ is a sigmoid times the shortest interval between two events
+    of a pixel, which no refractory period can exceed.
+
+    Args:
+        sensor: initial values.
+        learn_contrast_threshold_ratio: whether C+ / C− is learned.
+        learn_refractory_period: whether τ is learned.
+    """
+
+    _longest_refractory_period: Tensor
+
+    def __init__(
+        self, sensor: SensorModel, learn_contrast_threshold_ratio: bool, learn_refractory_period: bool
+    ) -> None:
+        super().__init__()
+        self._sensor = sensor
+        self.raw_ratio: nn.Parameter | None = None
+        self.raw_refractory_period: nn.Parameter | None = None
+        if learn_contrast_threshold_ratio:
+            ratio = sensor.positive_contrast_threshold / sensor.negative_contrast_threshold
+            # The inverse of softplus, for large ratios too.
+            self.raw_ratio = nn.Parameter(torch.tensor(ratio + math.log(-math.expm1(-ratio))))
+        if learn_refractory_period:
+            self.raw_refractory_period = nn.Parameter(torch.tensor(0.0))
+            # Of the events, which are read for training only: kept in checkpoints.
+            self.register_buffer("_longest_refractory_period", torch.tensor(torch.nan, dtype=torch.float64))
+
+    @property
+    def contrast_threshold_ratio(self) -> Tensor | None:
+        """C+ / C−, a scalar in the graph; None where it is not learned."""
+        return None if self.raw_ratio is None else F.softplus(self.raw_ratio)
+
+    @property
+    def refractory_period(self) -> Tensor | None:
+        """τ in seconds, a float64 scalar in the graph; None where it is not learned."""
+        if self.raw_refractory_period is None:
+            return None
+        return self._longest_refractory_period * torch.sigmoid(self.raw_refractory_period.double())
+
+    def bound_refractory_period(self, shortest_interval: int) -> None:
+        """Sets the bound of τ, and τ to the sensor's value where that is positive, else to half of the bound.
+
+        Args:
+            shortest_interval: between two consecutive events of a pixel, in nanoseconds; longer than the sensor's
+                refractory period.
+        """
+        if self.raw_refractory_period is None:
+            return
+        self._longest_refractory_period.fill_(shortest_interval * 1e-9)
+        part = self._sensor.refractory_period / shortest_interval
+        self.raw_refractory_period.data.fill_(math.log(part / (1 - part)) if part > 0 else 0.0)

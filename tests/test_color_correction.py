@@ -1,0 +1,255 @@
+"""The protocols of colour correction: what each recovers, from which views, and that it is stored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_stream
+from nerfstudio.cameras.rays import RayBundle
+
+from aenerf_ns.color_correction import (
+    COLOR_CORRECTIONS,
+    AffineColorCorrection,
+    ColorCorrectionProtocol,
+    NetworkColorCorrection,
+    NoColorCorrection,
+)
+from aenerf_ns.datamanager import EventDataManagerConfig
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.image_encoding import encode
+from aenerf_ns.model import AENeRFModelConfig
+from aenerf_ns.pipeline import AENeRFPipeline, AENeRFPipelineConfig
+from aenerf_ns.pose_correction import PoseCorrectionConfig
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
+
+
+def mean_squared_error(correction: torch.nn.Module, log_radiance: torch.Tensor, reference: torch.Tensor) -> float:
+    return float((correction(log_radiance) - encode(reference, "srgb")).square().mean())
+
+
+def crosstalk(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log-radiance and reference radiance (count, 3) between which lie an offset and an exponent of each channel, and
+    a mixture of the channels, which no map of single channels undoes."""
+    reference = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+    mixture = torch.tensor([[0.8, 0.2, 0.0], [0.1, 0.7, 0.2], [0.0, 0.3, 0.7]])
+    exponent, gain = torch.tensor([0.5, 0.8, 1.5]), torch.tensor([0.3, 2.0, 1.0])
+    return exponent * torch.log(reference @ mixture.T + 1e-3) + torch.log(gain), reference
+
+
+def test_every_protocol_has_a_class_of_its_name() -> None:
+    assert set(COLOR_CORRECTIONS) == set(get_args(ColorCorrectionProtocol))
+    for protocol, correction in COLOR_CORRECTIONS.items():
+        assert correction.protocol == protocol
+
+
+@pytest.mark.parametrize("protocol", ["affine", "affine-test"])
+def test_affine_fit_recovers_gain_and_exponent_of_each_channel(protocol: ColorCorrectionProtocol) -> None:
+    generator = torch.Generator().manual_seed(0)
+    reference = torch.rand(5000, 3, generator=generator)
+    gain, exponent = torch.tensor([0.3, 2.0, 1.0]), torch.tensor([0.5, 1.0, 1.7])
+    log_radiance = exponent * torch.log(reference + 1e-3) + torch.log(gain)
+    correction = COLOR_CORRECTIONS[protocol](3, "srgb")
+    assert isinstance(correction, AffineColorCorrection)
+    correction.fit(log_radiance, reference, num_views=7)
+    torch.testing.assert_close(correction.scale, 1 / exponent)
+    torch.testing.assert_close(correction.offset, -torch.log(gain) / exponent)
+    torch.testing.assert_close(correction(log_radiance), encode(reference, "srgb"), atol=1e-4, rtol=1e-4)
+
+
+def test_affine_fit_of_a_constant_rendering_is_the_mean() -> None:
+    correction = AffineColorCorrection(1, "linear")
+    correction.fit(torch.full((4, 1), 0.7), torch.full((4, 1), 0.25), num_views=1)
+    torch.testing.assert_close(correction(torch.tensor([[0.7]])), torch.tensor([[0.25]]))
+
+
+def test_the_network_learns_what_no_affine_map_can() -> None:
+    affine, network = AffineColorCorrection(3, "srgb"), NetworkColorCorrection(3, "srgb")
+    for correction in (affine, network):
+        correction.fit(*crosstalk(2000, seed=0), num_views=4)
+    held_out = crosstalk(2000, seed=1)
+    # 10 dB.
+    assert mean_squared_error(network, *held_out) < 0.1 * mean_squared_error(affine, *held_out)
+    assert network(held_out[0]).min() >= 0
+    assert network(held_out[0]).max() <= 1
+
+
+@pytest.mark.parametrize("num_channels", [1, 3])
+def test_the_network_is_the_affine_map_until_it_is_fitted_in_full(num_channels: int) -> None:
+    log_radiance, reference = (values[:, :num_channels] for values in crosstalk(500, seed=0))
+    affine, network = AffineColorCorrection(num_channels, "srgb"), NetworkColorCorrection(num_channels, "srgb")
+    assert torch.equal(network(log_radiance), affine(log_radiance))
+    affine.fit(log_radiance, reference, num_views=4)
+    network.fit(log_radiance, reference, num_views=4)
+    assert not torch.equal(network(log_radiance), affine(log_radiance))
+    assert network.description == "network, fitted on 4 validation views"
+    network.fit(log_radiance, reference, num_views=4, rough=True)
+    assert torch.equal(network(log_radiance), affine(log_radiance))
+    # A checkpoint of a run that was stopped early must not pass for the whole.
+    assert network.description == "network, fitted on 4 validation views, its affine part only"
+
+
+def test_the_network_is_bounded_far_from_what_it_was_fitted_on() -> None:
+    network = NetworkColorCorrection(1, "srgb")
+    affine = AffineColorCorrection(1, "srgb")
+    log_radiance, reference = (values[:, :1] for values in crosstalk(500, seed=0))
+    for correction in (affine, network):
+        correction.fit(log_radiance, reference, num_views=1)
+    far = torch.tensor([[-100.0], [100.0]])
+    torch.testing.assert_close(network(far), affine(far), atol=0.25, rtol=0)
+
+
+def test_none_shows_radiance_as_it_is() -> None:
+    radiance = torch.tensor([[0.0, 0.25, 0.5], [0.75, 1.0, 3.0]])
+    shown = NoColorCorrection(3, "linear")(torch.log(radiance))
+    torch.testing.assert_close(shown, radiance.clamp(max=1))
+    torch.testing.assert_close(NoColorCorrection(3, "srgb")(torch.log(radiance)), encode(radiance, "srgb"))
+
+
+@pytest.mark.parametrize("protocol", FITTED)
+def test_percentile_stretch_covers_the_display(protocol: ColorCorrectionProtocol) -> None:
+    correction = COLOR_CORRECTIONS[protocol](1, "linear")
+    assert isinstance(correction, AffineColorCorrection)
+    # What was fitted before leaves no trace.
+    correction.fit(*(values[:, :1] for values in crosstalk(100, seed=0)), num_views=2)
+    log_radiance = torch.linspace(-5, 3, 1001)[:, None]
+    correction.stretch(log_radiance)
+    shown = correction(log_radiance)
+    assert shown[10].item() == pytest.approx(0.02, rel=1e-3)
+    assert shown[990].item() == pytest.approx(0.9, rel=1e-3)
+    assert correction.description.startswith("percentile stretch, no ")
+
+
+@pytest.mark.parametrize("protocol", COLOR_CORRECTIONS)
+def test_fits_are_the_same_every_time_and_are_restored_from_checkpoints(protocol: ColorCorrectionProtocol) -> None:
+    log_radiance, reference = crosstalk(200, seed=0)
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    first, again, restored = (COLOR_CORRECTIONS[protocol](3, "srgb") for _ in range(3))
+    if not isinstance(first, NoColorCorrection):
+        assert isinstance(again, AffineColorCorrection)
+        with torch.no_grad():
+            first.fit(log_radiance, reference, num_views=3)
+        # From another state.
+        again.fit(-log_radiance.flip(0), reference, num_views=8)
+        again.fit(log_radiance, reference, num_views=3)
+    # The framework wants an optimizer for every parameter that is trained.
+    assert not list(first.parameters())
+    assert torch.equal(torch.get_rng_state(), before)
+    restored.load_state_dict(first.state_dict(), strict=True)
+    for other in (again, restored):
+        assert torch.equal(other(log_radiance), first(log_radiance))
+        assert other.description == first.description
+
+
+def test_checkpoints_of_the_affine_protocol_hold_these_buffers() -> None:
+    # Checkpoints of the first version do.
+    assert set(AffineColorCorrection(3, "srgb").state_dict()) == {"scale", "offset", "num_views"}
+
+
+def make_pipeline(
+    folder: Path, test_mode: Literal["test", "val"], num_views: int = 2, pose_correction: str = "off"
+) -> AENeRFPipeline:
+    """A small untrained model of a colour sensor: grey validation views, and one test view more, orange."""
+    if not folder.exists():
+        camera = EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
+        poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+        poses[:, 0, 3] = torch.tensor([-0.1, 0.0, 0.1])
+        with NativeDatasetWriter(folder, camera, SensorModel(bayer_pattern="RGGB"), "srgb") as writer:
+            writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 10**9, -1)], 6, 4))
+            writer.add_trajectories(Trajectory([0, 5 * 10**8, 10**9], poses))
+            for _ in range(num_views):
+                writer.add_image("val", np.full((4, 6, 3), 102, np.uint8), poses[0])
+            for _ in range(num_views + 1):
+                writer.add_image("test", np.full((4, 6, 3), (204, 102, 51), np.uint8), poses[2])
+    model = AENeRFModelConfig(
+        num_levels=4,
+        max_resolution=32,
+        log2_hashmap_size=10,
+        num_proposal_samples_per_ray=(16,),
+        num_nerf_samples_per_ray=12,
+        proposal_max_resolutions=(16,),
+        proposal_num_levels=2,
+        proposal_log2_hashmap_size=8,
+        color_correction_num_rays=64,
+        camera_optimizer=PoseCorrectionConfig(mode=pose_correction),
+    )
+    torch.manual_seed(0)
+    datamanager = EventDataManagerConfig(dataparser=NativeDataParserConfig(data=folder))
+    return AENeRFPipelineConfig(datamanager=datamanager, model=model).setup(device="cpu", test_mode=test_mode)
+
+
+@pytest.mark.parametrize("test_mode", ["val", "test"])
+def test_each_protocol_is_fitted_on_its_own_views(test_mode: Literal["test", "val"], tmp_path: Path) -> None:
+    pipeline = make_pipeline(tmp_path / "made", test_mode)
+    grey, orange = torch.full((3,), 0.4), torch.tensor([0.8, 0.4, 0.2])
+    expected: dict[ColorCorrectionProtocol, tuple[str, torch.Tensor]] = {
+        "affine": ("affine, fitted on 2 validation views", grey),
+        "affine-test": ("affine-test, fitted on the 3 test views themselves", orange),
+        "network": ("network, fitted on 2 validation views", grey),
+    }
+    camera = pipeline.datamanager.reference_views("test").cameras[0:1]
+    rays = camera.generate_rays(0, keep_shape=False)
+    for protocol, (description, color) in expected.items():
+        pipeline.replace_color_correction(protocol)
+        assert pipeline.model.color_correction.description == description
+        # All references are alike, so whatever is rendered becomes their colour.
+        shown = pipeline.model.eval()(rays)["rgb"]
+        torch.testing.assert_close(shown, color.expand_as(shown), atol=0.02, rtol=0)
+    pipeline.replace_color_correction("none")
+    outputs = pipeline.model.eval()(rays)
+    torch.testing.assert_close(outputs["rgb"], encode(torch.exp(outputs["log_radiance"]), "srgb"))
+    assert pipeline.model.color_correction.description == "none"
+
+
+def test_without_reference_views_every_fitted_protocol_says_that_it_is_a_stretch(tmp_path: Path) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "test", num_views=0)
+    # There is one test view, which the protocols for validation views may not use.
+    for protocol, description in (
+        ("affine", "percentile stretch, no validation views (protocol affine)"),
+        ("network", "percentile stretch, no validation views (protocol network)"),
+        ("affine-test", "affine-test, fitted on the 1 test views themselves"),
+    ):
+        pipeline.replace_color_correction(protocol)
+        assert pipeline.model.color_correction.description == description
+
+
+def test_a_rough_fit_leaves_the_network_out(tmp_path: Path) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "val")
+    pipeline.replace_color_correction("network")
+    pipeline.fit_color_correction(1 / 8)
+    assert pipeline.model.color_correction.description.endswith("its affine part only")
+    # What the framework asks an optimizer for is what it was.
+    names = {name for name, _ in pipeline.model.named_parameters()}
+    assert not any("color_correction" in name for name in names)
+
+
+def test_reference_views_are_placed_by_the_poses_of_the_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "val", pose_correction="spline")
+    seen: list[torch.Tensor] = []
+    render = pipeline.model.render_log_radiance
+
+    def spy(rays: RayBundle) -> torch.Tensor:
+        seen.append(rays.origins)
+        return render(rays)
+
+    monkeypatch.setattr(pipeline.model, "render_log_radiance", spy)
+    pipeline.fit_color_correction()
+    correction = pipeline.model.camera_optimizer
+    assert correction.twists is not None
+    with torch.no_grad():
+        # The whole scene moves 0.5 along the camera's y axis.
+        correction.twists.control_twists[:, 1] = 0.5
+    pipeline.fit_color_correction()
+    before, after = seen
+    expected = correction.apply_to_camera(pipeline.datamanager.reference_views("val").cameras)[0, :, 3]
+    torch.testing.assert_close(after, expected.expand_as(after))
+    torch.testing.assert_close((after - before).norm(dim=-1), torch.full((64,), 0.5))

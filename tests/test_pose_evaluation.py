@@ -1,0 +1,258 @@
+"""Alignment of trajectories and their errors, and reference views in the frame of the corrected poses."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from test_model import make_model
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import REFERENCE_SECONDS, EventCamera
+from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.pose_refinement import refine_camera
+from aenerf_ns.trajectory.alignment import Similarity, align, pose_errors, rotation_angle
+from aenerf_ns.trajectory.noise import perturb
+from aenerf_ns.trajectory.rotation import motion_from_twist, quaternion_from_rotation, rotation_from_vector
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+
+SECOND = 10**9
+
+
+def make_truth(random_poses: torch.Tensor, count: int = 120) -> Trajectory:
+    times = np.linspace(0, 7 * SECOND, count).astype(np.int64)
+    return Trajectory(times, Trajectory(SECOND * np.arange(8), random_poses).interpolate(times))
+
+
+def some_similarity(scale: float = 0.3) -> Similarity:
+    rotation = rotation_from_vector(torch.tensor([0.4, -1.2, 0.7], dtype=torch.float64))
+    return Similarity(torch.tensor(scale, dtype=torch.float64), rotation, torch.tensor([1.0, -2.0, 0.5]).double())
+
+
+@pytest.mark.parametrize("with_orientations", [True, False])
+def test_alignment_recovers_a_similarity(with_orientations: bool, random_poses: torch.Tensor) -> None:
+    reference = make_truth(random_poses).camera_to_worlds
+    poses = some_similarity().inverse()(reference)
+    found = align(poses, reference, with_orientations=with_orientations)
+    torch.testing.assert_close(found(poses), reference, rtol=0, atol=1e-12)
+    assert float(found.scale) == pytest.approx(0.3, rel=1e-12)
+    errors = pose_errors(poses, reference)
+    for name, value in errors.items():
+        # SE(3) cannot take out a scale.
+        assert (value < 1e-6) == ("se3" not in name or name == "rotation_error_degrees_se3"), name
+
+
+def test_errors_are_those_of_known_displacements(random_poses: torch.Tensor) -> None:
+    # Errors that no similarity can take out: alternating, along an axis of the camera.
+    reference = make_truth(random_poses, 2000).camera_to_worlds
+    sign = (-1.0) ** torch.arange(2000, dtype=torch.float64)[:, None]
+    twist = sign * torch.tensor([0.01, 0, 0, 0, 0, 0.02], dtype=torch.float64)
+    poses = (homogeneous(reference) @ motion_from_twist(twist))[:, :3]
+    errors = pose_errors(poses, reference)
+    assert errors["rotation_error_degrees"] == pytest.approx(np.degrees(0.02), rel=1e-3)
+    assert errors["translation_error"] == pytest.approx(0.01, rel=1e-3)
+    assert errors["ate_rmse_se3"] == pytest.approx(0.01, rel=1e-3)
+    length = float(reference[..., 3].diff(dim=0).norm(dim=-1).sum())
+    assert errors["translation_error_percent"] == pytest.approx(100 * errors["translation_error"] / length)
+
+
+def test_the_absolute_trajectory_error_is_evo_s(random_poses: torch.Tensor) -> None:
+    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed")
+    from evo.core.trajectory import PosePath3D
+
+    reference = make_truth(random_poses)
+    noisy = perturb(reference, rotation_degrees=3.0, translation=0.2, correlation_time=0.3, seed=1)
+    poses = some_similarity(2.5)(noisy.camera_to_worlds)
+    errors = pose_errors(poses, reference.camera_to_worlds)
+    for name, with_scale in (("sim3", True), ("se3", False)):
+        paths = [
+            PosePath3D(
+                positions_xyz=p[..., 3].numpy(),
+                orientations_quat_wxyz=quaternion_from_rotation(p[..., :3])[:, [3, 0, 1, 2]].numpy(),
+            )
+            for p in (reference.camera_to_worlds, poses)
+        ]
+        paths[1].align(paths[0], correct_scale=with_scale)
+        ape = metrics.APE(metrics.PoseRelation.translation_part)
+        ape.process_data(tuple(paths))
+        expected = ape.get_statistic(metrics.StatisticsType.rmse)
+        assert expected > 0.05
+        assert errors[f"ate_rmse_{name}"] == pytest.approx(expected, rel=1e-9)
+
+
+def test_orientations_settle_the_alignment_of_a_straight_line() -> None:
+    # Positions on a line leave the rotation about it open.
+    reference = torch.eye(4, dtype=torch.float64)[:3].repeat(50, 1, 1)
+    reference[:, 0, 3] = torch.linspace(0, 1, 50)
+    generator = torch.Generator().manual_seed(0)
+    noise = 1e-3 * torch.randn(50, 6, generator=generator, dtype=torch.float64)
+    poses = some_similarity()((homogeneous(reference) @ motion_from_twist(noise))[:, :3])
+    assert pose_errors(poses, reference)["rotation_error_degrees"] < 0.2
+    still = reference[:1].expand(50, 3, 4)
+    assert pose_errors(some_similarity()(still), still)["rotation_error_degrees"] < 1e-6
+
+
+def test_a_mirrored_trajectory_is_not_aligned_by_a_reflection(random_poses: torch.Tensor) -> None:
+    reference = make_truth(random_poses).camera_to_worlds
+    mirrored = reference.clone()
+    mirrored[:, 0, 3] *= -1
+    for with_orientations in (True, False):
+        found = align(mirrored, reference, with_orientations=with_orientations)
+        assert float(torch.linalg.det(found.rotation)) == pytest.approx(1.0)
+
+
+def test_small_rotation_angles_are_exact() -> None:
+    identity = torch.eye(3, 4, dtype=torch.float64)[None]
+    for angle in (1e-12, 1e-6, 0.5, 3.14):
+        vector = torch.tensor([[0.6 * angle, -0.8 * angle, 0.0]], dtype=torch.float64)
+        turned = torch.cat([rotation_from_vector(vector), torch.zeros(1, 3, 1).double()], -1)
+        assert float(rotation_angle(turned, identity)) == pytest.approx(angle, rel=1e-9)
+
+
+def make_correction(trajectory: Trajectory, ground_truth: Trajectory | None) -> PoseCorrection:
+    """With a correction that is far from none."""
+    torch.manual_seed(0)
+    correction = PoseCorrectionConfig(mode="spline", knot_interval=1.0).setup(
+        num_cameras=0,
+        device="cpu",
+        trajectory=trajectory,
+        camera_times=torch.zeros(0, dtype=torch.int64),
+        ground_truth=ground_truth,
+    )
+    torch.nn.init.normal_(correction.twists.control_twists, std=0.05)
+    return correction
+
+
+def reference_cameras(poses: torch.Tensor, seconds: list[float]):
+    cameras = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5).cameras(poses)
+    cameras.metadata[REFERENCE_SECONDS] = torch.tensor(seconds, dtype=torch.float64)[:, None]
+    return cameras
+
+
+def test_without_ground_truth_views_follow_the_correction_of_their_time(random_poses: torch.Tensor) -> None:
+    trajectory = make_truth(random_poses)
+    correction = make_correction(trajectory, None)
+    seconds = [1.3, 4.0]
+    cameras = reference_cameras(trajectory.pose(torch.tensor(seconds).double()), seconds)
+    expected = correction.pose(torch.tensor(seconds).double())
+    torch.testing.assert_close(correction.apply_to_camera(cameras), expected.float(), rtol=0, atol=1e-6)
+    # A camera that is mounted elsewhere on the rig keeps its place there.
+    mount = motion_from_twist(torch.tensor([0.1, 0.2, -0.1, 0.3, 0.0, 0.1], dtype=torch.float64))
+    cameras = reference_cameras((homogeneous(trajectory.pose(torch.tensor(seconds).double())) @ mount)[:, :3], seconds)
+    expected = (homogeneous(expected) @ mount)[:, :3]
+    torch.testing.assert_close(correction.apply_to_camera(cameras), expected.float(), rtol=0, atol=1e-6)
+    # One that was not taken on the trajectory moves with the trajectory as a whole.
+    cameras = reference_cameras(random_poses[:1], [np.nan])
+    expected = correction.alignment().inverse()(random_poses[:1])
+    torch.testing.assert_close(correction.apply_to_camera(cameras), expected.float(), rtol=0, atol=1e-6)
+
+
+def test_with_ground_truth_views_are_carried_by_the_alignment_to_it(random_poses: torch.Tensor) -> None:
+    truth = make_truth(random_poses)
+    # The estimated trajectory is the true one in another world, and the correction is none.
+    estimated = Trajectory(truth.times, some_similarity()(truth.camera_to_worlds))
+    correction = make_correction(estimated, truth)
+    torch.nn.init.zeros_(correction.twists.control_twists)
+    views = random_poses[2:5]
+    carried = correction.apply_to_camera(reference_cameras(views, [np.nan, 0.5, 1.0]))
+    torch.testing.assert_close(carried, some_similarity()(views).float(), rtol=0, atol=1e-5)
+    # Other cameras, such as the viewer's, are in the scene's frame and stay.
+    others = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5).cameras(views)
+    assert correction.apply_to_camera(others) is others.camera_to_worlds
+
+
+def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tensor) -> None:
+    truth = make_truth(random_poses)
+    late = Trajectory(truth.times + 8 * SECOND, truth.camera_to_worlds, "truth.txt")
+    with pytest.raises(DataError, match=r"^truth.txt: .*do not cover two of the estimated ones"):
+        make_correction(truth, late)
+    # Where it covers a part, that part is compared.
+    half = truth.between(0, 3 * SECOND)
+    estimated, corrected, reference = make_correction(truth, half).compared_poses()
+    assert len(estimated) == len(corrected) == len(reference) == len(half)
+    torch.testing.assert_close(estimated, reference, rtol=0, atol=1e-12)
+
+
+def test_photometric_refinement_finds_the_camera_back() -> None:
+    model = make_model(bounded=True, average_init_density=3.0).eval()
+    torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
+    before = copy.deepcopy(model.state_dict())
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([0.1, -0.2, 2.5])
+    camera = EventCamera(32, 24, 30.0, 30.0, 16.0, 12.0).cameras(pose[None, :3])
+    image = model.get_outputs_for_camera(camera)["rgb"]
+    moved = pose @ motion_from_twist(torch.tensor([0.02, -0.03, 0.0, 0.01, 0.02, -0.02], dtype=torch.float64))
+    wrong = replace(camera, camera_to_worlds=moved[None, :3].float())
+
+    def error(poses: torch.Tensor) -> float:
+        rendered = model.get_outputs_for_camera(replace(camera, camera_to_worlds=poses))["rgb"]
+        return float((rendered - image).square().mean())
+
+    refined = refine_camera(model, wrong, image)
+    assert error(refined.camera_to_worlds) < 0.05 * error(wrong.camera_to_worlds)
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    assert all(parameter.grad is None for parameter in model.parameters())
+
+
+def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor) -> None:
+    truth = make_truth(random_poses)
+    noisy = perturb(truth, rotation_degrees=3.0, translation=0.2, correlation_time=0.3, seed=1)
+    errors = pose_errors(noisy.camera_to_worlds, truth.camera_to_worlds)
+    flipped = [t.mapped(lambda poses: poses @ OPENCV_TO_OPENGL).camera_to_worlds for t in (noisy, truth)]
+    assert pose_errors(*flipped) == pytest.approx(errors, rel=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["network", "spline"])
+def test_in_a_known_scene_the_correction_finds_the_true_poses(mode: str) -> None:
+    times = np.linspace(0, SECOND, 60).astype(np.int64)
+    path = torch.eye(4, dtype=torch.float64).repeat(60, 1, 1)
+    path[:, 2, 3] = 2.2
+    path[:, 0, 3] = torch.linspace(-0.5, 0.5, 60)
+    truth = Trajectory(times, path)
+    estimated = perturb(truth, rotation_degrees=2.0, translation=0.05, correlation_time=0.3, seed=0)
+    config = PoseCorrectionConfig(mode=mode)
+    model = make_model(bounded=True, camera_optimizer=config, max_resolution=16, trajectory=estimated)
+    torch.nn.init.uniform_(model.field.encoding.hash_table, -0.5, 0.5)
+    model.field.average_init_density = 3.0
+    reference = PoseCorrectionConfig(mode="off").setup(
+        num_cameras=0, device="cpu", trajectory=truth, camera_times=torch.zeros(0, dtype=torch.int64)
+    )
+    correction = model.camera_optimizer
+    generator = torch.Generator().manual_seed(0)
+
+    def errors() -> torch.Tensor:
+        # Not aligned: the scene holds the frame.
+        seconds = torch.linspace(0, 1, 50, dtype=torch.float64)
+        with torch.no_grad():
+            poses, true = correction.pose(seconds), reference.pose(seconds)
+        return torch.stack([rotation_angle(poses, true).mean(), (poses - true)[..., 3].norm(dim=-1).mean()])
+
+    before = errors()
+    optimizer = torch.optim.Adam(correction.parameters(), lr=3e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 150)
+    for _ in range(150):
+        directions = torch.randn(256, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.3, 0.3, 0.0])
+        directions = torch.nn.functional.normalize(directions - torch.tensor([0.0, 0.0, 1.0]), dim=-1)
+        seconds = torch.rand(256, 1, generator=generator, dtype=torch.float64)
+        rendered = []
+        for source in (correction, reference):
+            rays = RayBundle(
+                origins=torch.zeros(256, 3),
+                directions=directions.float(),
+                pixel_area=torch.ones(256, 1),
+                times=seconds,
+                metadata={"camera_directions": directions},
+            )
+            source.apply_to_raybundle(rays)
+            rays.times = None
+            rendered.append(model.eval()(rays)["log_radiance"])
+        optimizer.zero_grad()
+        (rendered[0] - rendered[1].detach()).square().mean().backward()
+        optimizer.step()
+        schedule.step()
+    assert (errors() < before / 3).all(), (before, errors())

@@ -1,0 +1,100 @@
+"""Learned contrast thresholds and refractory period."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from nerfstudio.model_components.ray_samplers import UniformSampler
+from test_model import ALL_LOSSES, make_batch, make_model, make_rays
+
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.model import AENeRFModel
+from aenerf_ns.sensor_parameters import SensorParameters
+
+
+@pytest.mark.parametrize("ratio", [1e-3, 0.5, 1.0, 1.458, 40.0])
+def test_the_ratio_starts_at_the_given_one(ratio: float) -> None:
+    parameters = SensorParameters(SensorModel(0.2 * ratio, 0.2), True, False)
+    assert parameters.contrast_threshold_ratio.item() == pytest.approx(ratio, rel=1e-4)
+    assert parameters.refractory_period is None
+
+
+@pytest.mark.parametrize(("given", "expected"), [(0, 5e-6), (2_000, 2e-6), (9_999, 9.999e-6)])
+def test_the_refractory_period_starts_at_the_given_one_and_stays_below_the_bound(given: int, expected: float) -> None:
+    parameters = SensorParameters(SensorModel(refractory_period=given), False, True)
+    parameters.bound_refractory_period(10_000)
+    assert parameters.refractory_period.item() == pytest.approx(expected, rel=1e-3)
+    assert parameters.contrast_threshold_ratio is None
+    for raw in (-200.0, 200.0):
+        parameters.raw_refractory_period.data.fill_(raw)
+        assert 0 <= parameters.refractory_period.item() <= 1e-5
+
+
+def make_learning_model() -> AENeRFModel:
+    model = make_model(
+        SensorModel(0.3, 0.2, refractory_period=20_000_000),
+        learn_contrast_threshold_ratio=True,
+        learn_refractory_period=True,
+        loss_coefficients=ALL_LOSSES,
+        far_plane=6.0,
+    ).double()
+    torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
+    model.field.average_init_density = 2.0
+    model.sensor_parameters.bound_refractory_period(50_000_000)
+    return model
+
+
+def test_their_gradients_are_those_of_finite_differences() -> None:
+    model = make_learning_model().eval()
+    # Samples at fixed distances: the framework does not differentiate the places of its own.
+    sampler = UniformSampler(num_samples=24).eval()
+    model.proposal_sampler.forward = lambda rays, density_fns: (sampler(rays), [], [])  # type: ignore[method-assign]
+    # A scalar in float64 does not make a float32 batch one.
+    batch = {name: value.double() if value.is_floating_point() else value for name, value in make_batch(5).items()}
+
+    def loss() -> torch.Tensor:
+        rays = make_rays(10, with_times=True)
+        rays.origins, rays.directions = rays.origins.double(), rays.directions.double()
+        outputs = model(rays)
+        return model.get_loss_dict(outputs, batch)["reconstruction_loss"]
+
+    for name, parameter in model.sensor_parameters.named_parameters():
+        (gradient,) = torch.autograd.grad(loss(), parameter)
+        values = []
+        for step in (1e-5, -1e-5):
+            parameter.data += step
+            values.append(loss().item())
+            parameter.data -= step
+        assert gradient.item() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-3), name
+        assert abs(gradient.item()) > 1e-6, name
+
+
+def test_only_the_starts_of_the_intervals_move() -> None:
+    model = make_learning_model().train()
+    rays = make_rays(15, with_times=True)
+    before = rays.times.clone()
+    with torch.no_grad():
+        model.sensor_parameters.raw_refractory_period.add_(0.7)
+    period = model.sensor_parameters.refractory_period.item()
+    outputs = model(rays)
+    moved = rays.times - before
+    torch.testing.assert_close(moved[:5], torch.full_like(moved[:5], period - 0.02), rtol=0, atol=1e-12)
+    assert (moved[5:] == 0).all()
+    # Later starts make shorter intervals.
+    assert outputs["interval_change"].item() == pytest.approx(0.02 - period, rel=1e-9)
+    losses = model.get_loss_dict(outputs, make_batch(5) | {"interval": torch.full((5,), 0.1)})
+    shorter = model.get_loss_dict(
+        {k: v for k, v in outputs.items() if k != "interval_change"},
+        make_batch(5) | {"interval": torch.full((5,), 0.1 + 0.02 - period)},
+    )
+    torch.testing.assert_close(losses["temporal_loss"], shorter["temporal_loss"])
+
+
+def test_they_form_a_parameter_group_and_are_logged() -> None:
+    model = make_learning_model()
+    assert len(model.get_param_groups()["sensor"]) == 2
+    assert "sensor" not in make_model().get_param_groups()
+    outputs = model(make_rays(15, with_times=True))
+    metrics = model.get_metrics_dict(outputs, make_batch(5))
+    assert metrics["contrast_threshold_ratio"].item() == pytest.approx(1.5, rel=1e-6)
+    assert metrics["refractory_period_ns"].item() == pytest.approx(20e6, rel=1e-6)
