@@ -34,39 +34,35 @@ class RelativeMultiStepSchedulerConfig(SchedulerConfig):
 
 
 @dataclass
-class DelayedCosineSchedulerConfig(SchedulerConfig):
-    """Learning rate that waits, rises linearly, and falls as half a cosine until the end of the run.
+class RelativeCosineSchedulerConfig(SchedulerConfig):
+    """Learning rate that rises linearly, and falls as half a cosine until the end of the run.
 
-    For pose correction. In its first steps the field is worse than a constant one, and its gradients would move good
-    poses away, so the correction waits; and a single batch tells little of a pose, so the noise of the gradients is
-    averaged out by a rate that ends low.
+    For pose correction: a single batch tells little of a pose, so the noise of the gradients is averaged out by a rate
+    that ends low.
     """
 
-    _target: type = field(default_factory=lambda: DelayedCosineScheduler)
-    delay: int = 150
-    """Steps in which nothing is learned."""
+    _target: type = field(default_factory=lambda: RelativeCosineScheduler)
     warm_up: int = 50
-    """Steps in which the rate then rises."""
+    """Steps in which the rate rises."""
     final_factor: float = 0.01
     """Factor at the end of the run."""
     max_steps: tyro.conf.Suppress[int] = 0
     """Length of the run, which the trainer's configuration fills in."""
 
 
-class DelayedCosineScheduler(Scheduler):
+class RelativeCosineScheduler(Scheduler):
     """Not the framework's cosine decay, whose NumPy numbers current torch refuses to load from checkpoints."""
 
-    config: DelayedCosineSchedulerConfig
+    config: RelativeCosineSchedulerConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """The schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
 
         def factor(step: int) -> float:
-            since = max(step - config.delay, 0)
-            progress = min(since / max(config.max_steps - config.delay, 1), 1.0)
+            progress = min(step / max(config.max_steps, 1), 1.0)
             falling = config.final_factor + (1 - config.final_factor) * (1 + math.cos(math.pi * progress)) / 2
-            return min(since / max(config.warm_up, 1), 1.0) * falling
+            return min(step / max(config.warm_up, 1), 1.0) * falling
 
         return LambdaLR(optimizer, factor)
 
@@ -77,5 +73,5 @@ class AENeRFTrainerConfig(TrainerConfig):
 
     def __post_init__(self) -> None:
         for group in self.optimizers.values():
-            if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, DelayedCosineSchedulerConfig)):
+            if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, RelativeCosineSchedulerConfig)):
                 group["scheduler"].max_steps = self.max_num_iterations

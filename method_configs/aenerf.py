@@ -13,7 +13,7 @@ from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipelineConfig
 from aenerf_ns.training import (
     AENeRFTrainerConfig,
-    DelayedCosineSchedulerConfig,
+    RelativeCosineSchedulerConfig,
     RelativeMultiStepSchedulerConfig,
 )
 
@@ -45,7 +45,7 @@ aenerf = MethodSpecification(
             },
             "camera_opt": {
                 "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
-                "scheduler": DelayedCosineSchedulerConfig(),
+                "scheduler": RelativeCosineSchedulerConfig(),
             },
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
