@@ -29,9 +29,14 @@ def set_output(network: nn.Module, value: float) -> None:
         layer.bias[0] = value
 
 
-def set_density(model: AENeRFModel, exponent: float) -> None:
-    set_output(model.field.density_network, exponent)
-    set_output(model.proposal_networks[0].mlp_base[1], exponent)
+def set_proposal_density(model: AENeRFModel, raw: float) -> None:
+    proposal = model.proposal_networks[0]
+    set_output(proposal.mlp_base[1] if model.config.backbone == "hash" else proposal.density_network, raw)
+
+
+def set_density(model: AENeRFModel, raw: float) -> None:
+    set_output(model.field.density_network, raw)
+    set_proposal_density(model, raw)
 
 
 def set_radiance(model: AENeRFModel, raw: float) -> None:
@@ -71,9 +76,7 @@ CASES: dict[str, dict[str, Any]] = {
     "no density": {"model": lambda model: set_density(model, -1e4)},
     "density that underflows": {"model": lambda model: set_density(model, -100.0)},
     "density that overflows": {"model": lambda model: set_density(model, 1e4)},
-    "density of proposals that overflows": {
-        "model": lambda model: set_output(model.proposal_networks[0].mlp_base[1], 100.0)
-    },
+    "density of proposals that overflows": {"model": lambda model: set_proposal_density(model, 100.0)},
     "radiance that underflows": {"model": lambda model: set_radiance(model, -200.0)},
     "huge radiance": {"model": lambda model: set_radiance(model, 1e30)},
     "rays from afar": {"rays": moved_to(50.0)},
@@ -85,13 +88,24 @@ CASES: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("bounded", [False, True])
-@pytest.mark.parametrize(("mode", "temporal"), [("off", False), ("off", True), ("network", True), ("spline", True)])
-def test_losses_and_gradients_are_finite(case: str, bounded: bool, mode: str, temporal: bool) -> None:
+@pytest.mark.parametrize(
+    ("backbone", "mode", "temporal"),
+    [
+        ("hash", "off", False),
+        ("hash", "off", True),
+        ("hash", "network", True),
+        ("hash", "spline", True),
+        ("mlp", "off", False),
+        ("mlp", "spline", True),
+    ],
+)
+def test_losses_and_gradients_are_finite(case: str, bounded: bool, backbone: str, mode: str, temporal: bool) -> None:
     options = CASES[case]
     pairs = options.get("pairs", 5)
     model = make_model(
         SensorModel(0.2, 0.3),
         bounded=bounded,
+        backbone=backbone,
         camera_optimizer=PoseCorrectionConfig(mode=mode),
         loss_coefficients={**ALL_LOSSES, "temporal_loss": 1e-3 * temporal},
     )
@@ -124,11 +138,16 @@ def losses_and_gradients(model: AENeRFModel, precision: torch.dtype | None) -> t
 
 # Unit roundoff is 2⁻⁸ and 2⁻¹¹.
 @pytest.mark.parametrize(("precision", "tolerance"), [(torch.bfloat16, 1e-2), (torch.float16, 2e-3)])
-@pytest.mark.parametrize("mode", ["network", "spline"])
-def test_mixed_precision_is_near_full_precision(mode: str, precision: torch.dtype, tolerance: float) -> None:
-    model = make_model(camera_optimizer=PoseCorrectionConfig(mode=mode), loss_coefficients=ALL_LOSSES)
-    torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
-    torch.nn.init.uniform_(model.proposal_networks[0].encoding.hash_table, -1, 1)
+@pytest.mark.parametrize(("backbone", "mode"), [("hash", "network"), ("hash", "spline"), ("mlp", "network")])
+def test_mixed_precision_is_near_full_precision(
+    backbone: str, mode: str, precision: torch.dtype, tolerance: float
+) -> None:
+    model = make_model(
+        backbone=backbone, camera_optimizer=PoseCorrectionConfig(mode=mode), loss_coefficients=ALL_LOSSES
+    )
+    for name, parameter in model.named_parameters():
+        if name.endswith("hash_table"):
+            torch.nn.init.uniform_(parameter, -1, 1)
     # Denser than the proposals, or their loss has no gradient.
     model.field.average_init_density = 5.0
     expected_losses, expected = losses_and_gradients(model, None)
