@@ -36,6 +36,7 @@ from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
 from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.ray_sampler import CAMERA_DIRECTIONS
 from aenerf_ns.sensor_parameters import SensorParameters
 from aenerf_ns.temporal import log_radiance_rate
 
@@ -297,7 +298,8 @@ class AENeRFModel(Model):
     def forward(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Renders rays; those with times, of pairs of events, from the corrected poses."""
         learned: dict[str, Tensor] = {}
-        if ray_bundle.times is not None:
+        if _is_of_pairs(ray_bundle):
+            assert ray_bundle.times is not None
             # Here and not with the losses, for what the losses alone used would have no gradient on several processes.
             ratio = self.sensor_parameters.contrast_threshold_ratio
             if ratio is not None:
@@ -328,7 +330,7 @@ class AENeRFModel(Model):
         """
         samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
         outputs: dict[str, Any] = {}
-        if self.training and self.uses_temporal_loss and ray_bundle.times is not None:
+        if self.training and self.uses_temporal_loss and _is_of_pairs(ray_bundle):
             within = slice(2 * len(ray_bundle) // 3, None)
             moving = ray_bundle[within]
             ends, weights_of_ends = self._composite(samples[: within.start])
@@ -451,6 +453,11 @@ class AENeRFModel(Model):
         rendered = [self(rays[begin : begin + chunk])["log_radiance"] for begin in range(0, len(rays), chunk)]
         self.train(was_training)
         return torch.cat(rendered)
+
+
+def _is_of_pairs(ray_bundle: RayBundle) -> bool:
+    """Whether rays are a batch of the event ray sampler. The framework's viewer gives its cameras times, too."""
+    return CAMERA_DIRECTIONS in ray_bundle.metadata
 
 
 def _grey_to_rgb(values: Tensor) -> Tensor:

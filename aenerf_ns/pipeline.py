@@ -60,7 +60,8 @@ class AENeRFPipeline(VanillaPipeline):
         super().__init__(config, device, **kwargs)
         self._refined_test_poses = False
         if self.datamanager.train_pixel_sampler is not None:
-            self.datamanager.train_pixel_sampler.with_time_within = self.model.uses_temporal_loss
+            training = self.test_mode == "val"
+            self.datamanager.train_pixel_sampler.with_time_within = training and self.model.uses_temporal_loss
         if self.test_mode == "val" and self.model.config.learn_refractory_period:
             self.model.sensor_parameters.bound_refractory_period(self.datamanager.train_dataset.pairs.shortest_interval)
         # Made once: a fit every so many steps would read the images again.
@@ -74,6 +75,13 @@ class AENeRFPipeline(VanillaPipeline):
             RuntimeError: the checkpoint is of a model with other parameters.
         """
         super().load_state_dict(state_dict, strict=True)
+        data = self.datamanager
+        if self.test_mode != "val" and data.has_reference_views:
+            # The framework's renderers and exporters make cameras of their own from these.
+            for views in (data.eval_dataset, data.fixed_indices_eval_dataloader, data.eval_dataloader):
+                cameras = views.cameras
+                poses = self.model.camera_optimizer.apply_to_camera(cameras.to(self.device)).to(cameras.device)
+                views.cameras = replace(cameras, camera_to_worlds=poses, metadata={})
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
         """Outputs, weighted losses and metrics of a training batch; now and then with the errors of the corrected poses

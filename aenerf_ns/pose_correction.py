@@ -15,8 +15,8 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.encodings import NeRFEncoding
 from torch import Tensor, nn
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import REFERENCE_SECONDS
+from aenerf_ns.ray_sampler import CAMERA_DIRECTIONS
 from aenerf_ns.trajectory.alignment import Similarity, align
 from aenerf_ns.trajectory.rotation import motion_from_twist
 from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
@@ -114,7 +114,7 @@ class PoseCorrection(CameraOptimizer):
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Moves the rays of a training batch, which have times, from the camera's frame to the corrected poses."""
         assert raybundle.times is not None
-        origins, directions = world_rays(self.pose(raybundle.times[:, 0]), raybundle.metadata["camera_directions"])
+        origins, directions = world_rays(self.pose(raybundle.times[:, 0]), raybundle.metadata[CAMERA_DIRECTIONS])
         raybundle.origins, raybundle.directions = origins.to(raybundle.origins), directions.to(raybundle.directions)
 
     def apply_to_camera(self, camera: Cameras) -> Tensor:
@@ -126,7 +126,7 @@ class PoseCorrection(CameraOptimizer):
         cameras are in the scene's frame and stay.
         """
         poses = camera.camera_to_worlds
-        if REFERENCE_SECONDS not in (camera.metadata or {}):
+        if REFERENCE_SECONDS not in (camera.metadata or {}) or (self.twists is None and not self.has_ground_truth):
             return poses
         with torch.no_grad():
             carried = self.alignment().inverse()(poses.double())
@@ -163,7 +163,7 @@ class PoseCorrection(CameraOptimizer):
                 )
                 rate = forward_ad.unpack_dual(moving).tangent
         # Rays are linear in the pose.
-        origin_rates, direction_rates = world_rays(rate, raybundle.metadata["camera_directions"])
+        origin_rates, direction_rates = world_rays(rate, raybundle.metadata[CAMERA_DIRECTIONS])
         return origin_rates.to(raybundle.origins), direction_rates.to(raybundle.origins)
 
     def get_loss_dict(self, loss_dict: dict[str, Tensor]) -> None:
@@ -186,9 +186,10 @@ class PoseCorrection(CameraOptimizer):
         metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
 
     def _sampled_twists(self) -> Tensor:
-        """Twists at 64 times spread over the trajectory."""
+        """Twists at times spread over the trajectory, in every interval of the spline."""
         assert self.twists is not None
-        seconds = torch.linspace(0, self._duration, 64, dtype=torch.float64, device=self._camera_seconds.device)
+        count = max(64, math.ceil(self._duration / self.config.knot_interval))
+        seconds = torch.linspace(0, self._duration, count, dtype=torch.float64, device=self._camera_seconds.device)
         return self.twists(seconds, self.trajectory.pose(seconds))
 
     def get_param_groups(self, param_groups: dict[str, list[nn.Parameter]]) -> None:
@@ -208,21 +209,8 @@ def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _compared_times(trajectory: Trajectory, ground_truth: Trajectory | None) -> Tensor:
-    """Times in nanoseconds of at most _MAX_COMPARED knots, evenly thinned out, that the ground truth covers.
-
-    Raises:
-        DataError: there are fewer than two.
-    """
-    times = trajectory.times
-    if ground_truth is not None:
-        times = times[(times >= ground_truth.start) & (times <= ground_truth.end)]
-        if len(times) < 2:
-            raise DataError(
-                ground_truth.source,
-                f"its poses from {ground_truth.start} to {ground_truth.end} ns do not cover two of the estimated ones, "
-                f"from {trajectory.start} to {trajectory.end} ns",
-                "give ground truth on the clock of the estimated poses, or remove the file",
-            )
+    """Times in nanoseconds of at most _MAX_COMPARED knots, evenly thinned out, that the ground truth covers."""
+    times = trajectory.times if ground_truth is None else trajectory.knots_covered_by(ground_truth)
     count = min(len(times), _MAX_COMPARED)
     return times[torch.linspace(0, len(times) - 1, count, dtype=torch.float64).round().long()]
 
@@ -231,7 +219,7 @@ class TwistNetwork(nn.Module):
     """The paper's pose correction network (appendix, algorithm 1; softplus as in its text).
 
     Args:
-        trajectory: estimated trajectory, for the span of its times and positions.
+        trajectory: estimated trajectory, for the span of its times.
         num_frequencies: of the sinusoidal encoding.
     """
 

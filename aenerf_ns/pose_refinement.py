@@ -29,7 +29,8 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
         image: (H, W, 3) reference values in [0, 1].
 
     Returns:
-        The camera (1,) in the scene's frame, at the pose of the least error: never a worse one than at first.
+        The camera (1,) in the scene's frame: at the refined pose, or where that has a greater error, on pixels drawn
+        for the comparison, at the first.
     """
     camera = replace(camera, camera_to_worlds=model.camera_optimizer.apply_to_camera(camera), metadata={})
     reference = model.reference_display(image.to(model.device))

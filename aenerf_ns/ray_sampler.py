@@ -21,6 +21,9 @@ from aenerf_ns.trajectory.trajectory import Trajectory
 if TYPE_CHECKING:
     from aenerf_ns.events.pairs import EventPairs
 
+# Among the metadata of rays of pairs, and of no others: (N, 3) float64 unit vectors in the camera's frame.
+CAMERA_DIRECTIONS = "camera_directions"
+
 # t_sam: a truncated normal distribution over the interval.
 _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
 
@@ -103,7 +106,7 @@ class EventRaySampler:
             pixel_area=torch.full((len(seconds), 1), self._pixel_area, device=device),
             camera_indices=torch.zeros((len(seconds), 1), dtype=torch.long, device=device),
             times=seconds[:, None],
-            metadata={"camera_directions": in_camera},
+            metadata={CAMERA_DIRECTIONS: in_camera},
         )
         batch = {
             "num_positive": torch.from_numpy(pairs.num_positive[index].astype(np.float32)).to(device),

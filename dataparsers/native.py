@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile
@@ -75,7 +76,11 @@ class NativeDataParser(EventDataParser):
             trajectory=trajectory,
             frame_camera=_camera(meta, "w", "h") if frames else event_camera,
             reference_views=_reference_views(
-                meta, frames, trajectory if ground_truth is None else ground_truth, block.matrix("T_frame_event")
+                meta,
+                frames,
+                trajectory if ground_truth is None else ground_truth,
+                ground_truth is not None,
+                block.matrix("T_frame_event"),
             ),
             image_encoding=encoding,
             scene_box=None if box is None else _scene_box(meta, box),
@@ -191,25 +196,31 @@ def _scene_box(meta: _Metadata, value: list) -> Tensor:
 
 
 def _reference_views(
-    meta: _Metadata, frames: list, trajectory: Trajectory, frame_from_event: Tensor | None
+    meta: _Metadata, frames: list, trajectory: Trajectory, has_ground_truth: bool, frame_from_event: Tensor | None
 ) -> dict[Split, list[ReferenceView]]:
     """The images of each split. A frame without a pose but with a time stamp gets that of the reference trajectory."""
     if frame_from_event is None:
         frame_from_event = torch.eye(4, dtype=torch.float64)
     views: dict[str, ReferenceView] = {}
+    known: set[str] = set()
+    num_without_pose = 0
     for index, values in enumerate(frames):
         if not isinstance(values, dict):
             raise meta.error("frames", f"holds {values!r}")
         frame = _Metadata(meta.path, values, f"frames[{index}].")
         name = frame.get("file_path", str)
-        if name in views:
+        if name in known:
             raise frame.error("file_path", f"names {name} again")
+        known.add(name)
         file = meta.path.parent / name
         if not file.is_file():
             raise frame.error("file_path", f"names {name}, which does not exist")
         stamp = frame.get("timestamp", float, None)
         time = None if stamp is None else int((Decimal(values["timestamp"]) * 1_000_000_000).to_integral_value())
         pose = frame.matrix("transform_matrix")
+        if pose is None and time is not None and has_ground_truth and not trajectory.start <= time <= trajectory.end:
+            num_without_pose += 1
+            continue
         if pose is not None:
             require_rigid(pose[None], f"{meta.path}: frames[{index}].transform_matrix")
             pose = pose @ OPENCV_TO_OPENGL
@@ -218,13 +229,17 @@ def _reference_views(
         else:
             raise frame.error("transform_matrix", "is missing, and so is timestamp")
         views[name] = ReferenceView(file, pose, time)
+    if num_without_pose:
+        CONSOLE.print(
+            f"{num_without_pose} of {len(frames)} frames are left out: the true trajectory has no pose for them."
+        )
     splits: dict[Split, list[ReferenceView]] = {}
     for split in _SPLITS:
         names = meta.get(f"{split}_filenames", list, [])
-        unknown = [name for name in names if name not in views]
+        unknown = [name for name in names if name not in known]
         if unknown:
             raise meta.error(f"{split}_filenames", f"names {unknown[0]}, which is not among the frames")
-        splits[split] = [views[name] for name in names]
+        splits[split] = [views[name] for name in names if name in views]
     return splits
 
 

@@ -133,6 +133,7 @@ class EventDataParser(DataParser):
         ground_truth = recording.ground_truth
         if ground_truth is not None:
             ground_truth = ground_truth.mapped(lambda poses: to_scene(poses @ OPENCV_TO_OPENGL))
+            trajectory.knots_covered_by(ground_truth)
         if split == "train":
             times, images = _training_views(trajectory, recording.reference_views["train"])
             cameras = recording.event_camera.cameras(trajectory.interpolate(times))

@@ -167,6 +167,7 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
     given = read_tum_trajectory(workspace / "room" / "trajectory_estimated.txt")
     for poses, rate, times in (
         ("estimated", (), given.times),
+        ("corrected", (), given.times),
         ("ground-truth", ("--rate", "100"), torch.arange(0, given.end + 1, 10_000_000)),
     ):
         output = workspace / "poses.txt"
@@ -174,7 +175,7 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
         run("aenerf", "export-trajectory", "--load-config", trained, "--output", output, *options, cwd=workspace)
         exported = read_tum_trajectory(output)
         assert torch.equal(exported.times, times)
-        # Both are the given ones, but for the framework's float32 transform.
+        # Without pose correction all are the given ones, but for the framework's float32 transform.
         difference = exported.camera_to_worlds - given.interpolate(times)
         assert difference.abs().max() < 1e-6
     missing = ("aenerf", "export-trajectory", "--load-config", "nothing.yml", "--output", output)
@@ -213,7 +214,8 @@ def test_rendering_a_camera_path_of_the_viewer(trained: Path, workspace: Path) -
         "seconds": 1.0,
         "is_cycle": False,
         "smoothness_value": 0.0,
-        "camera_path": [{"camera_to_world": pose.flatten().tolist(), "fov": 75.0, "aspect": 4 / 3}] * 2,
+        "camera_path": [{"camera_to_world": pose.flatten().tolist(), "fov": 75.0, "aspect": 4 / 3, "render_time": 0.0}]
+        * 2,
     }
     (workspace / "path.json").write_text(json.dumps(path))
     run(
@@ -297,6 +299,8 @@ def test_neither_images_nor_ground_truth_are_trained_on(trained: Path, workspace
             "tensorboard",
             "--max-num-iterations",
             "4",
+            "--pipeline.model.camera-optimizer.mode",
+            "spline",
             "--data",
             data,
             cwd=workspace,

@@ -9,9 +9,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 from conftest import make_stream
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.model_components.losses import interlevel_loss
+from nerfstudio.viewer.utils import CameraState, get_camera
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
@@ -315,3 +317,13 @@ def test_rendering_in_chunks_changes_nothing() -> None:
     whole = make_model().eval()(make_rays())["log_radiance"]
     torch.testing.assert_close(model.render_log_radiance(rays), whole)
     assert model.training
+
+
+@pytest.mark.parametrize("mode", ["off", "spline"])
+def test_the_viewer_s_cameras_are_rendered(mode: str) -> None:
+    # They have a time, too, which is none of the trajectory's.
+    model = make_model(camera_optimizer=PoseCorrectionConfig(mode=mode)).eval()
+    state = CameraState(fov=1.0, aspect=4 / 3, c2w=torch.eye(4)[:3], camera_type=CameraType.PERSPECTIVE)
+    camera = get_camera(state, 6, 8)
+    assert camera.times is not None
+    assert model.get_outputs_for_camera(camera)["rgb"].shape == (6, 8, 3)

@@ -41,7 +41,7 @@ class Evaluate:
             raise DataError(self.load_config, f"the run is of method {config.method_name}", "use ns-eval")
         of_run = pipeline.model.color_correction.protocol
         used = self.color_correction or of_run
-        if used != of_run:
+        if self.color_correction is not None:
             pipeline.replace_color_correction(used)
         if self.test_poses == "photometric":
             pipeline.refine_test_poses()

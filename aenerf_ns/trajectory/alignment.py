@@ -38,8 +38,8 @@ def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orient
     """Least-squares map of poses onto reference poses of the same cameras at the same times.
 
     Positions alone leave the rotation uncertain, and on a straight line undetermined. So each camera contributes its
-    position, in units of the root mean square distance of all reference positions from their mean, and with equal
-    weight the three axes of its orientation.
+    position, in units of the root mean square distance of all positions from their mean, and the three axes of its
+    orientation, each with the weight of the position.
 
     Args:
         poses: (N, 3, 4) camera-to-world.
@@ -60,8 +60,9 @@ def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orient
     sign[2] = torch.linalg.det(u @ vh).sign()
     rotation = u @ (sign[:, None] * vh)
     scale = torch.ones((), dtype=torch.float64, device=poses.device)
-    if with_scale:
-        scale = (reference_centered * (centered @ rotation.mT)).sum() / centered.square().sum().clamp_min(1e-30)
+    # Positions that do not spread tell no scale.
+    if with_scale and min(centered.norm(), reference_centered.norm()) > 1e-12:
+        scale = (reference_centered * (centered @ rotation.mT)).sum() / centered.square().sum()
     return Similarity(scale, rotation, reference_mean - scale * (rotation @ mean))
 
 
@@ -86,7 +87,7 @@ def pose_errors(poses: Tensor, reference: Tensor) -> dict[str, float]:
         errors[f"rotation_error_degrees{name}"] = torch.rad2deg(rotation_angle(aligned, reference)).mean()
         errors[f"translation_error{name}"] = (aligned - reference)[..., 3].norm(dim=-1).mean()
     length = reference[..., 3].diff(dim=0).norm(dim=-1).sum()
-    errors["translation_error_percent"] = 100 * errors["translation_error"] / length
+    errors["translation_error_percent"] = 100 * errors["translation_error"] / length.clamp_min(1e-30)
     for name, with_scale in (("sim3", True), ("se3", False)):
         aligned = align(poses, reference, with_scale, with_orientations=False)(poses)
         errors[f"ate_rmse_{name}"] = (aligned - reference)[..., 3].square().sum(-1).mean().sqrt()

@@ -178,6 +178,22 @@ class Trajectory(nn.Module):
             )
         return Trajectory(self.times[first : last + 1], self.camera_to_worlds[first : last + 1], self.source)
 
+    def knots_covered_by(self, reference: Trajectory) -> Tensor:
+        """Times in nanoseconds of the knots within the span of a reference trajectory.
+
+        Raises:
+            DataError: there are fewer than two.
+        """
+        times = self.times[(self.times >= reference.start) & (self.times <= reference.end)]
+        if len(times) < 2:
+            raise DataError(
+                reference.source,
+                f"its poses from {reference.start} to {reference.end} ns do not cover two of the estimated ones, from "
+                f"{self.start} to {self.end} ns",
+                "give ground truth on the clock of the estimated poses, or remove the file",
+            )
+        return times
+
     def mapped(self, function) -> Trajectory:
         """The trajectory with ``function`` applied to its (N, 4, 4) float64 camera-to-world matrices."""
         return Trajectory(self.times, function(homogeneous(self.camera_to_worlds)), self.source)
