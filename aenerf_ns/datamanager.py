@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from torch import Tensor
 
 from aenerf_ns.dataset import EventDataset
 from aenerf_ns.errors import DataError
@@ -84,6 +85,15 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         options = {"input_dataset": self.eval_dataset, "device": self.device, "num_workers": self.world_size * 4}
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**options)
         self.eval_dataloader = RandIndicesEvalDataloader(**options)
+
+    def place_reference_views(self, poses: Tensor) -> None:
+        """Gives the reference views the poses (N, 3, 4), camera-to-world in the scene, for good."""
+        cameras = self.eval_dataset.cameras
+        # Without metadata: these cameras are in the scene's frame, and nothing is to carry them there again.
+        self.eval_dataset.cameras = replace(cameras, camera_to_worlds=poses.to(cameras.device), metadata={})
+        if self.test_mode != "inference":
+            # The loaders have copies of the cameras.
+            self.setup_eval()
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """A batch of pairs; see :meth:`EventRaySampler.sample`."""

@@ -75,13 +75,10 @@ class AENeRFPipeline(VanillaPipeline):
             RuntimeError: the checkpoint is of a model with other parameters.
         """
         super().load_state_dict(state_dict, strict=True)
-        data = self.datamanager
-        if self.test_mode != "val" and data.has_reference_views:
+        if self.test_mode != "val" and self.datamanager.has_reference_views:
             # The framework's renderers and exporters make cameras of their own from these.
-            for views in (data.eval_dataset, data.fixed_indices_eval_dataloader, data.eval_dataloader):
-                cameras = views.cameras
-                poses = self.model.camera_optimizer.apply_to_camera(cameras.to(self.device)).to(cameras.device)
-                views.cameras = replace(cameras, camera_to_worlds=poses, metadata={})
+            cameras = self.datamanager.eval_dataset.cameras.to(self.device)
+            self.datamanager.place_reference_views(self.model.camera_optimizer.apply_to_camera(cameras))
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
         """Outputs, weighted losses and metrics of a training batch; now and then with the errors of the corrected poses
@@ -223,7 +220,7 @@ class AENeRFPipeline(VanillaPipeline):
                 for camera, batch in progress.track(views, total=len(views), description="Refining test poses")
             ]
         self.train()
-        views.cameras = replace(views.cameras, camera_to_worlds=torch.cat(refined), metadata={})
+        self.datamanager.place_reference_views(torch.cat(refined))
         self._refined_test_poses = True
 
     def _require_reference_views(self) -> None:
