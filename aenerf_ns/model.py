@@ -388,12 +388,7 @@ class AENeRFModel(Model):
         predicted, target = self._log_radiance_changes(outputs, batch)
         metrics = {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
         self.camera_optimizer.get_metrics_dict(metrics)
-        if "positive_contrast_threshold" in outputs:
-            threshold = outputs["positive_contrast_threshold"].detach()
-            metrics["contrast_threshold_ratio"] = threshold / self.sensor.negative_contrast_threshold
-        if "interval_change" in outputs:
-            metrics["refractory_period_ns"] = self.sensor.refractory_period - 1e9 * outputs["interval_change"].detach()
-        return metrics
+        return metrics | self.sensor_parameters.learned()
 
     def _log_radiance_changes(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Rendered and true changes (N,) over the intervals of a batch, each of its pixel's channel."""

@@ -153,7 +153,7 @@ class AENeRFPipeline(VanillaPipeline):
             self._pixels_of_split[correction.split] = self._pixels(correction.split)
         pixels = self._pixels_of_split[correction.split]
         count = max(round(share * len(pixels.view)), 1)
-        # The views move with the corrected poses.
+        # Reference views are carried over to the frame that the corrected poses have by now.
         cameras = replace(pixels.cameras, camera_to_worlds=self.model.camera_optimizer.apply_to_camera(pixels.cameras))
         rays = cameras.generate_rays(pixels.view[:count], coords=pixels.coordinates[:count])
         log_radiance = self.model.render_log_radiance(rays)
@@ -258,6 +258,7 @@ class AENeRFPipeline(VanillaPipeline):
             metrics["pose_correction"] = self.model.config.camera_optimizer.mode
             metrics["pose_errors"] = self.pose_errors()
             metrics["test_poses"] = self._test_poses
+            metrics |= self.model.sensor_parameters.learned()
             if self.model.image_metrics.lpips_absent is not None:
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent

@@ -54,6 +54,15 @@ class SensorParameters(nn.Module):
             return None
         return self._longest_refractory_period * torch.sigmoid(self.raw_refractory_period.double())
 
+    def learned(self) -> dict[str, float]:
+        """The values of those that are learned, for logs and evaluations."""
+        values = {}
+        if self.contrast_threshold_ratio is not None:
+            values["contrast_threshold_ratio"] = self.contrast_threshold_ratio.item()
+        if self.refractory_period is not None:
+            values["refractory_period_ns"] = 1e9 * self.refractory_period.item()
+        return values
+
     def bound_refractory_period(self, shortest_interval: int) -> None:
         """Sets the bound of τ, and τ to the sensor's value where that is positive, else to half of the bound.
 

@@ -1,4 +1,4 @@
-"""The training schedule of the paper, for runs of any length."""
+"""The training schedules, for runs of any length."""
 
 from __future__ import annotations
 
@@ -6,20 +6,56 @@ import math
 from dataclasses import dataclass, field
 
 import tyro
-from nerfstudio.engine.schedulers import MultiStepScheduler, Scheduler, SchedulerConfig
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
 
-@dataclass
-class RelativeMultiStepSchedulerConfig(SchedulerConfig):
-    """Learning rate that falls by a factor at milestones given as parts of the run.
+class _StepsFactor:
+    """Factor on a learning rate that rises linearly and falls at milestones.
 
-    Steps, not the framework's exponential decay, whose checkpoints current torch refuses to load.
+    An object, since only those go into checkpoints, and of plain numbers, since current torch refuses to load others,
+    such as those that the framework's exponential and cosine decay leave there.
     """
 
-    _target: type = field(default_factory=lambda: MultiStepScheduler)
+    def __init__(self, warm_up: int, milestones: list[int], gamma: float) -> None:
+        self.warm_up = warm_up
+        self.milestones = milestones
+        self.gamma = gamma
+
+    def __call__(self, step: int) -> float:
+        return _rise(step, self.warm_up) * self.gamma ** sum(step >= milestone for milestone in self.milestones)
+
+
+class _CosineFactor:
+    """Factor on a learning rate that rises linearly and falls as half a cosine. An object, see above."""
+
+    def __init__(self, warm_up: int, last_step: int, final_factor: float) -> None:
+        self.warm_up = warm_up
+        self.last_step = last_step
+        self.final_factor = final_factor
+
+    def __call__(self, step: int) -> float:
+        falling = (1 + math.cos(math.pi * min(step / max(self.last_step, 1), 1.0))) / 2
+        return _rise(step, self.warm_up) * (self.final_factor + (1 - self.final_factor) * falling)
+
+
+def _rise(step: int, warm_up: int) -> float:
+    return min((step + 1) / max(warm_up, 1), 1.0)
+
+
+@dataclass
+class RelativeMultiStepSchedulerConfig(SchedulerConfig):
+    """Learning rate that rises linearly at first, and falls by a factor at milestones given as parts of the run.
+
+    It must not begin at its height: Adam's first steps are of full size however little the gradients say, and what they
+    build is a fog in front of the cameras, which no camera motion changes and which a run can take long to leave.
+    """
+
+    _target: type = field(default_factory=lambda: RelativeMultiStepScheduler)
+    warm_up: int = 100
+    """Steps in which the rate rises."""
     gamma: float = 0.33
     """Factor at each milestone."""
     relative_milestones: tuple[float, ...] = (0.5, 0.75, 0.9)
@@ -27,10 +63,17 @@ class RelativeMultiStepSchedulerConfig(SchedulerConfig):
     max_steps: tyro.conf.Suppress[int] = 0
     """Length of the run, which the trainer's configuration fills in."""
 
-    @property
-    def milestones(self) -> tuple[int, ...]:
-        """Milestones in steps."""
-        return tuple(round(part * self.max_steps) for part in self.relative_milestones)
+
+class RelativeMultiStepScheduler(Scheduler):
+    """The framework's has no warm-up, and milestones in steps."""
+
+    config: RelativeMultiStepSchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
+        """The schedule of an optimizer whose learning rate is ``lr_init``."""
+        config = self.config
+        milestones = [round(part * config.max_steps) for part in config.relative_milestones]
+        return LambdaLR(optimizer, _StepsFactor(config.warm_up, milestones, config.gamma))
 
 
 @dataclass
@@ -51,20 +94,14 @@ class RelativeCosineSchedulerConfig(SchedulerConfig):
 
 
 class RelativeCosineScheduler(Scheduler):
-    """Not the framework's cosine decay, whose NumPy numbers current torch refuses to load from checkpoints."""
+    """The framework's leaves NumPy's numbers in checkpoints."""
 
     config: RelativeCosineSchedulerConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """The schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
-
-        def factor(step: int) -> float:
-            progress = min(step / max(config.max_steps, 1), 1.0)
-            falling = config.final_factor + (1 - config.final_factor) * (1 + math.cos(math.pi * progress)) / 2
-            return min(step / max(config.warm_up, 1), 1.0) * falling
-
-        return LambdaLR(optimizer, factor)
+        return LambdaLR(optimizer, _CosineFactor(config.warm_up, config.max_steps, config.final_factor))
 
 
 @dataclass

@@ -4,11 +4,12 @@
     python benchmarks/ablation.py --table poses --work WORK --output benchmarks/results/ablation_poses_NAME.json
 
 Simulates the dataset once for each size of pose noise, then trains and evaluates each row. Everything lands in the work
-folder; rows that are there already are not run again, so the command can be stopped and repeated.
+folder; rows that are there already, with the same options, are not run again: the command can be stopped and repeated.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
@@ -72,6 +73,7 @@ class Ablation:
         """Runs what is missing, and writes the table."""
         rows = self._loss_rows() if self.table == "losses" else self._pose_rows()
         for noise in {row.noise: None for row in rows}:
+            # Before the trainings, which run side by side.
             self._dataset(noise)
         with ThreadPoolExecutor(self.jobs) as pool:
             figures = list(pool.map(self._run, rows))
@@ -106,23 +108,33 @@ class Ablation:
     def _rays(self, rays_per_pair: int) -> tuple[str, str]:
         return ("--pipeline.datamanager.train-num-rays-per-batch", str(rays_per_pair * self.pairs))
 
-    def _dataset(self, noise: str) -> None:
+    def _dataset(self, noise: str) -> str:
+        """The name of the dataset, in the work folder."""
         degrees, translation = _NOISE[noise]
-        if not (self.work / noise).exists():
+        options = (
+            *self.simulate.split(),
+            "--pose-noise-degrees",
+            str(degrees),
+            "--pose-noise-translation",
+            str(translation),
+        )
+        name = f"{noise}_{_digest(options)}"
+        if not (self.work / name).exists():
             self.work.mkdir(parents=True, exist_ok=True)
-            size = ("--pose-noise-degrees", str(degrees), "--pose-noise-translation", str(translation))
-            self._command("aenerf", "simulate", "--output", noise, *self.simulate.split(), *size)
+            self._command("aenerf", "simulate", "--output", name, *options)
+        return name
 
     def _run(self, row: _Row) -> dict:
-        name = f"{self.table}_{row.name}_{self.seed}_{self.steps}".replace(" ", "")
+        data = self._dataset(row.noise)
+        settings = ("--machine.seed", str(self.seed), "--max-num-iterations", str(self.steps), *row.options)
+        name = f"{self.table}_{row.name}_{_digest((self.method, data, *settings))}".replace(" ", "")
         file = self.work / f"{name}.json"
         if not file.exists():
             device = "cuda" if torch.cuda.is_available() else "cpu"
             begin = time.perf_counter()
             self._command(
-                "ns-train", self.method, "--machine.device-type", device, "--machine.seed", str(self.seed),
-                "--vis", "tensorboard", "--max-num-iterations", str(self.steps), "--experiment-name", name,
-                *row.options, "--data", row.noise,
+                "ns-train", self.method, "--machine.device-type", device, "--vis", "tensorboard",
+                "--experiment-name", name, *settings, "--data", data,
             )  # fmt: skip
             seconds = time.perf_counter() - begin
             config = max((self.work / "outputs" / name).rglob("config.yml"))
@@ -142,6 +154,11 @@ class Ablation:
         )  # fmt: skip
         if done.returncode:
             raise SystemExit(f"{name} {' '.join(arguments)}\n{done.stdout[-3000:]}")
+
+
+def _digest(options: tuple[str, ...]) -> str:
+    """Tells apart what was made with other options."""
+    return hashlib.sha256("\0".join(options).encode()).hexdigest()[:8]
 
 
 def _losses_table(rows: list[dict]) -> str:

@@ -1,7 +1,7 @@
 r"""Pose correction on a real recording: known poses are perturbed, and the correction is compared with them.
 
     python benchmarks/real_poses.py --recording slider_depth --output benchmarks/results/real_poses_NAME.json \
-        --train "--pipeline.model.near-plane 0.25 --pipeline.model.far-plane 20"
+        --train="--pipeline.model.near-plane 0.25 --pipeline.model.far-plane 20"
 
 The recording is in the text format of the Event Camera Dataset. Its poses serve as ground truth; training gets the
 perturbed ones.

@@ -25,6 +25,9 @@ from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homoge
 
 Split = Literal["train", "val", "test"]
 
+# Nerfstudio's cameras are float32: further out a reference view's position would be rounded by a pixel and more.
+_MAX_REFERENCE_DISTANCE = 1e4
+
 # Training cameras are only there to be seen: the framework's viewer and its start-up slow down with their number.
 _MAX_SHOWN = 24
 
@@ -142,7 +145,9 @@ class EventDataParser(DataParser):
             for view in views:
                 _check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
-            cameras = recording.frame_camera.cameras(to_scene(poses @ OPENCV_TO_OPENGL))
+            poses = to_scene(poses @ OPENCV_TO_OPENGL)
+            _check_distance(poses, recording)
+            cameras = recording.frame_camera.cameras(poses)
             cameras.metadata[REFERENCE_SECONDS] = _reference_seconds(views, trajectory)
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
         # The framework wants a name for every camera, also for one without an image.
@@ -236,6 +241,17 @@ def _check_image(file: Path, camera: EventCamera) -> None:
             )
         if image.mode not in ("L", "RGB", "RGBA"):
             raise DataError(file, f"the image is of PIL's mode {image.mode}", "store 8 bits of grey or RGB")
+
+
+def _check_distance(poses: Tensor, recording: Recording) -> None:
+    """Raises a DataError for reference views, in scene units, that single precision would displace."""
+    distance = float(poses[..., 3].abs().max()) if len(poses) else 0.0
+    if distance > _MAX_REFERENCE_DISTANCE:
+        raise DataError(
+            recording.reference_trajectory.source,
+            f"a reference view is {distance:.3g} times as far from the estimated poses as these are apart",
+            "subtract one offset from the positions of the ground truth and of the reference views",
+        )
 
 
 def _views_within(views: list[ReferenceView], start: int, end: int) -> list[ReferenceView]:

@@ -219,6 +219,24 @@ def test_options_take_the_place_of_the_sensors_values(tmp_path: Path) -> None:
         parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
 
 
+def test_reference_views_far_from_the_estimated_poses_are_refused(tmp_path: Path) -> None:
+    # True poses in a geodetic frame: single precision, which the framework's cameras have, would displace them.
+    folder = write_native(tmp_path / "scene")
+    truth = make_trajectory()
+    far = Trajectory(truth.times, truth.camera_to_worlds + torch.tensor([[0, 0, 0, 4e5]], dtype=torch.float64))
+    write_tum_trajectory(folder / "trajectory_ground_truth.txt", far)
+    transforms = json.loads((folder / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        frame["transform_matrix"][0][3] += 4e5
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    config = NativeDataParserConfig(data=folder)
+    assert len(parse(config, "train").image_filenames)
+    with pytest.raises(
+        DataError, match=r"ground_truth.txt: a reference view is .* times as far .*; subtract one offset"
+    ):
+        parse(config, "test")
+
+
 def test_a_camera_that_only_turns_gives_no_scale(tmp_path: Path) -> None:
     folder = write_ecd(tmp_path / "made")
     (folder / "groundtruth.txt").write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n")

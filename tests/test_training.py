@@ -7,27 +7,57 @@ from itertools import pairwise
 
 import pytest
 import torch
+from torch.optim.lr_scheduler import LRScheduler
 
-from aenerf_ns.training import RelativeCosineSchedulerConfig
+from aenerf_ns.training import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
 
 
-def test_the_pose_correction_s_rate_rises_and_falls() -> None:
+def make_scheduler(
+    config: RelativeCosineSchedulerConfig | RelativeMultiStepSchedulerConfig,
+) -> tuple[torch.optim.Optimizer, LRScheduler]:
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=0.2)
-    config = RelativeCosineSchedulerConfig(warm_up=10, final_factor=0.01, max_steps=250)
-    scheduler = config.setup().get_scheduler(optimizer, 0.2)
+    return optimizer, config.setup().get_scheduler(optimizer, 0.2)
+
+
+def run(optimizer: torch.optim.Optimizer, scheduler: LRScheduler, count: int) -> list[float]:
+    """The rates of ``count`` steps."""
     rates = []
-    for _ in range(251):
+    for _ in range(count):
         rates.append(optimizer.param_groups[0]["lr"])
         optimizer.step()
         scheduler.step()
-    assert rates[0] == 0
-    assert rates[5] == pytest.approx(0.1, rel=0.01)
+    return rates
+
+
+def test_the_fields_rate_rises_and_falls_at_the_milestones() -> None:
+    rates = run(*make_scheduler(RelativeMultiStepSchedulerConfig(warm_up=10, max_steps=200)), 200)
+    assert rates[0] == pytest.approx(0.02)
+    assert rates[4] == pytest.approx(0.1)
+    for first, last, drops in ((9, 100, 0), (100, 150, 1), (150, 180, 2), (180, 200, 3)):
+        assert rates[first:last] == pytest.approx([0.2 * 0.33**drops] * (last - first))
+
+
+def test_the_pose_corrections_rate_rises_and_falls() -> None:
+    rates = run(*make_scheduler(RelativeCosineSchedulerConfig(warm_up=10, final_factor=0.01, max_steps=250)), 251)
+    assert rates[0] == pytest.approx(0.02, rel=0.01)
+    assert rates[4] == pytest.approx(0.1, rel=0.01)
     # Half way to the end.
     assert rates[125] == pytest.approx(0.2 * 0.505)
     assert rates[250] == pytest.approx(0.002)
     assert all(later <= earlier for earlier, later in pairwise(rates[10:]))
-    # Current torch loads nothing but plain numbers and tensors.
+
+
+@pytest.mark.parametrize("kind", [RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig])
+def test_a_resumed_run_goes_on_with_the_schedule_in_its_checkpoint(kind: type) -> None:
+    optimizer, scheduler = make_scheduler(kind(max_steps=200))
+    run(optimizer, scheduler, 160)
     file = io.BytesIO()
-    torch.save(scheduler.state_dict(), file)
+    torch.save((optimizer.state_dict(), scheduler.state_dict()), file)
     file.seek(0)
-    assert torch.load(file, weights_only=True)["last_epoch"] == 251
+    # The length of the run that resumes is the number of its additional steps.
+    resumed, resumed_scheduler = make_scheduler(kind(max_steps=1000))
+    # Current torch loads nothing but plain numbers and tensors.
+    state, scheduler_state = torch.load(file, weights_only=True)
+    resumed.load_state_dict(state)
+    resumed_scheduler.load_state_dict(scheduler_state)
+    assert run(resumed, resumed_scheduler, 100) == run(optimizer, scheduler, 100)
