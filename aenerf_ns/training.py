@@ -29,16 +29,19 @@ class _StepsFactor:
 
 
 class _CosineFactor:
-    """Factor on a learning rate that rises linearly and falls as half a cosine. An object, see above."""
+    """Factor on a learning rate that is zero, rises linearly and falls as half a cosine. An object, see above."""
 
-    def __init__(self, warm_up: int, last_step: int, final_factor: float) -> None:
+    def __init__(self, delay: int, warm_up: int, last_step: int, final_factor: float) -> None:
+        self.delay = delay
         self.warm_up = warm_up
         self.last_step = last_step
         self.final_factor = final_factor
 
     def __call__(self, step: int) -> float:
         falling = (1 + math.cos(math.pi * min(step / max(self.last_step, 1), 1.0))) / 2
-        return _rise(step, self.warm_up) * (self.final_factor + (1 - self.final_factor) * falling)
+        if step < self.delay:
+            return 0.0
+        return _rise(step - self.delay, self.warm_up) * (self.final_factor + (1 - self.final_factor) * falling)
 
 
 def _rise(step: int, warm_up: int) -> float:
@@ -78,15 +81,18 @@ class RelativeMultiStepScheduler(Scheduler):
 
 @dataclass
 class RelativeCosineSchedulerConfig(SchedulerConfig):
-    """Learning rate that rises linearly, and falls as half a cosine until the end of the run.
+    """Learning rate that is zero for some steps, rises linearly, and falls as half a cosine until the end of the run.
 
-    For pose correction: a single batch tells little of a pose, so the noise of the gradients is averaged out by a rate
-    that ends low.
+    For pose correction. Before the field has begun to take shape its gradients only lead poses astray; a field that has
+    taken shape holds on to wrong ones. And a single batch tells little of a pose, so the noise is averaged out by a
+    rate that ends low.
     """
 
     _target: type = field(default_factory=lambda: RelativeCosineScheduler)
-    warm_up: int = 50
-    """Steps in which the rate rises."""
+    delay: int = 100
+    """Steps for which the rate is zero."""
+    warm_up: int = 100
+    """Steps after these in which the rate rises."""
     final_factor: float = 0.01
     """Factor at the end of the run."""
     max_steps: tyro.conf.Suppress[int] = 0
@@ -101,7 +107,7 @@ class RelativeCosineScheduler(Scheduler):
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """The schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
-        return LambdaLR(optimizer, _CosineFactor(config.warm_up, config.max_steps, config.final_factor))
+        return LambdaLR(optimizer, _CosineFactor(config.delay, config.warm_up, config.max_steps, config.final_factor))
 
 
 @dataclass

@@ -38,7 +38,7 @@ class Quality:
     simulate: str = "--scene room --speed easy --width 160 --height 120"
     """Options of aenerf simulate."""
     train: str = ""
-    """More options of ns-train."""
+    """More options of ns-train, as in --train="--machine.seed 1"."""
 
     def main(self) -> None:
         """Measures and writes the figures and the picture."""

@@ -38,13 +38,15 @@ def test_the_fields_rate_rises_and_falls_at_the_milestones() -> None:
 
 
 def test_the_pose_corrections_rate_rises_and_falls() -> None:
-    rates = run(*make_scheduler(RelativeCosineSchedulerConfig(warm_up=10, final_factor=0.01, max_steps=250)), 251)
-    assert rates[0] == pytest.approx(0.02, rel=0.01)
-    assert rates[4] == pytest.approx(0.1, rel=0.01)
+    config = RelativeCosineSchedulerConfig(delay=5, warm_up=10, final_factor=0.01, max_steps=250)
+    rates = run(*make_scheduler(config), 251)
+    assert rates[:5] == [0.0] * 5
+    assert rates[5] == pytest.approx(0.02, rel=0.01)
+    assert rates[9] == pytest.approx(0.1, rel=0.01)
     # Half way to the end.
     assert rates[125] == pytest.approx(0.2 * 0.505)
     assert rates[250] == pytest.approx(0.002)
-    assert all(later <= earlier for earlier, later in pairwise(rates[10:]))
+    assert all(later <= earlier for earlier, later in pairwise(rates[15:]))
 
 
 @pytest.mark.parametrize("kind", [RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig])
