@@ -37,6 +37,8 @@ class Quality:
     """Training steps."""
     simulate: str = "--scene room --speed easy --width 160 --height 120"
     """Options of aenerf simulate."""
+    protocols: tuple[str, ...] = ()
+    """Other colour corrections than the run's to evaluate it under."""
     train: str = ""
     """More options of ns-train, as in --train="--machine.seed 1"."""
 
@@ -62,14 +64,25 @@ class Quality:
             seconds["evaluate"] = self._run(evaluate, root)
             results = json.loads((root / "out.json").read_text())["results"]
             self._picture(root / "out")
+            others = {protocol: self._under(protocol, config, root) for protocol in self.protocols}
         report = {
             "results": results,
+            "results_under": others,
             "seconds": seconds,
             "commands": [" ".join(simulate), " ".join(train)],
             **environment(),
         }
         (_RESULTS / f"{self.name}.json").write_text(json.dumps(report, indent=2) + "\n")
         print(json.dumps(report, indent=2))
+
+    def _under(self, protocol: str, config: Path, folder: Path) -> dict:
+        """Metrics with another colour correction."""
+        file = folder / f"{protocol}.json"
+        self._run(
+            ["aenerf", "evaluate", "--load-config", str(config), "--output", str(file), "--color-correction", protocol],
+            folder,
+        )
+        return json.loads(file.read_text())["results"]
 
     def _run(self, command: list[str], folder: Path) -> float:
         begin = time.perf_counter()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -27,7 +28,7 @@ from aenerf_ns.image_encoding import encode
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipeline, AENeRFPipelineConfig
 from aenerf_ns.pose_correction import PoseCorrectionConfig
-from aenerf_ns.trajectory.trajectory import Trajectory
+from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
 FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
 
@@ -156,16 +157,24 @@ def test_checkpoints_of_the_affine_protocol_hold_these_buffers() -> None:
 
 
 def make_pipeline(
-    folder: Path, test_mode: Literal["test", "val"], num_views: int = 2, pose_correction: str = "off"
+    folder: Path,
+    test_mode: Literal["test", "val"],
+    num_views: int = 2,
+    pose_correction: str = "off",
+    true_world: Callable[[torch.Tensor], torch.Tensor] | None = None,
 ) -> AENeRFPipeline:
-    """A small untrained model of a colour sensor: grey validation views, and one test view more, orange."""
+    """A small untrained model of a colour sensor: grey validation views, and one test view more, orange. With
+    ``true_world`` there are true poses, in the world that it maps to, and the views' are in that as well."""
     if not folder.exists():
         camera = EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
         poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
         poses[:, 0, 3] = torch.tensor([-0.1, 0.0, 0.1])
         with NativeDatasetWriter(folder, camera, SensorModel(bayer_pattern="RGGB"), "srgb") as writer:
             writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 10**9, -1)], 6, 4))
-            writer.add_trajectories(Trajectory([0, 5 * 10**8, 10**9], poses))
+            trajectory = Trajectory([0, 5 * 10**8, 10**9], poses)
+            writer.add_trajectories(trajectory, None if true_world is None else trajectory.mapped(true_world))
+            if true_world is not None:
+                poses = homogeneous(true_world(poses))
             for _ in range(num_views):
                 writer.add_image("val", np.full((4, 6, 3), 102, np.uint8), poses[0])
             for _ in range(num_views + 1):

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from test_color_correction import make_pipeline
 from test_model import make_model
 
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import REFERENCE_SECONDS, EventCamera
 from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
@@ -166,6 +169,25 @@ def test_with_ground_truth_views_are_carried_by_the_alignment_to_it(random_poses
     # Other cameras, such as the viewer's, are in the scene's frame and stay.
     others = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5).cameras(views)
     assert correction.apply_to_camera(others) is others.camera_to_worlds
+
+
+def test_the_true_poses_may_be_in_another_world(tmp_path: Path) -> None:
+    world = some_similarity(2.5)
+    plain = make_pipeline(tmp_path / "plain", "test")
+    moved = make_pipeline(tmp_path / "moved", "test", true_world=lambda poses: world(poses[..., :3, :]))
+    errors = moved.pose_errors()
+    assert errors is not None
+    # With digits as the files have them.
+    assert all(errors["estimated"][name] < 1e-5 for name in ("rotation_error_degrees", "translation_error"))
+    assert errors["estimated"]["translation_error_se3"] > 0.05
+    correction = moved.model.camera_optimizer
+    views = [pipeline.datamanager.reference_views("test") for pipeline in (plain, moved)]
+    expected, given = (view.cameras for view in views)
+    assert (given.camera_to_worlds - expected.camera_to_worlds).abs().max() > 0.5
+    torch.testing.assert_close(correction.apply_to_camera(given), expected.camera_to_worlds, rtol=0, atol=1e-5)
+    truth = read_tum_trajectory(tmp_path / "moved" / "trajectory_ground_truth.txt")
+    in_recording = moved.in_recording(correction.compared_poses()[2])
+    torch.testing.assert_close(in_recording, truth.camera_to_worlds, rtol=0, atol=1e-6)
 
 
 def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tensor) -> None:
