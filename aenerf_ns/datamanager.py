@@ -88,12 +88,14 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     def place_reference_views(self, poses: Tensor) -> None:
         """Gives the reference views the poses (N, 3, 4), camera-to-world in the scene, for good."""
-        cameras = self.eval_dataset.cameras
-        # Without metadata: these cameras are in the scene's frame, and nothing is to carry them there again.
-        self.eval_dataset.cameras = replace(cameras, camera_to_worlds=poses.to(cameras.device), metadata={})
+        _place(self.eval_dataset, poses)
         if self.test_mode != "inference":
             # The loaders have copies of the cameras.
             self.setup_eval()
+
+    def place_training_cameras(self, poses: Tensor) -> None:
+        """Gives the training cameras, which are only shown, the poses (N, 3, 4), likewise."""
+        _place(self.train_dataset, poses)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """A batch of pairs; see :meth:`EventRaySampler.sample`."""
@@ -106,3 +108,9 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         self.eval_count += 1
         assert self.train_pixel_sampler is not None
         return self.train_pixel_sampler.sample(max(self.config.eval_num_rays_per_batch // 2, 1))
+
+
+def _place(dataset: EventDataset, poses: Tensor) -> None:
+    # Without metadata: these cameras are in the scene's frame, and nothing is to carry them there again.
+    cameras = dataset.cameras
+    dataset.cameras = replace(cameras, camera_to_worlds=poses.to(cameras.device), metadata={})

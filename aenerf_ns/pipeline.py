@@ -75,10 +75,13 @@ class AENeRFPipeline(VanillaPipeline):
             RuntimeError: the checkpoint is of a model with other parameters.
         """
         super().load_state_dict(state_dict, strict=True)
-        if self.test_mode != "val" and self.datamanager.has_reference_views:
+        if self.test_mode != "val":
             # The framework's renderers and exporters make cameras of their own from these.
-            cameras = self.datamanager.eval_dataset.cameras.to(self.device)
-            self.datamanager.place_reference_views(self.model.camera_optimizer.apply_to_camera(cameras))
+            data, correction = self.datamanager, self.model.camera_optimizer
+            if data.has_reference_views:
+                data.place_reference_views(correction.apply_to_camera(data.eval_dataset.cameras.to(self.device)))
+            data.place_training_cameras(correction.apply_to_camera(data.train_dataset.cameras.to(self.device)))
+            correction.training_cameras_are_corrected = True
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
         """Outputs, weighted losses and metrics of a training batch; now and then with the errors of the corrected poses
@@ -242,19 +245,22 @@ class AENeRFPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Mean metrics over the reference views, and what they were computed with.
+        """Mean metrics over the reference views, and what they were computed with. Without such views, where true poses
+        are known, the errors of the poses alone.
 
         Raises:
-            SystemExit: there are no reference views.
+            SystemExit: there are neither.
         """
-        self._require_reference_views()
-        metrics: dict[str, Any] = super().get_average_eval_image_metrics(step, output_path, get_std)
-        # A single view has no standard deviation, and NaN is no JSON.
-        metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
+        metrics: dict[str, Any] = {}
+        if self.datamanager.has_reference_views or not self.model.camera_optimizer.has_ground_truth:
+            self._require_reference_views()
+            metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+            # A single view has no standard deviation, and NaN is no JSON.
+            metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
         if self.test_mode == "test":
             # The trainer's log, in the other mode, takes numbers only.
             metrics["color_correction"] = self.model.color_correction.description
-            metrics["num_views"] = len(self.datamanager.eval_dataset)
+            metrics["num_views"] = len(self.datamanager.eval_dataset) if self.datamanager.has_reference_views else 0
             metrics["pose_correction"] = self.model.config.camera_optimizer.mode
             metrics["pose_errors"] = self.pose_errors()
             metrics["test_poses"] = self._test_poses

@@ -15,7 +15,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.encodings import NeRFEncoding
 from torch import Tensor, nn
 
-from aenerf_ns.event_camera import REFERENCE_SECONDS
+from aenerf_ns.event_camera import REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.ray_sampler import CAMERA_DIRECTIONS
 from aenerf_ns.trajectory.alignment import Similarity, align
 from aenerf_ns.trajectory.rotation import motion_from_twist
@@ -89,6 +89,7 @@ class PoseCorrection(CameraOptimizer):
         self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
         self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
         self._duration = (trajectory.end - trajectory.start) * 1e-9
+        self.training_cameras_are_corrected = False
         self.twists: nn.Module | None = None
         if config.mode == "network":
             self.twists = TwistNetwork(trajectory, config.num_frequencies)
@@ -106,7 +107,10 @@ class PoseCorrection(CameraOptimizer):
         return base @ motion_from_twist(self.twists(seconds, base).double())
 
     def forward(self, indices: Tensor) -> Tensor:
-        """The framework's contract: (N, 3, 4) motions that the training cameras' poses are multiplied with."""
+        """The framework's contract: (N, 3, 4) motions that the training cameras' poses are multiplied with, none once
+        these are corrected (``training_cameras_are_corrected``)."""
+        if self.training_cameras_are_corrected:
+            return torch.eye(4, device=indices.device)[:3].expand(len(indices), 3, 4)
         seconds = self._camera_seconds[indices]
         base = homogeneous(self.trajectory.pose(seconds))
         return (torch.linalg.inv(base) @ homogeneous(self.pose(seconds)))[:, :3].float()
@@ -120,18 +124,23 @@ class PoseCorrection(CameraOptimizer):
     def apply_to_camera(self, camera: Cameras) -> Tensor:
         """Poses (N, 3, 4) in the scene of cameras.
 
-        Those of reference images are moved from the reference frame to that of the corrected poses: with ground truth
-        by the Sim(3) that best maps the corrected trajectory to the true one; without it as the corrected pose at the
-        time the image was taken, and images not taken on the trajectory by the Sim(3) to the estimated one. All other
-        cameras are in the scene's frame and stay.
+        Those on the estimated trajectory get the corrected poses of their times. Those of reference images are moved
+        from the reference frame to that of the corrected poses: with ground truth by the Sim(3) that best maps the
+        corrected trajectory to the true one; without it as the corrected pose at the time the image was taken, and
+        images not taken on the trajectory by the Sim(3) to the estimated one. All other cameras are in the scene's
+        frame and stay.
         """
         poses = camera.camera_to_worlds
-        if REFERENCE_SECONDS not in (camera.metadata or {}) or (self.twists is None and not self.has_ground_truth):
+        metadata = camera.metadata or {}
+        if TRAJECTORY_SECONDS in metadata and self.twists is not None:
+            with torch.no_grad():
+                return self.pose(metadata[TRAJECTORY_SECONDS][..., 0]).to(poses)
+        if REFERENCE_SECONDS not in metadata or (self.twists is None and not self.has_ground_truth):
             return poses
         with torch.no_grad():
             carried = self.alignment().inverse()(poses.double())
             if not self.has_ground_truth:
-                seconds = camera.metadata[REFERENCE_SECONDS][..., 0]
+                seconds = metadata[REFERENCE_SECONDS][..., 0]
                 on_trajectory = seconds.isfinite()
                 taken = seconds.nan_to_num(0.0)
                 motion = homogeneous(self.pose(taken)) @ torch.linalg.inv(homogeneous(self.trajectory.pose(taken)))

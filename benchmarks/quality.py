@@ -23,6 +23,7 @@ from PIL import Image
 
 _RESULTS = Path(__file__).parent / "results"
 _NUM_PICTURES = 3
+_EVALUATE = ("aenerf", "evaluate", "--output", "other.json")
 
 
 @dataclass
@@ -38,7 +39,7 @@ class Quality:
     simulate: str = "--scene room --speed easy --width 160 --height 120"
     """Options of aenerf simulate."""
     protocols: tuple[str, ...] = ()
-    """Other colour corrections than the run's to evaluate it under."""
+    """Other colour corrections than the run's to evaluate it under, with aenerf evaluate --color-correction."""
     train: str = ""
     """More options of ns-train, as in --train="--machine.seed 1"."""
 
@@ -51,38 +52,24 @@ class Quality:
             train = ["ns-train", self.method, "--machine.device-type", device, "--vis", "tensorboard",
                      "--max-num-iterations", str(self.steps), *self.train.split(), "--data", "scene"]  # fmt: skip
             seconds = {"simulate": self._run(simulate, root), "train": self._run(train, root)}
-            config = next(root.rglob("config.yml"))
-            evaluate = [
-                "ns-eval",
-                "--load-config",
-                str(config),
-                "--output-path",
-                "out.json",
-                "--render-output-path",
-                "out",
-            ]
+            config = str(next(root.rglob("config.yml")).relative_to(root))
+            evaluate = ["ns-eval", "--load-config", config, "--output-path", "out.json", "--render-output-path", "out"]
             seconds["evaluate"] = self._run(evaluate, root)
+            others = {}
+            for protocol in self.protocols:
+                self._run([*_EVALUATE, "--load-config", config, "--color-correction", protocol], root)
+                others[protocol] = json.loads((root / "other.json").read_text())["results"]
             results = json.loads((root / "out.json").read_text())["results"]
             self._picture(root / "out")
-            others = {protocol: self._under(protocol, config, root) for protocol in self.protocols}
         report = {
             "results": results,
             "results_under": others,
             "seconds": seconds,
-            "commands": [" ".join(simulate), " ".join(train)],
+            "commands": [" ".join(command) for command in (simulate, train, evaluate)],
             **environment(),
         }
         (_RESULTS / f"{self.name}.json").write_text(json.dumps(report, indent=2) + "\n")
         print(json.dumps(report, indent=2))
-
-    def _under(self, protocol: str, config: Path, folder: Path) -> dict:
-        """Metrics with another colour correction."""
-        file = folder / f"{protocol}.json"
-        self._run(
-            ["aenerf", "evaluate", "--load-config", str(config), "--output", str(file), "--color-correction", protocol],
-            folder,
-        )
-        return json.loads(file.read_text())["results"]
 
     def _run(self, command: list[str], folder: Path) -> float:
         begin = time.perf_counter()

@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import REFERENCE_SECONDS, EventCamera
+from aenerf_ns.event_camera import REFERENCE_SECONDS, TRAJECTORY_SECONDS, EventCamera
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.image_encoding import ImageEncoding
@@ -25,7 +25,7 @@ from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homoge
 
 Split = Literal["train", "val", "test"]
 
-# Nerfstudio's cameras are float32: further out a reference view's position would be rounded by a pixel and more.
+# In extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
 _MAX_REFERENCE_DISTANCE = 1e4
 
 # Training cameras are only there to be seen: the framework's viewer and its start-up slow down with their number.
@@ -140,13 +140,14 @@ class EventDataParser(DataParser):
         if split == "train":
             times, images = _training_views(trajectory, recording.reference_views["train"])
             cameras = recording.event_camera.cameras(trajectory.interpolate(times))
+            cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
         else:
             views = _views_within(recording.reference_views[_as_split(split)], start, end)
             for view in views:
                 _check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
             poses = to_scene(poses @ OPENCV_TO_OPENGL)
-            _check_distance(poses, recording)
+            _check_distance(poses, trajectory if ground_truth is None else ground_truth)
             cameras = recording.frame_camera.cameras(poses)
             cameras.metadata[REFERENCE_SECONDS] = _reference_seconds(views, trajectory)
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
@@ -243,14 +244,16 @@ def _check_image(file: Path, camera: EventCamera) -> None:
             raise DataError(file, f"the image is of PIL's mode {image.mode}", "store 8 bits of grey or RGB")
 
 
-def _check_distance(poses: Tensor, recording: Recording) -> None:
-    """Raises a DataError for reference views, in scene units, that single precision would displace."""
+def _check_distance(poses: Tensor, reference: Trajectory) -> None:
+    """Raises a DataError for reference views that single precision would displace."""
+    positions = reference.camera_to_worlds[..., 3]
+    extent = float((positions - positions.mean(0)).norm(dim=-1).max())
     distance = float(poses[..., 3].abs().max()) if len(poses) else 0.0
-    if distance > _MAX_REFERENCE_DISTANCE:
+    if distance > _MAX_REFERENCE_DISTANCE * extent > 0:
         raise DataError(
-            recording.reference_trajectory.source,
-            f"a reference view is {distance:.3g} times as far from the estimated poses as these are apart",
-            "subtract one offset from the positions of the ground truth and of the reference views",
+            reference.source,
+            f"a reference view is {distance / extent:.3g} times as far from the estimated poses as these poses extend",
+            "subtract one offset from the positions of these poses and of the reference views",
         )
 
 

@@ -301,6 +301,8 @@ def test_neither_images_nor_ground_truth_are_trained_on(trained: Path, workspace
             "4",
             "--pipeline.model.camera-optimizer.mode",
             "spline",
+            "--optimizers.camera-opt.scheduler.delay",
+            "0",
             "--data",
             data,
             cwd=workspace,
@@ -310,6 +312,7 @@ def test_neither_images_nor_ground_truth_are_trained_on(trained: Path, workspace
     for name, value in weights[0].items():
         if "color_correction" not in name:
             assert torch.equal(value, weights[1][name]), name
+    assert weights[0]["_model.camera_optimizer.twists.control_twists"].any()
     assert not torch.equal(*(w["_model.color_correction.offset"] for w in weights))
 
 

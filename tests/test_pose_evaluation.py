@@ -104,11 +104,14 @@ def test_orientations_settle_the_alignment_of_a_straight_line() -> None:
 
 def test_a_mirrored_trajectory_is_not_aligned_by_a_reflection(random_poses: torch.Tensor) -> None:
     reference = make_truth(random_poses).camera_to_worlds
-    mirrored = reference.clone()
-    mirrored[:, 0, 3] *= -1
-    for with_orientations in (True, False):
-        found = align(mirrored, reference, with_orientations=with_orientations)
-        assert float(torch.linalg.det(found.rotation)) == pytest.approx(1.0)
+    for factors in ([-1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]):
+        mirrored = reference.clone()
+        mirrored[..., 3] *= torch.tensor(factors)
+        for with_orientations in (True, False):
+            found = align(mirrored, reference, with_orientations=with_orientations)
+            assert float(torch.linalg.det(found.rotation)) == pytest.approx(1.0)
+            assert found.scale > 0
+        assert pose_errors(mirrored, reference)["translation_error"] > 0.1
 
 
 def test_small_rotation_angles_are_exact() -> None:
@@ -188,6 +191,28 @@ def test_the_true_poses_may_be_in_another_world(tmp_path: Path) -> None:
     truth = read_tum_trajectory(tmp_path / "moved" / "trajectory_ground_truth.txt")
     in_recording = moved.in_recording(correction.compared_poses()[2])
     torch.testing.assert_close(in_recording, truth.camera_to_worlds, rtol=0, atol=1e-6)
+
+
+def test_a_trained_run_shows_and_exports_the_corrected_poses(tmp_path: Path) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
+    correction, data = pipeline.model.camera_optimizer, pipeline.datamanager
+    torch.nn.init.normal_(correction.twists.control_twists, std=0.05)
+    estimated = data.train_dataset.cameras
+    with torch.no_grad():
+        expected = correction.pose(correction._camera_seconds).float()
+    assert (estimated.camera_to_worlds - expected).abs().max() > 0.01
+    # As ns-export cameras and ns-render dataset do.
+    torch.testing.assert_close(correction.apply_to_camera(estimated), expected)
+    # As the viewer does while training.
+    indices = torch.arange(len(estimated))
+    moved = (homogeneous(estimated.camera_to_worlds) @ homogeneous(correction(indices)))[:, :3]
+    torch.testing.assert_close(moved, expected, rtol=0, atol=1e-6)
+    # Opening a run moves them, once.
+    pipeline.load_state_dict(pipeline.state_dict())
+    opened = data.train_dataset.cameras
+    torch.testing.assert_close(opened.camera_to_worlds, expected)
+    torch.testing.assert_close(correction.apply_to_camera(opened), expected)
+    torch.testing.assert_close(homogeneous(correction(indices)), torch.eye(4).expand(len(indices), 4, 4))
 
 
 def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tensor) -> None:

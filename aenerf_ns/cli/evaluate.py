@@ -59,6 +59,9 @@ class Evaluate:
         }
         self.output.parent.mkdir(parents=True, exist_ok=True)
         self.output.write_text(json.dumps(evaluation, indent=2) + "\n", "utf8")
+        if results["num_views"] == 0:
+            CONSOLE.print(f"{self.output}: errors of the poses; there are no views to evaluate on.")
+            return
         CONSOLE.print(
             f"{self.output}: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.3f} over {results['num_views']} "
             f"views; colour correction {results['color_correction']}."

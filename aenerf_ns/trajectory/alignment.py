@@ -63,6 +63,9 @@ def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orient
     # Positions that do not spread tell no scale.
     if with_scale and min(centered.norm(), reference_centered.norm()) > 1e-12:
         scale = (reference_centered * (centered @ rotation.mT)).sum() / centered.square().sum()
+        if scale <= 0:
+            # Positions that contradict the orientations: a negative factor would be a reflection.
+            scale = reference_centered.norm() / centered.norm()
     return Similarity(scale, rotation, reference_mean - scale * (rotation @ mean))
 
 
