@@ -383,10 +383,10 @@ class AENeRFModel(Model):
             self.camera_optimizer.get_loss_dict(losses)
         return scale_dict(losses, self.config.loss_coefficients)
 
-    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         """How far the rendered changes of log-radiance agree with the events."""
         predicted, target = self._log_radiance_changes(outputs, batch)
-        metrics = {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
+        metrics: dict[str, Any] = {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics | self.sensor_parameters.learned()
 
