@@ -131,6 +131,8 @@ class Ablation:
         file = self.work / f"{name}.json"
         if not file.exists():
             device = "cuda" if torch.cuda.is_available() else "cpu"
+            # Later rows may be of a later commit than the first.
+            commit = environment()["commit"]
             begin = time.perf_counter()
             self._command(
                 "ns-train", self.method, "--machine.device-type", device, "--vis", "tensorboard",
@@ -142,7 +144,8 @@ class Ablation:
             self._command("ns-eval", "--load-config", str(config.relative_to(self.work)), "--output-path", partial.name)
             figures = json.loads(partial.read_text())["results"]
             partial.unlink()
-            figures |= {"name": row.name, "options": " ".join(row.options), "train_seconds": round(seconds)}
+            figures |= {"name": row.name, "options": " ".join(row.options), "train_seconds": round(seconds),
+                        "commit": commit}  # fmt: skip
             file.write_text(json.dumps(figures, indent=2) + "\n")
             print(row.name, round(figures["psnr"], 2), figures["pose_errors"]["corrected"], flush=True)
         return json.loads(file.read_text())

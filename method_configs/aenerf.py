@@ -11,6 +11,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.ffmpeg import provide_ffmpeg
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipelineConfig
+from aenerf_ns.pose_correction import PoseCorrectionConfig
 from aenerf_ns.training import (
     AENeRFTrainerConfig,
     RelativeCosineSchedulerConfig,
@@ -28,7 +29,8 @@ aenerf = MethodSpecification(
         steps_per_eval_batch=500,
         steps_per_eval_image=500,
         pipeline=AENeRFPipelineConfig(
-            datamanager=EventDataManagerConfig(dataparser=NativeDataParserConfig()), model=AENeRFModelConfig()
+            datamanager=EventDataManagerConfig(dataparser=NativeDataParserConfig()),
+            model=AENeRFModelConfig(camera_optimizer=PoseCorrectionConfig(mode="spline")),
         ),
         optimizers={
             "encodings": {

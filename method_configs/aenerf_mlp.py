@@ -9,6 +9,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.pose_correction import PoseCorrectionConfig
 
 _base = deepcopy(aenerf.config)
 
@@ -35,6 +36,7 @@ aenerf_mlp = MethodSpecification(
                 num_nerf_samples_per_ray=32,
                 proposal_num_hidden_layers=4,
                 proposal_hidden_dim=256,
+                camera_optimizer=PoseCorrectionConfig(mode="network"),
                 loss_coefficients={**_base.pipeline.model.loss_coefficients, "temporal_loss": 1e-3},
             ),
         ),

@@ -175,9 +175,13 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
         run("aenerf", "export-trajectory", "--load-config", trained, "--output", output, *options, cwd=workspace)
         exported = read_tum_trajectory(output)
         assert torch.equal(exported.times, times)
-        # Without pose correction all are the given ones, but for the framework's float32 transform.
-        difference = exported.camera_to_worlds - given.interpolate(times)
-        assert difference.abs().max() < 1e-6
+        difference = (exported.camera_to_worlds - given.interpolate(times)).abs().max()
+        if poses == "corrected":
+            # Corrected for some steps, of poses that are the true ones.
+            assert 1e-4 < difference < 0.2
+        else:
+            # The given ones, but for the framework's float32 transform.
+            assert difference < 1e-6
     missing = ("aenerf", "export-trajectory", "--load-config", "nothing.yml", "--output", output)
     assert "nothing.yml: there is no such file" in run(*missing, cwd=workspace, fails=True)
 
@@ -299,8 +303,6 @@ def test_neither_images_nor_ground_truth_are_trained_on(trained: Path, workspace
             "tensorboard",
             "--max-num-iterations",
             "4",
-            "--pipeline.model.camera-optimizer.mode",
-            "spline",
             "--optimizers.camera-opt.scheduler.delay",
             "0",
             "--data",
