@@ -135,8 +135,8 @@ def test_a_run_is_evaluated_under_other_protocols(trained: Path, evaluated: dict
     assert results.keys() == of_run.keys()
     assert results["color_correction"] == "network, fitted on 4 validation views"
     assert results["test_poses"].startswith("photometric refinement, 100 steps, from: Sim(3)")
-    # The same pictures in other colours, from places that suit them better.
-    assert of_run["psnr"] < results["psnr"] < of_run["psnr"] + 3
+    # The same pictures in other colours, from other places.
+    assert 0 < abs(results["psnr"] - of_run["psnr"]) < 3
     assert len(list(pictures.glob("eval_img_*.png"))) == 3
     assert (trained.read_bytes(), checkpoint.read_bytes()) == before
     missing = ("aenerf", "evaluate", "--load-config", "nothing.yml", "--output", output)
@@ -392,9 +392,15 @@ def test_a_recording_without_reference_views_trains_and_says_so_at_evaluation(tr
         cwd=workspace,
     )  # fmt: skip
     config = newest_config(workspace / "outputs" / "bare")
-    output = run(
-        "ns-eval", "--load-config", config, "--output-path", workspace / "none.json", cwd=workspace, fails=True
-    )
+    # What can be evaluated is the poses, as long as the true ones are known.
+    command = ("ns-eval", "--load-config", config, "--output-path", workspace / "none.json")
+    run(*command, cwd=workspace)
+    results = json.loads((workspace / "none.json").read_text())["results"]
+    assert results["num_views"] == 0
+    assert "psnr" not in results
+    assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 1
+    (data / "trajectory_ground_truth.txt").unlink()
+    output = run(*command, cwd=workspace, fails=True)
     assert "Error: " in output
     assert "the test split has no reference images to evaluate on" in output
     # The renderers start from places on the trajectory then.
