@@ -14,18 +14,8 @@ from scipy.stats import norm
 from aenerf_ns.scenes import BuiltInScene, built_in_scene, paths
 from aenerf_ns.scenes import textures as tx
 from aenerf_ns.scenes.frames import frame_displacement, frame_parameters
-from aenerf_ns.scenes.raycast import (
-    BOX,
-    CYLINDER,
-    RECTANGLE,
-    SPHERE,
-    AreaLight,
-    Primitive,
-    Scene,
-    bake,
-    render,
-    sample_offsets,
-)
+from aenerf_ns.scenes.light_baking import AreaLight, bake
+from aenerf_ns.scenes.raycast import BOX, CYLINDER, RECTANGLE, SPHERE, Primitive, Scene, render, sample_offsets
 
 WHITE = {"white": np.full((8, 8, 3), 0.5, np.float32)}
 OVERHEAD = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])

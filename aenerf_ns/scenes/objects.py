@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from aenerf_ns.scenes import textures as tx
-from aenerf_ns.scenes.raycast import AreaLight, Primitive, Scene, bake
+from aenerf_ns.scenes.light_baking import AreaLight, bake
+from aenerf_ns.scenes.raycast import Primitive, Scene
 from aenerf_ns.scenes.shapes import ALONG_X, ALONG_Y, box, pillar, rod, sphere, turned_box
 
 TEXTURE_SIZE = 256

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from aenerf_ns.scenes import textures as tx
-from aenerf_ns.scenes.raycast import AreaLight, Primitive, Scene, bake
+from aenerf_ns.scenes.light_baking import AreaLight, bake
+from aenerf_ns.scenes.raycast import Primitive, Scene
 from aenerf_ns.scenes.shapes import ALONG_X, axes, box, panel, pillar, rod, sphere, turned_box
 
 TEXTURE_SIZE = 256
