@@ -26,6 +26,7 @@ _MAX_COMPARED = 2000
 # A step of the optimizer changes hundreds of weights behind each number of a network's twist, and few behind a
 # spline's. With this factor on the network's output both move about as far at one learning rate.
 _NETWORK_OUTPUT_SCALE = 2e-3
+_SMALLEST_EXTENT = 1e-6
 
 
 @dataclass
@@ -36,7 +37,7 @@ class PoseCorrectionConfig(CameraOptimizerConfig):
     mode: Literal["off", "network", "spline"] = "off"
     """The paper's network, a cubic B-spline of twists, or none."""
     trans_l2_penalty: float = 1e-2
-    """Weight of the mean squared translation of the corrections, in scene units."""
+    """Weight of the mean squared translation of the corrections, in units of the trajectory's extent."""
     rot_l2_penalty: float = 1e-2
     """Weight of the mean squared rotation of the corrections, in radians."""
     knot_interval: float = 0.1
@@ -48,7 +49,9 @@ class PoseCorrectionConfig(CameraOptimizerConfig):
 class PoseCorrection(CameraOptimizer):
     """A twist ξ(t) for every time, so that the corrected pose is base pose(t) · exp(ξ(t)) (paper, eq. 6).
 
-    ξ is zero at first, with gradients that are not.
+    ξ is zero at first, with gradients that are not. What the network or the spline gives counts in radians and, for the
+    translation, in units of the trajectory's extent (root mean square distance from its middle), so that a learning
+    rate means the same for a camera that moves by centimetres and one that walks through a hall.
 
     The scene is reconstructed in the frame of the corrected poses, while reference images have poses in the frame of
     the true trajectory or, where that is not known, of the estimated one. :meth:`apply_to_camera` carries their cameras
@@ -67,6 +70,7 @@ class PoseCorrection(CameraOptimizer):
     _camera_seconds: Tensor
     _compared_seconds: Tensor
     _reference_poses: Tensor
+    _twist_units: Tensor
 
     def __init__(
         self,
@@ -89,6 +93,10 @@ class PoseCorrection(CameraOptimizer):
         self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
         self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
         self._duration = (trajectory.end - trajectory.start) * 1e-9
+        # A camera that only turns gives translations no unit: that of the scene will do.
+        extent = trajectory.extent if trajectory.extent > _SMALLEST_EXTENT else 1.0
+        units = torch.tensor([extent] * 3 + [1.0] * 3)
+        self.register_buffer("_twist_units", units, persistent=False)
         self.training_cameras_are_corrected = False
         self.twists: nn.Module | None = None
         if config.mode == "network":
@@ -104,7 +112,7 @@ class PoseCorrection(CameraOptimizer):
         """Corrected poses where the estimated ones are ``base`` (N, 3, 4)."""
         if self.twists is None:
             return base
-        return base @ motion_from_twist(self.twists(seconds, base).double())
+        return base @ motion_from_twist((self._twist_units * self.twists(seconds, base)).double())
 
     def forward(self, indices: Tensor) -> Tensor:
         """The framework's contract: (N, 3, 4) motions that the training cameras' poses are multiplied with, none once
@@ -190,12 +198,12 @@ class PoseCorrection(CameraOptimizer):
         if self.twists is None:
             return
         with torch.no_grad():
-            size = self._sampled_twists().unflatten(-1, (2, 3)).square().sum(-1).mean(0).sqrt()
+            size = (self._twist_units * self._sampled_twists()).unflatten(-1, (2, 3)).square().sum(-1).mean(0).sqrt()
         metrics_dict["pose_correction_translation"] = size[0]
         metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
 
     def _sampled_twists(self) -> Tensor:
-        """Twists at times spread over the trajectory, in every interval of the spline."""
+        """Twists at times spread over the trajectory, in every interval of the spline, in units of its extent."""
         assert self.twists is not None
         count = max(64, math.ceil(self._duration / self.config.knot_interval))
         seconds = torch.linspace(0, self._duration, count, dtype=torch.float64, device=self._camera_seconds.device)

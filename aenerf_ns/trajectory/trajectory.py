@@ -91,6 +91,12 @@ class Trajectory(nn.Module):
         """Time of the last knot in nanoseconds."""
         return int(self.times[-1])
 
+    @property
+    def extent(self) -> float:
+        """Root mean square distance of the positions at the knots from their mean."""
+        positions = self.camera_to_worlds[:, :, 3]
+        return float((positions - positions.mean(0)).square().sum(-1).mean().sqrt())
+
     def seconds(self, times: Tensor) -> Tensor:
         """Float64 seconds since ``start`` of integer times in nanoseconds."""
         return (times - self.times[0]).to(torch.float64) * 1e-9
