@@ -161,6 +161,48 @@ def test_off_has_no_parameters_and_changes_nothing() -> None:
     assert torch.equal(rays.origins, base[:, :, 3].float())
 
 
+def test_the_unit_of_length_does_not_matter() -> None:
+    """Parameters that turn a trajectory into another one do the same to the same trajectory in millimetres."""
+    correction = make_correction("spline")
+    scaled = correction.trajectory.camera_to_worlds.clone()
+    scaled[:, :, 3] *= 1000
+    in_millimetres = PoseCorrectionConfig(mode="spline").setup(
+        num_cameras=3,
+        device="cpu",
+        trajectory=Trajectory(correction.trajectory.times, scaled),
+        camera_times=correction.trajectory.times[:3],
+    )
+    torch.nn.init.normal_(correction.twists.control_twists, std=0.1)
+    in_millimetres.load_state_dict(correction.state_dict())
+    seconds = torch.linspace(0, 2, 9, dtype=torch.float64)
+    expected = correction.pose(seconds).detach()
+    expected[:, :, 3] *= 1000
+    torch.testing.assert_close(in_millimetres.pose(seconds).detach(), expected, rtol=1e-6, atol=1e-6)
+    losses: dict[str, torch.Tensor] = {}
+    penalties = []
+    for one in (correction, in_millimetres):
+        one.get_loss_dict(losses)
+        penalties.append(losses["pose_correction_penalty"].item())
+    assert penalties[0] == pytest.approx(penalties[1])
+
+
+def test_a_camera_that_only_turns_is_corrected_in_scene_units() -> None:
+    correction = make_correction("spline")
+    turning = correction.trajectory.camera_to_worlds.clone()
+    turning[:, :, 3] = 0
+    correction = PoseCorrectionConfig(mode="spline").setup(
+        num_cameras=3,
+        device="cpu",
+        trajectory=Trajectory(correction.trajectory.times, turning),
+        camera_times=correction.trajectory.times[:3],
+    )
+    with torch.no_grad():
+        correction.twists.control_twists[:, 0] = 0.5
+    seconds = torch.linspace(0, 2, 9, dtype=torch.float64)
+    distance = correction.pose(seconds)[:, :, 3].norm(dim=-1)
+    torch.testing.assert_close(distance, torch.full_like(distance, 0.5))
+
+
 @pytest.mark.parametrize("mode", ["network", "spline"])
 def test_the_viewer_s_motion_takes_the_base_pose_to_the_corrected_one(mode: str) -> None:
     correction = make_correction(mode)
