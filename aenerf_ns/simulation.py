@@ -1,4 +1,4 @@
-"""An event camera moving through a built-in scene."""
+"""An event camera moving through a scene."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.image_encoding import encode, to_channels
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.scenes import BuiltInScene
+from aenerf_ns.scenes import SimulationScene
 from aenerf_ns.scenes.frames import frame_parameters
 from aenerf_ns.scenes.paths import SpeedProfile
-from aenerf_ns.scenes.raycast import render
 from aenerf_ns.trajectory.trajectory import Trajectory
 
 # Rays through a pixel: enough that the frames' own aliasing triggers few events, and references without visible noise.
@@ -46,7 +45,7 @@ class Simulation:
 
     def __init__(
         self,
-        scene: BuiltInScene,
+        scene: SimulationScene,
         camera: EventCamera,
         sensor: SensorModel,
         speed: Literal["easy", "hard"],
@@ -63,7 +62,7 @@ class Simulation:
         self._simulator = EventSimulator(
             width, height, sensor, contrast_threshold_spread=contrast_threshold_spread, seed=seed
         )
-        self._frames = frame_parameters(scene.scene, scene.path, self._intrinsics, width, height, max_displacement)
+        self._frames = frame_parameters(scene.renderer, scene.path, self._intrinsics, width, height, max_displacement)
         self._times = _nanoseconds(self._profile.time(self._frames))
         if (np.diff(self._times) <= 0).any():
             raise ValueError(f"duration must be long enough to tell its frames apart, not {easy_duration} s")
@@ -111,7 +110,7 @@ class Simulation:
 
     def _render(self, camera_to_world: NDArray[np.float64], samples: int) -> NDArray[np.float32]:
         camera = self._camera
-        return render(self._scene.scene, camera_to_world, self._intrinsics, camera.width, camera.height, samples)[0]
+        return self._scene.renderer.render(camera_to_world, self._intrinsics, camera.width, camera.height, samples)[0]
 
 
 def _nanoseconds(seconds: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -11,11 +11,12 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from aenerf_ns.scenes import BuiltInScene, built_in_scene, paths
+from aenerf_ns.scenes import SimulationScene, built_in_scene, paths
 from aenerf_ns.scenes import textures as tx
 from aenerf_ns.scenes.frames import frame_displacement, frame_parameters
 from aenerf_ns.scenes.light_baking import AreaLight, bake
-from aenerf_ns.scenes.raycast import BOX, CYLINDER, RECTANGLE, SPHERE, Primitive, Scene, render, sample_offsets
+from aenerf_ns.scenes.raycast import BOX, CYLINDER, RECTANGLE, SPHERE, Primitive, PrimitiveScene
+from aenerf_ns.scenes.renderer import sample_offsets
 
 WHITE = {"white": np.full((8, 8, 3), 0.5, np.float32)}
 OVERHEAD = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])
@@ -32,16 +33,16 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def room() -> BuiltInScene:
+def room() -> SimulationScene:
     return built_in_scene("room")
 
 
 @pytest.fixture(scope="module")
-def toy() -> BuiltInScene:
+def toy() -> SimulationScene:
     return built_in_scene("object")
 
 
-def lit_evenly(primitives: list[Primitive], textures: dict[str, tx.Texture] = WHITE) -> Scene:
+def lit_evenly(primitives: list[Primitive], textures: dict[str, tx.Texture] = WHITE) -> PrimitiveScene:
     return bake(primitives, textures, [], spacing=0.5, ambient=1.0, background=(0.2, 0.3, 0.4))
 
 
@@ -95,7 +96,7 @@ def test_depth_and_silhouette_match_the_solid(kind: int, half: tuple[float, ...]
     centre = np.array([0.1, -0.2, 0.3])
     scene = lit_evenly([Primitive(kind, centre, half, "white", rotation=rotation)])
     width, height, intrinsics = 24, 20, (20.0, 22.0, 12.3, 9.1)
-    _, depth, alpha = render(scene, OVERHEAD, intrinsics, width, height, 1)
+    _, depth, alpha = scene.render(OVERHEAD, intrinsics, width, height, 1)
     directions = ray_directions(intrinsics, width, height) @ OVERHEAD[:3, :3].T
 
     def inside(points: np.ndarray, slack: float) -> np.ndarray:
@@ -121,8 +122,8 @@ def test_depth_and_silhouette_match_the_solid(kind: int, half: tuple[float, ...]
 def test_rectangle_is_seen_from_its_front_only() -> None:
     scene = lit_evenly([Primitive(RECTANGLE, (0, 0, 0), (1, 1, 0), "white")])
     below = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3], [0, 0, 0, 1]])
-    assert render(scene, OVERHEAD, (10, 10, 2, 2), 4, 4, 1)[2].all()
-    radiance, depth, alpha = render(scene, below, (10, 10, 2, 2), 4, 4, 1)
+    assert scene.render(OVERHEAD, (10, 10, 2, 2), 4, 4, 1)[2].all()
+    radiance, depth, alpha = scene.render(below, (10, 10, 2, 2), 4, 4, 1)
     assert not alpha.any()
     assert np.isinf(depth).all()
     np.testing.assert_allclose(radiance, np.broadcast_to([0.2, 0.3, 0.4], (4, 4, 3)), rtol=1e-6)
@@ -133,7 +134,7 @@ def test_texture_coordinates() -> None:
     ramp = np.repeat(np.repeat(np.linspace(0.1, 0.8, 64)[None, :, None], 64, axis=0), 3, axis=2).astype(np.float32)
     plate = Primitive(RECTANGLE, (0, 0, 0), (1, 1, 0), "ramp", texture_scale=2.0, texture_offset=(0.5, 0.5))
     scene = lit_evenly([plate], {"ramp": ramp})
-    radiance, depth, _ = render(scene, OVERHEAD, (30.0, 30.0, 8.0, 6.0), 16, 12, 1)
+    radiance, depth, _ = scene.render(OVERHEAD, (30.0, 30.0, 8.0, 6.0), 16, 12, 1)
     np.testing.assert_allclose(depth, 3.0, rtol=1e-6)
     x = (np.arange(16) + 0.5 - 8.0) / 30.0 * 3.0
     texel = (x / 2 + 0.5) * 64 - 0.5
@@ -144,7 +145,7 @@ def test_texture_coordinates() -> None:
 def test_far_textures_fade_to_their_mean() -> None:
     noise = np.random.default_rng(0).uniform(0.1, 0.9, (64, 64, 3)).astype(np.float32)
     scene = lit_evenly([Primitive(RECTANGLE, (0, 0, 0), (50, 50, 0), "noise", texture_scale=0.05)], {"noise": noise})
-    radiance, _, _ = render(scene, OVERHEAD, (10.0, 10.0, 4.0, 4.0), 8, 8, 1)
+    radiance, _, _ = scene.render(OVERHEAD, (10.0, 10.0, 4.0, 4.0), 8, 8, 1)
     np.testing.assert_allclose(radiance, np.broadcast_to(noise.mean((0, 1)), (8, 8, 3)), rtol=1e-4)
 
 
@@ -153,7 +154,7 @@ def test_direct_light_is_the_form_factor() -> None:
     plate = Primitive(RECTANGLE, (0, 0, 0), (2, 2, 0), "white")
     light = AreaLight((0.5, 0, 2.0), (0.01, 0, 0), (0, -0.01, 0), (100.0, 200.0, 300.0))
     scene = bake([plate], WHITE, [light], spacing=0.1, ambient=0.0)
-    radiance, _, _ = render(scene, OVERHEAD, (6.0, 6.0, 4.0, 4.0), 8, 8, 1)
+    radiance, _, _ = scene.render(OVERHEAD, (6.0, 6.0, 4.0, 4.0), 8, 8, 1)
     x, y = ray_directions((6.0, 6.0, 4.0, 4.0), 8, 8)[..., :2].transpose(2, 0, 1) * 3.0
     square = (x - 0.5) ** 2 + y**2 + 4.0
     expected = 0.5 * 100.0 * 0.0004 * 4.0 / (np.pi * square**2)
@@ -168,7 +169,7 @@ def test_shadow() -> None:
     lit, shaded = (bake(parts, WHITE, [light], spacing=0.05, ambient=0.0) for parts in ([plate], [plate, roof]))
     # The penumbra's edge, projected from the light: 1 +- 0.4 * 2 / 1.5.
     sight = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.4], [0, 0, 0, 1]])
-    values = [render(scene, sight, (10.0, 10.0, 20.0, 1.0), 80, 2, 1)[0][0, :, 0] for scene in (lit, shaded)]
+    values = [scene.render(sight, (10.0, 10.0, 20.0, 1.0), 80, 2, 1)[0][0, :, 0] for scene in (lit, shaded)]
     x = (np.arange(80) + 0.5 - 20.0) / 10.0 * 0.4
     seen = (x > -0.7) & (x < 1.9)
     shadow = abs(x - 1.0) < 0.53 - 0.08
@@ -190,7 +191,7 @@ def test_sky_light() -> None:
         ambient=0.0,
         sky=((0.0, 0.0, 0.0), (1.0, 2.0, 0.5)),
     )
-    radiance, _, _ = render(scene, OVERHEAD, (30.0, 30.0, 4.0, 4.0), 8, 8, 1)
+    radiance, _, _ = scene.render(OVERHEAD, (30.0, 30.0, 4.0, 4.0), 8, 8, 1)
     mean = 0.5 * (0.5 + 0.5 * 2 / 3)  # albedo x the mean of (1 + cos) / 2 over cosine-weighted directions
     np.testing.assert_allclose(radiance.mean((0, 1)), mean * np.array([1.0, 2.0, 0.5]), rtol=0.01)
 
@@ -210,7 +211,7 @@ def test_edge_is_blurred_by_the_point_spread() -> None:
     scene = lit_evenly([Primitive(RECTANGLE, (1.0, 0, 0), (1.0, 2.0, 0), "white")])
     # The edge x = 0 crosses the pixels at cx; moving cx moves it through the pixel.
     shifts = np.linspace(-1.5, 1.5, 21)
-    alpha = np.array([render(scene, OVERHEAD, (50.0, 50.0, 2.5 - d, 2.5), 5, 5, 300)[2][2, 2] for d in shifts])
+    alpha = np.array([scene.render(OVERHEAD, (50.0, 50.0, 2.5 - d, 2.5), 5, 5, 300)[2][2, 2] for d in shifts])
     np.testing.assert_allclose(alpha, norm.cdf(shifts, scale=0.5), atol=0.02)
 
 
@@ -306,36 +307,36 @@ def test_frame_displacement_of_a_turn_and_of_a_shift() -> None:
     assert frame_displacement(np.full((24, 32), np.inf), np.eye(4), shifted, intrinsics) == 0
 
 
-def test_frame_parameters_bound_the_motion(toy: BuiltInScene) -> None:
+def test_frame_parameters_bound_the_motion(toy: SimulationScene) -> None:
     width, height = 40, 30
     intrinsics = toy.intrinsics(width, height)
 
     def path(s: float) -> np.ndarray:
         return paths.object_path(s, turns=3.0)
 
-    parameters = frame_parameters(toy.scene, path, intrinsics, width, height, 1.0)
+    parameters = frame_parameters(toy.renderer, path, intrinsics, width, height, 1.0)
     assert parameters[0] == 0
     assert parameters[-1] == 1
     assert (np.diff(parameters) > 0).all()
     moved = []
     for a, b in itertools.pairwise(parameters):
-        depth = render(toy.scene, path(a), intrinsics, width, height, 1)[1]
+        depth = toy.renderer.render(path(a), intrinsics, width, height, 1)[1]
         moved.append(frame_displacement(depth, path(a), path(b), intrinsics))
     # The bound holds for the coarse depth map of the search; the full one's percentile differs a little.
     assert max(moved) < 1.1
     assert np.mean(moved[1:-1]) > 0.9
     with pytest.raises(ValueError, match="must be positive, got 0"):
-        frame_parameters(toy.scene, path, intrinsics, width, height, 0.0)
+        frame_parameters(toy.renderer, path, intrinsics, width, height, 0.0)
 
 
 # --- built-in scenes
 
 
-def test_room_is_closed_and_well_exposed(room: BuiltInScene) -> None:
+def test_room_is_closed_and_well_exposed(room: SimulationScene) -> None:
     width, height = 64, 48
     pictures = []
     for pose in [*(room.path(k / 12) for k in range(12)), *room.validation_views(12), *room.test_views(40, 3)]:
-        radiance, depth, alpha = render(room.scene, pose, room.intrinsics(width, height), width, height, 4)
+        radiance, depth, alpha = room.renderer.render(pose, room.intrinsics(width, height), width, height, 4)
         assert alpha.min() == 1
         assert depth.min() > 0.2  # nowhere inside the furniture or right in front of it
         pictures.append(radiance)
@@ -347,24 +348,24 @@ def test_room_is_closed_and_well_exposed(room: BuiltInScene) -> None:
     assert radiance.max() < 1.05
 
 
-def test_room_is_textured_everywhere(room: BuiltInScene) -> None:
+def test_room_is_textured_everywhere(room: SimulationScene) -> None:
     """Along the loop hardly a pixel sees less than a few thresholds' worth of change: no bare walls."""
     width, height = 64, 48
     frames = [
-        render(room.scene, room.path(s), room.intrinsics(width, height), width, height, 4)[0].mean(-1)
+        room.renderer.render(room.path(s), room.intrinsics(width, height), width, height, 4)[0].mean(-1)
         for s in np.linspace(0, 1, 200)
     ]
     change = np.abs(np.diff(np.log(np.stack(frames) + 1e-3), axis=0)).sum(0)
     assert change.min() > 10 * 0.25
 
 
-def test_object_stays_in_its_box(toy: BuiltInScene) -> None:
+def test_object_stays_in_its_box(toy: SimulationScene) -> None:
     assert toy.aabb is not None
     assert toy.background is not None
     width, height = 60, 45
     intrinsics = toy.intrinsics(width, height)
     for pose in [*(toy.path(k / 7) for k in range(8)), *toy.validation_views(6), *toy.test_views(6, 1)]:
-        radiance, depth, _ = render(toy.scene, pose, intrinsics, width, height, 1)
+        radiance, depth, _ = toy.renderer.render(pose, intrinsics, width, height, 1)
         hit = np.isfinite(depth)
         assert 0.1 < hit.mean() < 0.6
         points = (ray_directions(intrinsics, width, height)[hit] * depth[hit][:, None]) @ pose[:3, :3].T + pose[:3, 3]
@@ -374,7 +375,7 @@ def test_object_stays_in_its_box(toy: BuiltInScene) -> None:
         assert radiance.max() < 1.05
 
 
-def test_held_out_views_are_off_the_path_and_seeded(room: BuiltInScene, toy: BuiltInScene) -> None:
+def test_held_out_views_are_off_the_path_and_seeded(room: SimulationScene, toy: SimulationScene) -> None:
     for scene in (room, toy):
         validation, test = scene.validation_views(30), scene.test_views(30, 5)
         assert validation.shape == test.shape == (30, 4, 4)
@@ -385,13 +386,15 @@ def test_held_out_views_are_off_the_path_and_seeded(room: BuiltInScene, toy: Bui
             assert np.abs(on_path - pose[:3]).max((1, 2)).min() > 1e-3
 
 
-def test_pictures_do_not_depend_on_the_run_or_the_threads(toy: BuiltInScene) -> None:
+def test_pictures_do_not_depend_on_the_run_or_the_threads(toy: SimulationScene) -> None:
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     again = built_in_scene("object")
-    pictures = [render(scene.scene, scene.path(0.3), scene.intrinsics(40, 30), 40, 30, 4)[0] for scene in (toy, again)]
+    pictures = [
+        scene.renderer.render(scene.path(0.3), scene.intrinsics(40, 30), 40, 30, 4)[0] for scene in (toy, again)
+    ]
     numba.set_num_threads(1)
     assert pictures[0].tobytes() == pictures[1].tobytes()
-    np.testing.assert_array_equal(toy.scene.arrays.light, again.scene.arrays.light)
+    np.testing.assert_array_equal(toy.renderer.arrays.light, again.renderer.arrays.light)
 
 
 def test_unknown_scene() -> None:

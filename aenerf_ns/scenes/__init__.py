@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.scenes import paths
-from aenerf_ns.scenes.raycast import Scene
+from aenerf_ns.scenes.renderer import Renderer
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class BuiltInScene:
+class SimulationScene:
     """A scene and how it is looked at. Poses are camera-to-world, OpenCV axes, z up, metres.
 
     Attributes:
         name: "room" or "object".
-        scene: for `raycast.render`.
+        renderer: the lit scene.
         path: s in [0, 1] to a pose (4, 4).
         focal_ratio: focal length over image width; the pixels are square and the principal point is the middle.
         aabb: (2, 3) corners of the box that holds the scene; None where it surrounds the camera.
@@ -30,7 +30,7 @@ class BuiltInScene:
     """
 
     name: str
-    scene: Scene
+    renderer: Renderer
     path: Callable[[float], Array]
     focal_ratio: float
     aabb: Array | None
@@ -44,7 +44,7 @@ class BuiltInScene:
         return focal, focal, width / 2, height / 2
 
 
-def built_in_scene(name: str, seed: int = 0) -> BuiltInScene:
+def built_in_scene(name: str, seed: int = 0) -> SimulationScene:
     """Make and light a built-in scene, in a few seconds.
 
     Raises:
@@ -53,7 +53,7 @@ def built_in_scene(name: str, seed: int = 0) -> BuiltInScene:
     if name == "room":
         from aenerf_ns.scenes.room import room_scene
 
-        return BuiltInScene(
+        return SimulationScene(
             name,
             room_scene(seed),
             paths.room_path,
@@ -67,7 +67,7 @@ def built_in_scene(name: str, seed: int = 0) -> BuiltInScene:
         from aenerf_ns.scenes.objects import locomotive_scene
 
         scene = locomotive_scene(seed)
-        return BuiltInScene(
+        return SimulationScene(
             name,
             scene,
             paths.object_path,

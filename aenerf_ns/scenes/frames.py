@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.scenes.raycast import Scene, render
+from aenerf_ns.scenes.renderer import Renderer
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def frame_displacement(
 
 
 def frame_parameters(
-    scene: Scene,
+    renderer: Renderer,
     path: Callable[[float], Array],
     intrinsics: Sequence[float],
     width: int,
@@ -79,7 +79,7 @@ def frame_parameters(
     try:
         parameters, pose, step = [0.0], path(0.0), 1e-4
         while parameters[-1] < 1.0:
-            depth = render(scene, pose, probe, _PROBE_WIDTH, rows, 1)[1]
+            depth = renderer.render(pose, probe, _PROBE_WIDTH, rows, 1)[1]
             while True:
                 step = min(step, _LARGEST_STEP, 1.0 - parameters[-1])
                 next_pose = path(parameters[-1] + step)

@@ -21,7 +21,7 @@ from aenerf_ns.scenes.raycast import (
     SPHERE,
     Array,
     Primitive,
-    Scene,
+    PrimitiveScene,
     SceneArrays,
     intersect,
     irradiance,
@@ -172,7 +172,7 @@ def bake(
     sky: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     background: ArrayLike = (0.0, 0.0, 0.0),
     seed: int = 0,
-) -> Scene:
+) -> PrimitiveScene:
     """Light a scene once and for all.
 
     Args:
@@ -236,7 +236,7 @@ def bake(
         lit = arrays._replace(light=light)
         light = direct.copy()
         _reflected_light(lit, points, normals, albedo, np.asarray(sky, np.float64), directions, jitter, light)
-    return Scene(arrays._replace(light=light), np.asarray(background, np.float64))
+    return PrimitiveScene(arrays._replace(light=light), np.asarray(background, np.float64))
 
 
 def _plane_sequence(count: int) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 
 from aenerf_ns.scenes import textures as tx
 from aenerf_ns.scenes.light_baking import AreaLight, bake
-from aenerf_ns.scenes.raycast import Primitive, Scene
+from aenerf_ns.scenes.raycast import Primitive, PrimitiveScene
 from aenerf_ns.scenes.shapes import ALONG_X, ALONG_Y, box, pillar, rod, sphere, turned_box
 
 TEXTURE_SIZE = 256
@@ -16,7 +16,7 @@ RAIL = 0.3
 HALF = (0.5, 0.5)
 
 
-def locomotive_scene(seed: int = 0) -> Scene:
+def locomotive_scene(seed: int = 0) -> PrimitiveScene:
     """The locomotive, baked, in front of grey. The seed moves the patterns of its textures."""
     rng = np.random.default_rng(seed)
     primitives = [*_track(), *_wheels(), *_frame(), *_boiler(), *_cab(), *_tender()]

@@ -1,7 +1,7 @@
 """A ray caster for scenes of analytic primitives with baked light.
 
 Everything is Lambertian, so the light a surface receives does not depend on the view: `light_baking.bake` computes it
-once, into a light map, and `render` casts primary rays only. Radiance is linear RGB,
+once, into a light map, and rendering casts primary rays only. Radiance is linear RGB,
 lengths are metres, the world's z axis points up. A camera has OpenCV axes (x right, y down, z forward); the centre of
 pixel (x, y) lies at (x + 0.5, y + 0.5), as Nerfstudio counts.
 """
@@ -17,11 +17,11 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from aenerf_ns.scenes.renderer import POINT_SPREAD, sample_offsets
+
 Array = NDArray[np.float64]
 
 RECTANGLE, BOX, SPHERE, CYLINDER = range(4)
-POINT_SPREAD = 0.5
-"""Standard deviation of a pixel's Gaussian point-spread function, in pixels."""
 _FOOTPRINT = 0.5
 """Side of the texture region a sample averages, in pixels: about the distance between the samples of a pixel."""
 _TILE = 8
@@ -74,14 +74,6 @@ class SceneArrays(NamedTuple):
     light: NDArray[np.float32]  # (L, 3) irradiance / pi
     texels: NDArray[np.float32]  # (T, M, 3) mip pyramids
     level_start: NDArray[np.int64]  # (levels,)
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A baked scene and the radiance (3,) seen where a ray hits nothing."""
-
-    arrays: SceneArrays
-    background: Array
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -295,69 +287,40 @@ def _render(arrays, rotation, origin, centre, nearest, order, intrinsics, offset
                     alpha[y, x] = hits / samples
 
 
-def render(
-    scene: Scene,
-    camera_to_world: ArrayLike,
-    intrinsics: Sequence[float],
-    width: int,
-    height: int,
-    samples: int,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Picture of a scene through a pinhole camera.
+@dataclass(frozen=True)
+class PrimitiveScene:
+    """A baked scene and the radiance (3,) seen where a ray hits nothing."""
 
-    Args:
-        camera_to_world: (4, 4) or (3, 4), OpenCV axes.
-        intrinsics: (fx, fy, cx, cy) in pixels, pixel centres at +0.5.
-        samples: rays per pixel, the same pattern of a Gaussian point-spread in every pixel and every frame: 1, or 3
-            and more; one ray goes through the pixel's centre.
+    arrays: SceneArrays
+    background: Array
 
-    Returns:
-        radiance (H, W, 3) linear RGB; depth (H, W) along the optical axis, mean over the rays that hit, inf where
-        none does; alpha (H, W), the fraction of rays that hit. All float32.
-
-    Raises:
-        ValueError: on a number of samples that `sample_offsets` has no pattern for.
-    """
-    pose = np.asarray(camera_to_world, np.float64)
-    arrays = scene.arrays
-    to_camera = arrays.centre - pose[:3, 3]
-    nearest = np.linalg.norm(to_camera, axis=1) - arrays.bound
-    radiance = np.empty((height, width, 3), np.float32)
-    depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    _render(
-        arrays,
-        arrays.rotation @ pose[:3, :3],
-        -np.einsum("pij,pj->pi", arrays.rotation, to_camera),
-        to_camera @ pose[:3, :3],
-        nearest,
-        np.argsort(nearest, kind="stable"),
-        np.asarray(intrinsics, np.float64),
-        sample_offsets(samples),
-        scene.background,
-        radiance,
-        depth,
-        alpha,
-    )
-    return radiance, depth, alpha
-
-
-def sample_offsets(samples: int) -> Array:
-    """Offsets (N, 2) in pixels of equally weighted rays that stand for the point-spread function.
-
-    A spiral of golden angles with its radii at the quantiles of the Gaussian, then brought to exactly the Gaussian's
-    mean and covariance. One ray goes through the centre.
-
-    Raises:
-        ValueError: on fewer than one ray, or on two, which cannot spread both ways.
-    """
-    if samples == 1:
-        return np.zeros((1, 2))
-    if samples < 3:
-        raise ValueError(f"samples must be 1 or at least 3, got {samples}")
-    rank = np.arange(samples)
-    radius = np.sqrt(-2.0 * np.log(1.0 - (rank + 0.5) / samples))
-    angle = np.pi * (3.0 - np.sqrt(5.0)) * rank
-    offsets = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    offsets -= offsets.mean(axis=0)
-    spread = np.linalg.cholesky(offsets.T @ offsets / samples)
-    return np.ascontiguousarray(POINT_SPREAD * np.linalg.solve(spread, offsets.T).T)
+    def render(
+        self,
+        camera_to_world: ArrayLike,
+        intrinsics: Sequence[float],
+        width: int,
+        height: int,
+        samples: int,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Picture through a pinhole camera: see :class:`~aenerf_ns.scenes.renderer.Renderer`."""
+        pose = np.asarray(camera_to_world, np.float64)
+        arrays = self.arrays
+        to_camera = arrays.centre - pose[:3, 3]
+        nearest = np.linalg.norm(to_camera, axis=1) - arrays.bound
+        radiance = np.empty((height, width, 3), np.float32)
+        depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+        _render(
+            arrays,
+            arrays.rotation @ pose[:3, :3],
+            -np.einsum("pij,pj->pi", arrays.rotation, to_camera),
+            to_camera @ pose[:3, :3],
+            nearest,
+            np.argsort(nearest, kind="stable"),
+            np.asarray(intrinsics, np.float64),
+            sample_offsets(samples),
+            self.background,
+            radiance,
+            depth,
+            alpha,
+        )
+        return radiance, depth, alpha

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from aenerf_ns.scenes import textures as tx
 from aenerf_ns.scenes.light_baking import AreaLight, bake
-from aenerf_ns.scenes.raycast import Primitive, Scene
+from aenerf_ns.scenes.raycast import Primitive, PrimitiveScene
 from aenerf_ns.scenes.shapes import ALONG_X, axes, box, panel, pillar, rod, sphere, turned_box
 
 TEXTURE_SIZE = 256
@@ -17,7 +17,7 @@ HEIGHT = 2.5
 BOOK_COLOURS = ("b5523b", "d9a441", "4f7a5b", "3f6d8e", "8c4a6b", "e0d3b0", "6b7f3a", "c9772e", "5a5fa0", "a8463f")
 
 
-def room_scene(seed: int = 0) -> Scene:
+def room_scene(seed: int = 0) -> PrimitiveScene:
     """The room, baked. The seed moves the patterns of its textures, and which book stands where."""
     rng = np.random.default_rng(seed)
     primitives = [
