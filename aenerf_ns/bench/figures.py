@@ -92,18 +92,19 @@ def _paths(run: Path, file: Path) -> Path:
     truth = read_tum_trajectory(run / "ground-truth.txt")
     figure = Figure(figsize=(9, 4), layout="constrained")
     above, over_time = figure.subplots(1, 2)
-    above.plot(*truth.camera_to_worlds[:, :2, 3].T, color="black", label="true")
+    above.plot(*truth.camera_to_worlds[:, :2, 3].T, color="black")
     for poses, color in (("estimated", "tab:red"), ("corrected", "tab:blue")):
         trajectory = read_tum_trajectory(run / f"{poses}.txt")
         times = trajectory.knots_covered_by(truth)
         reference = truth.interpolate(times)
         aligned = align(trajectory.interpolate(times), reference)(trajectory.interpolate(times))
-        above.plot(*aligned[:, :2, 3].T, color=color, linewidth=0.8, label=poses)
+        above.plot(*aligned[:, :2, 3].T, color=color, linewidth=0.8)
         angles = torch.rad2deg(rotation_angle(aligned, reference))
         over_time.plot((times - truth.start).double() * 1e-9, angles, color=color, linewidth=0.8, label=poses)
     above.set(aspect="equal", xlabel="x", ylabel="y", title="path from above")
     over_time.set(xlabel="seconds", ylabel="degrees", title="rotation error")
-    above.legend(frameon=False)
+    over_time.plot([], color="black", label="true")
+    over_time.legend(frameon=False)
     figure.savefig(file, dpi=100)
     return file
 

@@ -1,14 +1,16 @@
-"""Nerfstudio's nerfacto, where LPIPS's weights cannot be downloaded.
+"""Nerfstudio's nerfacto, where it would not run.
 
     python -m aenerf_ns.bench.nerfacto ns-train nerfacto ...
     python -m aenerf_ns.bench.nerfacto ns-eval ...
 
-Its constructor builds LPIPS, asked for or not, and dies without a connection. Here the metric is left out then.
+Its constructor builds LPIPS, asked for or not, and dies without a connection: here the metric is left out then. And its
+checkpoints hold NumPy's numbers, which current torch refuses to load unless told that they are trusted.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 import torch
@@ -36,6 +38,7 @@ def main() -> None:
             return _Absent()
 
     lpip.LearnedPerceptualImagePatchSimilarity = build_or_leave_out  # type: ignore[misc,assignment]
+    os.environ["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"
     sys.argv = sys.argv[1:]
     importlib.import_module(_MODULES[sys.argv[0]]).entrypoint()
 
