@@ -6,6 +6,7 @@ import sys
 
 import tyro
 
+from aenerf_ns.cli.bench import Bench
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.simulate import Simulate
@@ -15,7 +16,7 @@ from aenerf_ns.errors import DataError
 def main() -> None:
     """Entry point of the ``aenerf`` command. Bad input ends it with one line and exit status 1."""
     command = tyro.extras.subcommand_cli_from_dict(
-        {"simulate": Simulate, "evaluate": Evaluate, "export-trajectory": ExportTrajectory},
+        {"simulate": Simulate, "evaluate": Evaluate, "export-trajectory": ExportTrajectory, "bench": Bench},
         prog="aenerf",
         description="AE-NeRF tools; train with ns-train aenerf.",
     )

@@ -1,0 +1,1 @@
+"""The benchmark: its runs, how they are made, and what is written about them."""

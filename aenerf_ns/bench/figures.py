@@ -1,0 +1,125 @@
+"""Figures of a benchmark: renderings beside the truth, paths before and after correction, quality during training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from aenerf_ns.bench.plan import OURS, Run
+
+_GAP = 4
+_LABEL = 14
+
+
+def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]]) -> list[Path]:
+    """Draws all figures of the runs that have been made into ``folder / "figures"``, one of each kind for every scene
+    and speed.
+
+    Args:
+        folder: of the benchmark.
+        runs: all runs.
+        figures: of the runs that have been made, by the name of the run.
+
+    Returns:
+        The files.
+    """
+    output = folder / "figures"
+    output.mkdir(exist_ok=True)
+    made = [run for run in runs if run.name in figures]
+    files = []
+    for scene, speed, table in dict.fromkeys((run.dataset.scene, run.dataset.speed, run.table) for run in made):
+        first = made[0].seed
+        rows = [
+            run
+            for run in made
+            if (run.dataset.scene, run.dataset.speed, run.table, run.seed) == (scene, speed, table, first)
+        ]
+        stem = rows[0].name.split(f"_{speed}_")[0] + f"_{speed}_{table}"
+        files += [
+            _views(folder, rows, output / f"{stem}_views.png"),
+            _curves(rows, figures, output / f"{stem}_psnr.png"),
+        ]
+        for run in rows:
+            if run.table == "methods" and run.row == OURS:
+                files.append(_paths(folder / "runs" / run.name, output / f"{stem}_paths.png"))
+    return files
+
+
+def _views(folder: Path, runs: Sequence[Run], file: Path) -> Path:
+    """A test view: the truth, and what each run made of it with the error below."""
+    columns: list[tuple[str, list[NDArray[np.uint8]]]] = []
+    for run in runs:
+        pictures = sorted((folder / "runs" / run.name / "pictures").glob("eval_img_*.png"))
+        both = np.asarray(Image.open(pictures[len(pictures) // 2]).convert("RGB"))
+        truth, rendered = np.split(both, 2, axis=1)
+        if not columns:
+            columns.append(("truth", [truth, np.zeros_like(truth)]))
+        columns.append((run.row, [rendered, error_map(rendered, truth)]))
+    height, width = columns[0][1][0].shape[:2]
+    picture = Image.new("RGB", (len(columns) * (width + _GAP) - _GAP, _LABEL + 2 * height + _GAP), "white")
+    pen = ImageDraw.Draw(picture)
+    for index, (name, tiles) in enumerate(columns):
+        left = index * (width + _GAP)
+        pen.text((left + 2, 1), name, fill="black")
+        for row, tile in enumerate(tiles):
+            picture.paste(Image.fromarray(tile), (left, _LABEL + row * (height + _GAP)))
+    picture.save(file, optimize=True)
+    return file
+
+
+def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) picture of the mean absolute error over the channels: black for none, white for a quarter of the range
+    and more."""
+    from matplotlib import colormaps
+
+    error = np.abs(rendered.astype(np.float64) - truth).mean(-1) / 255
+    return (colormaps["inferno"](np.clip(4 * error, 0, 1))[..., :3] * 255).round().astype(np.uint8)
+
+
+def _paths(run: Path, file: Path) -> Path:
+    """The given and the corrected path from above, aligned with the true one, and their errors over time."""
+    import torch
+    from matplotlib.figure import Figure
+
+    from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+    from aenerf_ns.trajectory.alignment import align, rotation_angle
+
+    truth = read_tum_trajectory(run / "ground-truth.txt")
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    above, over_time = figure.subplots(1, 2)
+    above.plot(*truth.camera_to_worlds[:, :2, 3].T, color="black")
+    for poses, color in (("estimated", "tab:red"), ("corrected", "tab:blue")):
+        trajectory = read_tum_trajectory(run / f"{poses}.txt")
+        times = trajectory.knots_covered_by(truth)
+        reference = truth.interpolate(times)
+        aligned = align(trajectory.interpolate(times), reference)(trajectory.interpolate(times))
+        above.plot(*aligned[:, :2, 3].T, color=color, linewidth=0.8)
+        angles = torch.rad2deg(rotation_angle(aligned, reference))
+        over_time.plot((times - truth.start).double() * 1e-9, angles, color=color, linewidth=0.8, label=poses)
+    above.set(aspect="equal", xlabel="x", ylabel="y", title="path from above")
+    over_time.set(xlabel="seconds", ylabel="degrees", title="rotation error")
+    over_time.plot([], color="black", label="true")
+    over_time.legend(frameon=False)
+    figure.savefig(file, dpi=100)
+    return file
+
+
+def _curves(runs: Sequence[Run], figures: Mapping[str, dict[str, Any]], file: Path) -> Path:
+    """PSNR during the trainings."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5, 3.5), layout="constrained")
+    axes = figure.subplots()
+    for run in runs:
+        one = figures[run.name]
+        points = [*one["curve"], (run.steps, one["results"]["psnr"])]
+        axes.plot(*zip(*points, strict=True), marker=".", label=run.row)
+    axes.set(xlabel="steps", ylabel="PSNR [dB] on the test views")
+    axes.legend(frameon=False, fontsize=8)
+    figure.savefig(file, dpi=100)
+    return file

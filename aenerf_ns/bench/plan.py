@@ -1,0 +1,181 @@
+"""Which runs a benchmark consists of."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+Poses = Literal["noise", "colmap"]
+Scale = Literal["full", "tiny"]
+Table = Literal["methods", "losses"]
+
+_SIMULATE = {
+    "full": ("--width", "346", "--height", "260", "--validation-views", "100", "--test-views", "100"),
+    "tiny": ("--width", "96", "--height", "72", "--validation-views", "20", "--test-views", "20"),
+}
+_POSES = {
+    "exact": (),
+    "noise": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
+    "colmap": ("--poses", "colmap"),
+}
+_METHOD = {"full": "aenerf", "tiny": "aenerf-small"}
+_STEPS = {"full": 30000, "tiny": 2000}
+
+OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
+    "with pose correction",
+    "without pose correction",
+    "true poses",
+    "images, nerfacto",
+)
+"""The rows of the table of methods. The last two are no rivals but bounds: what remains when the poses are right, and
+Nerfstudio's own method on sharp images with true poses."""
+
+LOSSES = {
+    "l_p + l_r": {"temporal-loss": 0.0, "distortion-loss": 0.0},
+    "l_p + l_r + l_g": {"temporal-loss": 1e-3, "distortion-loss": 0.0},
+    "l_p + l_r + l_d": {"temporal-loss": 0.0, "distortion-loss": 1e-3},
+    "all": {"temporal-loss": 1e-3, "distortion-loss": 1e-3},
+}
+"""The rows of the paper's table 4: weights of the terms."""
+
+_OFF = ("--pipeline.model.camera-optimizer.mode", "off")
+# A full-size nerfacto in the proportions of aenerf-small.
+_SMALL_NERFACTO = (
+    "--pipeline.datamanager.train-num-rays-per-batch", "1024",
+    "--pipeline.model.num-levels", "8",
+    "--pipeline.model.max-res", "256",
+    "--pipeline.model.log2-hashmap-size", "15",
+    "--pipeline.model.hidden-dim", "32",
+    "--pipeline.model.hidden-dim-color", "32",
+    "--pipeline.model.num-proposal-iterations", "1",
+    "--pipeline.model.num-proposal-samples-per-ray", "48",
+    "--pipeline.model.num-nerf-samples-per-ray", "24",
+    "--pipeline.model.proposal-weights-anneal-max-num-iters", "200",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A simulated dataset.
+
+    Attributes:
+        scene: name or file, as aenerf simulate takes it.
+        speed: "easy" or "hard".
+        poses: "exact", "noise" or "colmap".
+        options: of aenerf simulate.
+    """
+
+    scene: str
+    speed: str
+    poses: str
+    options: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Folder name: what it is, and a digest of the options."""
+        return f"{scene_name(self.scene)}_{self.speed}_{self.poses}_{digest((self.scene, *self.options))}"
+
+    @property
+    def command(self) -> tuple[str, ...]:
+        """Arguments of aenerf simulate, but for the output."""
+        return ("--scene", self.scene, "--speed", self.speed, *self.options)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training and its evaluation.
+
+    Attributes:
+        table: which table it is a row of.
+        row: its name there.
+        dataset: what it is trained and evaluated on.
+        method: registered method.
+        steps: of the training.
+        seed: of the training.
+        options: of ns-train.
+    """
+
+    table: Table
+    row: str
+    dataset: Dataset
+    method: str
+    steps: int
+    seed: int
+    options: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """File name: what it is, and a digest of all that it depends on."""
+        unique = digest((self.dataset.name, self.method, str(self.steps), *self.options))
+        row = self.row.replace(",", "").replace(" + ", "+").replace(" ", "-")
+        return f"{scene_name(self.dataset.scene)}_{self.dataset.speed}_{row}_seed{self.seed}_{unique}"
+
+
+def plan(
+    scenes: Sequence[str],
+    speeds: Sequence[str],
+    poses: Poses,
+    tables: Sequence[Table],
+    seeds: Sequence[int],
+    scale: Scale,
+    steps: int | None = None,
+    simulate: Sequence[str] = (),
+    train: Sequence[str] = (),
+) -> list[Run]:
+    """All runs, in the order in which they are made.
+
+    Args:
+        scenes: names or files, as aenerf simulate takes them.
+        speeds: "easy" and "hard".
+        poses: how the estimated poses come about.
+        tables: "methods" are those of the paper's tables 1 and 3; "losses", its table 4, is of hard speed only.
+        seeds: of the trainings.
+        scale: "full" or, for a CPU, "tiny".
+        steps: of every training; 30,000 or 2000 by default.
+        simulate: more options of aenerf simulate.
+        train: more options of the event method's trainings.
+    """
+
+    def dataset(scene: str, speed: str, kind: str) -> Dataset:
+        return Dataset(scene, speed, kind, (*_SIMULATE[scale], *_POSES[kind], *simulate))
+
+    event_method, length, runs = _METHOD[scale], steps or _STEPS[scale], []
+    for seed in seeds:
+        for scene in scenes:
+            for speed in speeds if "methods" in tables else ():
+                estimated, exact = dataset(scene, speed, poses), dataset(scene, speed, "exact")
+                small = _SMALL_NERFACTO if scale == "tiny" else ()
+                rows = {
+                    OURS: (estimated, event_method, tuple(train)),
+                    WITHOUT_CORRECTION: (estimated, event_method, (*train, *_OFF)),
+                    TRUE_POSES: (exact, event_method, (*train, *_OFF)),
+                    CEILING: (exact, "nerfacto", small),
+                }
+                runs += [
+                    Run("methods", row, data, method, length, seed, options)
+                    for row, (data, method, options) in rows.items()
+                ]
+            if "losses" in tables:
+                data = dataset(scene, "hard", poses)
+                for row, weights in LOSSES.items():
+                    options = [
+                        word
+                        for loss, weight in weights.items()
+                        for word in (f"--pipeline.model.loss-coefficients.{loss}", str(weight))
+                    ]
+                    runs.append(Run("losses", row, data, event_method, length, seed, (*train, *options)))
+    return runs
+
+
+def scene_name(scene: str) -> str:
+    """Short name of a scene, which may be given as a file."""
+    path = Path(scene)
+    return path.parent.name if path.name == "scene.json" else path.stem
+
+
+def digest(words: Sequence[str]) -> str:
+    """Tells apart what was made with other options."""
+    return hashlib.sha256("\0".join(words).encode()).hexdigest()[:8]

@@ -1,0 +1,176 @@
+"""Making the runs of a benchmark: simulate, train, evaluate, and keep the figures.
+
+Everything lies in one folder, which can be worked on again and by several processes at once:
+
+    datasets/DATASET/       what was simulated
+    outputs/RUN/            what was trained, as ns-train leaves it
+    logs/                   what the commands printed
+    runs/RUN.json           the figures of a run; a run that has them is not made again
+    runs/RUN/               pictures of the test views, and trajectories
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from aenerf_ns.bench.environment import environment
+from aenerf_ns.bench.plan import CEILING, Dataset, Run
+from aenerf_ns.errors import DataError
+
+_CURVE_POINTS = 8
+_CURVE = "Eval Images Metrics Dict (all images)/psnr"
+_POSES = ("estimated", "corrected", "ground-truth")
+_NERFACTO = (sys.executable, "-m", "aenerf_ns.bench.nerfacto")
+
+
+class Runner:
+    """Makes runs in a folder.
+
+    Args:
+        folder: of the benchmark.
+        device: "cuda" or "cpu".
+    """
+
+    def __init__(self, folder: Path, device: str) -> None:
+        self._folder = folder
+        self._device = device
+        for name in ("datasets", "outputs", "logs", "runs"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+
+    def figures(self, run: Run) -> dict[str, Any] | None:
+        """The figures of a run, None where it has not been made."""
+        file = self._figures_file(run)
+        return json.loads(file.read_text("utf8")) if file.exists() else None
+
+    def make(self, run: Run) -> dict[str, Any]:
+        """Makes a run, unless that has been done.
+
+        Returns:
+            Its figures.
+
+        Raises:
+            DataError: a command failed.
+        """
+        done = self.figures(run)
+        if done is not None:
+            return done
+        data = self._dataset(run.dataset)
+        # What was left by a training that was killed.
+        shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)
+        begin = time.perf_counter()
+        self._train(run, data)
+        seconds = time.perf_counter() - begin
+        (config,) = (self._folder / "outputs" / run.name).rglob("config.yml")
+        results = self._evaluate(run, config)
+        figures = {
+            "table": run.table,
+            "row": run.row,
+            "scene": run.dataset.scene if "/" not in run.dataset.scene else Path(run.dataset.scene).parent.name,
+            "kind": "object" if "scene_box" in json.loads((data / "transforms.json").read_text("utf8")) else "large",
+            "speed": run.dataset.speed,
+            "poses": run.dataset.poses,
+            "method": run.method,
+            "seed": run.seed,
+            "simulate": " ".join(("aenerf", "simulate", *run.dataset.command)),
+            "options": " ".join(run.options),
+            "train_seconds": round(seconds),
+            "results": results,
+            "curve": _curve(config.parent),
+            **environment(),
+        }
+        file = self._figures_file(run)
+        partial = file.with_suffix(f".{os.getpid()}")
+        partial.write_text(json.dumps(figures, indent=2) + "\n", "utf8")
+        partial.rename(file)
+        return figures
+
+    def _figures_file(self, run: Run) -> Path:
+        return self._folder / "runs" / f"{run.name}.json"
+
+    def _dataset(self, dataset: Dataset) -> Path:
+        folder = self._folder / "datasets" / dataset.name
+        if not folder.exists():
+            # Another process may be making the same: whoever is first gives it its name.
+            partial = folder.with_name(f".{dataset.name}.{os.getpid()}")
+            shutil.rmtree(partial, ignore_errors=True)
+            scene = dataset.scene if not Path(dataset.scene).exists() else str(Path(dataset.scene).resolve())
+            options = ("--scene", scene, *dataset.command[2:])
+            self._call(dataset.name, _script("aenerf"), "simulate", "--output", str(partial.resolve()), *options)
+            try:
+                partial.rename(folder)
+            except OSError:
+                if not folder.exists():
+                    raise
+                shutil.rmtree(partial)
+        return folder
+
+    def _train(self, run: Run, data: Path) -> None:
+        path = str(data.resolve())
+        common = (
+            run.method, "--machine.device-type", self._device, "--machine.seed", str(run.seed), "--vis", "tensorboard",
+            "--experiment-name", run.name, "--output-dir", "outputs", "--max-num-iterations", str(run.steps),
+            "--steps-per-eval-all-images", str(max(run.steps // _CURVE_POINTS, 1)),
+        )  # fmt: skip
+        if run.row == CEILING:
+            # Of the framework's implementations, the one that needs no CUDA extension.
+            options = ("--pipeline.model.implementation", "torch", "--pipeline.model.camera-optimizer.mode", "off",
+                       "--pipeline.model.use-appearance-embedding", "False")  # fmt: skip
+            data_options = ("--data", path, "nerfstudio-data")
+            self._call(run.name, *_NERFACTO, "ns-train", *common, *options, *run.options, *data_options)
+        else:
+            self._call(run.name, _script("ns-train"), *common, *run.options, "--data", path)
+
+    def _evaluate(self, run: Run, config: Path) -> dict[str, Any]:
+        relative = str(config.relative_to(self._folder))
+        folder = Path("runs") / run.name
+        output = folder / "evaluation.json"
+        command = (*_NERFACTO, "ns-eval") if run.row == CEILING else (_script("ns-eval"),)
+        pictures = ("--render-output-path", str(folder / "pictures"))
+        self._call(run.name, *command, "--load-config", relative, "--output-path", str(output), *pictures)
+        results = json.loads((self._folder / output).read_text("utf8"))["results"]
+        (self._folder / output).unlink()
+        if run.row == CEILING:
+            # JSON has no NaN.
+            return {name: None if math.isnan(value) else value for name, value in results.items()}
+        for poses in _POSES:
+            self._call(
+                run.name, _script("aenerf"), "export-trajectory", "--load-config", relative, "--poses", poses,
+                "--output", str(folder / f"{poses}.txt"),
+            )  # fmt: skip
+        return results
+
+    def _call(self, log: str, *command: str) -> None:
+        """Runs a command in the benchmark's folder.
+
+        Raises:
+            DataError: it failed.
+        """
+        file = self._folder / "logs" / f"{log}.log"
+        with file.open("a", encoding="utf8") as output:
+            output.write(f"$ {' '.join(command)}\n")
+            output.flush()
+            done = subprocess.run(command, cwd=self._folder, stdout=output, stderr=subprocess.STDOUT, check=False)
+        if done.returncode:
+            raise DataError(file, f"a command ended with status {done.returncode}", "see the end of this file")
+
+
+def _script(name: str) -> str:
+    """A console script of this environment."""
+    return str(Path(sys.executable).parent / name)
+
+
+def _curve(run: Path) -> list[tuple[int, float]]:
+    """PSNR over the test views now and then during a training: steps and values, from its TensorBoard log."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    log = EventAccumulator(str(run))
+    log.Reload()
+    return [(event.step, event.value) for event in log.Scalars(_CURVE)] if _CURVE in log.Tags()["scalars"] else []

@@ -1,0 +1,163 @@
+"""The benchmark: its plan, its tables against hand-made figures, and a whole small one through the command."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from aenerf_ns.bench import tables
+from aenerf_ns.bench.figures import error_map
+from aenerf_ns.bench.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
+
+
+def small_plan(**changes: Any) -> list[Run]:
+    options: dict[str, Any] = {
+        "scenes": ("room", "object"),
+        "speeds": ("easy", "hard"),
+        "poses": "noise",
+        "tables": ("methods", "losses"),
+        "seeds": (1, 2),
+        "scale": "tiny",
+    }
+    return plan(**{**options, **changes})
+
+
+def test_the_plan_has_every_run_once() -> None:
+    runs = small_plan()
+    assert len({run.name for run in runs}) == len(runs) == 2 * (2 * 2 * 4 + 2 * 4)
+    rows = Counter(run.row for run in runs)
+    assert rows == {OURS: 8, WITHOUT_CORRECTION: 8, TRUE_POSES: 8, CEILING: 8, **dict.fromkeys(LOSSES, 4)}
+    # The bounds are of true poses, all else of estimated ones; the paper's ablation of losses is of hard speed.
+    for run in runs:
+        assert (run.dataset.poses == "exact") == (run.row in (TRUE_POSES, CEILING))
+        assert run.table == "methods" or run.dataset.speed == "hard"
+        assert ("--poses" in run.dataset.options) == (run.dataset.poses == "colmap")
+
+
+def test_whatever_a_run_depends_on_is_in_its_name() -> None:
+    names = {run.name for run in small_plan()}
+    for change in (
+        {"steps": 7},
+        {"seeds": (3,)},
+        {"scale": "full"},
+        {"train": ("--pipeline.model.num-levels", "4")},
+        {"simulate": ("--refractory-period-ns", "1000")},
+    ):
+        changed = {run.name for run in small_plan(**change) if run.row != CEILING}
+        assert not changed & names, change
+
+
+def test_a_scene_file_goes_by_its_folder() -> None:
+    (run, *_) = small_plan(scenes=("scenes/piano/scene.json",))
+    assert run.name.startswith("piano_easy_")
+    (run, *_) = small_plan(scenes=("models/lamp.glb",))
+    assert run.name.startswith("lamp_easy_")
+
+
+def figures_of(run: Run, psnr: float, kind: str, errors: tuple[float, float]) -> dict[str, Any]:
+    poses = {
+        which: {"rotation_error_degrees": error, "translation_error_percent": 2 * error}
+        for which, error in zip(("estimated", "corrected"), errors, strict=True)
+    }
+    return {
+        "table": run.table,
+        "row": run.row,
+        "scene": run.dataset.scene,
+        "kind": kind,
+        "speed": run.dataset.speed,
+        "seed": run.seed,
+        "results": {"psnr": psnr, "ssim": psnr / 100, "lpips": None, "pose_errors": poses},
+        "machine": {"cpu": "a processor", "gpu": None, "cores": 2},
+        "versions": {"aenerf-ns": "0.1.0"},
+        "commit": "abc",
+    }
+
+
+def cells(table: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+
+
+def test_tables_are_means_over_scenes_and_seeds() -> None:
+    runs = small_plan()
+    kinds = {"room": "large", "object": "object"}
+    figures = [
+        figures_of(run, 20 + index, kinds[run.dataset.scene], (3.0 + run.seed, 1.0)) for index, run in enumerate(runs)
+    ]
+    methods = [one for one in figures if one["table"] == "methods"]
+    header, _, *rows = cells(tables.methods_table(methods))
+    assert [row[0] for row in rows] == [WITHOUT_CORRECTION, OURS, TRUE_POSES, CEILING]
+    column = header.index("large scenes, hard: PSNR")
+    expected = [
+        one["results"]["psnr"] for one in methods if (one["row"], one["scene"], one["speed"]) == (OURS, "room", "hard")
+    ]
+    assert len(expected) == 2
+    assert rows[1][column] == f"{sum(expected) / 2:.2f}"
+    # LPIPS is not known, and never a number then.
+    assert rows[1][header.index("large scenes, hard: LPIPS")] == "n/a"
+    poses = cells(tables.poses_table(methods))
+    assert poses[0] == ["", "easy: with ψ", "easy: without ψ", "hard: with ψ", "hard: without ψ"]
+    assert poses[2:] == [
+        ["RE", "1.000", "4.500", "1.000", "4.500"],
+        ["TE", "2.000", "9.000", "2.000", "9.000"],
+    ]
+    losses = cells(tables.losses_table([one for one in figures if one["table"] == "losses"]))
+    assert [row[0] for row in losses[2:]] == list(LOSSES)
+    text = tables.report(figures[:-1], ["the last"])
+    assert "1 runs are missing: the last" in text
+    assert "a processor, 2 cores; aenerf-ns 0.1.0; commit abc" in text
+    # Over two seeds 24 runs apart.
+    assert f"± {24 / 2**0.5:.2f}" in text
+
+
+def test_the_error_map_is_dark_where_there_is_no_error() -> None:
+    truth = np.full((2, 2, 3), 100, np.uint8)
+    rendered = truth.copy()
+    rendered[0, 0] += 64
+    picture = error_map(rendered, truth).sum(-1)
+    assert picture[0, 0] > 600
+    assert (picture.ravel()[1:] < 10).all()
+
+
+@pytest.mark.slow
+def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path) -> None:
+    options = (
+        "--output", "bench", "--scale", "tiny", "--device", "cpu", "--scenes", "object", "--speeds", "easy",
+        "--steps", "8", "--tables", "methods",
+        "--simulate=--width 32 --height 24 --duration 0.5 --validation-views 3 --test-views 3 --train-images 6",
+    )  # fmt: skip
+    command = [str(Path(sys.executable).parent / "aenerf"), "bench", *options]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    first = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
+    while not list(tmp_path.glob("bench/runs/*.json")):
+        assert first.poll() is None
+        time.sleep(0.2)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.wait()
+    (done,) = tmp_path.glob("bench/runs/*.json")
+    before = done.stat().st_mtime_ns
+    both = [subprocess.Popen([*command, "--shard", shard], cwd=tmp_path, env=environment) for shard in ("1/2", "2/2")]
+    assert [process.wait() for process in both] == [0, 0]
+    assert done.stat().st_mtime_ns == before
+    figures = [json.loads(path.read_text()) for path in tmp_path.glob("bench/runs/*.json")]
+    assert {one["row"] for one in figures} == {OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING}
+    assert {one["kind"] for one in figures} == {"object"}
+    for one in figures:
+        assert len(one["curve"]) >= 4
+        assert one["results"]["psnr"] > 5
+    # Whichever ended last has written all of it.
+    report = (tmp_path / "bench" / "report.md").read_text()
+    assert "missing" not in report
+    drawn = sorted(path.name for path in (tmp_path / "bench" / "figures").iterdir())
+    assert drawn == [f"object_easy_methods_{kind}.png" for kind in ("paths", "psnr", "views")]
+    assert Image.open(tmp_path / "bench" / "figures" / drawn[2]).size == (5 * 32 + 4 * 4, 14 + 2 * 24 + 4)
