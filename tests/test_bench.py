@@ -160,4 +160,4 @@ def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path)
     assert "missing" not in report
     drawn = sorted(path.name for path in (tmp_path / "bench" / "figures").iterdir())
     assert drawn == [f"object_easy_methods_{kind}.png" for kind in ("paths", "psnr", "views")]
-    assert Image.open(tmp_path / "bench" / "figures" / drawn[2]).size == (5 * 32 + 4 * 4, 14 + 2 * 24 + 4)
+    assert Image.open(tmp_path / "bench" / "figures" / drawn[2]).size == (5 * 192 + 4 * 4, 14 + 2 * 144 + 4)

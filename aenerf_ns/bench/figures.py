@@ -14,6 +14,8 @@ from aenerf_ns.bench.plan import OURS, Run
 
 _GAP = 4
 _LABEL = 14
+_MIN_WIDTH = 190
+"""In pixels: smaller pictures are enlarged, or the names above them would not fit."""
 
 
 def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]]) -> list[Path]:
@@ -61,13 +63,16 @@ def _views(folder: Path, runs: Sequence[Run], file: Path) -> Path:
             columns.append(("truth", [truth, np.zeros_like(truth)]))
         columns.append((run.row, [rendered, error_map(rendered, truth)]))
     height, width = columns[0][1][0].shape[:2]
+    factor = -(-_MIN_WIDTH // width)
+    height, width = factor * height, factor * width
     picture = Image.new("RGB", (len(columns) * (width + _GAP) - _GAP, _LABEL + 2 * height + _GAP), "white")
     pen = ImageDraw.Draw(picture)
     for index, (name, tiles) in enumerate(columns):
         left = index * (width + _GAP)
         pen.text((left + 2, 1), name, fill="black")
         for row, tile in enumerate(tiles):
-            picture.paste(Image.fromarray(tile), (left, _LABEL + row * (height + _GAP)))
+            enlarged = Image.fromarray(tile).resize((width, height), Image.Resampling.NEAREST)
+            picture.paste(enlarged, (left, _LABEL + row * (height + _GAP)))
     picture.save(file, optimize=True)
     return file
 
