@@ -87,7 +87,7 @@ def open_scene(name: str, seed: int = 0) -> SimulationScene:
     """A built-in scene by its name, or a mesh or scene.json by its file name.
 
     Raises:
-        DataError: the file cannot be used.
+        DataError: there is no such scene, or the file cannot be used.
     """
     if name in ("room", "object"):
         return built_in_scene(name, seed)

@@ -65,12 +65,20 @@ def light_points(mesh: Mesh) -> LightPoints:
     faces_at = np.bincount(corner, minlength=count)[:, None]
     normal = total(angle[:, None] * np.repeat(normals, 3, axis=0))
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    position = total(corners.reshape(-1, 3)) / faces_at
-    # Along the surface only: at the tip of a curved one the way to its faces' middles leads inside.
-    inward = total(inwards) / faces_at
-    inward -= (inward * normal).sum(axis=1, keepdims=True) * normal
+    # A surface ends at a corner to whose neighbour an edge leads once. There the point goes onto the face that leads
+    # inside best; elsewhere it stays, for beside a corner of a curved surface the way along it is not in the surface.
+    neighbours = np.concatenate([np.roll(place.reshape(-1, 3), turn, axis=1).reshape(-1) for turn in (1, 2)])
+    edges = np.concatenate([corner, corner]) * (place.max() + 1) + neighbours
+    edge, uses = np.unique(edges, return_counts=True)
+    is_open = np.zeros(count, bool)
+    is_open[edge[uses == 1] // (place.max() + 1)] = True
+    leads = (inwards * (total(inwards) / faces_at)[corner]).sum(axis=1)
+    best = np.empty(count, np.int64)
+    best_last = np.lexsort((leads, corner))
+    best[corner[best_last]] = best_last
+    position = corners.reshape(-1, 3)[best] + 0.1 * is_open[:, None] * inwards[best]
     size = (total(lengths.reshape(-1, 1)) / faces_at)[:, 0]
-    return LightPoints(corner.reshape(-1, 3), position + 0.1 * inward, normal, size)
+    return LightPoints(corner.reshape(-1, 3), position, normal, size)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -105,6 +113,7 @@ def _smooth_parts(start, order, normals, part):
 
 def light_mesh(
     mesh: Mesh,
+    caster: RayCaster,
     environment: Environment,
     lamps: Sequence[AreaLight],
     background: Array,
@@ -116,6 +125,7 @@ def light_mesh(
 
     Args:
         mesh: what is lit, on both sides of its faces. Light is computed at their corners and is linear between them.
+        caster: its rays.
         environment: light from far away.
         lamps: invisible rectangles that shine.
         background: (3,) radiance where a ray of the camera hits nothing, unless the environment is shown there.
@@ -124,17 +134,15 @@ def light_mesh(
     """
     points = light_points(mesh)
     arrays = mesh_arrays(mesh, points.corner)
-    caster = RayCaster(mesh.vertices, mesh.faces)
     textures = mip_maps(mesh.textures, bits16=True)
     light = _light(arrays, textures, caster, points, environment, lamps, seed)
     shown = surroundings(environment if show_environment else None)
     return MeshScene(arrays, textures, caster, light, background, shown, math.inf)
 
 
-def baked_mesh(mesh: Mesh, background: Array) -> MeshScene:
+def baked_mesh(mesh: Mesh, caster: RayCaster, background: Array) -> MeshScene:
     """A mesh whose colours are the radiance that is seen, in front of a uniform background (3,)."""
     arrays = mesh_arrays(mesh, np.zeros_like(mesh.faces))
-    caster = RayCaster(mesh.vertices, mesh.faces)
     light, textures = np.ones((2, 1, 3), np.float32), mip_maps(mesh.textures, bits16=True)
     return MeshScene(arrays, textures, caster, light, background, surroundings(None), math.inf)
 

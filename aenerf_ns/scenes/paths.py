@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 from scipy.special import i0, iv
 
+from aenerf_ns.errors import DataError
+
 Array = NDArray[np.float64]
 
 HARD_SPEED_RATIO = 8.0
@@ -105,7 +107,7 @@ def object_validation_views(
         is_free: whether a camera may be at a place (3,). A view is turned about the vertical until it may.
 
     Raises:
-        ValueError: a view cannot be placed.
+        DataError: a view cannot be placed.
     """
 
     def candidates(k: int, z: float) -> Iterator[Array]:
@@ -126,7 +128,7 @@ def object_test_views(
     """Random views (count, 4, 4) over the hemisphere, at other distances and off-centre: those that `is_free` accepts.
 
     Raises:
-        ValueError: a view cannot be placed.
+        DataError: a view cannot be placed.
     """
     rng = np.random.default_rng(seed)
 
@@ -147,7 +149,7 @@ def _first_free(candidates: Iterator[Array], is_free: Callable[[Array], bool]) -
     for pose in candidates:
         if is_free(pose[:3, 3]):
             return pose
-    raise ValueError("no free place was found for a view: the scene leaves the cameras no room")
+    raise DataError("views around the scene", "no place is free of the mesh", "give its path a larger radius")
 
 
 class WalkPath:

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.scenes import SimulationScene, paths
+from aenerf_ns.scenes.embree import RayCaster
 from aenerf_ns.scenes.environment import Environment, load_environment, sky
 from aenerf_ns.scenes.free_space import FreeSpace
 from aenerf_ns.scenes.light_baking import AreaLight
 from aenerf_ns.scenes.mesh import MeshScene
 from aenerf_ns.scenes.mesh_lighting import baked_mesh, light_mesh
-from aenerf_ns.scenes.mesh_loading import Mesh, load_mesh, scaled
+from aenerf_ns.scenes.mesh_loading import SUFFIXES, Mesh, load_mesh, scaled
 from aenerf_ns.scenes.mesh_repair import prepared
 
 Array = NDArray[np.float64]
@@ -30,7 +31,7 @@ _FOCAL_RATIO = {"around": 1.2, "walk": 0.62}
 _SKY = [[0.25, 0.25, 0.25], [1.0, 1.0, 1.0]]
 _BACKGROUND = [0.5, 0.5, 0.5]
 _RADIUS = 4.0
-_RADII = 3.2
+_RADII = 3.6
 """Distance from which an object is looked at by default: in metres, and in half diagonals of its bounds."""
 _BRIGHTEST = 0.9
 """What the brightest surface that probes of the path see is brought to: it leaves room for what they miss."""
@@ -55,19 +56,31 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
     Raises:
         DataError: a file is missing or malformed, or the camera's path runs into the mesh.
     """
-    bare = path.suffix.lower() != ".json"
+    bare = path.suffix.lower() in SUFFIXES
+    if not bare and path.suffix.lower() != ".json":
+        raise DataError(path, "an unknown scene", 'give "room", "object", a .glb, .obj or .ply file, or a scene.json')
     values = {"mesh": path.name} if bare else _read(path)
     file = path.parent / _text(path, values, "mesh")
     up = values.get("up", "y" if file.suffix.lower() == ".glb" else "z")
     if up not in ("y", "z"):
         raise DataError(path, f"up is {up!r}", 'give "y" or "z"')
+    scale = _positive(path, values, "scale", 1.0)
+    light = _light(path, values.get("light", {"sky": _SKY}))
+    background = _background(path, values.get("background", _BACKGROUND), light)
+    kind = _kind(path, values.get("path", {"kind": "around"}))
+    focal_ratio = _positive(path, values, "focal_ratio", _FOCAL_RATIO[kind])
+    box = _box(path, values.get("box"), kind)
+
     mesh = load_mesh(file, up == "y")
-    scale = _half_diagonal_scale(mesh) if bare else _positive(path, values, "scale", 1.0)
+    if bare:
+        scale = _half_diagonal_scale(mesh)
     try:
         mesh, coincident = prepared(scaled(mesh, scale))
     except ValueError as error:
         raise DataError(file, str(error), "give a mesh of triangles") from error
     bounds = np.stack([mesh.vertices[mesh.faces].min(axis=(0, 1)), mesh.vertices[mesh.faces].max(axis=(0, 1))])
+    if box is None and kind == "around" and background is not None:
+        box = bounds + 0.025 * np.diff(bounds, axis=0) * [[-1], [1]]
     notes = []
     if bare:
         notes.append(
@@ -75,39 +88,32 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
             f"{' x '.join(f'{side:.2f}' for side in np.diff(bounds, axis=0)[0])} m (a scene.json can say otherwise)"
         )
     if coincident:
-        notes.append(f"{file}: {coincident} faces lie in others; where two do, the first in the file is seen")
+        notes.append(f"{file}: {coincident} faces coincide with others; where they do, the first in the file is seen")
 
-    kind, make_views = _path(path, values.get("path", {"kind": "around"}), bounds)
-    renderer, background = _lit(path, values, mesh, seed)
-    views = make_views(renderer)
-    box = values.get("box")
-    if kind == "walk" and box is not None:
-        raise DataError(path, "a box with a walk, which is inside its scene", 'leave "box" out')
-    if kind == "walk" or (box is None and background is None):
-        aabb = None
-    elif box is None:
-        aabb = bounds + 0.025 * np.diff(bounds, axis=0) * [[-1], [1]]
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    views = _views(path, values.get("path", {"kind": "around"}), bounds, caster)
+    behind = np.zeros(3) if background is None else background
+    if light is None:
+        renderer = baked_mesh(mesh, caster, behind)
     else:
-        aabb = _array(path, "box", box, (2, 3))
-        if not (aabb[0] < aabb[1]).all():
-            raise DataError(path, f"box is {box}", "give its lowest corner, then its highest")
+        renderer = light_mesh(mesh, caster, *light, behind, show_environment=background is None, seed=seed)
     scene = SimulationScene(
         path.stem,
         renderer,
         views.path,
-        focal_ratio=_positive(path, values, "focal_ratio", _FOCAL_RATIO[kind]),
-        aabb=aabb,
+        focal_ratio=focal_ratio,
+        aabb=box,
         background=background,
         validation_views=views.validation,
         test_views=views.test,
         notes=tuple(notes),
     )
-    return scene if values.get("light") == "baked" else replace(scene, renderer=_exposed(scene, renderer))
+    return scene if light is None else replace(scene, renderer=_exposed(scene, renderer))
 
 
 def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise DataError(path, "the scene does not exist", 'give "room", "object", a mesh or a scene.json')
+        raise DataError(path, "the file does not exist", "check the name")
     try:
         values = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
@@ -127,23 +133,33 @@ def _half_diagonal_scale(mesh: Mesh) -> float:
     return _RADIUS / (_RADII * half_diagonal) if half_diagonal > 0 else 1.0
 
 
-def _lit(path: Path, values: dict[str, Any], mesh: Mesh, seed: int) -> tuple[MeshScene, Array | None]:
-    """The lit mesh, and its uniform background or None."""
-    seen, light = values.get("background", _BACKGROUND), values.get("light", {"sky": _SKY})
-    shown = isinstance(seen, str) and seen == "environment"
-    background = np.zeros(3) if shown else _radiance(path, "background", seen)
-    if background.max() > 1:
-        raise DataError(path, f"background is {seen}", "give what the picture shows, at most 1")
-    if light == "baked":
-        if shown:
+def _background(path: Path, value: Any, light: tuple[Environment, list[AreaLight]] | None) -> Array | None:
+    """The uniform background, or None where the environment is seen."""
+    if isinstance(value, str) and value == "environment":
+        if light is None:
             raise DataError(path, "the environment as background of baked light", "give a colour")
-        return baked_mesh(mesh, background), background
-    environment, lamps = _light(path, light)
-    scene = light_mesh(mesh, environment, lamps, background, show_environment=shown, seed=seed)
-    return scene, None if shown else background
+        return None
+    background = _radiance(path, "background", value)
+    if background.max() > 1:
+        raise DataError(path, f"background is {value}", "give what the picture shows, at most 1")
+    return background
 
 
-def _light(path: Path, light: Any) -> tuple[Environment, list[AreaLight]]:
+def _box(path: Path, value: Any, kind: str) -> Array | None:
+    if value is None:
+        return None
+    if kind == "walk":
+        raise DataError(path, "a box with a walk, which is inside its scene", 'leave "box" out')
+    box = _array(path, "box", value, (2, 3))
+    if not (box[0] < box[1]).all():
+        raise DataError(path, f"box is {value}", "give its lowest corner, then its highest")
+    return box
+
+
+def _light(path: Path, light: Any) -> tuple[Environment, list[AreaLight]] | None:
+    """The environment and the lamps, or None for baked light."""
+    if light == "baked":
+        return None
     if not isinstance(light, dict) or ("sky" in light) == ("environment" in light):
         raise DataError(path, 'light is neither "baked" nor has it one of "sky" and "environment"', "give one")
     known = {"sky", "lamps"} if "sky" in light else {"environment", "turn_degrees", "gain", "lamps"}
@@ -168,53 +184,48 @@ def _light(path: Path, light: Any) -> tuple[Environment, list[AreaLight]]:
     return environment, made
 
 
-def _path(path: Path, value: Any, bounds: Array) -> tuple[str, Callable[[MeshScene], _Views]]:
-    """The kind of a path, and what makes its views once the mesh can be asked what is free."""
+def _kind(path: Path, value: Any) -> str:
     known = {"around": {"kind", "centre", "radius", "turns"}, "walk": {"kind", "positions", "targets"}}
     kind = value.get("kind") if isinstance(value, dict) else None
     if kind not in known:
         raise DataError(path, f"path.kind is {kind!r}", 'give "around" or "walk"')
     if unknown := sorted(set(value) - known[kind]):
         raise DataError(path, f"unknown key {unknown[0]!r} in path", f"known are {', '.join(sorted(known[kind]))}")
-    if kind == "around":
+    return kind
+
+
+def _views(path: Path, value: dict[str, Any], bounds: Array, caster: RayCaster) -> _Views:
+    """The camera's path and the views beside it, checked to keep clear of the mesh."""
+    route: Callable[[float], Array]
+    if value["kind"] == "around":
         centre = _array(path, "path.centre", value.get("centre", bounds.mean(axis=0).tolist()), (3,))
         radius = _positive(path, value, "radius", 0.5 * _RADII * float(np.linalg.norm(bounds[1] - bounds[0])))
-        turns = _positive(path, value, "turns", 4.0)
-        spiral = partial(paths.object_path, turns=turns, radius=radius, centre=centre)
-
-        def around(renderer: MeshScene) -> _Views:
-            space = _checked(path, renderer, spiral, radius)
-            return _Views(
-                spiral,
-                lambda count: paths.object_validation_views(count, radius, centre, space.is_free),
-                lambda count, seed: paths.object_test_views(count, seed, radius, centre, space.is_free),
-            )
-
-        return kind, around
-    points = [_array(path, f"path.{key}", value.get(key), (None, 3)) for key in ("positions", "targets")]
-    try:
-        route = paths.WalkPath(*points)
-    except ValueError as error:
-        raise DataError(path, f"path: {error}", "see docs/simulator.md") from error
-
-    def walk(renderer: MeshScene) -> _Views:
-        space = _checked(path, renderer, route, route.size)
-        return _Views(
-            route,
-            lambda count: route.validation_views(count, space.is_reached),
-            lambda count, seed: route.test_views(count, seed, space.is_reached),
+        route = partial(
+            paths.object_path, turns=_positive(path, value, "turns", 4.0), radius=radius, centre=centre
         )
-
-    return kind, walk
-
-
-def _checked(path: Path, renderer: MeshScene, route: Callable[[float], Array], size: float) -> FreeSpace:
-    space = FreeSpace(renderer.caster, min(CLEARANCE, 0.13 * size))
+        space = FreeSpace(caster, min(CLEARANCE, 0.13 * radius))
+        views = _Views(
+            route,
+            lambda count: paths.object_validation_views(count, radius, centre, space.is_free),
+            lambda count, seed: paths.object_test_views(count, seed, radius, centre, space.is_free),
+        )
+    else:
+        points = [_array(path, f"path.{key}", value.get(key), (None, 3)) for key in ("positions", "targets")]
+        try:
+            route = walk = paths.WalkPath(*points)
+        except ValueError as error:
+            raise DataError(path, f"path: {error}", "see docs/simulator.md") from error
+        space = FreeSpace(caster, min(CLEARANCE, 0.13 * walk.size))
+        views = _Views(
+            route,
+            lambda count: walk.validation_views(count, space.is_reached),
+            lambda count, seed: walk.test_views(count, seed, space.is_reached),
+        )
     try:
         space.check_path(route)
     except ValueError as error:
         raise DataError(path, str(error), "change the path or the scale") from error
-    return space
+    return views
 
 
 def _exposed(scene: SimulationScene, renderer: MeshScene) -> MeshScene:
