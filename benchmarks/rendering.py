@@ -93,9 +93,7 @@ def _cave(subdivisions: int) -> MeshScene:
     mesh = Mesh(vertices, faces, uv, np.ones((len(vertices), 3)), np.zeros(len(faces), np.int64), (picture,))
     mesh, _ = prepared(scaled(mesh, 1.0))
     lamp = AreaLight((0, 0, 2.2), (0.3, 0, 0), (0, -0.3, 0), (10.0, 9.0, 8.0))
-    return light_mesh(
-        mesh, RayCaster(mesh.vertices, mesh.faces), sky((0.1,) * 3, (0.1,) * 3), [lamp], np.zeros(3)
-    )
+    return light_mesh(mesh, RayCaster(mesh.vertices, mesh.faces), sky((0.1,) * 3, (0.1,) * 3), [lamp], np.zeros(3))
 
 
 if __name__ == "__main__":

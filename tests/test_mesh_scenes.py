@@ -22,8 +22,8 @@ from aenerf_ns.scenes.embree import RayCaster
 from aenerf_ns.scenes.environment import Environment, load_environment, sky
 from aenerf_ns.scenes.frames import frame_parameters
 from aenerf_ns.scenes.light_baking import AreaLight, bake
-from aenerf_ns.scenes.mesh_lighting import light_points
 from aenerf_ns.scenes.mesh import MeshScene
+from aenerf_ns.scenes.mesh_lighting import light_points
 from aenerf_ns.scenes.mesh_loading import Mesh, linear, load_mesh, scaled
 from aenerf_ns.scenes.mesh_repair import normals_and_areas, prepared, subdivided
 from aenerf_ns.scenes.mip_maps import mip_maps
@@ -107,7 +107,9 @@ def test_depth_and_alpha_of_a_tilted_plate() -> None:
     np.testing.assert_allclose(depth[inside], expected[inside], rtol=3e-7)
     assert np.isinf(depth[~inside]).all()
     np.testing.assert_allclose(radiance[inside], 0.5, rtol=1e-6)
-    np.testing.assert_allclose(radiance[~inside], np.broadcast_to([0.2, 0.3, 0.4], (int((~inside).sum()), 3)), rtol=1e-6)
+    np.testing.assert_allclose(
+        radiance[~inside], np.broadcast_to([0.2, 0.3, 0.4], (int((~inside).sum()), 3)), rtol=1e-6
+    )
 
 
 def test_texture_coordinates_and_wrapping() -> None:
@@ -263,7 +265,9 @@ def test_the_same_radiance_as_analytic_primitives() -> None:
     analytic = bake(primitives, grey, [lamp], spacing=0.03, ambient=0.0, sky=skies)
     box = trimesh.creation.box((0.6, 0.5, 0.5)).apply_translation((0.1, 0.1, 0.25))
     ground = plate(1.5)
-    mesh, coincident = prepared(joined(Mesh(**{**vars(ground), "colour": 0.8 * ground.colour}), mesh_of(box, [0.4] * 3)), 0.04)
+    mesh, coincident = prepared(
+        joined(Mesh(**{**vars(ground), "colour": 0.8 * ground.colour}), mesh_of(box, [0.4] * 3)), 0.04
+    )
     assert coincident == 2  # the foot of the box lies in the floor
     scene = light_mesh(mesh, sky(*skies), [lamp], BLACK)
     for eye in ((1.4, -1.8, 1.2), (-1.5, -0.8, 1.6)):
@@ -361,7 +365,10 @@ def painted_box() -> trimesh.Trimesh:
     normal = np.repeat(body.face_normals, 3, axis=0)
     axis = np.abs(normal).argmax(axis=1)
     rows = np.arange(len(body.vertices))
-    uv = np.stack([body.vertices[rows, (axis + 1) % 3], body.vertices[rows, (axis + 2) % 3]], axis=1) + 0.1 * axis[:, None]
+    uv = (
+        np.stack([body.vertices[rows, (axis + 1) % 3], body.vertices[rows, (axis + 2) % 3]], axis=1)
+        + 0.1 * axis[:, None]
+    )
     picture = np.random.default_rng(0).integers(40, 220, (12, 16, 3)).astype(np.uint8)
     material = trimesh.visual.material.PBRMaterial(
         baseColorTexture=Image.fromarray(picture), baseColorFactor=[0.8, 1.0, 0.6, 1.0]
@@ -416,10 +423,17 @@ def test_the_same_picture_from_glb_and_obj(tmp_path: Path) -> None:
 def test_colours_of_a_ply_are_srgb(tmp_path: Path) -> None:
     body = trimesh.creation.box()
     for kind in ("vertex_colors", "face_colors"):
-        coloured = trimesh.Trimesh(body.vertices, body.faces, process=False, **{kind: np.array([[200, 100, 50, 255]] * (8 if kind[0] == "v" else 12), np.uint8)})
+        coloured = trimesh.Trimesh(
+            body.vertices,
+            body.faces,
+            process=False,
+            **{kind: np.array([[200, 100, 50, 255]] * (8 if kind[0] == "v" else 12), np.uint8)},
+        )
         coloured.export(tmp_path / "box.ply")
         mesh = load_mesh(tmp_path / "box.ply", False)
-        np.testing.assert_allclose(mesh.colour[mesh.faces], np.broadcast_to(linear(np.array([200, 100, 50]) / 255), (12, 3, 3)))
+        np.testing.assert_allclose(
+            mesh.colour[mesh.faces], np.broadcast_to(linear(np.array([200, 100, 50]) / 255), (12, 3, 3))
+        )
 
 
 def test_an_obj_with_a_concave_polygon_and_two_materials(tmp_path: Path) -> None:
@@ -586,7 +600,9 @@ def test_a_bare_mesh_is_an_object_in_view(tmp_path: Path) -> None:
         assert 0.02 < alpha.mean() < 0.6
         hit = alpha == 1
         brightest = max(brightest, radiance[hit].max())
-        points = ray_directions(scene.intrinsics(60, 45), 60, 45)[hit] * depth[hit][:, None] @ pose[:3, :3].T + pose[:3, 3]
+        points = (
+            ray_directions(scene.intrinsics(60, 45), 60, 45)[hit] * depth[hit][:, None] @ pose[:3, :3].T + pose[:3, 3]
+        )
         assert (points > scene.aabb[0]).all()
         assert (points < scene.aabb[1]).all()
     assert 0.8 < brightest < 1

@@ -30,7 +30,7 @@ _DIRECTIONS = 64
 _STRATA = 4
 _SUN_SAMPLES = 32
 _BOUNCES = 12
-_SMOOTHING = 2
+_SMOOTHING = 4
 _CHUNK = 1 << 14
 
 
@@ -280,7 +280,7 @@ def _face_colours(arrays, textures, colours):
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _lamp_rays(points, normals, jitter, lamp, offset, rays, weights):
-    """Segments to a lamp (4, 3), and the irradiance / pi of unit radiance that each would bring were it the only one."""
+    """Segments to a lamp (4, 3), and the irradiance / pi, of unit radiance, that each would bring by itself."""
     centre, half_u, half_v = lamp[0], lamp[1], lamp[2]
     nx = half_u[1] * half_v[2] - half_u[2] * half_v[1]
     ny = half_u[2] * half_v[0] - half_u[0] * half_v[2]
@@ -374,8 +374,8 @@ def _gathering_rays(points, normals, jitter, directions, rays):
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _gather(arrays, half, rays, hits, distance, coordinates, size, sky, links, received, buried):
-    """Of each point: the light points its rays end at (behind a surface: ``half`` farther), -1 for the sky; the light of the
-    sky; and whether it is inside of something or right beneath it."""
+    """Of each point: the light points its rays end at (behind a surface: ``half`` farther), -1 for the sky; the light
+    of the sky; and whether it is inside of something or right beneath it."""
     count = links.shape[1]
     for n in numba.prange(len(links)):
         red, green, blue, behind, near = 0.0, 0.0, 0.0, 0, 0

@@ -87,10 +87,10 @@ def load_mesh(path: Path, y_up: bool) -> Mesh:
         )
         nodes = list(scene.graph.nodes_geometry)
         # Its reader of .obj files makes a part of each material, the last one first.
-        parts = [scene.graph[name] for name in (reversed(nodes) if suffix == ".obj" else nodes)]
+        placed = [scene.graph[name] for name in (reversed(nodes) if suffix == ".obj" else nodes)]
         meshes = [
             (scene.geometry[name], np.asarray(transform, np.float64))
-            for transform, name in parts
+            for transform, name in placed
             if len(getattr(scene.geometry[name], "faces", ()))
         ]
     except Exception as error:  # whatever a malformed file makes of the reader
@@ -98,8 +98,8 @@ def load_mesh(path: Path, y_up: bool) -> Mesh:
     if not meshes:
         raise DataError(path, "there is no surface in it", "give a mesh of triangles, not points or lines")
     textures: dict[int, tuple[int, NDArray[np.float32]]] = {}
-    columns = zip(*(_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in meshes), strict=True)
-    vertices, faces, uv, colour, texture = columns
+    parts = [_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in meshes]
+    vertices, faces, uv, colour, texture = zip(*parts, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
     world = np.concatenate(vertices)
     if y_up:

@@ -196,8 +196,8 @@ class WalkPath:
         across, up, along = np.asarray(shift, np.float64)
         eye = eye + across * right + along * forward + [0.0, 0.0, up]
         cos, sin = np.cos(gaze), np.sin(gaze)
-        look = target - eye
-        return look_at(eye, eye + [cos * look[0] - sin * look[1], sin * look[0] + cos * look[1], look[2]])
+        x, y, z = target - eye
+        return look_at(eye, eye + np.array([cos * x - sin * y, sin * x + cos * y, z]))
 
     def validation_views(self, count: int, is_free: Callable[[Array, Array], bool]) -> Array:
         """Views (count, 4, 4) spread along the walk, beside, above and below it.
@@ -216,7 +216,7 @@ class WalkPath:
         )
 
     def test_views(self, count: int, seed: int, is_free: Callable[[Array, Array], bool]) -> Array:
-        """Random views (count, 4, 4) around the walk, with gazes of their own. ``is_free`` as for `validation_views`."""
+        """Random views (count, 4, 4) around the walk, with gazes of their own; ``is_free`` as above."""
         rng = np.random.default_rng(seed)
         return _stack(
             [

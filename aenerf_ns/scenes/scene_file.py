@@ -179,8 +179,8 @@ def _light(path: Path, light: Any) -> tuple[Environment, list[AreaLight]] | None
         if set(lamp) != {"centre", "half_u", "half_v", "radiance"}:
             raise DataError(path, f"light.lamps[{i}] has {sorted(lamp)}", "give centre, half_u, half_v and radiance")
         name = f"light.lamps[{i}]"
-        centre, half_u, half_v = (_array(path, f"{name}.{key}", lamp[key], (3,)) for key in ("centre", "half_u", "half_v"))
-        made.append(AreaLight(centre, half_u, half_v, _radiance(path, f"{name}.radiance", lamp["radiance"])))
+        vectors = [_array(path, f"{name}.{key}", lamp[key], (3,)) for key in ("centre", "half_u", "half_v")]
+        made.append(AreaLight(*vectors, _radiance(path, f"{name}.radiance", lamp["radiance"])))
     return environment, made
 
 
@@ -200,9 +200,7 @@ def _views(path: Path, value: dict[str, Any], bounds: Array, caster: RayCaster) 
     if value["kind"] == "around":
         centre = _array(path, "path.centre", value.get("centre", bounds.mean(axis=0).tolist()), (3,))
         radius = _positive(path, value, "radius", 0.5 * _RADII * float(np.linalg.norm(bounds[1] - bounds[0])))
-        route = partial(
-            paths.object_path, turns=_positive(path, value, "turns", 4.0), radius=radius, centre=centre
-        )
+        route = partial(paths.object_path, turns=_positive(path, value, "turns", 4.0), radius=radius, centre=centre)
         space = FreeSpace(caster, min(CLEARANCE, 0.13 * radius))
         views = _Views(
             route,
@@ -230,13 +228,13 @@ def _views(path: Path, value: dict[str, Any], bounds: Array, caster: RayCaster) 
 
 def _exposed(scene: SimulationScene, renderer: MeshScene) -> MeshScene:
     """The scene with its light scaled so that no surface clips in the pictures, and its surroundings cut off there."""
-    width, height = 96, 72
+    width, height = 192, 144
     poses = [scene.path((k + 0.5) / 48) for k in range(48)]
     poses += [*scene.validation_views(16), *scene.test_views(16, 0)]
     brightest = 0.0
     for pose in poses:
-        radiance, _, alpha = renderer.render(pose, scene.intrinsics(width, height), width, height, 4)
-        brightest = max(brightest, float(radiance[alpha == 1].max(initial=0.0)))
+        radiance, _, alpha = renderer.render(pose, scene.intrinsics(width, height), width, height, 1)
+        brightest = max(brightest, float(radiance[alpha > 0].max(initial=0.0)))
     if brightest == 0:
         raise DataError(scene.name, "no light reaches what the camera sees", "give it light, or another path")
     gain = _BRIGHTEST / brightest
