@@ -59,7 +59,7 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
     bare = path.suffix.lower() in SUFFIXES
     if not bare and path.suffix.lower() != ".json":
         raise DataError(path, "an unknown scene", 'give "room", "object", a .glb, .obj or .ply file, or a scene.json')
-    values = {"mesh": path.name} if bare else _read(path)
+    values: dict[str, Any] = {"mesh": path.name} if bare else _read(path)
     file = path.parent / _text(path, values, "mesh")
     up = values.get("up", "y" if file.suffix.lower() == ".glb" else "z")
     if up not in ("y", "z"):
@@ -179,8 +179,10 @@ def _light(path: Path, light: Any) -> tuple[Environment, list[AreaLight]] | None
         if set(lamp) != {"centre", "half_u", "half_v", "radiance"}:
             raise DataError(path, f"light.lamps[{i}] has {sorted(lamp)}", "give centre, half_u, half_v and radiance")
         name = f"light.lamps[{i}]"
-        vectors = [_array(path, f"{name}.{key}", lamp[key], (3,)) for key in ("centre", "half_u", "half_v")]
-        made.append(AreaLight(*vectors, _radiance(path, f"{name}.radiance", lamp["radiance"])))
+        centre, half_u, half_v = (
+            _array(path, f"{name}.{key}", lamp[key], (3,)) for key in ("centre", "half_u", "half_v")
+        )
+        made.append(AreaLight(centre, half_u, half_v, _radiance(path, f"{name}.radiance", lamp["radiance"])))
     return environment, made
 
 
