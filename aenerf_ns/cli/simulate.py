@@ -1,4 +1,4 @@
-"""``aenerf simulate``: a dataset of a built-in scene."""
+"""``aenerf simulate``: a dataset of a built-in scene or of a mesh."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
-from aenerf_ns.scenes import built_in_scene
+from aenerf_ns.scenes import open_scene
 from aenerf_ns.simulation import Simulation
 from aenerf_ns.trajectory.noise import perturb
 from aenerf_ns.trajectory.trajectory import homogeneous
@@ -22,12 +22,13 @@ from aenerf_ns.trajectory.trajectory import homogeneous
 
 @dataclass
 class Simulate:
-    """Simulate an event camera that moves through a built-in scene, and write a dataset for ns-train aenerf."""
+    """Simulate an event camera that moves through a scene, and write a dataset for ns-train aenerf."""
 
     output: Path
     """Dataset folder to create."""
-    scene: Literal["room", "object"] = "room"
-    """A furnished room seen from inside, or an object seen from around it."""
+    scene: str = "room"
+    """room: a furnished room seen from inside; object: one seen from around it; or a file: a mesh (.glb, .obj, .ply)
+    to be seen from around it, or a scene.json with a mesh, its light and the camera's path (docs/simulator.md)."""
     speed: Literal["easy", "hard"] = "easy"
     """Constant speed, or the same path at 8^sin(2 pi t) times that speed."""
     width: int = 346
@@ -72,8 +73,12 @@ class Simulate:
         counts = (self.train_images, self.validation_views, self.test_views)
         if min(counts) < 0:
             raise DataError("aenerf simulate", f"numbers of images {counts}", "they must not be negative")
+        scene = open_scene(self.scene, self.seed)
+        for note in scene.notes:
+            CONSOLE.print(note, highlight=False, markup=False)
+        validation = torch.from_numpy(scene.validation_views(self.validation_views))
+        test = torch.from_numpy(scene.test_views(self.test_views, self.seed))
         try:
-            scene = built_in_scene(self.scene, self.seed)
             camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
             sensor = SensorModel(
                 self.positive_contrast_threshold,
@@ -111,9 +116,9 @@ class Simulate:
                 # The picture shows what is true; the pose beside it is what the user of the dataset is given.
                 pose = homogeneous(estimated.interpolate(time))
                 writer.add_image("train", simulation.reference_image(simulation.pose(time)), pose, time)
-            for pose in torch.from_numpy(scene.validation_views(self.validation_views)):
+            for pose in validation:
                 writer.add_image("val", simulation.reference_image(pose), pose)
-            for pose in torch.from_numpy(scene.test_views(self.test_views, self.seed)):
+            for pose in test:
                 writer.add_image("test", simulation.reference_image(pose), pose)
         seconds = (truth.end - truth.start) * 1e-9
         CONSOLE.print(

@@ -1,9 +1,10 @@
-"""What the simulator looks at: the built-in scenes, their cameras' paths and their held-out views."""
+"""What the simulator looks at: built-in scenes and meshes, their cameras' paths and their held-out views."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ class SimulationScene:
     """A scene and how it is looked at. Poses are camera-to-world, OpenCV axes, z up, metres.
 
     Attributes:
-        name: "room" or "object".
+        name: "room", "object", or a file's name.
         renderer: the lit scene.
         path: s in [0, 1] to a pose (4, 4).
         focal_ratio: focal length over image width; the pixels are square and the principal point is the middle.
@@ -27,6 +28,7 @@ class SimulationScene:
         background: (3,) linear RGB behind the scene; None where every ray hits something.
         validation_views: number of views to poses (n, 4, 4) around the path.
         test_views: number of views and seed to random poses (n, 4, 4).
+        notes: what the user should know was assumed, a line each.
     """
 
     name: str
@@ -37,6 +39,7 @@ class SimulationScene:
     background: Array | None
     validation_views: Callable[[int], Array]
     test_views: Callable[[int, int], Array]
+    notes: tuple[str, ...] = ()
 
     def intrinsics(self, width: int, height: int) -> tuple[float, float, float, float]:
         """(fx, fy, cx, cy) in pixels, pixel centres at +0.5."""
@@ -78,3 +81,16 @@ def built_in_scene(name: str, seed: int = 0) -> SimulationScene:
             test_views=paths.object_test_views,
         )
     raise ValueError(f'scene must be "room" or "object", got {name!r}')
+
+
+def open_scene(name: str, seed: int = 0) -> SimulationScene:
+    """A built-in scene by its name, or a mesh or scene.json by its file name.
+
+    Raises:
+        DataError: there is no such scene, or the file cannot be used.
+    """
+    if name in ("room", "object"):
+        return built_in_scene(name, seed)
+    from aenerf_ns.scenes.scene_file import load_scene
+
+    return load_scene(Path(name), seed)

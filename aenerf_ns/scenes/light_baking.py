@@ -228,7 +228,7 @@ def bake(
     albedo = np.array([pyramids[i][-1][0, 0] for i in arrays.texture], np.float64) * arrays.tint
     jitter = np.random.default_rng(seed).random((texel_count, 2))
     emitters = np.array([[a.centre, a.half_u, a.half_v, a.radiance] for a in lights], np.float64).reshape(-1, 4, 3)
-    directions = _plane_sequence(48)
+    directions = plane_sequence(48)
     direct = np.full((texel_count, 3), ambient, np.float32)
     _direct_light(arrays, points, normals, emitters, 4, jitter, direct)
     light = direct
@@ -239,7 +239,7 @@ def bake(
     return PrimitiveScene(arrays._replace(light=light), np.asarray(background, np.float64))
 
 
-def _plane_sequence(count: int) -> Array:
+def plane_sequence(count: int) -> Array:
     """The first points of the R2 low-discrepancy sequence in the unit square (Roberts, 2018)."""
     plastic = 1.32471795724474602596
     return (np.arange(1, count + 1)[:, None] * np.array([1 / plastic, 1 / plastic**2])) % 1.0

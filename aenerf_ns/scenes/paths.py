@@ -6,18 +6,24 @@ in a world whose z axis points up; lengths are metres.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 from scipy.special import i0, iv
+
+from aenerf_ns.errors import DataError
 
 Array = NDArray[np.float64]
 
 HARD_SPEED_RATIO = 8.0
 HARD_MEAN_SPEED = float(i0(np.log(HARD_SPEED_RATIO)))
 """Mean of 8 ** sin(2 pi t) over a period: 2.411."""
+
+_TRIES = 200
+_FINE = np.linspace(0, 1, 2001)
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), roll: float = 0.0) -> Array:
@@ -78,39 +84,173 @@ def _room_pose(angle: float, outwards: float, upwards: float, gaze: float) -> Ar
     return look_at(eye, target, roll=0.08 * np.sin(2 * angle + 1.0))
 
 
-def object_path(s: float, turns: float = 4.0, radius: float = 4.0) -> Array:
-    """A spiral from the equator to the pole of a hemisphere around the origin, as Robust e-NeRF's scenes have."""
-    return _hemisphere_pose(2 * np.pi * turns * s, 0.5 * np.pi * s, radius, (0.0, 0.0, 0.0))
+ORIGIN = (0.0, 0.0, 0.0)
 
 
-def object_validation_views(count: int) -> Array:
-    """Views (count, 4, 4) all over the hemisphere, on a golden-angle spiral."""
+def _anywhere(eye: Array) -> bool:
+    return True
+
+
+def object_path(s: float, turns: float = 4.0, radius: float = 4.0, centre: ArrayLike = ORIGIN) -> Array:
+    """A spiral from the equator to the pole of a hemisphere around a point, as Robust e-NeRF's scenes have."""
+    return _hemisphere_pose(2 * np.pi * turns * s, 0.5 * np.pi * s, radius, ORIGIN, centre)
+
+
+def object_validation_views(
+    count: int, radius: float = 4.0, centre: ArrayLike = ORIGIN, is_free: Callable[[Array], bool] = _anywhere
+) -> Array:
+    """Views (count, 4, 4) all over the hemisphere, on a golden-angle spiral.
+
+    Args:
+        count: number of views.
+        radius, centre: of the hemisphere, in metres.
+        is_free: whether a camera may be at a place (3,). A view is turned about the vertical until it may.
+
+    Raises:
+        DataError: a view cannot be placed.
+    """
+
+    def candidates(k: int, z: float) -> Iterator[Array]:
+        for i in range(_TRIES):
+            yield _hemisphere_pose(2.399963 * k + 0.1 * i, np.arcsin(z), radius, ORIGIN, centre)
+
     heights = (np.arange(count) + 0.5) / count
-    return _stack([_hemisphere_pose(2.399963 * k, np.arcsin(z), 4.0, (0.0, 0.0, 0.0)) for k, z in enumerate(heights)])
+    return _stack([_first_free(candidates(k, z), is_free) for k, z in enumerate(heights)])
 
 
-def object_test_views(count: int, seed: int) -> Array:
-    """Random views (count, 4, 4) over the hemisphere, at other distances and off-centre."""
+def object_test_views(
+    count: int,
+    seed: int,
+    radius: float = 4.0,
+    centre: ArrayLike = ORIGIN,
+    is_free: Callable[[Array], bool] = _anywhere,
+) -> Array:
+    """Random views (count, 4, 4) over the hemisphere, at other distances and off-centre: those that `is_free` accepts.
+
+    Raises:
+        DataError: a view cannot be placed.
+    """
     rng = np.random.default_rng(seed)
-    return _stack(
-        [
-            _hemisphere_pose(
+
+    def candidates() -> Iterator[Array]:
+        for _ in range(_TRIES):
+            yield _hemisphere_pose(
                 rng.uniform(0, 2 * np.pi),
                 np.arcsin(rng.uniform(0, 1)),
-                rng.uniform(3.6, 4.4),
-                rng.uniform(-0.15, 0.15, 3),
+                radius / 4.0 * rng.uniform(3.6, 4.4),
+                radius / 4.0 * rng.uniform(-0.15, 0.15, 3),
+                centre,
             )
-            for _ in range(count)
-        ]
-    )
+
+    return _stack([_first_free(candidates(), is_free) for _ in range(count)])
 
 
-def _hemisphere_pose(azimuth: float, elevation: float, radius: float, target: ArrayLike) -> Array:
+def _first_free(candidates: Iterator[Array], is_free: Callable[[Array], bool]) -> Array:
+    for pose in candidates:
+        if is_free(pose[:3, 3]):
+            return pose
+    raise DataError("views around the scene", "no place is free of the mesh", "give its path a larger radius")
+
+
+class WalkPath:
+    """A closed smooth walk through given positions, looking at given targets.
+
+    Both are periodic cubic splines whose parameter is the distance between neighbouring positions, so that the speed
+    hardly varies.
+
+    Args:
+        positions: (N, 3) that the camera passes, N at least 4; it returns to the first.
+        targets: (N, 3) that it looks at there.
+
+    Raises:
+        ValueError: too few points, neighbours in one place, or a gaze that is vertical or has no direction.
+    """
+
+    def __init__(self, positions: ArrayLike, targets: ArrayLike) -> None:
+        eyes, looked_at = np.asarray(positions, np.float64), np.asarray(targets, np.float64)
+        if eyes.ndim != 2 or eyes.shape[1] != 3 or len(eyes) < 4 or eyes.shape != looked_at.shape:
+            raise ValueError(f"positions {eyes.shape} and targets {looked_at.shape} must both be (N, 3), N at least 4")
+        closed = np.concatenate([eyes, eyes[:1]])
+        lengths = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+        if (lengths <= 1e-6 * lengths.max()).any():
+            raise ValueError(f"positions {int(lengths.argmin())} and the next are the same")
+        knots = np.append(0, np.cumsum(lengths)) / lengths.sum()
+        self._eye = CubicSpline(knots, closed, bc_type="periodic")
+        self._target = CubicSpline(knots, np.concatenate([looked_at, looked_at[:1]]), bc_type="periodic")
+        self.size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        """Root mean square distance of the positions from their middle, in metres."""
+        gaze = self._target(_FINE) - self._eye(_FINE)
+        if (np.linalg.norm(gaze[:, :2], axis=1) < 0.02 * np.linalg.norm(gaze, axis=1) + 1e-9).any():
+            raise ValueError("the camera looks straight up or down, or at the place it is in; move the targets")
+
+    def __call__(self, s: float) -> Array:
+        """Pose (4, 4) at a parameter in [0, 1]."""
+        return self._pose(s, np.zeros(3), 0.0)
+
+    def _pose(self, s: float, shift: ArrayLike, gaze: float) -> Array:
+        """The pose displaced by ``shift`` metres (right, up, forward, level), its gaze turned by ``gaze`` radians."""
+        eye, target = self._eye(s % 1.0), self._target(s % 1.0)
+        forward = (target - eye) * [1.0, 1.0, 0.0]
+        forward /= np.linalg.norm(forward)
+        right = np.array([forward[1], -forward[0], 0.0])
+        across, up, along = np.asarray(shift, np.float64)
+        eye = eye + across * right + along * forward + [0.0, 0.0, up]
+        cos, sin = np.cos(gaze), np.sin(gaze)
+        x, y, z = target - eye
+        return look_at(eye, eye + np.array([cos * x - sin * y, sin * x + cos * y, z]))
+
+    def validation_views(self, count: int, is_free: Callable[[Array, Array], bool]) -> Array:
+        """Views (count, 4, 4) spread along the walk, beside, above and below it.
+
+        ``is_free`` tells whether a camera may be at a place (3,) beside the second place, which is on the path; views
+        move towards the path until it may.
+        """
+        return _stack(
+            [
+                self._place(
+                    ((k + 0.5) / count, np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) * (0.8 * self._spread), 0.0),
+                    is_free,
+                )
+                for k in range(count)
+            ]
+        )
+
+    def test_views(self, count: int, seed: int, is_free: Callable[[Array, Array], bool]) -> Array:
+        """Random views (count, 4, 4) around the walk, with gazes of their own; ``is_free`` as above."""
+        rng = np.random.default_rng(seed)
+        return _stack(
+            [
+                self._place(
+                    (rng.uniform(), rng.uniform(-self._spread, self._spread, 3), rng.uniform(-0.5, 0.5)), is_free
+                )
+                for _ in range(count)
+            ]
+        )
+
+    @property
+    def _spread(self) -> float:
+        # That of the built-in room, in proportion.
+        return min(0.13 * self.size, 0.5)
+
+    def _place(self, view: tuple[float, Array, float], is_free: Callable[[Array, Array], bool]) -> Array:
+        s, shift, gaze = view
+        home = self._eye(s % 1.0)
+        for part in np.linspace(1, 0, 11):
+            pose = self._pose(s, part * shift, gaze)
+            if is_free(pose[:3, 3], home):
+                return pose
+        return pose  # on the path itself, which is free
+
+
+def _hemisphere_pose(
+    azimuth: float, elevation: float, radius: float, target: ArrayLike, centre: ArrayLike = ORIGIN
+) -> Array:
+    """``target`` counts from the centre."""
     outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     eye = radius * (np.cos(elevation) * outward + np.sin(elevation) * np.array([0.0, 0.0, 1.0]))
     # The direction of growing elevation is a vertical that stays defined at the pole.
     up = np.cos(elevation) * np.array([0.0, 0.0, 1.0]) - np.sin(elevation) * outward
-    return look_at(eye, target, up)
+    return look_at(eye + np.asarray(centre), np.add(target, centre), up)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,50 @@
+"""Rays against triangles by Embree, through Open3D."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+NOTHING = np.uint32(0xFFFFFFFF)
+"""The triangle a ray hits that hits none."""
+
+
+class RayCaster:
+    """Triangles (F, 3) of vertices (V, 3), which are rounded to float32.
+
+    Rays are float32 (N, 6): origin and direction. Their answers do not depend on the number of threads, which is
+    numba's: the tree is built by one.
+    """
+
+    def __init__(self, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> None:
+        import open3d  # takes seconds to import
+
+        self._tensor = open3d.core.Tensor.from_numpy
+        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(
+            self._tensor(np.ascontiguousarray(vertices, np.float32)),
+            self._tensor(np.ascontiguousarray(faces, np.uint32)),
+        )
+
+    def cast(self, rays: NDArray[np.float32]) -> dict[str, NDArray]:
+        """First hits: ``primitive_ids`` (N,) uint32, `NOTHING` where there is none; ``t_hit`` (N,) in lengths of the
+        direction, inf there; ``primitive_uvs`` (N, 2), barycentric coordinates of the second and third corner."""
+        hits = self._scene.cast_rays(self._tensor(rays), nthreads=numba.get_num_threads())
+        return {name: hits[name].numpy() for name in ("primitive_ids", "t_hit", "primitive_uvs")}
+
+    def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Whether anything lies on the segments (N,) from the origins to origin + direction."""
+        return self._scene.test_occlusions(
+            self._tensor(rays), tnear=0.0, tfar=1.0, nthreads=numba.get_num_threads()
+        ).numpy()
+
+    def all_hits(self, rays: NDArray[np.float32]) -> dict[str, NDArray]:
+        """Every intersection (M,) of every ray: ``ray_ids``, ``primitive_ids`` and ``t_hit``."""
+        hits = self._scene.list_intersections(self._tensor(rays), nthreads=numba.get_num_threads())
+        return {name: hits[name].numpy() for name in ("ray_ids", "primitive_ids", "t_hit")}
+
+    def distance(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Distance (N,) of points (N, 3) from the nearest triangle."""
+        query = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
+        return self._scene.compute_distance(self._tensor(query), nthreads=numba.get_num_threads()).numpy()

@@ -1,0 +1,93 @@
+"""Light from far away: a sky, or a panorama."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from aenerf_ns.errors import DataError
+
+Array = NDArray[np.float64]
+
+_COARSE_ROWS = 32
+_SKY_ROWS = 512
+_BRIGHT = 4.0
+"""What exceeds this multiple of the mean radiance is sampled by itself: the sun, lamps, windows."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Radiance from every direction, as an equirectangular picture.
+
+    The first row is straight up. The middle column lies along +x and columns go on clockwise seen from above: a
+    quarter of the width to the left of it is +y.
+
+    Attributes:
+        radiance: (rows, columns, 3) linear RGB, float32.
+    """
+
+    radiance: NDArray[np.float32]
+
+    def split(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The even part, coarse (at most 32 rows), and the rest, which is small and bright, at full resolution.
+
+        The two add up to the whole: a light that covers a few texels is noise where one samples it like the sky, and
+        the sky would need many samples where one samples it like the sun.
+        """
+        solid_angle = _row_weights(len(self.radiance))[:, None]
+        luminance = self.radiance.mean(axis=-1)
+        mean = float((luminance * solid_angle).sum() / solid_angle.sum() / luminance.shape[1])
+        even = np.minimum(1.0, _BRIGHT * mean / np.maximum(luminance, 1e-12))[..., None] * self.radiance
+        coarse = even
+        while len(coarse) > _COARSE_ROWS and len(coarse) % 2 == 0 and coarse.shape[1] % 2 == 0:
+            weight = _row_weights(len(coarse)).reshape(-1, 2, 1, 1)
+            rows = (coarse.reshape(-1, 2, *coarse.shape[1:]) * weight).sum(axis=1) / weight.sum(axis=1)
+            coarse = 0.5 * (rows[:, 0::2] + rows[:, 1::2])
+        return coarse.astype(np.float32), (self.radiance - even).astype(np.float32)
+
+
+def _row_weights(rows: int) -> Array:
+    """Solid angle (rows,) of each row, up to a factor."""
+    return -np.diff(np.cos(np.pi * np.arange(rows + 1) / rows))
+
+
+def sky(nadir: ArrayLike, zenith: ArrayLike) -> Environment:
+    """A sky that is linear in the cosine between radiances (3,) from straight below and from straight above."""
+    up = 0.5 + 0.5 * np.cos(np.pi * (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS)[:, None]
+    column = (1 - up) * np.asarray(nadir, np.float64) + up * np.asarray(zenith, np.float64)
+    return Environment(np.repeat(column[:, None].astype(np.float32), 2, axis=1))
+
+
+def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -> Environment:
+    """A Radiance .hdr panorama.
+
+    Args:
+        path: the file.
+        turn_degrees: by which it is turned about the vertical, anticlockwise seen from above.
+        gain: factor of its radiance.
+
+    Raises:
+        DataError: the file is missing or no panorama.
+    """
+    import cv2
+
+    if not path.is_file():
+        raise DataError(path, "the environment does not exist", "check the name")
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content[:2].tobytes() == b"#?" else None
+    if picture is None or picture.ndim != 3 or picture.dtype != np.float32:
+        raise DataError(path, "not a Radiance picture", "give an equirectangular .hdr file")
+    rows, columns = picture.shape[:2]
+    if columns != 2 * rows:
+        raise DataError(path, f"{columns} x {rows} pixels", "give an equirectangular .hdr, twice as wide as high")
+    if not np.isfinite(picture).all() or picture.min() < 0 or not 0 < picture.max() * gain < 1e12:
+        raise DataError(path, "radiance that is negative, infinite, or nowhere positive", "give another picture")
+    radiance = gain * picture[..., 2::-1]
+    # Turning it anticlockwise moves what was at +x towards +y: to the left.
+    shift = turn_degrees / 360.0 * columns
+    whole, part = int(np.floor(shift)), shift - np.floor(shift)
+    radiance = (1 - part) * np.roll(radiance, -whole, axis=1) + part * np.roll(radiance, -whole - 1, axis=1)
+    return Environment(np.ascontiguousarray(radiance, np.float32))

@@ -1,0 +1,48 @@
+"""Where a camera may be in a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from aenerf_ns.scenes.embree import RayCaster
+
+_STEPS = 2000
+
+
+class FreeSpace:
+    """The space that keeps a clearance, in metres, from every face."""
+
+    def __init__(self, caster: RayCaster, clearance: float) -> None:
+        self._caster = caster
+        self._clearance = clearance
+
+    def is_free(self, eye: ArrayLike) -> bool:
+        """Whether a place (3,) keeps the clearance."""
+        return bool(self._caster.distance(eye)[0] >= self._clearance)
+
+    def is_reached(self, eye: ArrayLike, home: ArrayLike) -> bool:
+        """Whether a place (3,) keeps the clearance, and sees another: so it is on the same side of all walls."""
+        segment = np.concatenate([np.asarray(home), np.subtract(eye, home)]).astype(np.float32)
+        return self.is_free(eye) and not self._caster.blocked(segment[None])[0]
+
+    def check_path(self, path: Callable[[float], NDArray[np.float64]]) -> None:
+        """Raises a ValueError where a path breaks through a face or comes too close to one."""
+        eyes = np.stack([path(s)[:3, 3] for s in np.linspace(0, 1, _STEPS + 1)]).astype(np.float32)
+        distance = self._caster.distance(eyes)
+        through = self._caster.blocked(np.concatenate([eyes[:-1], np.diff(eyes, axis=0)], axis=1))
+        if through.any():
+            where = int(np.flatnonzero(through)[0])
+            raise ValueError(f"the camera's path runs into the mesh at {_told(eyes[where])}")
+        if distance.min() < self._clearance:
+            where = int(distance.argmin())
+            raise ValueError(
+                f"the camera's path comes within {distance.min():.3f} m of the mesh at {_told(eyes[where])}; "
+                f"it must keep {self._clearance:.3g} m"
+            )
+
+
+def _told(place: NDArray[np.float32]) -> str:
+    return "(" + ", ".join(f"{value:.2f}" for value in place) + ")"

@@ -1,0 +1,239 @@
+"""Triangle meshes with colours and textures, from .glb, .obj and .ply files."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.scenes.polygons import triangulated_obj
+
+Array = NDArray[np.float64]
+
+SUFFIXES = (".glb", ".obj", ".ply")
+UNCOLOURED = 0.5
+"""Albedo of a surface whose file gives it no colour."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the world, z up, in metres once it is `scaled`.
+
+    The colour of a surface point is its texture's times that interpolated between the vertices.
+
+    Attributes:
+        vertices: (V, 3). Not shared between surfaces of different materials or across seams of a texture.
+        faces: (F, 3) vertices, anticlockwise seen from the front.
+        uv: (V, 2) texture coordinates in widths and heights of the texture, from its lower left corner.
+        colour: (V, 3) linear RGB.
+        texture: (F,) index into ``textures``, -1 for none.
+        textures: of linear RGB, float32 (rows, columns, 3), the lowest row first. They repeat.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    uv: Array
+    colour: Array
+    texture: NDArray[np.int64]
+    textures: tuple[NDArray[np.float32], ...]
+
+
+def linear(encoded: NDArray[Any]) -> Array:
+    """Linear radiance of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    encoded = np.asarray(encoded, np.float64)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def load_mesh(path: Path, y_up: bool) -> Mesh:
+    """Read a mesh with all the parts and transforms of its scene.
+
+    Materials are Lambertian and opaque: base colour (a factor, a texture, and colours of vertices or faces), and
+    nothing else. A .ply's and an .obj's vertex colours are sRGB; factors and a .glb's vertex colours are linear.
+
+    Args:
+        path: .glb, .obj (with its .mtl) or .ply.
+        y_up: whether the file's y axis points up, in place of z. It is turned by (x, y, z) -> (x, -z, y).
+
+    Raises:
+        DataError: the file or one it refers to is missing or cannot be read, or there is no surface in it.
+    """
+    import trimesh
+
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise DataError(path, f"unknown kind of mesh {suffix!r}", f"give one of {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise DataError(path, "the file does not exist", "check the name")
+    content = path.read_bytes()
+    if suffix == ".glb":
+        _check_glb(path, content)
+    elif suffix == ".obj":
+        _check_obj(path, content.decode("utf-8", errors="replace"))
+    try:
+        if suffix == ".obj":
+            content = triangulated_obj(content.decode("utf-8", errors="replace")).encode()
+        scene = trimesh.load_scene(
+            BytesIO(content),
+            file_type=suffix[1:],
+            resolver=trimesh.resolvers.FilePathResolver(str(path)),
+            process=False,
+        )
+        nodes = list(scene.graph.nodes_geometry)
+        # Its reader of .obj files makes a part of each material, the last one first.
+        placed = [scene.graph[name] for name in (reversed(nodes) if suffix == ".obj" else nodes)]
+        meshes = [
+            (scene.geometry[name], np.asarray(transform, np.float64))
+            for transform, name in placed
+            if len(getattr(scene.geometry[name], "faces", ()))
+        ]
+    except Exception as error:  # whatever a malformed file makes of the reader
+        raise DataError(path, f"cannot be read ({error})", "export the mesh again") from error
+    if not meshes:
+        raise DataError(path, "there is no surface in it", "give a mesh of triangles, not points or lines")
+    textures: dict[int, tuple[int, NDArray[np.float32]]] = {}
+    parts = [_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in meshes]
+    vertices, faces, uv, colour, texture = zip(*parts, strict=True)
+    first = np.cumsum([0, *map(len, vertices)])
+    world = np.concatenate(vertices)
+    if y_up:
+        world = np.stack([world[:, 0], -world[:, 2], world[:, 1]], axis=1)
+    joined = np.concatenate([part + start for part, start in zip(faces, first, strict=False)])
+    if not np.isfinite(world[joined]).all():
+        raise DataError(path, "vertices that are not finite", "export the mesh again")
+    return Mesh(
+        world,
+        joined,
+        np.concatenate(uv),
+        np.concatenate(colour),
+        np.concatenate(texture),
+        tuple(image for _, image in textures.values()),
+    )
+
+
+def scaled(mesh: Mesh, scale: float) -> Mesh:
+    """The mesh with ``scale`` metres per unit, its vertices rounded as the ray caster will round them."""
+    return replace(mesh, vertices=(scale * mesh.vertices).astype(np.float32).astype(np.float64))
+
+
+def _part(
+    path: Path, mesh: Any, transform: Array, is_gltf: bool, textures: dict[int, tuple[int, NDArray[np.float32]]]
+) -> tuple[Array, NDArray[np.int64], Array, Array, NDArray[np.int64]]:
+    """Vertices, faces, texture coordinates, colours, and the texture of each face; new textures are added."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    if faces.max() >= len(vertices) or faces.min() < 0:
+        raise DataError(path, "a face has a vertex that does not exist", "export the mesh again")
+    visual = mesh.visual
+    uv, index = np.zeros((len(vertices), 2)), -1
+    if visual.kind == "face":
+        # Each face with vertices of its own.
+        vertices, uv = vertices[faces].reshape(-1, 3), np.zeros((3 * len(faces), 2))
+        colour = np.repeat(_colours(visual.face_colors, is_gltf), 3, axis=0)
+        faces = np.arange(3 * len(faces)).reshape(-1, 3)
+    elif visual.kind == "vertex":
+        colour = _colours(visual.vertex_colors, is_gltf)
+    elif visual.kind == "texture":
+        material = visual.material
+        factor, image = _material(material)
+        colour = np.tile(factor, (len(vertices), 1))
+        painted = visual.vertex_attributes.get("color")
+        if painted is not None and len(painted) == len(vertices):
+            colour = colour * _colours(painted, is_gltf)
+        if image is not None and visual.uv is not None and len(visual.uv) == len(vertices):
+            uv = np.asarray(visual.uv, np.float64)[:, :2]
+            if not np.isfinite(uv).all():
+                raise DataError(path, "texture coordinates that are not finite", "export the mesh again")
+            if id(image) not in textures:
+                try:
+                    pixels = np.asarray(image.convert("RGB"))[::-1]
+                except OSError as error:
+                    raise DataError(path, f"a texture cannot be read ({error})", "export the mesh again") from error
+                table = linear(np.arange(256) / 255).astype(np.float32)
+                textures[id(image)] = (len(textures), table[pixels])
+            index = textures[id(image)][0]
+    else:
+        colour = np.full((len(vertices), 3), UNCOLOURED)
+    turned = vertices @ transform[:3, :3].T + transform[:3, 3]
+    if np.linalg.det(transform[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    return turned, faces, uv, colour, np.full(len(faces), index)
+
+
+def _material(material: Any) -> tuple[Array, Any]:
+    """Linear colour factor (3,) and picture or None of a material."""
+    if hasattr(material, "baseColorTexture"):
+        factor = material.baseColorFactor
+        return (np.ones(3) if factor is None else np.asarray(factor)[:3] / 255.0), material.baseColorTexture
+    # The reader rounds what it calls diffuse to 8 bits, and keeps what the file says.
+    image, factor = material.image, (material.kwargs or {}).get("kd")
+    if factor is not None and np.size(factor) == 3:
+        return np.asarray(factor, np.float64), image
+    return np.full(3, UNCOLOURED if image is None else 1.0), image
+
+
+def _colours(values: Any, is_linear: bool) -> Array:
+    """Linear RGB (N, 3) of colours as integers of any width or decimals."""
+    colours = np.asarray(values)[:, :3]
+    if colours.dtype.kind in "iu":
+        colours = colours / float(np.iinfo(colours.dtype).max)
+    colours = np.asarray(colours, np.float64).clip(0, None)
+    return colours if is_linear else linear(colours)
+
+
+def _check_glb(path: Path, content: bytes) -> None:
+    """What the reader would pass over in silence."""
+    try:
+        magic, _, _, length, kind = struct.unpack_from("<4sIII4s", content)
+        header = json.loads(content[20 : 20 + length])
+        if magic != b"glTF" or kind != b"JSON" or not isinstance(header, dict):
+            raise ValueError("no glTF 2.0 header")
+        required = [name for name in header.get("extensionsRequired", []) if not name.startswith("KHR_materials")]
+        textures = [texture for texture in header.get("textures", []) if "source" not in texture]
+        names = [image.get("uri", "data:") for image in header.get("images", [])]
+    except (struct.error, ValueError, AttributeError, TypeError) as error:
+        raise DataError(path, f"not a binary glTF file ({error})", "export the mesh as .glb") from error
+    if required:
+        raise DataError(path, f"needs {', '.join(required)}", "export the mesh without extensions or compression")
+    if textures:
+        raise DataError(path, "textures of an unknown kind", "export the mesh with PNG or JPEG textures")
+    for name in names:
+        if not name.startswith("data:") and not (path.parent / name).is_file():
+            raise DataError(path.parent / name, f"the texture does not exist, and {path.name} needs it", "add it")
+
+
+def _check_obj(path: Path, text: str) -> None:
+    """Every file that an .obj refers to must be there: the reader would leave surfaces grey."""
+    from PIL import Image
+
+    libraries = [line.split(None, 1)[1].strip() for line in text.splitlines() if line.startswith("mtllib ")]
+    if len(libraries) > 1:
+        raise DataError(path, f"{len(libraries)} material files", "join them into one")
+    defined: set[str] = set()
+    for library in libraries:
+        file = path.parent / library
+        if not file.is_file():
+            raise DataError(file, f"the materials do not exist, and {path.name} needs them", "add the file")
+        for line in file.read_text(errors="replace").splitlines():
+            key, _, name = line.strip().partition(" ")
+            name = name.strip()
+            if key == "newmtl":
+                defined.add(name)
+            elif key.lower() == "map_kd":
+                if name.startswith("-"):
+                    raise DataError(file, f"options of a texture ({line.strip()!r})", "apply them in the picture")
+                texture = path.parent / name
+                if not texture.is_file():
+                    raise DataError(texture, f"the texture does not exist, and {file.name} needs it", "add the file")
+                try:
+                    Image.open(texture).close()
+                except OSError as error:
+                    raise DataError(texture, f"not a picture ({error})", "give a PNG or JPEG file") from error
+    used = {line.split(None, 1)[1].strip() for line in text.splitlines() if line.startswith("usemtl ")}
+    if libraries and used - defined:
+        raise DataError(path.parent / libraries[0], f"no material {min(used - defined)!r}", "add it to the file")

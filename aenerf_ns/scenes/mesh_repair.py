@@ -1,0 +1,162 @@
+"""Meshes made fit to be rendered: without degenerate and coincident faces, and cut small enough to carry light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.scenes.embree import RayCaster
+from aenerf_ns.scenes.mesh_loading import Array, Mesh
+
+_RESOLUTION = 4e-6
+"""Distance, in parts of the largest coordinate, below which the ray caster's float32 cannot order two surfaces."""
+_SEPARATION = 8.0
+"""How far coincident surfaces are moved apart, in the same distances."""
+
+
+_POINTS = 60_000
+"""About how many corners large faces are cut into."""
+
+
+def prepared(mesh: Mesh, spacing: float | None = None) -> tuple[Mesh, int]:
+    """A mesh without degenerate, coincident or large faces.
+
+    Args:
+        mesh: as it was read.
+        spacing: longest edge in metres; by default, one that makes some ten thousands of corners of large faces.
+
+    Returns:
+        the mesh, and how many of its faces lay in others.
+
+    Raises:
+        ValueError: no face has an area.
+    """
+    mesh, dropped = without_duplicate_faces(without_degenerate_faces(mesh))
+    if len(mesh.faces) == 0:
+        raise ValueError("no face has an area")
+    if spacing is None:
+        # Halved edges have about 0.7 of that length, and a corner has two equilateral triangles of them.
+        spacing = math.sqrt(2.3 * float(normals_and_areas(mesh)[1].sum()) / _POINTS)
+    small, source = subdivided(mesh, spacing)
+    apart, moved = with_coincident_faces_apart(small, source)
+    return apart, dropped + len(np.unique(source[moved]))
+
+
+def normals_and_areas(mesh: Mesh) -> tuple[Array, Array]:
+    """Unit normals (F, 3), zero where a face is degenerate, and areas (F,)."""
+    a, b, c = mesh.vertices[mesh.faces.T]
+    cross = np.cross(b - a, c - a)
+    norm = np.linalg.norm(cross, axis=1)
+    return cross / np.maximum(norm, 1e-300)[:, None], norm / 2
+
+
+def without_degenerate_faces(mesh: Mesh) -> Mesh:
+    """Drops faces without area: those whose height is lost in float32."""
+    a, b, c = mesh.vertices[mesh.faces.T]
+    longest = np.sqrt(np.maximum.reduce([((p - q) ** 2).sum(1) for p, q in ((a, b), (b, c), (c, a))]))
+    area = normals_and_areas(mesh)[1]
+    keep = 2 * area > np.abs(mesh.vertices).max() * 1e-7 * longest
+    return replace(mesh, faces=mesh.faces[keep], texture=mesh.texture[keep])
+
+
+def position_ids(vertices: Array) -> NDArray[np.int64]:
+    """Number (V,) of each vertex's position: the same for vertices in one place."""
+    keys = np.ascontiguousarray(vertices.astype(np.float32) + np.float32(0))  # -0 is 0
+    words = keys.view(np.uint32).astype(np.uint64)
+    order = np.lexsort(words.T)
+    new = np.append(False, (words[order][1:] != words[order][:-1]).any(axis=1))
+    ids = np.empty(len(vertices), np.int64)
+    ids[order] = np.cumsum(new)
+    return ids
+
+
+def without_duplicate_faces(mesh: Mesh) -> tuple[Mesh, int]:
+    """Of faces with the same corners, in any order, keeps the first; and how many were dropped."""
+    corners = np.sort(position_ids(mesh.vertices)[mesh.faces], axis=1)
+    first = np.sort(np.unique(corners, axis=0, return_index=True)[1])
+    kept = replace(mesh, faces=mesh.faces[first], texture=mesh.texture[first])
+    return kept, len(mesh.faces) - len(first)
+
+
+def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
+    """Halves edges longer than ``spacing``, the longest of a face first (Rivara, 1984); and each face's old number.
+
+    An edge is halved in all its faces or in none, so that no gaps open.
+    """
+    vertices, uv, colour, faces = mesh.vertices, mesh.uv, mesh.colour, mesh.faces
+    source = np.arange(len(faces))
+    while True:
+        corners = vertices[faces]
+        square = ((np.roll(corners, -1, axis=1) - corners) ** 2).sum(axis=-1)
+        longest = square.argmax(axis=1)
+        split = np.flatnonzero(square[np.arange(len(faces)), longest] > spacing * spacing)
+        if len(split) == 0:
+            kept = replace(mesh, vertices=vertices, uv=uv, colour=colour, faces=faces, texture=mesh.texture[source])
+            return kept, source
+        turn = (longest[split, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(faces[split], turn, axis=1).T
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        _, representative, middle = np.unique(low * len(vertices) + high, return_index=True, return_inverse=True)
+        i, j = low[representative], high[representative]
+        middle = len(vertices) + middle.reshape(-1)
+        # Rounded as the ray caster rounds.
+        midpoints = (0.5 * (vertices[i] + vertices[j])).astype(np.float32).astype(np.float64)
+        vertices = np.concatenate([vertices, midpoints])
+        uv = np.concatenate([uv, 0.5 * (uv[i] + uv[j])])
+        colour = np.concatenate([colour, 0.5 * (colour[i] + colour[j])])
+        faces = faces.copy()
+        faces[split] = np.stack([a, middle, c], axis=1)
+        faces = np.concatenate([faces, np.stack([middle, b, c], axis=1)])
+        source = np.concatenate([source, source[split]])
+
+
+def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:
+    """Moves faces that lie in others, overlapping them, a hair behind the ones that come first.
+
+    Which of the two a ray hits would be rounding's choice, another one in each frame.
+
+    Args:
+        order: (F,) the lower comes first.
+
+    Returns:
+        the mesh, and the faces that were moved.
+    """
+    resolution = _RESOLUTION * float(np.abs(mesh.vertices).max())
+    a, b, c = mesh.vertices[mesh.faces.T]
+    normal = normals_and_areas(mesh)[0]
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    above = 16 * resolution
+    depth = np.zeros(len(mesh.faces))
+    shift = np.zeros((len(mesh.faces), 3))
+    # The middle, and points near the corners.
+    for weights in ((1 / 3, 1 / 3, 1 / 3), (0.8, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.1, 0.8)):
+        points = weights[0] * a + weights[1] * b + weights[2] * c
+        # Directions that end just behind the face: farther hits are of no interest, but are listed.
+        rays = np.concatenate([points + above * normal, -above * normal], axis=1).astype(np.float32)
+        for start in range(0, len(rays), 1 << 18):
+            hits = caster.all_hits(rays[start : start + (1 << 18)])
+            one = hits["ray_ids"].astype(np.int64) + start
+            other = hits["primitive_ids"].astype(np.int64)
+            near = (np.abs(hits["t_hit"] - 1) * above < resolution) & (one != other)
+            near &= np.abs((normal[one] * normal[other]).sum(axis=1)) > 0.999
+            near &= order[one] != order[other]
+            one, other = one[near], other[near]
+            later, first = np.where(order[one] > order[other], (one, other), (other, one))
+            np.add.at(depth, later, 1.0)
+            shift[later] = -normal[first]
+    moved = np.flatnonzero(depth)
+    offset = _SEPARATION * resolution * shift[moved]
+    apart = (mesh.vertices[mesh.faces[moved]] + offset[:, None]).reshape(-1, 3).astype(np.float32).astype(np.float64)
+    faces = mesh.faces.copy()
+    faces[moved] = len(mesh.vertices) + np.arange(3 * len(moved)).reshape(-1, 3)
+    copied = mesh.faces[moved].reshape(-1)
+    return replace(
+        mesh,
+        vertices=np.concatenate([mesh.vertices, apart]),
+        uv=np.concatenate([mesh.uv, mesh.uv[copied]]),
+        colour=np.concatenate([mesh.colour, mesh.colour[copied]]),
+        faces=faces,
+    ), moved

@@ -1,0 +1,111 @@
+"""Mip-mapped lookup in pictures of any size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+
+class MipMaps(NamedTuple):
+    """Pictures with their successive halvings, L of them in all, one after the other."""
+
+    texels: NDArray  # (M, 3) uint16 or float32
+    level: NDArray[np.int64]  # (L, 3): first texel, rows and columns
+    first_level: NDArray[np.int64]  # (pictures + 1,)
+
+
+def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
+    """Mip maps of pictures (rows, columns, 3), whose mean every level keeps.
+
+    Args:
+        bits16: values in [0, 1] as 16-bit integers, for half the memory.
+    """
+    texels, level, first_level, start = [], [], [0], 0
+    for picture in pictures:
+        while True:
+            rows, columns = picture.shape[:2]
+            stored = np.rint(picture.clip(0, 1) * 65535).astype(np.uint16) if bits16 else picture.astype(np.float32)
+            texels.append(stored.reshape(-1, 3))
+            level.append((start, rows, columns))
+            start += rows * columns
+            if rows == columns == 1:
+                break
+            picture = _halved(_halved(picture, 0), 1)
+        first_level.append(len(level))
+    return MipMaps(
+        np.concatenate(texels) if texels else np.zeros((0, 3), np.uint16 if bits16 else np.float32),
+        np.array(level, np.int64).reshape(-1, 3),
+        np.array(first_level, np.int64),
+    )
+
+
+def _halved(picture: NDArray[np.floating], axis: int) -> NDArray[np.floating]:
+    """Means over two texels each; over two and a bit where their number is odd."""
+    picture = np.moveaxis(picture, axis, 0)
+    size = len(picture)
+    half = max(1, size // 2)
+    if size == 1:
+        means = picture
+    elif size % 2 == 0:
+        means = 0.5 * (picture[0::2] + picture[1::2])
+    else:
+        total = np.concatenate([np.zeros_like(picture[:1], np.float64), np.cumsum(picture, axis=0, dtype=np.float64)])
+        edge = np.arange(half + 1) * (size / half)
+        i = np.minimum(edge.astype(np.int64), size - 1)
+        part = (edge - i).reshape(-1, *(1,) * (picture.ndim - 1))
+        means = np.diff((1 - part) * total[i] + part * total[i + 1], axis=0) * (half / size)
+    return np.moveaxis(means, 0, axis)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def lookup(maps, picture, u, v, footprint, repeats):
+    """Trilinear value of a picture at (u, v) in its widths and heights.
+
+    ``footprint`` is the side of the region to average, in texels of the finest level. Rows go on beyond their ends from
+    the other side with ``repeats``, and else with the last row; columns always go on.
+    """
+    first, last = maps.first_level[picture], maps.first_level[picture + 1] - 1
+    detail = min(math.log2(max(footprint, 1.0)), float(last - first))
+    base = int(detail)
+    red, green, blue = 0.0, 0.0, 0.0
+    for step in range(2):
+        weight = 1.0 - abs(detail - (base + step))
+        if weight <= 0.0:
+            continue
+        start, rows, columns = maps.level[first + base + step]
+        x, y = (u - math.floor(u)) * columns - 0.5, v * rows - 0.5
+        if repeats:
+            y = (v - math.floor(v)) * rows - 0.5
+        i, j = int(math.floor(x)), int(math.floor(y))
+        fx, fy = x - i, y - j
+        left, right = i, i + 1
+        if left < 0:
+            left = columns - 1
+        if right >= columns:
+            right = 0
+        if repeats:
+            low, high = (rows - 1 if j < 0 else j), (0 if j + 1 >= rows else j + 1)
+        else:
+            low, high = max(0, min(j, rows - 1)), max(0, min(j + 1, rows - 1))
+        low, high = start + low * columns, start + high * columns
+        a, b = weight * (1.0 - fx) * (1.0 - fy), weight * fx * (1.0 - fy)
+        c, d = weight * (1.0 - fx) * fy, weight * fx * fy
+        texels = maps.texels
+        for texel, part in ((low + left, a), (low + right, b), (high + left, c), (high + right, d)):
+            red += part * texels[texel, 0]
+            green += part * texels[texel, 1]
+            blue += part * texels[texel, 2]
+    return red, green, blue
+
+
+@numba.njit(cache=True, error_model="numpy")
+def panorama(maps, dx, dy, dz, footprint):
+    """Value of an equirectangular picture (see `Environment`) in a direction of any length."""
+    turn = math.atan2(dy, dx) / (2.0 * math.pi)
+    down = math.acos(max(-1.0, min(1.0, dz / math.sqrt(dx * dx + dy * dy + dz * dz)))) / math.pi
+    return lookup(maps, 0, 0.5 - turn, down, footprint, False)
