@@ -40,6 +40,8 @@ _FLIP_DEGREES = 90.0
 _MISPLACED_DEGREES = 5.0
 _MISPLACED_EXTENTS = 0.1
 
+_MAX_GAPS_SHOWN = 10
+
 
 @dataclass(frozen=True)
 class EstimatedPoses:
@@ -90,13 +92,15 @@ class EstimatedPoses:
         }
 
     def summary(self) -> str:
-        """One line; a second one names the times that have no pose of their own."""
+        """One line; where frames are lost, a second one that names their times."""
         pieces = f" in the largest of {len(self.model_sizes)} models" if len(self.model_sizes) > 1 else ""
         line = (
             f"COLMAP: {len(self.trajectory)} of {len(self.frame_times)} frames registered{pieces}, {self.num_points} "
             f"points, reprojection error {self.reprojection_error:.2f} px"
         )
         gaps = [f"{start * 1e-9:.3f} to {end * 1e-9:.3f} s ({count})" for start, end, count in self.gaps()]
+        if len(gaps) > _MAX_GAPS_SHOWN:
+            gaps = [*gaps[:_MAX_GAPS_SHOWN], f"and {len(gaps) - _MAX_GAPS_SHOWN} more runs"]
         if gaps:
             line += (
                 f"\nFrames without a pose: {', '.join(gaps)}. Between registered frames poses are interpolated; before "
@@ -249,7 +253,7 @@ class _Workspace:
         import pycolmap
 
         reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
-        reader.camera_model, parameters = _colmap_camera(camera)
+        reader.camera_model, parameters = colmap_camera(camera)
         reader.camera_params = ", ".join(map(repr, parameters))
         extraction.use_gpu, extraction.num_threads = False, 1
         extraction.sift.peak_threshold = _PEAK_THRESHOLD
@@ -335,7 +339,7 @@ def _pairs(num_frames: int) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _colmap_camera(camera: EventCamera) -> tuple[str, Sequence[float]]:
+def colmap_camera(camera: EventCamera) -> tuple[str, Sequence[float]]:
     """COLMAP's name of a lens, and its parameters. Its pixels count from the edge of the image, as here."""
     pinhole = [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
     distortion = [float(value) for value in camera.distortion]

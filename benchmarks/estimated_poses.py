@@ -57,13 +57,13 @@ class EstimatedPoses:
     def main(self) -> None:
         """Measures and writes the figures."""
         settings = {"width": self.width, "height": self.height, "duration": self.duration}
+        where = environment()
+        where["versions"]["pycolmap"] = version("pycolmap")
         rows: list[dict] = []
         for case in self.cases:
             for seed in self.seeds:
                 rows.append(self._measure(*case, seed))
                 print(json.dumps(rows[-1]), flush=True)
-                where = environment()
-                where["versions"]["pycolmap"] = version("pycolmap")
                 self.output.write_text(json.dumps({**settings, "rows": rows, **where}, indent=2) + "\n")
 
     def _measure(self, name: str, speed: Speed, rate: float, exposure: float, seed: int) -> dict:

@@ -21,7 +21,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.image_encoding import decode
 from aenerf_ns.scenes import SimulationScene, built_in_scene
 from aenerf_ns.simulation import Simulation
-from aenerf_ns.structure_from_motion import EstimatedPoses, compare_with_truth, estimate_poses
+from aenerf_ns.structure_from_motion import EstimatedPoses, colmap_camera, compare_with_truth, estimate_poses
 from aenerf_ns.trajectory.alignment import Similarity, align
 from aenerf_ns.trajectory.rotation import rotation_from_vector
 from aenerf_ns.trajectory.trajectory import Trajectory
@@ -101,6 +101,29 @@ def test_unusable_frames_are_told(tmp_path: Path) -> None:
     Image.fromarray(frames[0].astype(np.uint16)).save(tmp_path / "deep.png")
     with pytest.raises(DataError, match=r"deep\.png: the frame is of PIL's mode I;16"):
         estimate_poses([tmp_path / "deep.png"] * 2, [0, 1], camera, "video")
+
+
+@pytest.mark.parametrize(
+    ("lens", "distortion"),
+    [
+        ("radial_tangential", (0.0,) * 5),
+        ("radial_tangential", (-0.3, 0.1, 0.002, -0.001, -0.02)),
+        ("fisheye", (0.05, -0.02, 0.01, -0.003)),
+    ],
+)
+def test_colmap_has_the_same_lens(lens: str, distortion: tuple[float, ...]) -> None:
+    import pycolmap
+
+    camera = EventCamera(80, 60, 70.0, 72.0, 41.0, 29.0, lens, distortion)
+    model, parameters = colmap_camera(camera)
+    colmap = pycolmap.Camera(model=model, width=80, height=60, params=parameters)
+    directions, valid = camera.pixel_directions()
+    assert valid.all()
+    plane = (directions / -directions[..., 2:]).reshape(-1, 3) * [1, -1, -1]
+    columns, rows = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    np.testing.assert_allclose(
+        colmap.img_from_cam(np.ascontiguousarray(plane)), np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("pattern", ["", "RGGB"])
@@ -197,6 +220,10 @@ def test_lost_frames_and_fragments_are_told(truth: torch.Tensor) -> None:
     assert report["model_sizes"] == [5, 3]
     assert "5 of 10 frames registered in the largest of 2 models" in found.summary()
     assert "0.120 to 0.160 s (2)" in found.summary()
+    many = Trajectory(FRAME * np.arange(0, 40, 2), truth[:20])
+    told = dataclasses.replace(found, frame_times=FRAME * np.arange(40), trajectory=many).summary()
+    assert told.count("(1)") == 10
+    assert "and 10 more runs" in told
     whole = dataclasses.replace(found, frame_times=times[[1, 2, 5, 6, 8]], model_sizes=[5])
     assert whole.gaps() == []
     assert "\n" not in whole.summary()
