@@ -25,7 +25,7 @@ from aenerf_ns.progress import progress_bar
 from aenerf_ns.trajectory.alignment import Similarity, align, pose_errors, rotation_angle
 from aenerf_ns.trajectory.trajectory import Trajectory
 
-# Each frame is matched with so many after it, and with those twice, four times, ... as far away,
+# Each frame is matched with so many after it, and with those 16, 32, ... 1024 after it,
 _NEIGHBOURS = 10
 # and so many frames, evenly spread, with each other: without them errors add up along the path, and a loop stays open.
 _KEY_FRAMES = 100
@@ -52,7 +52,7 @@ class EstimatedPoses:
         trajectory: poses of the frames that the largest model places, camera-to-world, OpenCV camera axes, in a world
             of arbitrary position, orientation and scale.
         model_sizes: numbers of frames that the models place, the largest first. More than one model means that the
-            video fell apart into pieces whose relative poses are not known.
+            video fell apart into pieces whose relative poses are not known. COLMAP drops pieces of less than 10 frames.
         num_points: 3D points of the largest model.
         reprojection_error: mean over their observations, in pixels.
         features: median number of features in a frame.
@@ -331,9 +331,8 @@ class _Workspace:
 
 def _pairs(num_frames: int) -> list[tuple[int, int]]:
     """Which frames of a video are matched: the indices, the smaller first."""
-    near = [1 + offset for offset in range(_NEIGHBOURS)]
-    far = [2**power for power in range(num_frames.bit_length()) if _NEIGHBOURS < 2**power <= 2**_NEIGHBOURS]
-    pairs = {(i, i + offset) for offset in near + far for i in range(num_frames - offset)}
+    offsets = [*range(1, _NEIGHBOURS + 1), *(2**power for power in range(4, 11))]
+    pairs = {(i, i + offset) for offset in offsets for i in range(num_frames - offset)}
     keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _KEY_FRAMES))})
     pairs |= {(i, j) for i in keys for j in keys if i < j}
     return sorted(pairs)

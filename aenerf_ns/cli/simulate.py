@@ -148,8 +148,8 @@ class Simulate:
         true_poses = torch.stack([simulation.pose(time)[:3] for time in found.trajectory.times.tolist()])
         # Only the world's position, orientation and scale, which no picture tells, are taken from the truth.
         estimated, errors = compare_with_truth(found.trajectory, true_poses)
-        times = truth.knots_covered_by(estimated)
-        between = pose_errors(estimated.interpolate(times), truth.interpolate(times))
+        knots = truth.knots_covered_by(estimated)
+        between = pose_errors(estimated.interpolate(knots), truth.interpolate(knots))
         CONSOLE.print(
             f"{found.summary()}\nMean errors {errors['rotation_error_degrees']:.2f} degrees and "
             f"{errors['translation_error']:.2g} m at the frames, {between['rotation_error_degrees']:.2f} degrees and "
