@@ -102,11 +102,54 @@ class Simulation:
                 image = self._render(self._scene.path(float(parameter)), _EVENT_SAMPLES)
                 yield EventStream(*self._simulator(image, int(time)), camera.width, camera.height, "simulation")
 
+    def frame_times(self, frame_rate: float, exposure: float) -> NDArray[np.int64]:
+        """Middles of the exposures of a camera that takes frames all along the path, in nanoseconds.
+
+        Args:
+            frame_rate: frames a second.
+            exposure: in seconds; the first frame's begins with the path, and the last frame's ends within it.
+
+        Raises:
+            ValueError: a number is not positive, an exposure takes longer than a frame, or the path is too short for
+                two frames.
+        """
+        if not 0 < frame_rate < np.inf or not 0 < exposure * frame_rate <= 1:
+            raise ValueError(f"{frame_rate} frames a second of {exposure} s each cannot be taken")
+        room = self._profile.duration - exposure
+        if room < 1 / frame_rate:
+            raise ValueError(f"{frame_rate} frames a second are fewer than two in {self._profile.duration:.3f} s")
+        # The last frame of a path of just so many frames must not be lost to rounding.
+        return _nanoseconds(exposure / 2 + np.arange(int(room * frame_rate * (1 + 1e-12)) + 1) / frame_rate)
+
+    def blurred_frame(self, time: int, exposure: float) -> NDArray[np.uint8]:
+        """The sRGB picture (height, width) of a monochrome or (height, width, 3) of a colour sensor with an exposure.
+
+        Light is summed, so the mean over the exposure is that of linear radiance, by the midpoint rule at steps within
+        which the image moves no more than between two frames of the events.
+
+        Args:
+            time: middle of the exposure, in nanoseconds.
+            exposure: in seconds.
+        """
+        middle = time * 1e-9
+        ends = np.interp(
+            [middle - exposure / 2, middle + exposure / 2], self._times * 1e-9, np.arange(len(self._times))
+        )
+        steps = max(int(np.ceil(ends[1] - ends[0])), 1)
+        seconds = middle + exposure * ((np.arange(steps) + 0.5) / steps - 0.5)
+        parameters = self._profile.parameter(seconds).clip(0, 1)
+        radiance = sum(self._render(self._scene.path(float(s)), _EVENT_SAMPLES) for s in parameters) / steps
+        return self._picture(radiance)
+
     def reference_image(self, camera_to_world: NDArray[np.float64] | Tensor) -> NDArray[np.uint8]:
         """The (height, width, 3) sRGB picture from a pose, grey for a monochrome sensor."""
-        radiance = torch.from_numpy(self._render(np.asarray(camera_to_world), _REFERENCE_SAMPLES))
-        seen = to_channels(radiance, self._sensor.num_channels).expand(-1, -1, 3)
-        return (encode(seen, "srgb") * 255).round().to(torch.uint8).numpy()
+        picture = self._picture(self._render(np.asarray(camera_to_world), _REFERENCE_SAMPLES))
+        return picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, -1)
+
+    def _picture(self, radiance: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """The 8-bit sRGB picture (height, width) or (height, width, 3) that the sensor's channels see."""
+        seen = to_channels(torch.from_numpy(radiance), self._sensor.num_channels)
+        return (encode(seen, "srgb") * 255).round().to(torch.uint8).squeeze(-1).numpy()
 
     def _render(self, camera_to_world: NDArray[np.float64], samples: int) -> NDArray[np.float32]:
         camera = self._camera

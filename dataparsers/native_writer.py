@@ -104,6 +104,11 @@ class NativeDatasetWriter:
         if ground_truth is not None:
             write_tum_trajectory(self._partial / "trajectory_ground_truth.txt", ground_truth)
 
+    def add_poses_report(self, report: dict[str, Any]) -> None:
+        """Writes how the estimated trajectory was made and what is known of its errors. Nothing reads it but people."""
+        text = json.dumps(report, indent=2)
+        (self._partial / "poses_report.json").write_text(text + "\n", encoding="utf-8")
+
     def add_image(
         self, split: Split, image: NDArray[np.uint8], camera_to_world: Tensor, time: int | None = None
     ) -> None:

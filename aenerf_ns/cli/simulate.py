@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,8 +16,10 @@ from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.scenes import open_scene
 from aenerf_ns.simulation import Simulation
+from aenerf_ns.structure_from_motion import compare_with_truth, estimate_poses
+from aenerf_ns.trajectory.alignment import pose_errors
 from aenerf_ns.trajectory.noise import perturb
-from aenerf_ns.trajectory.trajectory import homogeneous
+from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
 
 @dataclass
@@ -38,7 +40,14 @@ class Simulate:
     duration: float = 4.0
     """Seconds that the path takes at constant speed."""
     pose_rate: float = 250.0
-    """Poses a second in the trajectories."""
+    """Poses a second in the trajectories; with --poses colmap, in the true one."""
+    poses: Literal["noise", "colmap"] = "noise"
+    """Where the estimated poses come from: the true ones with noise, or COLMAP run on the frames of a camera beside the
+    event sensor, as in a DAVIS. COLMAP gives a pose a frame, and may lose or misplace some."""
+    frame_rate: float = 25.0
+    """Frames a second that COLMAP gets."""
+    exposure: float = 0.003
+    """Seconds for which a frame is exposed, and blurred by motion."""
     pose_noise_degrees: float = 0.0
     """Error of the estimated rotations: root mean square of its angle, in degrees."""
     pose_noise_translation: float = 0.0
@@ -97,22 +106,20 @@ class Simulate:
                 self.seed,
             )
             truth = simulation.trajectory(self.pose_rate)
-            estimated = perturb(
-                truth,
-                self.pose_noise_degrees,
-                self.pose_noise_translation,
-                self.pose_noise_correlation_time,
-                self.seed,
-            )
+            estimated, report = self._estimate(simulation, camera, truth)
+        except DataError:
+            raise
         except ValueError as error:
             raise DataError("aenerf simulate", str(error), "see aenerf simulate --help") from error
         num_events = 0
         with NativeDatasetWriter(self.output, camera, sensor, "srgb", scene.aabb) as writer:
             writer.add_trajectories(estimated, truth)
+            if report is not None:
+                writer.add_poses_report(report)
             for events in simulation.events():
                 writer.events.append(events)
                 num_events += len(events)
-            for time in np.linspace(truth.start, truth.end, self.train_images, dtype=np.int64).tolist():
+            for time in np.linspace(estimated.start, estimated.end, self.train_images, dtype=np.int64).tolist():
                 # The picture shows what is true; the pose beside it is what the user of the dataset is given.
                 pose = homogeneous(estimated.interpolate(time))
                 writer.add_image("train", simulation.reference_image(simulation.pose(time)), pose, time)
@@ -122,7 +129,37 @@ class Simulate:
                 writer.add_image("test", simulation.reference_image(pose), pose)
         seconds = (truth.end - truth.start) * 1e-9
         CONSOLE.print(
-            f"{self.output}: {num_events:,} events in {seconds:.2f} s, {len(truth)} poses, {self.train_images} train, "
-            f"{self.validation_views} validation and {self.test_views} test images.\n"
+            f"{self.output}: {num_events:,} events in {seconds:.2f} s, {len(estimated)} poses, {self.train_images} "
+            f"train, {self.validation_views} validation and {self.test_views} test images.\n"
             f"Train with: ns-train aenerf --data {self.output}"
         )
+
+    def _estimate(
+        self, simulation: Simulation, camera: EventCamera, truth: Trajectory
+    ) -> tuple[Trajectory, dict[str, Any] | None]:
+        """The estimated trajectory, and where structure from motion was run, what it says of itself."""
+        noise = (self.pose_noise_degrees, self.pose_noise_translation)
+        if self.poses == "noise":
+            return perturb(truth, *noise, self.pose_noise_correlation_time, self.seed), None
+        if any(noise):
+            raise DataError(
+                "aenerf simulate",
+                f"pose noise {noise} with --poses colmap",
+                "leave it out: COLMAP errs by itself",
+            )
+        times = simulation.frame_times(self.frame_rate, self.exposure)
+        frames = (simulation.blurred_frame(int(time), self.exposure) for time in times)
+        found = estimate_poses(frames, times, camera, "frames of aenerf simulate", self.seed)
+        true_poses = torch.stack([simulation.pose(time)[:3] for time in found.trajectory.times.tolist()])
+        # Only the world's position, orientation and scale, which no picture tells, are taken from the truth.
+        estimated, errors = compare_with_truth(found.trajectory, true_poses)
+        knots = truth.knots_covered_by(estimated)
+        between = pose_errors(estimated.interpolate(knots), truth.interpolate(knots))
+        CONSOLE.print(
+            f"{found.summary()}\nMean errors {errors['rotation_error_degrees']:.2f} degrees and "
+            f"{errors['translation_error']:.2g} m at the frames, {between['rotation_error_degrees']:.2f} degrees and "
+            f"{between['translation_error']:.2g} m interpolated between them; {errors['misplaced_frames']} frames "
+            f"misplaced, {errors['flipped_frames']} of them flipped."
+        )
+        settings = {"frame_rate": self.frame_rate, "exposure_seconds": self.exposure}
+        return estimated, {**settings, **found.report(), "errors": errors, "errors_between_frames": between}

@@ -1,0 +1,349 @@
+"""Camera poses from the frames of a video, by COLMAP."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import statistics
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from rich.progress import Progress
+from torch import Tensor
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.trajectory.alignment import Similarity, align, pose_errors, rotation_angle
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+# Each frame is matched with so many after it, and with those 16, 32, ... 1024 after it,
+_NEIGHBOURS = 10
+# and so many frames, evenly spread, with each other: without them errors add up along the path, and a loop stays open.
+_KEY_FRAMES = 100
+
+# COLMAP's own limits are made for photographs of many megapixels. These are for frames of a fraction of one.
+_PEAK_THRESHOLD = 0.004
+_MIN_POSE_INLIERS = 15
+_MIN_INITIAL_INLIERS = 50
+
+# A camera that is off by more than this was not estimated badly but put elsewhere.
+_FLIP_DEGREES = 90.0
+_MISPLACED_DEGREES = 5.0
+_MISPLACED_EXTENTS = 0.1
+
+_MAX_GAPS_SHOWN = 10
+
+
+@dataclass(frozen=True)
+class EstimatedPoses:
+    """What structure from motion makes of a video.
+
+    Attributes:
+        frame_times: (N,) times of all frames in nanoseconds.
+        trajectory: poses of the frames that the largest model places, camera-to-world, OpenCV camera axes, in a world
+            of arbitrary position, orientation and scale.
+        model_sizes: numbers of frames that the models place, the largest first. More than one model means that the
+            video fell apart into pieces whose relative poses are not known. COLMAP drops pieces of less than 10 frames.
+        num_points: 3D points of the largest model.
+        reprojection_error: mean over their observations, in pixels.
+        features: median number of features in a frame.
+        seconds: how long it took.
+    """
+
+    frame_times: NDArray[np.int64]
+    trajectory: Trajectory
+    model_sizes: list[int]
+    num_points: int
+    reprojection_error: float
+    features: float
+    seconds: float
+
+    def gaps(self) -> list[tuple[int, int, int]]:
+        """First time, last time (nanoseconds) and number of frames of every run of frames without a pose."""
+        lost = ~np.isin(self.frame_times, self.trajectory.times.numpy())
+        edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
+        return [
+            (int(self.frame_times[first]), int(self.frame_times[end - 1]), int(end - first))
+            for first, end in zip(edges[::2], edges[1::2], strict=True)
+        ]
+
+    def report(self) -> dict[str, Any]:
+        """The figures, for JSON."""
+        registered, frames = len(self.trajectory), len(self.frame_times)
+        return {
+            "frames": frames,
+            "registered_frames": registered,
+            "registered_fraction": registered / frames,
+            "model_sizes": self.model_sizes,
+            "gaps": [{"start_ns": start, "end_ns": end, "frames": count} for start, end, count in self.gaps()],
+            "points": self.num_points,
+            "mean_reprojection_error_pixels": self.reprojection_error,
+            "median_features": self.features,
+            "seconds": self.seconds,
+        }
+
+    def summary(self) -> str:
+        """One line; where frames are lost, a second one that names their times."""
+        pieces = f" in the largest of {len(self.model_sizes)} models" if len(self.model_sizes) > 1 else ""
+        line = (
+            f"COLMAP: {len(self.trajectory)} of {len(self.frame_times)} frames registered{pieces}, {self.num_points} "
+            f"points, reprojection error {self.reprojection_error:.2f} px"
+        )
+        gaps = [f"{start * 1e-9:.3f} to {end * 1e-9:.3f} s ({count})" for start, end, count in self.gaps()]
+        if len(gaps) > _MAX_GAPS_SHOWN:
+            gaps = [*gaps[:_MAX_GAPS_SHOWN], f"and {len(gaps) - _MAX_GAPS_SHOWN} more runs"]
+        if gaps:
+            line += (
+                f"\nFrames without a pose: {', '.join(gaps)}. Between registered frames poses are interpolated; before "
+                "the first and after the last events are not used."
+            )
+        return line
+
+
+def estimate_poses(
+    frames: Iterable[Path | NDArray[np.uint8]],
+    times: ArrayLike,
+    camera: EventCamera,
+    source: str | Path,
+    seed: int = 0,
+) -> EstimatedPoses:
+    """Runs COLMAP's incremental structure from motion on a video, on the CPU.
+
+    Intrinsics and distortion stay as given. Every frame is matched with its neighbours, and a hundred frames with each
+    other. On one thread: COLMAP's results depend on the order in which threads end, and so a seed gives the same poses
+    again, to the last bit on one machine with one version of COLMAP.
+
+    Args:
+        frames: (height, width) grey or (height, width, 3) RGB arrays, or files that hold such pictures, in the order of
+            time.
+        times: (N,) times in nanoseconds, increasing.
+        camera: the lens of the frames.
+        source: where they came from, for messages.
+        seed: of COLMAP's random samples.
+
+    Raises:
+        DataError: there are fewer than two frames, a frame is of another size than the camera, the times do not
+            increase, or COLMAP places no frames.
+    """
+    times = np.asarray(times, np.int64)
+    if len(times) < 2:
+        raise DataError(source, f"{len(times)} frames", "poses can be estimated from two and more")
+    if (np.diff(times) <= 0).any():
+        index = int(np.argmax(np.diff(times) <= 0)) + 1
+        raise DataError(source, f"frame {index} is not after the one ahead of it", "sort the frames by time")
+    begin = time.perf_counter()
+    with TemporaryDirectory() as folder, progress_bar() as progress:
+        workspace = _Workspace(Path(folder), len(times), seed, progress)
+        workspace.add_frames(frames, camera, source)
+        workspace.find_features(camera)
+        workspace.match()
+        models = workspace.reconstruct()
+        features, pairs = workspace.num_features(), workspace.num_matched_pairs()
+    if not models:
+        raise DataError(
+            source,
+            f"COLMAP places none of {len(times)} frames of {features:.0f} features (median), of which {pairs} pairs "
+            "match",
+            "it needs a moving camera and sharp, textured frames: a shorter exposure, a higher frame rate, more pixels",
+        )
+    model = models[0]
+    poses = {
+        int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
+        for image in model.images.values()
+        if image.has_pose
+    }
+    indices = sorted(poses)
+    return EstimatedPoses(
+        frame_times=times,
+        trajectory=Trajectory(times[indices], torch.from_numpy(np.stack([poses[i] for i in indices])), source),
+        model_sizes=[model.num_reg_images() for model in models],
+        num_points=model.num_points3D(),
+        reprojection_error=model.compute_mean_reprojection_error(),
+        features=features,
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory, dict[str, float]]:
+    """Maps estimated poses to the true world by one Sim(3), and tells their errors.
+
+    Only position, orientation and scale of the whole world are taken from the truth. The similarity is that of
+    positions and orientations (:func:`~aenerf_ns.trajectory.alignment.align`) of the frames that agree with most
+    others, so that a few misplaced ones do not turn the world away from the rest. All are mapped and none is removed.
+
+    Args:
+        estimated: the estimated poses.
+        truth: (N, 3, 4) true poses at the same times, with the same camera axes.
+
+    Returns:
+        The mapped trajectory, and its errors in the units of the truth: those of
+        :func:`~aenerf_ns.trajectory.alignment.pose_errors`, which aligns all frames; and without another alignment the
+        medians and maxima of rotation and translation error, the ``extent`` (root mean square distance of the true
+        positions from their mean), the number of ``misplaced_frames``, off by more than 5 degrees or a tenth of the
+        extent, and of ``flipped_frames`` among them, by more than 90 degrees.
+    """
+    poses, truth = estimated.camera_to_worlds, truth.double()
+    extent = Trajectory(estimated.times, truth).extent
+    aligned = _majority(poses, truth)(poses)
+    degrees = torch.rad2deg(rotation_angle(aligned, truth))
+    distances = (aligned - truth)[..., 3].norm(dim=-1)
+    misplaced = (degrees > _MISPLACED_DEGREES) | (distances > _MISPLACED_EXTENTS * extent)
+    return Trajectory(estimated.times, aligned, estimated.source), {
+        **pose_errors(aligned, truth),
+        "median_rotation_error_degrees": float(degrees.median()),
+        "median_translation_error": float(distances.median()),
+        "largest_rotation_error_degrees": float(degrees.max()),
+        "largest_translation_error": float(distances.max()),
+        "extent": extent,
+        "misplaced_frames": int(misplaced.sum()),
+        "flipped_frames": int((degrees > _FLIP_DEGREES).sum()),
+    }
+
+
+def _majority(poses: Tensor, truth: Tensor) -> Similarity:
+    """The alignment of those frames that turn the world alike, if they are most."""
+    # Each frame alone tells how the world is turned.
+    turns = truth[..., :3] @ poses[..., :3].mT
+    degrees = torch.rad2deg(torch.stack([rotation_angle(turns, turn.expand_as(turns)) for turn in turns]))
+    agree = degrees[degrees.median(1).values.argmin()] <= _MISPLACED_DEGREES
+    if 2 * agree.sum() <= len(poses):
+        return align(poses, truth)
+    return align(poses[agree], truth[agree])
+
+
+class _Workspace:
+    """COLMAP's database and images in a folder, and its steps."""
+
+    def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
+        self._images, self._database = folder / "images", folder / "database.db"
+        self._output, self._pairs = folder / "models", folder / "pairs.txt"
+        self._images.mkdir()
+        self._output.mkdir()
+        self._names = [f"{index:08d}.png" for index in range(num_frames)]
+        self._seed = seed
+        self._progress = progress
+
+    def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], camera: EventCamera, source: str | Path) -> None:
+        """Writes the frames as COLMAP reads them."""
+        named = zip(self._names, frames, strict=True)
+        for name, frame in self._progress.track(named, total=len(self._names), description="Collecting frames"):
+            with Image.open(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
+                origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
+                if image.size != (camera.width, camera.height):
+                    raise DataError(
+                        origin,
+                        f"the frame has {image.width} x {image.height} pixels, its camera {camera.width} x "
+                        f"{camera.height}",
+                        "give the intrinsics of the frames as they are",
+                    )
+                if image.mode not in ("L", "RGB", "RGBA"):
+                    raise DataError(origin, f"the frame is of PIL's mode {image.mode}", "store 8 bits of grey or RGB")
+                image.convert("L" if image.mode == "L" else "RGB").save(self._images / name)
+
+    def find_features(self, camera: EventCamera) -> None:
+        import pycolmap
+
+        reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+        reader.camera_model, parameters = colmap_camera(camera)
+        reader.camera_params = ", ".join(map(repr, parameters))
+        extraction.use_gpu, extraction.num_threads = False, 1
+        extraction.sift.peak_threshold = _PEAK_THRESHOLD
+        with self._step("Finding features"):
+            pycolmap.extract_features(
+                self._database,
+                self._images,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
+
+    def match(self) -> None:
+        import pycolmap
+
+        pairs = [f"{self._names[i]} {self._names[j]}" for i, j in _pairs(len(self._names))]
+        self._pairs.write_text("\n".join(pairs), encoding="utf-8")
+        matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
+        verification = pycolmap.TwoViewGeometryOptions()
+        matching.use_gpu, matching.num_threads = False, 1
+        pairing.match_list_path = self._pairs
+        verification.ransac.random_seed = self._seed
+        with self._step("Matching frames"):
+            pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
+
+    def reconstruct(self) -> list[Any]:
+        """The models, the one that places most frames first."""
+        import pycolmap
+
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self._seed
+        options.num_threads = options.mapper.num_threads = 1
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        options.mapper.abs_pose_min_num_inliers = _MIN_POSE_INLIERS
+        options.mapper.init_min_num_inliers = _MIN_INITIAL_INLIERS
+        options.extract_colors = False
+        with self._step("Placing frames", len(self._names)) as placed:
+            models = pycolmap.incremental_mapping(
+                self._database,
+                self._images,
+                self._output,
+                options,
+                next_image_callback=lambda: self._progress.advance(placed),
+            )
+        return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+    def num_features(self) -> float:
+        """Median over the frames."""
+        rows = [rows for (rows,) in self._query("SELECT rows FROM keypoints")]
+        return statistics.median(rows) if rows else 0.0
+
+    def num_matched_pairs(self) -> int:
+        return int(self._query("SELECT count(*) FROM two_view_geometries WHERE rows > 0")[0][0])
+
+    def _query(self, sql: str) -> list[tuple]:
+        with contextlib.closing(sqlite3.connect(self._database)) as database:
+            return database.execute(sql).fetchall()
+
+    @contextlib.contextmanager
+    def _step(self, description: str, total: int | None = None) -> Iterator[Any]:
+        """Shows a step of COLMAP's, and keeps its log off the console."""
+        import pycolmap
+
+        level = pycolmap.logging.minloglevel
+        pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+        task = self._progress.add_task(description, total=total)
+        try:
+            yield task
+        finally:
+            pycolmap.logging.minloglevel = level
+            self._progress.update(task, total=len(self._names), completed=len(self._names))
+
+
+def _pairs(num_frames: int) -> list[tuple[int, int]]:
+    """Which frames of a video are matched: the indices, the smaller first."""
+    offsets = [*range(1, _NEIGHBOURS + 1), *(2**power for power in range(4, 11))]
+    pairs = {(i, i + offset) for offset in offsets for i in range(num_frames - offset)}
+    keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _KEY_FRAMES))})
+    pairs |= {(i, j) for i in keys for j in keys if i < j}
+    return sorted(pairs)
+
+
+def colmap_camera(camera: EventCamera) -> tuple[str, Sequence[float]]:
+    """COLMAP's name of a lens, and its parameters. Its pixels count from the edge of the image, as here."""
+    pinhole = [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    distortion = [float(value) for value in camera.distortion]
+    if camera.lens_model == "fisheye":
+        return "OPENCV_FISHEYE", pinhole + distortion
+    if not any(distortion):
+        return "PINHOLE", pinhole
+    return "FULL_OPENCV", [*pinhole, *distortion, 0.0, 0.0, 0.0]
