@@ -11,7 +11,7 @@ import tarfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -79,10 +79,7 @@ def fetch(package: Package, folder: Path) -> Path:
             raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
         if not file.is_file():
             raise DataError(file, f"{package.command[0]} saved it under another name", by_hand)
-    with file.open("rb") as stream:
-        found = hashlib.file_digest(stream, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else ""
-    if not found:  # Python 3.10
-        found = hashlib.sha256(file.read_bytes()).hexdigest()
+    found = hashlib.sha256(file.read_bytes()).hexdigest()
     if found != package.sha256:
         raise DataError(file, f"sha256 {found}, not the pinned {package.sha256}", f"remove it, then {by_hand}")
     return file
@@ -99,7 +96,7 @@ class Library:
         self.folder = folder
         self.credits: dict[str, dict[str, str]] = {}
 
-    @lru_cache(maxsize=None)  # noqa: B019 one library lives as long as the command
+    @cache  # noqa: B019 one library lives as long as the command
     def _furniture(self) -> Path:
         """Folder of the CC0 furniture, unpacked."""
         package = fetch(FURNITURE, self.folder)
@@ -110,13 +107,15 @@ class Library:
             try:
                 subprocess.run(("dpkg-deb", "-x", package, raw), check=True, capture_output=True, text=True)
             except (FileNotFoundError, subprocess.CalledProcessError) as error:
-                raise DataError(package, f"cannot be unpacked by dpkg-deb ({error})", "install Debian's dpkg") from error
+                raise DataError(
+                    package, f"cannot be unpacked by dpkg-deb ({error})", "install Debian's dpkg"
+                ) from error
             with zipfile.ZipFile(raw / _FURNITURE_FILE) as archive:
                 archive.extractall(target)
             shutil.rmtree(raw)
         return target
 
-    @lru_cache(maxsize=None)  # noqa: B019
+    @cache  # noqa: B019
     def _catalogue(self) -> dict[str, dict[str, str]]:
         """Entries of the furniture's catalogue by model name."""
         entries: dict[str, dict[str, str]] = {}
@@ -138,12 +137,16 @@ class Library:
             dress: other materials by the name of those they replace; None leaves the faces out.
 
         Raises:
-            DataError: on a model that the package lacks.
+            DataError: on a model that the package lacks, or whose own licence is another one than the package says: a few
+                of its CC0 file are CC BY.
         """
         entry = self._catalogue().get(name)
         if entry is None:
             raise DataError(name, f"no such model in {FURNITURE.file}", "name one of its folders")
         path = self._furniture() / entry["model"].lstrip("/")
+        for licence in path.parent.glob("*[Ll][Ii][Cc][Ee][Nn]*"):
+            if "Creative Commons Zero" not in licence.read_text(errors="replace"):
+                raise DataError(licence, f"{name} is not under {_LICENCE}", "use another model")
         dress = dress or {}
 
         def surface(material: str, colour: tuple[float, float, float], picture: Path | None) -> Material | None:
@@ -197,7 +200,7 @@ def coloured(name: str, colour: tuple[float, float, float], pattern: str = "plai
     return paint(name, generator, hexadecimal, *options, size=128)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _photograph(name: str, path: Path) -> Material:
     """A material of a picture file, its sides powers of two, its albedo within the range of the other textures."""
     with Image.open(path) as picture:

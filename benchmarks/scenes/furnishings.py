@@ -36,7 +36,10 @@ def podium(radius: float, height: float, top: Material, side: Material, tile: fl
 def books(width: float, depth: float, height: float, seed: int, fill: float = 1.0) -> Model:
     """A row of books that stands on z = 0, from x = 0 to at most ``fill`` of the width, its spines at y = 0."""
     rng = np.random.default_rng(seed)
-    spine, cover = paint("book spine", tx.book_spine, size=128), paint("book cover", tx.mottled, ["9a968c", "b0aca2"], size=64)
+    spine, cover = (
+        paint("book spine", tx.book_spine, size=128),
+        paint("book cover", tx.mottled, ["9a968c", "b0aca2"], size=64),
+    )
     pages = paint("pages", tx.mottled, ["cbbf9f", "d8cfb4"], 0.1, size=64)
     row, x = [], 0.0
     while True:
@@ -59,7 +62,9 @@ def bookcase(
     thick, top = 0.025, levels[-1]
     sides = np.linspace(-width / 2, width / 2 - thick, columns + 1)
     parts = [box((x, -depth / 2, 0), (x + thick, depth / 2, top), wood) for x in sides]
-    parts.append(box((-width / 2 + thick, depth / 2 - 0.012, 0.001), (width / 2 - thick, depth / 2 - 0.001, top - 0.001), wood))
+    parts.append(
+        box((-width / 2 + thick, depth / 2 - 0.012, 0.001), (width / 2 - thick, depth / 2 - 0.001, top - 0.001), wood)
+    )
     for k, level in enumerate(levels):
         for column, (low, high) in enumerate(zip(sides[:-1] + thick, sides[1:], strict=True)):
             parts.append(box((low, -depth / 2 + 0.004, level - thick), (high, depth / 2 - 0.012, level), wood))
@@ -127,9 +132,14 @@ def window(width: float, height: float, material: Material, columns: int = 2, ro
 
 
 def room(
-    low: tuple[float, float], high: tuple[float, float], height: float, walls: Sequence[Model], floor: Model, ceiling: Model
+    low: tuple[float, float],
+    high: tuple[float, float],
+    height: float,
+    walls: Sequence[Model],
+    floor: Model,
+    ceiling: Model,
 ) -> Model:
-    """Walls as `wall` makes them, for the far (+y), right (+x), near (-y) and left (-x) side, floor and ceiling from 0."""
+    """Walls as `wall` makes them, in the order far (+y), right (+x), near (-y), left (-x); floor and ceiling from 0."""
     (x0, y0), (x1, y1) = low, high
     far, right, near, left = walls
     return join(

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 _LARGE = 0.02
 """Longest side, in metres, up to which a triangle is looked at in its middle only."""
 
+
 @dataclass(frozen=True, eq=False)
 class Material:
     """A Lambertian surface.
@@ -98,9 +99,7 @@ class Model:
 
     def inside_out(self) -> Model:
         """With the other side of its faces in front."""
-        return Model(
-            tuple(replace(part, points=part.points[:, ::-1], uv=part.uv[:, ::-1]) for part in self.parts)
-        )
+        return Model(tuple(replace(part, points=part.points[:, ::-1], uv=part.uv[:, ::-1]) for part in self.parts))
 
     def height_under(self, x: float, y: float, below: float = np.inf) -> float:
         """z of the highest surface at (x, y) that lies below a height.
@@ -125,7 +124,9 @@ class Model:
         return self + model.standing().moved((x, y, self.height_under(x, y, below)), turn_degrees)
 
 
-def paint(name: str, generator: Callable[..., Texture], *arguments: object, size: int = 256, **options: object) -> Material:
+def paint(
+    name: str, generator: Callable[..., Texture], *arguments: object, size: int = 256, **options: object
+) -> Material:
     """A material of a generated texture (see aenerf_ns.scenes.textures). Its name is the seed of its pattern."""
     texture = generator(size, np.random.default_rng(zlib.crc32(name.encode())), *arguments, **options)
     return Material(name, srgb_picture(texture)[::-1])
@@ -155,7 +156,7 @@ def srgb_picture(value: ArrayLike) -> NDArray[np.uint8]:
 
 
 def rectangle(origin: ArrayLike, u: ArrayLike, v: ArrayLike, material: Material, tile: float | None = None) -> Model:
-    """A parallelogram seen from the side of u x v. The texture repeats every ``tile`` metres; None: it fills it once."""
+    """A parallelogram seen from the side of u x v. The texture repeats every ``tile`` metres, or fills it once."""
     origin, u, v = (np.asarray(value, np.float64) for value in (origin, u, v))
     repeats = (1.0, 1.0) if tile is None else (np.linalg.norm(u) / tile, np.linalg.norm(v) / tile)
     corner = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])[[[0, 1, 2], [0, 2, 3]]]
@@ -301,7 +302,9 @@ def read_obj(
         if triangles:
             part = _without_degenerate(Part(np.array(triangles), np.array(corner_uv), material))
             bare = np.isnan(part.uv).any(axis=(1, 2)) | (entry.picture is None)
-            parts.append(replace(part, uv=np.where(bare[:, None, None], _plane_coordinates(part.points) / tile, part.uv)))
+            parts.append(
+                replace(part, uv=np.where(bare[:, None, None], _plane_coordinates(part.points) / tile, part.uv))
+            )
     return Model(tuple(parts))
 
 

@@ -16,7 +16,9 @@ def piano(library: Library) -> Model:
     boards = paint("parquet", tx.planks, ["8f6a45", "a98258", "c09a6e"], rows=6)
     scene = podium(1.3, 0.12, boards, mahogany)
     scene += library.model("pianoAQueue", "wood", {"black": mahogany}).moved((0, 0.25, 0))
-    bench = library.model("pianoBench", "wood", {"Glossy_Coating": walnut(), "Matte_Coating": walnut(), "Leather": cloth})
+    bench = library.model(
+        "pianoBench", "wood", {"Glossy_Coating": walnut(), "Matte_Coating": walnut(), "Leather": cloth}
+    )
     scene += bench.moved((0, -0.92, 0))
     scene = scene.with_dropped(library.model("teddyBear"), 0.05, -0.92, 165)
     scene += library.model("electricGuitar").moved((0.85, -0.55, 0), -30)
@@ -30,9 +32,10 @@ def bookshelf(library: Library) -> Model:
     scene = podium(1.15, 0.1, boards, walnut())
     case = bookcase(1.5, 0.34, (0.12, 0.52, 0.9, 1.26, 1.6), oak(), 7, fill=0.72)
     scene += case.moved((0, 0.45, 0))
-    for x, kind in ((-0.36, (tx.landscape, ["d9cdb0", "a9bccf"], ["8f9a8a", "6f7f5f", "4f6448"])), (0.36, (tx.abstract, "d0c6ae", ["b5623f", "4f6f8f", "c9b58f"]))):
-        picture = framed_picture(0.5, 0.8, paint(f"picture at {x}", *kind, size=512), walnut())
-        scene += picture.moved((x, 0.62, 1.05), 180)
+    landscape = paint("shelf landscape", tx.landscape, ["d9cdb0", "a9bccf"], ["8f9a8a", "6f7f5f", "4f6448"], size=512)
+    shapes = paint("shelf shapes", tx.abstract, "d0c6ae", ["b5623f", "4f6f8f", "c9b58f"], size=512)
+    for x, canvas in ((-0.36, landscape), (0.36, shapes)):
+        scene += framed_picture(0.5, 0.8, canvas, walnut()).moved((x, 0.62, 1.05), 180)
     for name, x, below, turn in (
         ("cactus", 0.62, 0.9, 0),
         ("cartoon_biplane", 0.62, 1.25, -30),
@@ -92,7 +95,9 @@ def breakfast(library: Library) -> Model:
     china = paint("china", tx.mottled, ["d8d6cf", "e2e0da", "e9e7e1"], 0.03)
     scene = box((-0.46, -0.36, -0.04), (0.46, 0.36, 0), walnut(), 0.3)
     scene += box((-0.42, -0.32, 0), (0.42, 0.32, 0.004), cloth, 0.3, without="z")
-    plate = revolved([(0.06, 0), (0.115, 0.014), (0.11, 0.018), (0.06, 0.008)], china, 0.1) + disc(0.06, 0.008, china, 0.1)
+    plate = revolved([(0.06, 0), (0.115, 0.014), (0.11, 0.018), (0.06, 0.008)], china, 0.1) + disc(
+        0.06, 0.008, china, 0.1
+    )
     for x, y in ((-0.24, -0.17), (0.06, -0.19)):
         scene = scene.with_dropped(plate, x, y)
     for name, x, y, turn, scale in (
@@ -113,16 +118,15 @@ def breakfast(library: Library) -> Model:
 
 
 def lounge(library: Library) -> Model:
-    """Leather armchair and sofa on a rug, with a lamp, a plant and a side table."""
+    """Leather sofa and an armchair on a rug, with a lamp, a plant and a side table."""
     leather = paint("leather", tx.mottled, ["7d3b2a", "965040", "ab6852"], 0.07)
     rug = paint("rug", tx.rug, ["7a3b35", "4f6480", "c9a66b", "d9cfb8"], size=512)
     boards = paint("dark boards", tx.planks, ["7a5a3c", "8f6c4a", "a5825e"], rows=6)
     scene = box((-1.75, -1.75, -0.12), (1.75, 1.75, 0), boards, 1.0)
     scene += box((-1.2, -1.3, 0), (1.2, 0.7, 0.012), rug, 2.4, without="zZ")
     scene += top((-1.2, -1.3, 0), (1.2, 0.7, 0.012), rug)
-    dress = {name: leather for name in ("Back", "Buttons", "Sit", "Surround")}
-    scene += library.model("winchesterSofa", "wood", dress).moved((0.1, 1.1, 0))
-    scene += library.model("winchesterArmchair", "wood", dress).moved((-0.95, -0.75, 0), 120)
+    scene += library.model("sofa2", "wood", {"Fabric": leather, "Trim": leather}).moved((0.1, 1.1, 0))
+    scene += library.model("armchair2", "cloth").moved((-0.95, -0.75, 0), 120)
     scene += library.model("oakTable").moved((0.35, -0.35, 0), scale=0.6)
     scene += library.model("bedsideTable2").moved((-1.4, 1.15, 0))
     scene = scene.with_dropped(library.model("desklamp"), -1.4, 1.15)
@@ -159,6 +163,6 @@ def games(library: Library) -> Model:
     scene = scene.with_dropped(library.model("silla2"), -0.95, -0.85, 20)
     scene = scene.with_dropped(library.model("stool2"), 0.95, -0.75)
     scene = scene.with_dropped(library.model("tableFan"), 0.95, -0.75, 30)
-    scene = scene.with_dropped(library.model("speaker3"), -1.0, 0.95, 30)
+    scene = scene.with_dropped(library.model("caballito"), -0.95, 0.95, 30)
     scene = scene.with_dropped(library.model("basketball"), 0.5, -1.0)
     return scene.with_dropped(library.model("motorbike").moved(scale=0.6), 0.95, 1.0, 200)

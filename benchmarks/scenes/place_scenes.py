@@ -17,7 +17,7 @@ from furnishings import (
     white_paint,
     window,
 )
-from meshes import Material, Model, box, disc, join, paint, rectangle, revolved, top
+from meshes import Material, Model, box, disc, paint, rectangle, revolved, top
 
 from aenerf_ns.scenes import textures as tx
 
@@ -25,9 +25,10 @@ Placing = tuple[str, float, float, float]
 """Model, x, y and turn in degrees of something that is put down."""
 
 
-def _with_all(scene: Model, library: Library, placings: list[Placing]) -> Model:
+def _with_all(scene: Model, library: Library, placings: list[Placing], below: float) -> Model:
+    """With furniture put down on the highest surfaces below a height: that of a ceiling, or of an umbrella."""
     for name, x, y, turn in placings:
-        scene = scene.with_dropped(library.model(name), x, y, turn, below=3.0)
+        scene = scene.with_dropped(library.model(name), x, y, turn, below)
     return scene
 
 
@@ -88,8 +89,8 @@ def living_room(library: Library) -> Model:
         scene,
         library,
         [
-            ("winchesterSofa", 0.4, -2.15, 180),
-            ("winchesterArmchair", -1.9, -1.9, 150),
+            ("couch", 0.4, -2.2, 180),
+            ("armchair2", -1.9, -1.95, 150),
             ("sofa2", -2.85, -0.2, 90),
             ("televisionCabinet", 1.0, 2.3, 0),
             ("pianoAQueue", 2.48, 0.3, -90),
@@ -105,9 +106,12 @@ def living_room(library: Library) -> Model:
             ("orchids", 2.8, -1.2, 0),
             ("basketball", -0.6, 2.0, 0),
         ],
+        2.2,
     )
     scene += library.model("oakTable").moved((0, 0, 0.012), scale=0.62)
-    return _with_all(scene, library, [("cardGame", 0.12, -0.12, 20), ("caffe_final", -0.12, 0.1, 0), ("cactus", 0.0, 0.17, 0)])
+    return _with_all(
+        scene, library, [("cardGame", 0.12, -0.12, 20), ("caffe_final", -0.12, 0.1, 0), ("cactus", 0.0, 0.17, 0)], 2.2
+    )
 
 
 LIVING_ROOM_LAMPS = tuple(lamp(x, y, 2.45, 0.35, (10, 9.2, 8)) for x in (-1.7, 1.7) for y in (-1.0, 1.0))
@@ -126,9 +130,9 @@ def terrace(library: Library) -> Model:
     scene = disc(24, -0.03, grass, 2.2, sides=64)
     scene += box((-5, -4.5, -0.2), (5, 4.5, 0), paving, 1.6, without="z")
     # The house to the back.
-    scene += wall(12, 3.2, facade, 2.5, [(1.2, 2.8, 0.9, 2.2), (5.2, 6.8, 0.02, 2.2), (9.2, 10.8, 0.9, 2.2)], white_paint()).moved(
-        (-6, 5.6, -0.03)
-    )
+    scene += wall(
+        12, 3.2, facade, 2.5, [(1.2, 2.8, 0.9, 2.2), (5.2, 6.8, 0.02, 2.2), (9.2, 10.8, 0.9, 2.2)], white_paint()
+    ).moved((-6, 5.6, -0.03))
     dark = paint("dark room", tx.mottled, ["4a4a48", "55544f", "605f5a"], 0.04)
     for x, bottom, height in ((-4.8, 0.9, 1.3), (-0.8, 0.02, 2.18), (3.2, 0.9, 1.3)):
         scene += rectangle((x, 5.75, bottom - 0.03), (1.6, 0, 0), (0, 0, height), dark, 1.0)
@@ -147,8 +151,8 @@ def terrace(library: Library) -> Model:
         library,
         [
             ("table", 0, 0, 10),
-            ("umbrella", 4.0, 2.9, 0),
-            ("deckChair", 3.7, 2.6, 140),
+            ("umbrella", 4.2, 3.1, 0),
+            ("deckChair", 3.2, 2.9, 140),
             ("deckChair", -3.9, 2.8, 215),
             ("osakaChair", -0.5, -0.85, 190),
             ("osakaChair", 0.65, 0.85, 15),
@@ -183,6 +187,7 @@ def terrace(library: Library) -> Model:
             ("chicken", -2.9, -6.2, 60),
             ("chicken", -2.2, -6.9, 200),
         ],
+        1.4,
     )
     return _with_all(
         scene,
@@ -195,6 +200,7 @@ def terrace(library: Library) -> Model:
             ("cupcake", 0.6, -0.05, 0),
             ("orchids", -0.05, -0.02, 0),
         ],
+        1.4,
     )
 
 
@@ -256,11 +262,12 @@ def gallery(library: Library) -> Model:
             ("plant", -6.4, -2.6, 0),
             ("plant", 6.4, 2.6, 0),
             ("decorativePlant", 6.4, -2.6, 0),
-            ("winchesterSofa", -2.1, 2.65, 0),
-            ("winchesterSofa", 2.5, -2.65, 180),
-            ("winchesterArmchair", 2.9, 2.55, 20),
+            ("sofa2", -2.1, 2.75, 0),
+            ("sofa2", 2.5, -2.75, 180),
+            ("armchair2", 2.9, 2.65, 20),
             ("couch", -2.1, -2.65, 180),
         ],
+        1.4,
     )
 
 
@@ -339,11 +346,18 @@ def workshop(library: Library) -> Model:
             ("box", 4.6, -2.3, 85),
             ("speaker3", 1.4, 4.1, 0),
         ],
+        2.2,
     )
     return _with_all(
         scene,
         library,
-        [("crate", -0.45, 0.05, 12), ("crate", 0.2, 0.25, 25), ("ammoBox", 4.5, -2.3, 70), ("teddyBear", 0.25, 0.2, 200)],
+        [
+            ("crate", -0.45, 0.05, 12),
+            ("crate", 0.2, 0.25, 25),
+            ("ammoBox", 4.5, -2.3, 70),
+            ("teddyBear", 0.25, 0.2, 200),
+        ],
+        2.2,
     )
 
 
