@@ -137,7 +137,7 @@ class Library:
             dress: other materials by the name of those they replace; None leaves the faces out.
 
         Raises:
-            DataError: on a model that the package lacks, or whose own licence is another one than the package says: a few
+            DataError: on a model that the package lacks, or whose own licence is not the package's: a few models
                 of its CC0 file are CC BY.
         """
         entry = self._catalogue().get(name)
