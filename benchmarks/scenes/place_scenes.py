@@ -94,7 +94,7 @@ def living_room(library: Library) -> Model:
             ("sofa2", -2.85, -0.2, 90),
             ("televisionCabinet", 1.0, 2.3, 0),
             ("pianoAQueue", 2.48, 0.3, -90),
-            ("plant", -3.0, 2.3, 0),
+            ("plant", -2.95, 2.3, 0),
             ("decorativePlant", 2.95, 2.25, 0),
             ("bedsideTable2", -3.05, -1.65, 90),
             ("desklamp", -3.05, -1.65, 0),
@@ -196,7 +196,7 @@ def terrace(library: Library) -> Model:
             ("bread", -0.5, 0.05, 40),
             ("caffe_final", 0.3, 0.2, 0),
             ("caffe_final", -0.2, -0.25, 90),
-            ("tetrapak", 0.0, 0.12, 30),
+            ("tetrapak", 0.3, -0.2, 30),
             ("cupcake", 0.6, -0.05, 0),
             ("orchids", -0.05, -0.02, 0),
         ],
@@ -253,7 +253,7 @@ def gallery(library: Library) -> Model:
         scene += box((x - 0.36, -0.36, 0), (x + 0.36, 0.36, 0.12), marble, 0.6, without="z")
         scene += box((x - 0.3, -0.3, 0.12), (x + 0.3, 0.3, 0.85), marble, 0.6, without="zZ")
         scene += box((x - 0.36, -0.36, 0.85), (x + 0.36, 0.36, 0.92), marble, 0.6)
-        scene = scene.with_dropped(library.model(name).moved(scale=scale), x, 0, turn)
+        scene = scene.with_dropped(library.model(name).moved(scale=scale), x, 0, turn, below=1.4)
     return _with_all(
         scene,
         library,
@@ -264,7 +264,7 @@ def gallery(library: Library) -> Model:
             ("decorativePlant", 6.4, -2.6, 0),
             ("sofa2", -2.1, 2.75, 0),
             ("sofa2", 2.5, -2.75, 180),
-            ("armchair2", 2.9, 2.65, 20),
+            ("armchair2", 2.9, 2.5, 20),
             ("couch", -2.1, -2.65, 180),
         ],
         1.4,
@@ -324,11 +324,11 @@ def workshop(library: Library) -> Model:
             ("forkLift", 3.6, 2.9, 8),
             ("pallet", -0.2, 0.15, 12),
             ("pallet", 4.4, -0.6, 80),
-            ("crate", 4.3, -0.9, 10),
-            ("crate", 4.5, -0.25, 40),
-            ("barrel", -4.9, 3.8, 0),
-            ("barrel", -4.0, 3.95, 50),
-            ("barrel", -4.9, 2.9, 100),
+            ("crate", 4.4, -0.95, 5),
+            ("crate", 4.4, -0.26, 93),
+            ("barrel", -4.9, 3.95, 0),
+            ("barrel", -4.9, 2.95, 50),
+            ("barrel", -4.85, 1.9, 100),
             ("spiralStaircase", -4.5, -3.5, 0),
             ("lockedLocker", 0.3, -4.25, 180),
             ("technicalTable1", 2.6, -3.9, 180),
@@ -337,7 +337,7 @@ def workshop(library: Library) -> Model:
             ("kitchenaid", 2.5, -3.9, 150),
             ("motorbike", -4.5, 0.3, 60),
             ("wheelbarrow", -4.4, -1.4, 200),
-            ("electricGuitar", 0.8, 4.1, 0),
+            ("electricGuitar", 1.05, 4.1, 0),
             ("table_football", -0.9, 3.75, 0),
             ("plant", 0.35, 4.05, 0),
             ("desk", -3.0, 4.0, 0),
@@ -352,7 +352,7 @@ def workshop(library: Library) -> Model:
         scene,
         library,
         [
-            ("crate", -0.45, 0.05, 12),
+            ("crate", -0.55, 0.0, 12),
             ("crate", 0.2, 0.25, 25),
             ("ammoBox", 4.5, -2.3, 70),
             ("teddyBear", 0.25, 0.2, 200),
