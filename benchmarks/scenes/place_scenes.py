@@ -242,7 +242,7 @@ def gallery(library: Library) -> Model:
         for y in (-2.75, 2.75):
             scene += revolved(shaft, marble, 0.6).moved((x, y, 0))
     exhibits = (
-        ("cartoon_biplane", -5.0, 6.0, 40),
+        ("cartoon_biplane", -5.0, 4.5, 40),
         ("deer", -3.0, 5.0, 30),
         ("horse2", -1.0, 0.35, 60),
         ("peterbilt", 1.0, 0.06, 20),
