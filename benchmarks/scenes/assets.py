@@ -1,0 +1,209 @@
+"""The packages that the benchmark scenes are made of: fetched by their registries' clients, verified, and opened."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import shutil
+import subprocess
+import tarfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from meshes import Material, Model, linear, paint, read_obj, srgb_picture
+from numpy.typing import NDArray
+from PIL import Image
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.scenes import textures
+
+# OpenCV reads OpenEXR files only where this is set before it is imported.
+os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"
+import cv2
+
+_PICTURE_SIZE = 512
+_DETAILS = {"plain": (textures.mottled, 0.08), "wood": (textures.wood,), "cloth": (textures.fabric,)}
+_LICENCE = "CC0 1.0"
+
+
+@dataclass(frozen=True)
+class Package:
+    """A file of a package registry.
+
+    Attributes:
+        file: its name, as the client saves it.
+        sha256: of the file.
+        command: what fetches it into the current folder.
+    """
+
+    file: str
+    sha256: str
+    command: tuple[str, ...]
+
+
+FURNITURE = Package(
+    "sweethome3d-furniture_1.8-1_all.deb",
+    "3ccb90c63f9525e887a767b9cd5c8b6933b8b6b2973a615a5359ee68a2118668",
+    ("apt-get", "download", "sweethome3d-furniture=1.8-1"),
+)
+ENVIRONMENTS = Package(
+    "pmndrs-assets-1.7.0.tgz",
+    "152bd218a3390703f184f0c6ce16e73c8f0a87f32d38530d418a09d33d8208dc",
+    ("npm", "pack", "--silent", "@pmndrs/assets@1.7.0"),
+)
+_FURNITURE_FILE = "usr/share/sweethome3d/furniture/BlendSwap-CC-0.sh3f"
+_CATALOGUE = "PluginFurnitureCatalog.properties"
+
+
+def fetch(package: Package, folder: Path) -> Path:
+    """The package's file in the folder, fetched if it is not there yet.
+
+    Raises:
+        DataError: if it cannot be fetched or is not the pinned version.
+    """
+    file = folder / package.file
+    by_hand = f"run `{' '.join(package.command)}` where it works and put {package.file} into {folder}"
+    if not file.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            subprocess.run(package.command, cwd=folder, check=True, capture_output=True, text=True)
+        except FileNotFoundError as error:
+            raise DataError(file, f"missing, and there is no {package.command[0]} to fetch it with", by_hand) from error
+        except subprocess.CalledProcessError as error:
+            reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
+            raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
+        if not file.is_file():
+            raise DataError(file, f"{package.command[0]} saved it under another name", by_hand)
+    found = hashlib.sha256(file.read_bytes()).hexdigest()
+    if found != package.sha256:
+        raise DataError(file, f"sha256 {found}, not the pinned {package.sha256}", f"remove it, then {by_hand}")
+    return file
+
+
+class Library:
+    """The models and environments of the packages in a folder, which are fetched and unpacked when first needed.
+
+    Attributes:
+        credits: what was taken from the library, as the "credits" of a scene file.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.credits: dict[str, dict[str, str]] = {}
+
+    @cache  # noqa: B019 one library lives as long as the command
+    def _furniture(self) -> Path:
+        """Folder of the CC0 furniture, unpacked."""
+        package = fetch(FURNITURE, self.folder)
+        target = self.folder / package.stem
+        if not (target / _CATALOGUE).is_file():
+            shutil.rmtree(target, ignore_errors=True)
+            raw = self.folder / f"{package.stem}.raw"
+            try:
+                subprocess.run(("dpkg-deb", "-x", package, raw), check=True, capture_output=True, text=True)
+            except (FileNotFoundError, subprocess.CalledProcessError) as error:
+                raise DataError(
+                    package, f"cannot be unpacked by dpkg-deb ({error})", "install Debian's dpkg"
+                ) from error
+            with zipfile.ZipFile(raw / _FURNITURE_FILE) as archive:
+                archive.extractall(target)
+            shutil.rmtree(raw)
+        return target
+
+    @cache  # noqa: B019
+    def _catalogue(self) -> dict[str, dict[str, str]]:
+        """Entries of the furniture's catalogue by model name."""
+        entries: dict[str, dict[str, str]] = {}
+        for line in (self._furniture() / _CATALOGUE).read_text(encoding="latin-1").splitlines():
+            key, _, value = line.partition("=")
+            name, _, number = key.partition("#")
+            if name and number:
+                entries.setdefault(number, {})[name] = value
+        return {Path(entry["model"]).parent.name: entry for entry in entries.values()}
+
+    def model(
+        self, name: str, detail: str | Mapping[str, str] = "plain", dress: Mapping[str, Material | None] | None = None
+    ) -> Model:
+        """A piece of furniture at its true size, standing on z = 0 above the origin, its front towards -y.
+
+        Args:
+            name: folder of the model in its package.
+            detail: pattern of the materials without a picture, "plain", "wood" or "cloth", or one for each by name.
+            dress: other materials by the name of those they replace; None leaves the faces out.
+
+        Raises:
+            DataError: on a model that the package lacks, or whose own licence is not the package's: a few models
+                of its CC0 file are CC BY.
+        """
+        entry = self._catalogue().get(name)
+        if entry is None:
+            raise DataError(name, f"no such model in {FURNITURE.file}", "name one of its folders")
+        path = self._furniture() / entry["model"].lstrip("/")
+        for licence in path.parent.glob("*[Ll][Ii][Cc][Ee][Nn]*"):
+            if "Creative Commons Zero" not in licence.read_text(errors="replace"):
+                raise DataError(licence, f"{name} is not under {_LICENCE}", "use another model")
+        dress = dress or {}
+
+        def surface(material: str, colour: tuple[float, float, float], picture: Path | None) -> Material | None:
+            if material in dress:
+                return dress[material]
+            if picture is not None:
+                return _photograph(f"{name}/{picture.name}", picture)
+            pattern = detail if isinstance(detail, str) else detail.get(material, "plain")
+            return coloured(f"{name}/{material}", colour, pattern)
+
+        centimetres = [float(entry[key]) for key in ("width", "depth", "height")]
+        model = read_obj(path, surface, np.array(centimetres) / 100)
+        self.credits[name] = {
+            "asset": name,
+            "source": f"{FURNITURE.file}: BlendSwap-CC-0.sh3f",
+            "author": entry.get("creator", "unknown"),
+            "licence": _LICENCE,
+        }
+        return model.standing()
+
+    def environment(self, name: str) -> NDArray[np.float32]:
+        """An environment: linear radiance (256, 512, 3) RGB, equirectangular, its first row straight up.
+
+        Raises:
+            DataError: on one that the package lacks.
+        """
+        package = fetch(ENVIRONMENTS, self.folder)
+        with tarfile.open(package) as archive:
+            try:
+                stream = archive.extractfile(f"package/hdri/{name}.exr.js")
+            except KeyError:
+                stream = None
+            if stream is None:
+                raise DataError(name, f"no such environment in {package.name}", "name one of its hdri/*.exr.js")
+            encoded = stream.read().split(b"base64,")[1].rstrip(b"';\n ")
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_UNCHANGED)
+        self.credits[name] = {
+            "asset": f"{name} (environment)",
+            "source": f"{package.name}: hdri/{name}.exr.js",
+            "author": "Poly Haven",
+            "licence": _LICENCE,
+        }
+        return np.ascontiguousarray(picture[..., 2::-1], np.float32)
+
+
+def coloured(name: str, colour: tuple[float, float, float], pattern: str = "plain") -> Material:
+    """A material around an sRGB colour (each 0 to 1), neither black nor glaring, with a faint pattern."""
+    tones = [np.clip(np.array(colour) * factor, 0.2, 0.95) for factor in (0.85, 1.0, 1.15)]
+    generator, *options = _DETAILS[pattern]
+    hexadecimal = ["".join(f"{round(255 * value):02x}" for value in tone) for tone in tones]
+    return paint(name, generator, hexadecimal, *options, size=128)
+
+
+@cache
+def _photograph(name: str, path: Path) -> Material:
+    """A material of a picture file, its sides powers of two, its albedo within the range of the other textures."""
+    with Image.open(path) as picture:
+        sides = [int(min(_PICTURE_SIZE, 2 ** round(np.log2(side)))) for side in picture.size]
+        pixels = np.asarray(picture.convert("RGB").resize(sides, Image.Resampling.LANCZOS))
+    return Material(name, srgb_picture(np.clip(linear(pixels), *textures.ALBEDO_RANGE)))

@@ -1,0 +1,70 @@
+"""Builds the benchmark's scenes from assets of package registries.
+
+    python benchmarks/scenes/build.py --output FOLDER [--scenes NAME ...] [--assets FOLDER]
+
+Each becomes FOLDER/NAME/scene.json with its mesh and environment, for `aenerf simulate`. The same assets and libraries
+give the same bytes. See CREDITS.md for who made the assets.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import tyro
+from assets import Library, cv2
+from catalogue import SCENES
+from meshes import write_glb
+
+from aenerf_ns.errors import DataError
+
+_BRIGHTEST = 300.0
+"""Radiance that an environment is cut off at: a sun of a few texels would leave hard shadows, and all else dark."""
+
+
+@dataclass
+class Build:
+    """Build benchmark scenes."""
+
+    output: Path
+    """Folder to create a folder for each scene in."""
+    scenes: tuple[str, ...] = tuple(SCENES)
+    """Names of the scenes."""
+    assets: Path = field(default_factory=lambda: Path.home() / ".cache" / "aenerf-ns" / "scene-assets")
+    """Folder that keeps the packages that the scenes are made of."""
+
+    def main(self) -> None:
+        """Fetches what is missing and writes the scenes."""
+        for name in self.scenes:
+            if name not in SCENES:
+                raise DataError("--scenes", f"no scene is called {name!r}", f"choose among {', '.join(SCENES)}")
+        for name in self.scenes:
+            build_scene(name, Library(self.assets), self.output / name)
+
+
+def build_scene(name: str, library: Library, folder: Path) -> None:
+    """Write a scene's mesh, environment and scene.json into a folder.
+
+    Raises:
+        DataError: if an asset cannot be had.
+    """
+    scene = SCENES[name]
+    panorama = np.clip(library.environment(scene.environment), 0, _BRIGHTEST)
+    model = scene.model(library)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_glb(folder / "scene.glb", model)
+    _, encoded = cv2.imencode(".hdr", panorama[..., ::-1])
+    (folder / f"{scene.environment}.hdr").write_bytes(encoded.tobytes())
+    credits = [library.credits[asset] for asset in sorted(library.credits)]
+    description = scene.description("scene.glb", f"{scene.environment}.hdr", credits)
+    (folder / "scene.json").write_text(json.dumps(description, indent=1) + "\n")
+    print(f"{folder}: {len(model.triangles):,} triangles, {len(credits)} assets")
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(Build).main()
+    except DataError as error:
+        raise SystemExit(str(error)) from None

@@ -1,0 +1,125 @@
+"""The benchmark scenes: what is in them, their light, and the camera's path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import object_scenes
+import place_scenes
+from assets import Library
+from meshes import Model, without_coincident_faces
+
+_HALF_EXTENT, _RADIUS, _DISTANCE = 1.2, 1.35, 4.0
+"""Of an object: half its longest side, the ball that holds it, and where the camera is, in metres."""
+_GREY = (0.5, 0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class BenchmarkScene:
+    """A scene to be built.
+
+    Attributes:
+        compose: makes its mesh from a library.
+        environment: name of the environment that lights it.
+        gain: factor of the environment's radiance.
+        turn_degrees: by which the environment is turned.
+        lamps: further lights, as in a scene file.
+        walk: positions and targets of a walk; None: the camera goes around it.
+        show_environment: whether the environment is seen where there is nothing else; else it is grey.
+    """
+
+    compose: Callable[[Library], Model]
+    environment: str
+    gain: float = 1.0
+    turn_degrees: float = 0.0
+    lamps: tuple[dict[str, list[float]], ...] = ()
+    walk: tuple[list[list[float]], list[list[float]]] | None = None
+    show_environment: bool = False
+
+    def model(self, library: Library) -> Model:
+        """The finished mesh: an object brought to its size and place, no faces in one another."""
+        model = self.compose(library)
+        if self.walk is None:
+            model = model.fitted(_HALF_EXTENT, _RADIUS)
+        return without_coincident_faces(model, 5e-4)
+
+    def description(self, mesh: str, environment: str, credits: Sequence[dict[str, str]]) -> dict[str, object]:
+        """The scene file's content, with the names of its mesh and its environment."""
+        path: dict[str, object] = {"kind": "around", "centre": [0, 0, 0], "radius": _DISTANCE, "turns": 4}
+        if self.walk is not None:
+            path = {"kind": "walk", "positions": self.walk[0], "targets": self.walk[1]}
+        light: dict[str, object] = {
+            "environment": environment,
+            "turn_degrees": self.turn_degrees,
+            "gain": self.gain,
+        }
+        if self.lamps:
+            light["lamps"] = list(self.lamps)
+        return {
+            "mesh": mesh,
+            "light": light,
+            "background": "environment" if self.show_environment else list(_GREY),
+            "path": path,
+            "credits": list(credits),
+        }
+
+
+def loop(
+    half_length: float, half_width: float, height: float, reach: float, look_height: float, count: int = 16
+) -> tuple[list[list[float]], list[list[float]]]:
+    """Positions and targets of an oval walk around the origin, up and down a little, that looks across the middle.
+
+    Args:
+        half_length, half_width: of the oval, along x and y.
+        height: mean height of the camera.
+        reach: how far beyond the middle the targets lie, in parts of the oval.
+        look_height: mean height of the targets.
+        count: number of positions.
+    """
+    turn = 2 * np.pi * np.arange(count) / count
+    across = turn + np.pi + 0.45 * np.sin(2 * turn + 0.4)
+    eyes = np.column_stack(
+        [half_length * np.cos(turn), half_width * np.sin(turn), height + 0.14 * np.sin(3 * turn + 0.7)]
+    )
+    targets = np.column_stack(
+        [
+            reach * half_length * np.cos(across),
+            reach * half_width * np.sin(across),
+            look_height + 0.3 * np.sin(3 * turn - 0.6),
+        ]
+    )
+    return eyes.round(3).tolist(), targets.round(3).tolist()
+
+
+SCENES: dict[str, BenchmarkScene] = {
+    "piano": BenchmarkScene(object_scenes.piano, "apartment"),
+    "bookshelf": BenchmarkScene(object_scenes.bookshelf, "lobby"),
+    "plants": BenchmarkScene(object_scenes.plants, "venice"),
+    "playground": BenchmarkScene(object_scenes.playground, "park"),
+    "breakfast": BenchmarkScene(object_scenes.breakfast, "apartment", turn_degrees=120),
+    "lounge": BenchmarkScene(object_scenes.lounge, "lobby", turn_degrees=60),
+    "forklift": BenchmarkScene(object_scenes.forklift, "warehouse"),
+    "games": BenchmarkScene(object_scenes.games, "lab"),
+    "living_room": BenchmarkScene(
+        place_scenes.living_room,
+        "park",
+        lamps=place_scenes.LIVING_ROOM_LAMPS,
+        walk=loop(1.2, 0.9, 1.4, 0.9, 0.95),
+        show_environment=True,
+    ),
+    "terrace": BenchmarkScene(
+        place_scenes.terrace, "park", turn_degrees=200, walk=loop(2.7, 2.0, 1.55, 0.8, 0.85), show_environment=True
+    ),
+    "gallery": BenchmarkScene(
+        place_scenes.gallery, "lobby", lamps=place_scenes.GALLERY_LAMPS, walk=loop(6.1, 1.55, 1.6, 0.75, 1.35)
+    ),
+    "workshop": BenchmarkScene(
+        place_scenes.workshop,
+        "venice",
+        lamps=place_scenes.WORKSHOP_LAMPS,
+        walk=loop(2.0, 1.55, 1.6, 0.9, 1.0),
+        show_environment=True,
+    ),
+}

@@ -1,0 +1,200 @@
+"""The benchmark's scenes: geometry against truth, what they are composed of, and what a missing asset says."""
+
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.errors import DataError
+
+FOLDER = Path(__file__).parent.parent / "benchmarks" / "scenes"
+sys.path.insert(0, str(FOLDER))
+import assets  # noqa: E402
+import catalogue  # noqa: E402
+import furnishings  # noqa: E402
+import meshes  # noqa: E402
+import object_scenes  # noqa: E402
+import place_scenes  # noqa: E402
+import settings  # noqa: E402
+
+PLAIN = meshes.Material("plain", np.full((2, 2, 3), 128, np.uint8))
+
+
+class StandIns:
+    """A library whose models are small boxes, and that notes which were asked for."""
+
+    def __init__(self):
+        self.names = set()
+
+    def model(self, name, detail="plain", dress=None):
+        self.names.add(name)
+        return meshes.box((-0.1, -0.1, 0), (0.1, 0.1, 0.2), PLAIN)
+
+
+def area(triangles):
+    return 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("outline", "expected"),
+    [
+        ([(0, 0), (2, 0), (2, 2), (1, 0.5), (0, 2)], 2.5),  # a notch
+        ([(0, 0), (1, 0), (1, 1), (0, 1)], 1.0),
+        ([(0, 0), (4, 0), (1, 1), (0, 4)], 4.0),  # a concave quadrilateral
+        ([(0, 0), (3, 0), (3, 3), (0, 3), (0, 2), (2, 2), (2, 1), (0, 1)], 7.0),  # a C
+    ],
+)
+@pytest.mark.parametrize("start", [0, 1, 2, 3])
+def test_polygons_are_filled_once_and_keep_their_sense(outline, expected, turned, start):
+    corners = np.roll(np.array(outline, float), start, axis=0)
+    corners = corners[::-1] if turned else corners
+    # In a plane that no axis lies in.
+    basis = np.linalg.qr(np.array([[1.0, 2, 3], [3, -1, 1], [2, 2, -1]]))[0]
+    basis *= np.sign(np.linalg.det(basis))
+    polygon = corners @ basis[:2]
+    triangles = polygon[meshes.triangulate(polygon)]
+    assert len(triangles) == len(outline) - 2
+    # Without overlap, areas add up to the polygon's only if none lies outside.
+    assert area(triangles).sum() == pytest.approx(expected)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert (normals @ basis[2] * (-1 if turned else 1) > 0).all()
+
+
+def test_dropped_models_stand_on_what_is_below():
+    table = meshes.box((-1, -1, 0.7), (1, 1, 0.75), PLAIN)
+    ceiling = meshes.rectangle((-2, -2, 2.5), (4, 0, 0), (0, 4, 0), PLAIN)
+    cup = meshes.box((3, 3, 5), (3.1, 3.1, 5.2), PLAIN)
+    scene = table + ceiling
+    assert scene.with_dropped(cup, 0.5, 0.5).bounds[1, 2] == pytest.approx(2.7)
+    stood = scene.with_dropped(cup, 0.5, 0.5, 30, below=2.0).parts[-6:]
+    np.testing.assert_allclose(meshes.Model(stood).bounds.mean(axis=0), [0.5, 0.5, 0.85])
+    assert scene.height_under(0.5, 0.5, below=0.72) == pytest.approx(0.7)
+    with pytest.raises(ValueError, match="nothing lies under"):
+        scene.height_under(1.5, 1.5, below=2.0)
+
+
+def test_fitted_models_keep_to_both_limits():
+    model = meshes.box((3, 0, 0), (5, 4, 1), PLAIN)
+    fitted = model.fitted(1.2, 1.25)
+    reach = np.linalg.norm(fitted.triangles, axis=2).max()
+    assert reach == pytest.approx(1.25)
+    np.testing.assert_allclose(fitted.bounds.sum(axis=0), 0, atol=1e-12)
+    assert model.fitted(1.2, 5.0).bounds[1].max() == pytest.approx(1.2)
+
+
+def test_coincident_faces_are_dropped_or_moved_apart():
+    table = meshes.rectangle((-1, -1, 0), (2, 0, 0), (0, 2, 0), PLAIN)
+    label = meshes.rectangle((0.1, 0.2, 0), (0.3, 0, 0), (0, 0.3, 0), PLAIN)
+    sticker = meshes.rectangle((0.15, 0.25, 0), (0.1, 0, 0), (0, 0.1, 0), PLAIN)
+    above = meshes.rectangle((-1, -1, 0.4), (2, 0, 0), (0, 2, 0), PLAIN)
+    scene = meshes.without_coincident_faces(table + label + sticker + above + above.inside_out(), 1e-3)
+    heights = [part.points[..., 2] for part in scene.parts]
+    assert [len(height) for height in heights] == [2, 2, 2, 2, 0]
+    np.testing.assert_allclose(heights[0], 0)
+    np.testing.assert_allclose(heights[3], 0.4)
+    assert heights[1].min() == pytest.approx(1e-3)
+    assert np.ptp(heights[1]) == pytest.approx(0)
+    # What lay on the label must not have been moved into it.
+    assert heights[2].min() >= 2e-3 - 1e-9
+
+
+def test_boxes_face_outwards():
+    box = meshes.box((1, 2, 3), (2, 4, 6), PLAIN).triangles
+    outward = box.mean(axis=1) - [1.5, 3, 4.5]
+    normals = np.cross(box[:, 1] - box[:, 0], box[:, 2] - box[:, 0])
+    assert ((normals * outward).sum(axis=1) > 0).all()
+    assert area(box).sum() == pytest.approx(2 * (2 + 3 + 6))
+    volume = np.linalg.det(meshes.revolved([(0, 0), (1, 0), (1, 2), (0, 2)], PLAIN, sides=256).triangles).sum() / 6
+    assert volume == pytest.approx(2 * np.pi, rel=1e-3)
+
+
+def test_obj_files_are_read_with_their_materials(tmp_path):
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 100 0 0\nv 100 50 0\nv 0 50 -20\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+        "usemtl wood\nf 1/1 2/2 3/3\nusemtl glass\nf -4 -2 -1\nusemtl paper\nf 1 3 4\n"
+    )
+    (tmp_path / "a.mtl").write_text("newmtl wood\nKd 0.5 0.25 0\nnewmtl glass\nd 0.3\nnewmtl paper\nKd 1 1 1\n")
+    asked = {}
+
+    def surface(name, colour, picture):
+        asked[name] = (colour, picture)
+        return None if name == "paper" else PLAIN
+
+    model = meshes.read_obj(tmp_path / "a.obj", surface, size=(2.0, 0.4, 1.0))
+    assert asked == {"wood": ((0.5, 0.25, 0), None), "paper": ((1, 1, 1), None)}
+    np.testing.assert_allclose(model.triangles, [[[0, 0, 0], [2, 0, 0], [2, 0, 1]]])
+    (tmp_path / "b.obj").write_text("v 0 0\nf 1 2 x\n")
+    with pytest.raises(DataError, match=r"b\.obj"):
+        meshes.read_obj(tmp_path / "b.obj", surface)
+
+
+def test_glb_files_hold_the_model(tmp_path):
+    import trimesh
+
+    picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    model = meshes.box((0, 0, 0), (1, 2, 3), PLAIN) + meshes.rectangle(
+        (5, 0, 0), (1, 0, 0), (0, 0, 1), meshes.Material("picture", picture)
+    )
+    for name in ("a.glb", "b.glb"):
+        meshes.write_glb(tmp_path / name, model)
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+    read = trimesh.load_scene(tmp_path / "a.glb", process=False)
+    # y is up in the file: (x, y, z) there is (x, -z, y) here.
+    np.testing.assert_allclose(read.bounds, [[0, 0, -2], [6, 3, 0]], atol=1e-6)
+    last = list(read.geometry.values())[-1]
+    np.testing.assert_array_equal(np.asarray(last.visual.material.baseColorTexture), picture)
+    upper = last.vertices[:, 1] > 0.5
+    np.testing.assert_allclose(last.visual.uv[upper, 1], 1)  # the reader turns v upwards
+    with pytest.raises(ValueError, match="picture"):
+        meshes.write_glb(
+            tmp_path / "c.glb", model + meshes.box((0, 0, 0), (1, 1, 1), meshes.Material("picture", picture[::-1]))
+        )
+
+
+def test_settings_name_every_scene_and_only_options_of_simulate():
+    assert set(settings.DURATIONS) == set(catalogue.SCENES)
+    known = {field.name for field in fields(Simulate)}
+    for name in catalogue.SCENES:
+        full, tiny = (settings.simulate_options(name, size) for size in ("full", "tiny"))
+        assert set(full) == set(tiny) <= known
+        assert full["width"] > tiny["width"]
+        assert min(full["test_views"], tiny["test_views"], tiny["duration"]) > 0
+
+
+def test_credits_name_every_asset_of_every_scene(monkeypatch):
+    # Patterns take seconds, and do not matter here.
+    for module in (furnishings, object_scenes, place_scenes):
+        monkeypatch.setattr(module, "paint", lambda name, *rest, **options: meshes.Material(name, PLAIN.picture))
+    credits = (FOLDER / "CREDITS.md").read_text()
+    rows = {line.split("|")[1].strip(): line for line in credits.splitlines() if line.startswith("| ")}
+    for name, scene in catalogue.SCENES.items():
+        library = StandIns()
+        assert np.isfinite(scene.compose(library).triangles).all()
+        for asset in (*library.names, scene.environment):
+            assert name in rows[asset].split("|")[-2].replace(",", " ").split(), (asset, name)
+
+
+def test_walks_are_closed_loops_of_as_many_targets():
+    walks = [scene.walk for scene in catalogue.SCENES.values() if scene.walk]
+    assert len(walks) >= 4
+    for positions, targets in walks:
+        eyes = np.array(positions)
+        assert eyes.shape == np.array(targets).shape
+        steps = np.linalg.norm(np.roll(eyes, -1, axis=0) - eyes, axis=1)
+        assert steps.max() < 4 * np.median(steps)
+
+
+def test_missing_and_wrong_assets_say_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))  # no client to fetch with
+    library = assets.Library(tmp_path)
+    with pytest.raises(DataError, match=r"apt-get to fetch it with; run `apt-get download .*` .* put .*deb into"):
+        library.model("sofa")
+    with pytest.raises(DataError, match="no npm to fetch it with"):
+        library.environment("park")
+    (tmp_path / assets.ENVIRONMENTS.file).write_bytes(b"another version")
+    with pytest.raises(DataError, match=r"not the pinned .* remove it"):
+        library.environment("park")
