@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +31,7 @@ def main() -> None:
 
     build = lpip.LearnedPerceptualImagePatchSimilarity
 
-    def build_or_leave_out(*arguments: object, **options: object) -> nn.Module:
+    def build_or_leave_out(*arguments: Any, **options: Any) -> nn.Module:
         try:
             return build(*arguments, **options)
         except Exception:
