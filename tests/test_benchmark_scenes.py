@@ -198,3 +198,16 @@ def test_missing_and_wrong_assets_say_what_to_do(tmp_path, monkeypatch):
     (tmp_path / assets.ENVIRONMENTS.file).write_bytes(b"another version")
     with pytest.raises(DataError, match=r"not the pinned .* remove it"):
         library.environment("park")
+
+
+def test_a_sun_that_lost_its_colours_gets_those_of_the_sky_around_it() -> None:
+    sky = np.array([2.0, 1.5, 1.0], np.float32)
+    panorama = np.tile(sky, (16, 32, 1))
+    whole = assets.with_whole_sun(panorama)
+    np.testing.assert_array_equal(whole, panorama)
+    # The sun itself, and ringing beside it.
+    panorama[5, 7], panorama[5, 8] = (0, 0, 5000), (-1e-6, 0, -800)
+    whole = assets.with_whole_sun(panorama)
+    np.testing.assert_allclose(whole[5, 7], 5000 * sky)
+    np.testing.assert_array_equal(whole[5, 8], sky)
+    assert (np.delete(whole.reshape(-1, 3), [5 * 32 + 7, 5 * 32 + 8], axis=0) == sky).all()

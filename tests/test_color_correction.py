@@ -256,7 +256,7 @@ def test_reference_views_are_placed_by_the_poses_of_the_moment(tmp_path: Path, m
     assert correction.twists is not None
     with torch.no_grad():
         # The whole scene moves 0.5 along the camera's y axis.
-        correction.twists.control_twists[:, 1] = 0.5
+        correction.twists.control_twists[:, 1] = 0.5 / correction.trajectory.extent
     pipeline.fit_color_correction()
     before, after = seen
     expected = correction.apply_to_camera(pipeline.datamanager.reference_views("val").cameras)[0, :, 3]

@@ -41,7 +41,7 @@ def dataset(room: SimulationScene, tmp_path_factory: pytest.TempPathFactory) -> 
     """A dataset whose poses COLMAP estimated from 14 frames, and what the command printed."""
     folder = tmp_path_factory.mktemp("colmap") / "scene"
     with pytest.MonkeyPatch.context() as patch, command.CONSOLE.capture() as output:
-        patch.setattr(command, "built_in_scene", lambda *_: room)
+        patch.setattr(command, "open_scene", lambda *_: room)
         Simulate(
             folder, poses="colmap", width=160, height=120, duration=14 / 25 - 0.03, max_displacement=2.0,
             train_images=3, validation_views=1, test_views=1,
@@ -232,7 +232,7 @@ def test_lost_frames_and_fragments_are_told(truth: torch.Tensor) -> None:
 def test_pose_noise_and_colmap_exclude_each_other(room: SimulationScene, tmp_path: Path) -> None:
     options = Simulate(tmp_path / "scene", poses="colmap", pose_noise_degrees=1.0, width=16, height=12, duration=0.5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command, "built_in_scene", lambda *_: room)
+        patch.setattr(command, "open_scene", lambda *_: room)
         with pytest.raises(DataError, match="COLMAP errs by itself"):
             options.main()
     assert not (tmp_path / "scene").exists()

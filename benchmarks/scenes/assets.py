@@ -18,6 +18,7 @@ import numpy as np
 from meshes import Material, Model, linear, paint, read_obj, srgb_picture
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.ndimage import binary_dilation
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.scenes import textures
@@ -189,7 +190,23 @@ class Library:
             "author": "Poly Haven",
             "licence": _LICENCE,
         }
-        return np.ascontiguousarray(picture[..., 2::-1], np.float32)
+        return with_whole_sun(np.ascontiguousarray(picture[..., 2::-1], np.float32))
+
+
+def with_whole_sun(panorama: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A panorama (H, W, 3) whose sun has all its colours.
+
+    The package's compression has lost the red and the green of some suns, and left ringing in their blue: they get the
+    colour of the sky around them.
+    """
+    lost = (panorama[..., 0] < 1e-3) & (np.abs(panorama[..., 2]) > 1)
+    if not lost.any():
+        return panorama
+    around = panorama[binary_dilation(lost, iterations=2) & ~lost]
+    sky = np.median(around, axis=0)
+    whole = panorama.copy()
+    whole[lost] = np.maximum(panorama[lost][:, 2:] / sky[2], 1) * sky
+    return whole
 
 
 def coloured(name: str, colour: tuple[float, float, float], pattern: str = "plain") -> Material:

@@ -495,6 +495,9 @@ def _overlapped(triangles: Array, asked: NDArray[np.bool_], tolerance: float) ->
     # The middles of all, and points near the corners of those large enough to be overlapped in part.
     for weight in ((1 / 3, 1 / 3, 1 / 3), (0.8, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.1, 0.8)):
         source = np.flatnonzero(asked & ((longest > _LARGE) | (weight[0] == weight[1] == weight[2])))
+        if len(source) == 0:
+            # Open3D's list of intersections of no rays ends the process.
+            continue
         origin = np.einsum("k,fkd->fd", weight, triangles[source]) + tolerance * normals[source]
         rays = np.concatenate([origin, -normals[source]], axis=1).astype(np.float32)
         hits = scene.list_intersections(open3d.core.Tensor(rays), nthreads=1)
