@@ -138,10 +138,8 @@ class Simulation:
         steps = max(int(np.ceil(ends[1] - ends[0])), 1)
         seconds = middle + exposure * ((np.arange(steps) + 0.5) / steps - 0.5)
         parameters = self._profile.parameter(seconds).clip(0, 1)
-        radiance = np.zeros((self._camera.height, self._camera.width, 3), np.float32)
-        for parameter in parameters:
-            radiance += self._render(self._scene.path(float(parameter)), _EVENT_SAMPLES) / np.float32(steps)
-        return self._picture(radiance)
+        radiance = [self._render(self._scene.path(float(s)), _EVENT_SAMPLES) for s in parameters]
+        return self._picture(np.mean(radiance, axis=0))
 
     def reference_image(self, camera_to_world: NDArray[np.float64] | Tensor) -> NDArray[np.uint8]:
         """The (height, width, 3) sRGB picture from a pose, grey for a monochrome sensor."""
