@@ -22,7 +22,8 @@ from typing import Literal
 
 import torch
 import tyro
-from measuring import environment
+
+from aenerf_ns.bench.environment import environment
 
 # Root mean square of the pose noise: degrees and metres. What COLMAP left on a room walked through at constant and at
 # changing speed was about 0.7 and 2.3 degrees, 0.3 and 2.1 % of the extent.

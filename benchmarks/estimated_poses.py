@@ -17,8 +17,8 @@ from typing import Literal
 
 import torch
 import tyro
-from measuring import environment
 
+from aenerf_ns.bench.environment import environment
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from measuring import environment
 
+from aenerf_ns.bench.environment import environment
 from aenerf_ns.events.pairs import pair_events
 from aenerf_ns.events.stream import EventStream
 

@@ -18,8 +18,9 @@ from tempfile import TemporaryDirectory
 
 import torch
 import tyro
-from measuring import environment
 from PIL import Image
+
+from aenerf_ns.bench.environment import environment
 
 _RESULTS = Path(__file__).parent / "results"
 _NUM_PICTURES = 3

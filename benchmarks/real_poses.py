@@ -18,8 +18,8 @@ from tempfile import TemporaryDirectory
 
 import torch
 import tyro
-from measuring import environment
 
+from aenerf_ns.bench.environment import environment
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.trajectory.noise import perturb
 

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import torch
 import tyro
-from measuring import environment
 from nerfstudio.utils.eval_utils import eval_setup
 
+from aenerf_ns.bench.environment import environment
 from aenerf_ns.pipeline import AENeRFPipeline
 
 _NUM_BATCHES = 20

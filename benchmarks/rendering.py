@@ -19,8 +19,8 @@ import numba
 import numpy as np
 import trimesh
 import tyro
-from measuring import environment
 
+from aenerf_ns.bench.environment import environment
 from aenerf_ns.scenes import built_in_scene
 from aenerf_ns.scenes.embree import RayCaster
 from aenerf_ns.scenes.environment import sky

@@ -16,7 +16,8 @@ from tempfile import TemporaryDirectory
 
 import torch
 import tyro
-from measuring import environment
+
+from aenerf_ns.bench.environment import environment
 
 
 @dataclass

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import tyro
 import yaml
-from measuring import environment
+
+from aenerf_ns.bench.environment import environment
 
 _CAMERA_PATH = {
     "render_height": 12,

@@ -27,13 +27,13 @@ os.environ["TORCHINDUCTOR_FORCE_DISABLE_CACHES"] = "1"
 
 import torch
 import tyro
-from measuring import environment
 from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.field_components.encodings import HashEncoding as FrameworkHashEncoding
 
 import aenerf_ns.model
+from aenerf_ns.bench.environment import environment
 from aenerf_ns.hash_encoding import HashEncoding
 from aenerf_ns.temporal import log_radiance_rate
 

@@ -23,7 +23,7 @@ def environment() -> dict[str, Any]:
             **{name: version(name) for name in ("aenerf-ns", "nerfstudio", "torch", "numpy", "numba")},
         },
         "commit": _commit(),
-        "command": " ".join([Path(sys.argv[0]).name, *map(_portable, sys.argv[1:])]),
+        "command": " ".join([_program(), *map(_portable, sys.argv[1:])]),
     }
 
 
@@ -34,6 +34,12 @@ def _commit() -> str | None:
         return None
     changed = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=False)
     return commit.stdout.strip() + ("+changes" if changed.stdout.strip() else "")
+
+
+def _program() -> str:
+    """The console script or the script that runs."""
+    program = Path(sys.argv[0])
+    return program.name if program.is_absolute() else f"python {program}"
 
 
 def _portable(argument: str) -> str:
