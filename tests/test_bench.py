@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from aenerf_ns.bench import tables
-from aenerf_ns.bench.figures import error_map
+from aenerf_ns.bench.figures import draw, error_map
 from aenerf_ns.bench.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
 
 
@@ -129,6 +129,23 @@ def test_the_error_map_is_dark_where_there_is_no_error() -> None:
     assert (picture.ravel()[1:] < 10).all()
 
 
+def test_figures_are_drawn_of_whatever_seed_there_is(tmp_path: Path) -> None:
+    # As one shard finds them while the others are still at work.
+    made = [
+        run for run in small_plan(tables=("losses",)) if (run.dataset.scene, run.seed) in (("room", 1), ("object", 2))
+    ]
+    figures = {}
+    for run in made:
+        pictures = tmp_path / "runs" / run.name / "pictures"
+        pictures.mkdir(parents=True)
+        Image.new("RGB", (2 * 32, 24)).save(pictures / "eval_img_0000.png")
+        figures[run.name] = {**figures_of(run, 20.0, "large", (1.0, 0.5)), "curve": [(10, 15.0)]}
+    drawn = draw(tmp_path, small_plan(tables=("losses",)), figures)
+    names = [f"{scene}_hard_losses_{kind}.png" for scene in ("room", "object") for kind in ("views", "psnr")]
+    assert [path.name for path in drawn] == names
+    assert all(path.stat().st_size > 0 for path in drawn)
+
+
 @pytest.mark.slow
 def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path) -> None:
     options = (
@@ -136,6 +153,8 @@ def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path)
         "--steps", "8", "--tables", "methods",
         "--simulate=--width 32 --height 24 --duration 0.5 --validation-views 3 --test-views 3 --train-images 6",
     )  # fmt: skip
+    # A folder by the name of a built-in scene is no scene.
+    (tmp_path / "object").mkdir()
     command = [str(Path(sys.executable).parent / "aenerf"), "bench", *options]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     first = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)

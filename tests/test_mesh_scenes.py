@@ -24,11 +24,12 @@ from aenerf_ns.scenes.frames import frame_parameters
 from aenerf_ns.scenes.light_baking import AreaLight, bake
 from aenerf_ns.scenes.mesh import MeshScene
 from aenerf_ns.scenes.mesh_lighting import light_points
-from aenerf_ns.scenes.mesh_loading import Mesh, linear, load_mesh, scaled
+from aenerf_ns.scenes.mesh_loading import Mesh, load_mesh, scaled
 from aenerf_ns.scenes.mesh_repair import normals_and_areas, prepared, subdivided
 from aenerf_ns.scenes.mip_maps import mip_maps
 from aenerf_ns.scenes.polygons import ear_clipping
 from aenerf_ns.scenes.raycast import BOX, RECTANGLE, Primitive
+from aenerf_ns.scenes.textures import linear
 
 OVERHEAD = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])
 """A camera 3 m above the origin that looks down, its x axis along the world's."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from aenerf_ns.bench.plan import OURS, Run
+from aenerf_ns.bench.plan import OURS, Run, scene_name
 
 _GAP = 4
 _LABEL = 14
@@ -35,13 +35,10 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
     made = [run for run in runs if run.name in figures]
     files = []
     for scene, speed, table in dict.fromkeys((run.dataset.scene, run.dataset.speed, run.table) for run in made):
-        first = made[0].seed
-        rows = [
-            run
-            for run in made
-            if (run.dataset.scene, run.dataset.speed, run.table, run.seed) == (scene, speed, table, first)
-        ]
-        stem = rows[0].name.split(f"_{speed}_")[0] + f"_{speed}_{table}"
+        rows = [run for run in made if (run.dataset.scene, run.dataset.speed, run.table) == (scene, speed, table)]
+        # Of several seeds one will do: the first there is.
+        rows = [run for run in rows if run.seed == rows[0].seed]
+        stem = f"{scene_name(scene)}_{speed}_{table}"
         files += [
             _views(folder, rows, output / f"{stem}_views.png"),
             _curves(rows, figures, output / f"{stem}_psnr.png"),

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.bench.plan import CEILING, Dataset, Run
+from aenerf_ns.bench.plan import CEILING, Dataset, Run, scene_name
 from aenerf_ns.errors import DataError
 
 _CURVE_POINTS = 8
@@ -73,7 +73,7 @@ class Runner:
         figures = {
             "table": run.table,
             "row": run.row,
-            "scene": run.dataset.scene if "/" not in run.dataset.scene else Path(run.dataset.scene).parent.name,
+            "scene": scene_name(run.dataset.scene),
             "kind": "object" if "scene_box" in json.loads((data / "transforms.json").read_text("utf8")) else "large",
             "speed": run.dataset.speed,
             "poses": run.dataset.poses,
@@ -101,7 +101,8 @@ class Runner:
             # Another process may be making the same: whoever is first gives it its name.
             partial = folder.with_name(f".{dataset.name}.{os.getpid()}")
             shutil.rmtree(partial, ignore_errors=True)
-            scene = dataset.scene if not Path(dataset.scene).exists() else str(Path(dataset.scene).resolve())
+            # A built-in scene's name has no suffix; the path of a file is relative to where the benchmark was started.
+            scene = str(Path(dataset.scene).resolve()) if Path(dataset.scene).suffix else dataset.scene
             options = ("--scene", scene, *dataset.command[2:])
             self._call(dataset.name, _script("aenerf"), "simulate", "--output", str(partial.resolve()), *options)
             try:

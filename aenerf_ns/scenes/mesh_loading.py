@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.scenes.polygons import triangulated_obj
+from aenerf_ns.scenes.textures import linear
 
 Array = NDArray[np.float64]
 
@@ -43,12 +44,6 @@ class Mesh:
     colour: Array
     texture: NDArray[np.int64]
     textures: tuple[NDArray[np.float32], ...]
-
-
-def linear(encoded: NDArray[Any]) -> Array:
-    """Linear radiance of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    encoded = np.asarray(encoded, np.float64)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def load_mesh(path: Path, y_up: bool) -> Mesh:

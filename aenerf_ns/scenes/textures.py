@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Texture = NDArray[np.float32]
@@ -17,10 +17,15 @@ Texture = NDArray[np.float32]
 ALBEDO_RANGE = (0.03, 0.92)
 
 
-def linear_colour(colour: str) -> Array:
-    """Linear RGB (3,) of an sRGB colour "rrggbb" (IEC 61966-2-1)."""
-    encoded = np.array([int(colour[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0
+def linear(encoded: ArrayLike) -> Array:
+    """Linear radiance of sRGB values in [0, 1], any shape (IEC 61966-2-1)."""
+    encoded = np.asarray(encoded, np.float64)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def linear_colour(colour: str) -> Array:
+    """Linear RGB (3,) of an sRGB colour "rrggbb"."""
+    return linear(np.array([int(colour[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0)
 
 
 def spectral_noise(

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from meshes import Material, Model, linear, paint, read_obj, srgb_picture
+from meshes import Material, Model, paint, read_obj, srgb_picture
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import binary_dilation
@@ -223,4 +223,4 @@ def _photograph(name: str, path: Path) -> Material:
     with Image.open(path) as picture:
         sides = [int(min(_PICTURE_SIZE, 2 ** round(np.log2(side)))) for side in picture.size]
         pixels = np.asarray(picture.convert("RGB").resize(sides, Image.Resampling.LANCZOS))
-    return Material(name, srgb_picture(np.clip(linear(pixels), *textures.ALBEDO_RANGE)))
+    return Material(name, srgb_picture(np.clip(textures.linear(pixels / 255), *textures.ALBEDO_RANGE)))

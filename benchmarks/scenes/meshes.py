@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.scenes.textures import ALBEDO_RANGE, Texture
+from aenerf_ns.scenes.textures import ALBEDO_RANGE, Texture, linear
 
 Array = NDArray[np.float64]
 
@@ -136,13 +136,7 @@ def coloured_copy(material: Material, colour: ArrayLike) -> Material:
     """The material with its linear albedo times an RGB factor."""
     factor = np.asarray(colour, np.float64)
     name = f"{material.name} * {factor.round(4).tolist()}"
-    return Material(name, srgb_picture(np.clip(linear(material.picture) * factor, *ALBEDO_RANGE)))
-
-
-def linear(picture: NDArray[np.uint8]) -> Array:
-    """Linear values in [0, 1] of sRGB ones, any shape (IEC 61966-2-1)."""
-    encoded = np.asarray(picture) / 255.0
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return Material(name, srgb_picture(np.clip(linear(material.picture / 255) * factor, *ALBEDO_RANGE)))
 
 
 def srgb_picture(value: ArrayLike) -> NDArray[np.uint8]:
