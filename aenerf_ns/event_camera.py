@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -97,6 +97,10 @@ class EventCamera:
         directions = np.stack([plane[..., 0], -plane[..., 1], np.full(plane.shape[:2], -1.0)], -1)
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         return directions, error < _MAX_ROUND_TRIP_ERROR
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> EventCamera:
+        """The camera of the part of the sensor that begins at pixel (x, y) and has ``width`` x ``height`` pixels."""
+        return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
 
     def cameras(self, camera_to_worlds: Tensor) -> Cameras:
         """Nerfstudio's cameras with this lens.

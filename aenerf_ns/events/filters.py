@@ -1,0 +1,201 @@
+"""Leaving events out of a stream: by time, by pixel, or because they follow another too closely."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream
+
+_NEVER = np.iinfo(np.int64).min
+
+# A hot pixel has more events than its neighbours by this factor,
+_HOT_FACTOR = 4.0
+# and by so many standard deviations: of what pixels that see alike differ by, at least of a Poisson process.
+_HOT_DEVIATIONS = 6.0
+
+
+@dataclass(frozen=True)
+class EventFilters:
+    """Which events of a stream are kept.
+
+    Applied in this order: time window, hot pixels, region, share of the pixels, shortest interval.
+
+    Attributes:
+        start: events before this time in nanoseconds are left out.
+        end: events after this time in nanoseconds are left out.
+        region: x, y, width and height of the part of the sensor that is kept, in pixels. The pixels of what is kept
+            count from its corner.
+        hot_pixels: whether the events of hot pixels (:func:`find_hot_pixels`) are left out.
+        pixel_share: share of the pixels whose events are kept, all of them. Which ones is random.
+        shortest_interval: an event that follows the last kept one of its pixel by less than this, in nanoseconds, is
+            left out.
+        seed: of the random pixels.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+
+    start: int | None = None
+    end: int | None = None
+    region: tuple[int, int, int, int] | None = None
+    hot_pixels: bool = False
+    pixel_share: float = 1.0
+    shortest_interval: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.pixel_share <= 1:
+            raise ValueError(f"the share of pixels must be above 0 and at most 1, not {self.pixel_share}")
+        if self.shortest_interval < 0:
+            raise ValueError(f"the shortest interval must not be negative, not {self.shortest_interval} ns")
+        if self.start is not None and self.end is not None and self.start > self.end:
+            raise ValueError(f"the time window ends at {self.end} ns, before it begins at {self.start} ns")
+        if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) <= 0):
+            raise ValueError(f"the region of interest {self.region} must be x, y, width, height, of positive size")
+
+
+def count_events(chunks: Iterable[EventStream], width: int, height: int) -> NDArray[np.int64]:
+    """Number of events of every pixel (height, width), in one pass over the stream."""
+    counts = np.zeros(width * height, np.int64)
+    for chunk in chunks:
+        _count(chunk.x, chunk.y, width, counts)
+    return counts.reshape(height, width)
+
+
+def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Pixels that fire by themselves.
+
+    What a moving camera sees passes over many pixels, so that a pixel has about as many events as those around it. A
+    hot one has more than four times the median of the 5 x 5 pixels around it, and by more than 6 standard deviations.
+    For these, numbers are compared after Anscombe's transformation 2 sqrt(n + 3/8), under which the noise of a Poisson
+    process is 1; the standard deviation is the larger of that and 1.4826 times the median absolute deviation over the
+    sensor.
+
+    Args:
+        counts: (height, width) number of events of every pixel.
+
+    Returns:
+        (height, width) whether a pixel is hot.
+    """
+    around = cv2.medianBlur(counts.astype(np.float32), 5)
+    excess = 2 * (np.sqrt(counts + 0.375) - np.sqrt(around + 0.375))
+    spread = max(1.4826 * float(np.median(np.abs(excess))), 1.0)
+    return (counts > _HOT_FACTOR * around) & (excess > _HOT_DEVIATIONS * spread)
+
+
+class FilteredEventFile(EventFile):
+    """An event file of which only some events are kept, read through as it is.
+
+    Args:
+        source: the event file.
+        filters: which events are kept.
+
+    Raises:
+        DataError: the region of interest is not on the sensor.
+
+    Attributes:
+        hot_pixels: (height, width) which pixels of the source are hot, known once they were looked for; None when they
+            are kept.
+        counts: (height, width) number of events of every pixel of the source, likewise.
+    """
+
+    def __init__(self, source: EventFile, filters: EventFilters) -> None:
+        x, y, width, height = filters.region or (0, 0, source.width, source.height)
+        if x + width > source.width or y + height > source.height:
+            raise DataError(
+                source.path,
+                f"the region of interest {x} {y} {width} {height} (x, y, width, height) reaches beyond its "
+                f"{source.width} x {source.height} pixels",
+                "give one on the sensor",
+            )
+        super().__init__(source.path, width, height)
+        self._source = source
+        self._filters = filters
+        self._corner = (x, y)
+        self.hot_pixels: NDArray[np.bool_] | None = None
+        self.counts: NDArray[np.int64] | None = None
+
+    def find_hot_pixels(self, chunks: Iterable[EventStream] | None = None) -> None:
+        """Looks for hot pixels when they are to be left out. Reads the whole source.
+
+        Args:
+            chunks: of the source, to show progress; by default they are read here.
+        """
+        if self._filters.hot_pixels:
+            within = self._within(self._source.chunks() if chunks is None else chunks)
+            self.counts = count_events(within, self._source.width, self._source.height)
+            self.hot_pixels = find_hot_pixels(self.counts)
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        yield from self.filtered(self._source.chunks())
+
+    def filtered(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
+        """What is kept of chunks of the source, all of which must come, in order."""
+        if self._filters.hot_pixels and self.hot_pixels is None:
+            self.find_hot_pixels()
+        keep = self._kept_pixels()
+        last_kept = np.full(keep.size, _NEVER, np.int64)
+        x0, y0 = self._corner
+        for chunk in self._within(chunks):
+            kept = _select(
+                chunk.x, chunk.y, chunk.t, keep.ravel(), chunk.width, self._filters.shortest_interval, last_kept
+            )
+            yield EventStream(
+                (chunk.x[kept] - x0).astype(np.uint16),
+                (chunk.y[kept] - y0).astype(np.uint16),
+                chunk.t[kept],
+                chunk.p[kept],
+                self.width,
+                self.height,
+                self.path,
+            )
+
+    def _within(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
+        start, end = self._filters.start, self._filters.end
+        for chunk in chunks:
+            yield chunk.between(_NEVER if start is None else start, np.iinfo(np.int64).max - 1 if end is None else end)
+
+    def _kept_pixels(self) -> NDArray[np.bool_]:
+        """(height, width) pixels of the source whose events are kept."""
+        (x, y), shape = self._corner, (self._source.height, self._source.width)
+        keep = np.zeros(shape, bool)
+        keep[y : y + self.height, x : x + self.width] = True
+        if self._filters.pixel_share < 1:
+            keep &= np.random.default_rng(self._filters.seed).random(shape) < self._filters.pixel_share
+        if self.hot_pixels is not None:
+            keep &= ~self.hot_pixels
+        return keep
+
+    def time_span(self) -> tuple[int, int]:
+        """Times that bound those of the events that are kept, in nanoseconds."""
+        first, last = self._source.time_span()
+        start, end = self._filters.start, self._filters.end
+        return first if start is None else max(first, start), last if end is None else min(last, end)
+
+    def empty_error(self) -> DataError:
+        return DataError(self.path, "no event is left", "widen the time window, the region of interest or the share")
+
+
+@numba.njit(cache=True)
+def _count(x, y, width, counts):
+    for i in range(x.shape[0]):
+        counts[np.int64(y[i]) * width + x[i]] += 1
+
+
+@numba.njit(cache=True)
+def _select(x, y, t, keep, width, shortest_interval, last_kept):
+    """Which events are kept, (N,) bool; ``last_kept`` is carried from chunk to chunk."""
+    kept = np.zeros(x.shape[0], np.bool_)
+    for i in range(x.shape[0]):
+        pixel = np.int64(y[i]) * width + x[i]
+        if keep[pixel] and (last_kept[pixel] == _NEVER or t[i] - last_kept[pixel] >= shortest_interval):
+            kept[i] = True
+            last_kept[pixel] = t[i]
+    return kept

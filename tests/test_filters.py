@@ -1,0 +1,189 @@
+"""Event filters: the same as the slow and obvious way, however the stream is cut."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import make_stream
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.filters import EventFilters, FilteredEventFile, count_events, find_hot_pixels
+from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.events.stream import EventFile, EventStream
+
+WIDTH, HEIGHT = 6, 5
+Row = tuple[int, int, int, int]
+# Small ranges, so that pixels repeat and times coincide.
+EVENTS = st.lists(
+    st.tuples(st.integers(0, WIDTH - 1), st.integers(0, HEIGHT - 1), st.integers(0, 30), st.sampled_from([-1, 1])),
+    min_size=1,
+    max_size=120,
+).map(lambda rows: sorted(rows, key=lambda row: row[2]))
+
+
+class EventList(EventFile):
+    """Rows in memory, cut into pieces."""
+
+    def __init__(self, rows: list[Row], sizes: list[int]) -> None:
+        super().__init__(Path(__file__), WIDTH, HEIGHT)
+        self._rows, self._sizes = rows, sizes
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        begin = 0
+        for size in [*self._sizes, len(self._rows)]:
+            yield make_stream(self._rows[begin : begin + size], WIDTH, HEIGHT)
+            begin += size
+
+    def time_span(self) -> tuple[int, int]:
+        return self._rows[0][2], self._rows[-1][2]
+
+
+def rows_of(event_file: EventFile) -> list[Row]:
+    chunks = list(event_file.read_chunks())
+    assert all((chunk.width, chunk.height) == (event_file.width, event_file.height) for chunk in chunks)
+    columns = (np.concatenate([getattr(chunk, name) for chunk in chunks]).tolist() for name in "xytp")
+    return list(zip(*columns, strict=True))
+
+
+def kept_by_brute_force(rows: list[Row], filters: EventFilters, keep: set[tuple[int, int]]) -> list[Row]:
+    """The rows that stay, the slow and obvious way; ``keep`` are the pixels that stay."""
+    result: list[Row] = []
+    x0, y0 = filters.region[:2] if filters.region else (0, 0)
+    for x, y, t, p in rows:
+        if filters.start is not None and t < filters.start:
+            continue
+        if filters.end is not None and t > filters.end:
+            continue
+        before = [row[2] for row in result if row[:2] == (x, y)]
+        if (x, y) in keep and not (before and t - before[-1] < filters.shortest_interval):
+            result.append((x, y, t, p))
+    return [(x - x0, y - y0, t, p) for x, y, t, p in result]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    EVENTS,
+    st.lists(st.integers(0, 20), max_size=6),
+    st.none() | st.integers(0, 15),
+    st.none() | st.integers(15, 31),
+    st.none() | st.tuples(st.integers(0, 2), st.integers(0, 2), st.integers(1, 4), st.integers(1, 3)),
+    st.integers(0, 6),
+)
+def test_filters_are_those_of_brute_force_however_the_stream_is_cut(
+    rows: list[Row],
+    sizes: list[int],
+    start: int | None,
+    end: int | None,
+    region: tuple[int, int, int, int] | None,
+    shortest_interval: int,
+) -> None:
+    filters = EventFilters(start=start, end=end, region=region, shortest_interval=shortest_interval)
+    x0, y0, width, height = region or (0, 0, WIDTH, HEIGHT)
+    keep = {(x, y) for x in range(x0, x0 + width) for y in range(y0, y0 + height)}
+    filtered = FilteredEventFile(EventList(rows, sizes), filters)
+    assert rows_of(filtered) == kept_by_brute_force(rows, filters, keep)
+    assert (filtered.width, filtered.height) == (width, height)
+    first, last = filtered.time_span()
+    assert all(first <= t <= last for _, _, t, _ in rows_of(filtered))
+
+
+@settings(max_examples=50, deadline=None)
+@given(EVENTS, st.lists(st.integers(0, 20), max_size=6), st.floats(0.1, 0.9), st.integers(0, 3))
+def test_a_share_of_the_pixels_keeps_all_their_events_and_so_their_pairs(
+    rows: list[Row], sizes: list[int], share: float, seed: int
+) -> None:
+    kept = rows_of(FilteredEventFile(EventList(rows, sizes), EventFilters(pixel_share=share, seed=seed)))
+    pixels = {row[:2] for row in kept}
+    assert kept == [row for row in rows if row[:2] in pixels]
+    assert kept == rows_of(FilteredEventFile(EventList(rows, []), EventFilters(pixel_share=share, seed=seed)))
+    if kept:
+        # Every pair of the filtered stream is one of the whole stream.
+        pairs, whole = (pair_events([make_stream(part, WIDTH, HEIGHT)]) for part in (kept, rows))
+        columns = ("x", "y", "previous_time", "time", "num_positive", "num_negative")
+        kept_pairs, all_pairs = (
+            set(zip(*(getattr(p, c).tolist() for c in columns), strict=True)) for p in (pairs, whole)
+        )
+        assert kept_pairs <= all_pairs
+
+
+def test_the_share_of_pixels_is_as_asked_and_seeded() -> None:
+    everywhere = [(x, y, 0, 1) for y in range(HEIGHT) for x in range(WIDTH)]
+
+    def pixels(seed: int) -> list[Row]:
+        return rows_of(FilteredEventFile(EventList(everywhere, []), EventFilters(pixel_share=0.5, seed=seed)))
+
+    assert pixels(1) == pixels(1)
+    assert len({tuple(pixels(seed)) for seed in range(5)}) == 5
+    assert np.mean([len(pixels(seed)) for seed in range(200)]) == pytest.approx(0.5 * len(everywhere), rel=0.05)
+
+
+def test_planted_hot_pixels_are_found_and_no_others() -> None:
+    rng = np.random.default_rng(0)
+    # A scene whose event density varies smoothly by a factor of 30, with Poisson noise.
+    columns, rows = np.meshgrid(np.arange(80), np.arange(60))
+    density = 3 * np.exp(1.7 * (np.sin(columns / 7) + np.cos(rows / 9)))
+    counts = rng.poisson(density)
+    hot = np.zeros(counts.shape, bool)
+    hot[[0, 20, 21, 59, 40], [0, 30, 31, 79, 12]] = True
+    counts[hot] = 12 * density[hot] + 200
+    assert (find_hot_pixels(counts) == hot).all()
+    assert not find_hot_pixels(np.zeros((10, 10), np.int64)).any()
+
+
+def test_hot_pixels_are_left_out_and_told() -> None:
+    rng = np.random.default_rng(0)
+    rows = [(int(x), int(y), 2 * i, 1) for i, (x, y) in enumerate(rng.integers(0, (WIDTH, HEIGHT), (300, 2)))]
+    rows += [(4, 2, 2 * i + 1, 1) for i in range(300)]
+    rows.sort(key=lambda row: row[2])
+    filtered = FilteredEventFile(EventList(rows, [100, 0, 200]), EventFilters(hot_pixels=True))
+    assert rows_of(filtered) == [row for row in rows if row[:2] != (4, 2)]
+    assert filtered.hot_pixels is not None
+    assert filtered.counts is not None
+    assert np.argwhere(filtered.hot_pixels).tolist() == [[2, 4]]
+    np.testing.assert_array_equal(filtered.counts, count_events([make_stream(rows, WIDTH, HEIGHT)], WIDTH, HEIGHT))
+    # Only the time window counts: within it the pixel is as the others.
+    quiet = [row for row in rows if row[:2] != (4, 2) or row[2] < 300]
+    filters = EventFilters(start=301, hot_pixels=True)
+    assert rows_of(FilteredEventFile(EventList(quiet, []), filters)) == [row for row in quiet if row[2] >= 301]
+
+
+def test_a_cropped_camera_sees_the_same_directions() -> None:
+    camera = EventCamera(12, 10, 8.0, 8.5, 6.2, 4.9, "radial_tangential", (-0.1, 0.02, 0.001, 0.0, 0.0))
+    cropped = camera.cropped(3, 2, 7, 5)
+    assert (cropped.width, cropped.height) == (7, 5)
+    np.testing.assert_allclose(
+        cropped.pixel_directions()[0], camera.pixel_directions()[0][2:7, 3:10], rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"pixel_share": 0.0},
+        {"pixel_share": 1.5},
+        {"pixel_share": float("nan")},
+        {"shortest_interval": -1},
+        {"start": 5, "end": 4},
+        {"region": (0, 0, 0, 4)},
+        {"region": (-1, 0, 2, 4)},
+    ],
+)
+def test_impossible_filters_are_refused(values: dict) -> None:
+    with pytest.raises(ValueError, match=r"must|before"):
+        EventFilters(**values)
+
+
+def test_a_region_beyond_the_sensor_is_refused() -> None:
+    with pytest.raises(DataError, match=r"region of interest 3 0 4 5 .* beyond its 6 x 5 pixels; give one"):
+        FilteredEventFile(EventList([(0, 0, 0, 1)], []), EventFilters(region=(3, 0, 4, 5)))
+
+
+def test_filters_that_leave_nothing_are_told() -> None:
+    with pytest.raises(DataError, match="no event is left; widen"):
+        list(FilteredEventFile(EventList([(0, 0, 0, 1)], []), EventFilters(start=1)).chunks())
