@@ -7,7 +7,7 @@ camera-to-world, OpenCV axes) and ``calib.txt`` (fx fy cx cy k1 k2 p1 p2 k3).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 
@@ -16,7 +16,13 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
-from aenerf_ns.dataparsers.recording import EventDataParser, EventDataParserConfig, Recording, ReferenceView
+from aenerf_ns.dataparsers.recording import (
+    EventDataParser,
+    EventDataParserConfig,
+    FrameSequence,
+    Recording,
+    ReferenceView,
+)
 from aenerf_ns.dataparsers.text import parse_numbers, parse_seconds, read_rows
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
@@ -120,14 +126,33 @@ class EcdDataParser(EventDataParser):
     config: EcdDataParserConfig
 
     def read_recording(self) -> Recording:
+        frames = self._read_all_but_poses()
+        folder, given = Path(self.config.data), self.config.trajectory
+        reference = read_tum_trajectory(folder / "groundtruth.txt")
+        images = _views(frames, reference)
+        return Recording(
+            event_file=frames.event_file,
+            event_camera=frames.event_camera,
+            sensor=frames.sensor,
+            trajectory=reference if given is None else read_tum_trajectory(given),
+            ground_truth=None if given is None else reference,
+            frame_camera=frames.frame_camera,
+            reference_views={"train": images, "val": images[::2], "test": images[1::2]},
+            image_encoding=frames.image_encoding,
+        )
+
+    def read_frames(self) -> FrameSequence:
+        frames = self._read_all_but_poses()
+        has_poses = (Path(self.config.data) / "groundtruth.txt").exists()
+        return replace(frames, recording=self.read_recording() if has_poses else None)
+
+    def _read_all_but_poses(self) -> FrameSequence:
         folder = Path(self.config.data)
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
-        reference = read_tum_trajectory(folder / "groundtruth.txt")
-        given = self.config.trajectory
-        images = _read_images(folder, reference)
-        camera = _read_calibration(folder / "calib.txt", _image_size(images[0].file if images else None))
-        return Recording(
+        times, files = _list_images(folder)
+        camera = _read_calibration(folder / "calib.txt", _image_size(files[0] if files else None))
+        return FrameSequence(
             event_file=EcdEventFile(folder / "events.txt", camera.width, camera.height),
             event_camera=camera,
             sensor=SensorModel(
@@ -135,29 +160,38 @@ class EcdDataParser(EventDataParser):
                 self.config.negative_contrast_threshold,
                 self.config.refractory_period_ns,
             ),
-            trajectory=reference if given is None else read_tum_trajectory(given),
-            ground_truth=None if given is None else reference,
             frame_camera=camera,
-            reference_views={"train": images, "val": images[::2], "test": images[1::2]},
+            files=files,
+            times=times,
             image_encoding="linear",
+            recording=None,
         )
 
 
-def _read_images(folder: Path, trajectory: Trajectory) -> list[ReferenceView]:
-    """The frames that were taken within the span of the poses."""
-    if not (folder / "images.txt").exists():
-        return []
-    rows = read_rows(folder / "images.txt", "t file")
-    views, num_without_pose = [], 0
-    for time, (_, name) in zip(parse_seconds(folder / "images.txt", [row[0] for row in rows]), rows, strict=True):
+def _list_images(folder: Path) -> tuple[list[int], list[Path]]:
+    """Times and files of the frames."""
+    path = folder / "images.txt"
+    if not path.exists():
+        return [], []
+    rows = read_rows(path, "t file")
+    for _, name in rows:
         if not (folder / name).is_file():
-            raise DataError(folder / "images.txt", f"it names {name}, which does not exist", "copy the images too")
-        if trajectory.start <= time <= trajectory.end:
-            views.append(ReferenceView(folder / name, homogeneous(trajectory.interpolate(time)), int(time)))
-        else:
-            num_without_pose += 1
-    if num_without_pose:
-        CONSOLE.print(f"{num_without_pose} of {len(rows)} images are left out: they were taken outside the poses.")
+            raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
+    return parse_seconds(path, [row[0] for row in rows]).tolist(), [folder / name for _, name in rows]
+
+
+def _views(frames: FrameSequence, trajectory: Trajectory) -> list[ReferenceView]:
+    """The frames that were taken within the span of the poses."""
+    views = [
+        ReferenceView(file, homogeneous(trajectory.interpolate(time)), time)
+        for time, file in zip(frames.times, frames.files, strict=True)
+        if trajectory.start <= time <= trajectory.end
+    ]
+    if len(views) < len(frames.files):
+        CONSOLE.print(
+            f"{len(frames.files) - len(views)} of {len(frames.files)} images are left out: they were taken outside "
+            "the poses."
+        )
     return views
 
 

@@ -36,9 +36,10 @@ class NativeDatasetWriter:
         sensor: its contrast thresholds, refractory period and Bayer pattern.
         image_encoding: of the images to come.
         scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
+        frame_camera: the lens of the camera that took the images; by default the event camera's.
 
     Raises:
-        DataError: the folder exists.
+        DataError: the folder exists or cannot be created.
 
     Attributes:
         events: takes the events, piece by piece in the order of time.
@@ -51,25 +52,30 @@ class NativeDatasetWriter:
         sensor: SensorModel,
         image_encoding: ImageEncoding,
         scene_box: NDArray[np.float64] | None = None,
+        frame_camera: EventCamera | None = None,
     ) -> None:
+        frame_camera = event_camera if frame_camera is None else frame_camera
         if folder.exists():
             raise DataError(folder, "the folder exists already", "remove it or choose another --output")
         self._folder = folder
         self._partial = folder.with_name(f".{folder.name}.partial")
         shutil.rmtree(self._partial, ignore_errors=True)
-        self._partial.mkdir(parents=True)
+        try:
+            self._partial.mkdir(parents=True)
+        except OSError as error:
+            raise DataError(folder, f"it cannot be created ({error})", "choose another --output") from None
         self.events = Hdf5EventWriter(self._partial / "events.h5")
-        lens = _lens(event_camera)
+        self._files: dict[Path, dict[str, Any]] = {}
         self._meta: dict[str, Any] = {
-            "w": event_camera.width,
-            "h": event_camera.height,
-            **lens,
+            "w": frame_camera.width,
+            "h": frame_camera.height,
+            **_lens(frame_camera),
             "image_encoding": image_encoding,
             "event_camera": {
                 "file": "events.h5",
                 "width": event_camera.width,
                 "height": event_camera.height,
-                **lens,
+                **_lens(event_camera),
                 "positive_contrast_threshold": sensor.positive_contrast_threshold,
                 "negative_contrast_threshold": sensor.negative_contrast_threshold,
                 "refractory_period_ns": sensor.refractory_period,
@@ -120,10 +126,28 @@ class NativeDatasetWriter:
             camera_to_world: (4, 4) pose, OpenCV camera axes.
             time: in nanoseconds, when the image was taken on the trajectory.
         """
+        frame = self._add_frame(split, ".png", camera_to_world, time)
+        Image.fromarray(image).save(self._partial / frame["file_path"])
+
+    def add_image_file(self, split: Split, file: Path, camera_to_world: Tensor, time: int | None = None) -> None:
+        """Adds a reference image as it is: its file is copied, once when it is added to several splits.
+
+        Args:
+            split: which split it belongs to.
+            file: the image.
+            camera_to_world: (4, 4) pose, OpenCV camera axes; one file has one pose.
+            time: in nanoseconds, when the image was taken on the trajectory.
+        """
+        if file in self._files:
+            self._meta[f"{split}_filenames"].append(self._files[file]["file_path"])
+            return
+        self._files[file] = self._add_frame(split, file.suffix, camera_to_world, time)
+        shutil.copyfile(file, self._partial / self._files[file]["file_path"])
+
+    def _add_frame(self, split: Split, suffix: str, camera_to_world: Tensor, time: int | None) -> dict[str, Any]:
         names = self._meta[f"{split}_filenames"]
-        name = f"images/{split}/{len(names):05d}.png"
+        name = f"images/{split}/{len(names):05d}{suffix}"
         (self._partial / name).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(image).save(self._partial / name)
         frame: dict[str, Any] = {
             "file_path": name,
             "transform_matrix": (camera_to_world.double() @ OPENCV_TO_OPENGL).tolist(),
@@ -132,6 +156,7 @@ class NativeDatasetWriter:
             frame["timestamp"] = format_seconds(time)
         self._meta["frames"].append(frame)
         names.append(name)
+        return frame
 
 
 def _lens(camera: EventCamera) -> dict[str, Any]:

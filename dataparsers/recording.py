@@ -82,6 +82,31 @@ class Recording:
         return self.trajectory if self.ground_truth is None else self.ground_truth
 
 
+@dataclass(frozen=True)
+class FrameSequence:
+    """A recording as it is before it has poses, with the frames that they can be estimated from.
+
+    Attributes:
+        event_file: the events, not yet read.
+        event_camera: the event camera's lens.
+        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
+        frame_camera: the lens of the camera that took the frames.
+        files: the frames, in the order of time.
+        times: when they were taken, in nanoseconds on the clock of the events.
+        image_encoding: whether the frames' values are sRGB or linear in radiance.
+        recording: the recording with its given poses, or None where it has none.
+    """
+
+    event_file: EventFile
+    event_camera: EventCamera
+    sensor: SensorModel
+    frame_camera: EventCamera
+    files: list[Path]
+    times: list[int]
+    image_encoding: ImageEncoding
+    recording: Recording | None
+
+
 @dataclass
 class EventDataParserConfig(DataParserConfig):
     """What all event dataparsers have in common."""
@@ -118,6 +143,26 @@ class EventDataParser(DataParser):
             DataError: a file is missing or its content cannot be used.
         """
 
+    def read_frames(self) -> FrameSequence:
+        """Reads what poses can be estimated from: the timed reference views. A format whose poses may be missing
+        overrides it.
+
+        Raises:
+            DataError: a file is missing or its content cannot be used.
+        """
+        recording = self.read_recording()
+        timed = {v.time: v.file for views in recording.reference_views.values() for v in views if v.time is not None}
+        return FrameSequence(
+            event_file=recording.event_file,
+            event_camera=recording.event_camera,
+            sensor=recording.sensor,
+            frame_camera=recording.frame_camera,
+            files=[timed[time] for time in sorted(timed)],
+            times=sorted(timed),
+            image_encoding=recording.image_encoding,
+            recording=recording,
+        )
+
     @cached_property
     def _recording(self) -> Recording:
         return self.read_recording()
@@ -144,7 +189,7 @@ class EventDataParser(DataParser):
         else:
             views = _views_within(recording.reference_views[_as_split(split)], start, end)
             for view in views:
-                _check_image(view.file, recording.frame_camera)
+                check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
             poses = to_scene(poses @ OPENCV_TO_OPENGL)
             _check_distance(poses, trajectory if ground_truth is None else ground_truth)
@@ -231,7 +276,7 @@ def _as_split(split: str) -> Split:
     return split  # type: ignore[return-value]
 
 
-def _check_image(file: Path, camera: EventCamera) -> None:
+def check_image(file: Path, camera: EventCamera) -> None:
     """Raises a DataError for an image that the framework would read wrongly."""
     with Image.open(file) as image:
         if image.size != (camera.width, camera.height):

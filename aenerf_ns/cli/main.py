@@ -7,6 +7,7 @@ import sys
 import tyro
 
 from aenerf_ns.cli.bench import Bench
+from aenerf_ns.cli.convert import Convert
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.simulate import Simulate
@@ -16,7 +17,13 @@ from aenerf_ns.errors import DataError
 def main() -> None:
     """Entry point of the ``aenerf`` command. Bad input ends it with one line and exit status 1."""
     command = tyro.extras.subcommand_cli_from_dict(
-        {"simulate": Simulate, "evaluate": Evaluate, "export-trajectory": ExportTrajectory, "bench": Bench},
+        {
+            "simulate": Simulate,
+            "convert": Convert,
+            "evaluate": Evaluate,
+            "export-trajectory": ExportTrajectory,
+            "bench": Bench,
+        },
         prog="aenerf",
         description="AE-NeRF tools; train with ns-train aenerf.",
     )

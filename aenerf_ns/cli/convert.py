@@ -1,0 +1,242 @@
+"""``aenerf convert``: any dataset as a native one."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
+from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.dataparsers.recording import FrameSequence, Recording, ReferenceView, Split, check_image
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.filters import EventFilters, FilteredEventFile
+from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.structure_from_motion import compare_with_truth, estimate_poses
+from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
+
+_MAX_SHOWN = 10
+
+
+@dataclass
+class Convert:
+    """Write a dataset of any format as a dataset folder of aenerf-ns, with some of the events left out where asked.
+    The events are read and written piece by piece, and the folder appears when it is complete. Options of a format come
+    after its name; by default the format is recognised."""
+
+    data: Path
+    """The dataset to read."""
+    output: Path
+    """Dataset folder to create."""
+    poses: Literal["given", "colmap"] = "given"
+    """Take the poses that are there, or have COLMAP estimate them from the recording's frames. These have no metric
+    scale. Given poses are then kept as ground truth, to compare with."""
+    start_time_ns: int | None = None
+    """Leave out what happened before this time on the clock of the events, in nanoseconds."""
+    end_time_ns: int | None = None
+    """Leave out what happened after this time, likewise."""
+    region: tuple[int, int, int, int] | None = None
+    """Keep only this part of the sensor: x y width height, in pixels."""
+    drop_hot_pixels: bool = False
+    """Leave out pixels that fire by themselves. Reads the events twice."""
+    shortest_interval_ns: int = 0
+    """Leave out events that follow the last one kept of their pixel by less than this, in nanoseconds: repeated firing
+    for one change of light. Each event that was none of these takes a contrast threshold with it."""
+    pixel_share: float = 1.0
+    """Keep the events of this share of the pixels, chosen at random; to train on less."""
+    seed: int = 0
+    """Seed of the pixels that are kept, and of COLMAP."""
+    format: DatasetFormat = field(default_factory=Automatic)
+
+    def main(self) -> None:
+        """Reads the dataset and writes it."""
+        if self.output.exists():
+            raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
+        try:
+            filters = EventFilters(
+                start=self.start_time_ns,
+                end=self.end_time_ns,
+                region=self.region,
+                hot_pixels=self.drop_hot_pixels,
+                pixel_share=self.pixel_share,
+                shortest_interval=self.shortest_interval_ns,
+                seed=self.seed,
+            )
+        except ValueError as error:
+            raise DataError("aenerf convert", str(error), "see aenerf convert --help") from None
+        parser = open_dataset(self.data, self.format)
+        report = None
+        if self.poses == "colmap":
+            recording, report = _with_estimated_poses(parser.read_frames(), self._within, self.data, self.seed)
+        else:
+            recording = parser.read_recording()
+        events = FilteredEventFile(recording.event_file, filters)
+        trajectory = self._cut(recording, events)
+        views = {
+            split: [view for view in views if view.time is None or self._within(view.time)]
+            for split, views in recording.reference_views.items()
+        }
+        for file in {view.file for split in views.values() for view in split}:
+            check_image(file, recording.frame_camera)
+        camera = recording.event_camera
+        if self.region is not None:
+            camera = camera.cropped(*self.region)
+            if recording.sensor.bayer_pattern and (self.region[0] % 2 or self.region[1] % 2):
+                raise DataError(
+                    "aenerf convert",
+                    f"a region of interest from pixel {self.region[0]} {self.region[1]} of a colour sensor",
+                    "begin it at an even column and row, so that its first pixel is red",
+                )
+        try:
+            with (
+                _ended_by_exception(),
+                NativeDatasetWriter(
+                    self.output,
+                    camera,
+                    recording.sensor,
+                    recording.image_encoding,
+                    None if recording.scene_box is None else recording.scene_box.numpy(),
+                    recording.frame_camera,
+                ) as writer,
+            ):
+                writer.add_trajectories(trajectory, recording.ground_truth)
+                if report is not None:
+                    writer.add_poses_report(report)
+                for split, kept in views.items():
+                    for view in kept:
+                        writer.add_image_file(split, view.file, view.camera_to_world, view.time)
+                num_read, num_written = _copy_events(recording.event_file, events, writer)
+        except OSError as error:
+            raise DataError(self.output, f"it cannot be written ({error})", "check the space and the rights") from None
+        counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
+        CONSOLE.print(
+            f"{self.output}: {num_written:,} of {num_read:,} events, {len(trajectory)} poses, images: {counts}.\n"
+            f"Look it over with: aenerf check --data {self.output}\n"
+            f"Train with: ns-train aenerf --data {self.output}",
+            highlight=False,
+        )
+
+    def _within(self, time: int) -> bool:
+        return (self.start_time_ns is None or self.start_time_ns <= time) and (
+            self.end_time_ns is None or time <= self.end_time_ns
+        )
+
+    def _cut(self, recording: Recording, events: FilteredEventFile) -> Trajectory:
+        """The poses that cover the time window: all of them without one."""
+        first, last = recording.event_file.time_span()
+        if last < first:
+            raise DataError(
+                recording.event_file.path,
+                f"its last event, at {last} ns, is before its first, at {first} ns",
+                "sort the events by time",
+            )
+        start, end = events.time_span()
+        if end < start:
+            raise DataError(
+                recording.event_file.path,
+                f"its events are from {first} to {last} ns, all outside the time window",
+                "widen the time window (--start-time-ns, --end-time-ns)",
+            )
+        covered = recording.trajectory.between(start, end)
+        return recording.trajectory if self.start_time_ns is None and self.end_time_ns is None else covered
+
+
+def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDatasetWriter) -> tuple[int, int]:
+    """Writes what is kept of the events; returns how many were read and how many written."""
+    num_read = num_written = 0
+    with progress_bar() as progress:
+
+        def tracked(description: str) -> Iterator[EventStream]:
+            nonlocal num_read
+            num_read = 0
+            task = progress.add_task(description, total=source.count())
+            for chunk in source.chunks():
+                yield chunk
+                num_read += len(chunk)
+                progress.advance(task, len(chunk))
+
+        events.find_hot_pixels(tracked("Looking for hot pixels"))
+        for chunk in events.filtered(tracked("Converting events")):
+            writer.events.append(chunk)
+            num_written += len(chunk)
+    if num_written == 0:
+        raise events.empty_error()
+    if events.hot_pixels is not None:
+        CONSOLE.print(hot_pixel_summary(events.hot_pixels, events.counts), highlight=False)
+    return num_read, num_written
+
+
+def hot_pixel_summary(hot: np.ndarray, counts: np.ndarray) -> str:
+    """One line about (height, width) hot pixels and the number of events of all pixels."""
+    if not hot.any():
+        return "Hot pixels: none."
+    rows, columns = np.nonzero(hot)
+    order = np.argsort(-counts[hot], kind="stable")[:_MAX_SHOWN]
+    named = ", ".join(f"({columns[i]}, {rows[i]}) {counts[rows[i], columns[i]]:,}" for i in order)
+    more = f", and {len(rows) - len(order)} more" if len(rows) > len(order) else ""
+    share = counts[hot].sum() / counts.sum()
+    return f"Hot pixels: {len(rows)}, with {share:.2%} of the events. (x, y) and events: {named}{more}."
+
+
+def _with_estimated_poses(
+    frames: FrameSequence, within: Callable[[int], bool], source: Path, seed: int
+) -> tuple[Recording, dict[str, Any]]:
+    """The recording with COLMAP's poses as the estimated ones, and what COLMAP says of itself."""
+    if frames.frame_camera != frames.event_camera:
+        raise DataError(
+            source,
+            "its frames are of another camera than its events, and COLMAP finds the poses of the frames",
+            "estimate poses elsewhere, carry them over to the event camera, and give them as the trajectory",
+        )
+    kept = [(time, file) for time, file in zip(frames.times, frames.files, strict=True) if within(time)]
+    found = estimate_poses([file for _, file in kept], [time for time, _ in kept], frames.frame_camera, source, seed)
+    trajectory, report, given = found.trajectory, found.report(), frames.recording
+    CONSOLE.print(found.summary(), highlight=False)
+    CONSOLE.print(
+        "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale: frames of one camera "
+        "tell no lengths."
+    )
+    if given is not None:
+        truth = given.reference_trajectory
+        knots = trajectory.times[(trajectory.times >= truth.start) & (trajectory.times <= truth.end)]
+        if len(knots) > 1:
+            covered = Trajectory(knots, trajectory.interpolate(knots))
+            _, errors = compare_with_truth(covered, truth.interpolate(knots))
+            report["errors"] = errors
+            CONSOLE.print(
+                f"Compared with the given poses, which are kept as ground truth: mean errors "
+                f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units.",
+                highlight=False,
+            )
+        # A box in the world of the given poses is none in COLMAP's.
+        return replace(given, trajectory=trajectory, ground_truth=truth, scene_box=None), report
+    placed = [(time, file) for time, file in kept if trajectory.start <= time <= trajectory.end]
+    views = [ReferenceView(file, homogeneous(trajectory.interpolate(time)), time) for time, file in placed]
+    splits: dict[Split, list[ReferenceView]] = {"train": views, "val": views[::2], "test": views[1::2]}
+    return Recording(
+        event_file=frames.event_file,
+        event_camera=frames.event_camera,
+        sensor=frames.sensor,
+        trajectory=trajectory,
+        frame_camera=frames.frame_camera,
+        reference_views=splits,
+        image_encoding=frames.image_encoding,
+    ), report
+
+
+@contextmanager
+def _ended_by_exception() -> Iterator[None]:
+    """Has a request to end the process raise an exception, which cleans up, as an interrupt from the keyboard does."""
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,54 @@
+"""Which format a dataset is in, as subcommands of the commands that read one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, make_dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+import tyro
+
+from aenerf_ns.dataparsers.formats import FORMATS, recognise
+from aenerf_ns.dataparsers.recording import EventDataParser, EventDataParserConfig
+
+
+@dataclass
+class Automatic:
+    """Recognise the format from what is there."""
+
+
+def _format_options(config: EventDataParserConfig) -> Any:
+    """The config with those options hidden that make a scene of a recording: these commands keep its world."""
+    kind = type(config)
+    hints = get_type_hints(kind)
+    hidden = [
+        (option.name, tyro.conf.Suppress[hints[option.name]], field(default=getattr(config, option.name)))
+        for option in fields(EventDataParserConfig)
+    ]
+    options = make_dataclass(kind.__name__, hidden, bases=(kind,), namespace={"__doc__": kind.__doc__})
+    return options(**{option.name: getattr(config, option.name) for option in fields(config)})
+
+
+if TYPE_CHECKING:
+    DatasetFormat = Automatic | EventDataParserConfig
+else:
+    DatasetFormat = tyro.conf.OmitArgPrefixes[
+        tyro.extras.subcommand_type_from_defaults(
+            {"auto": Automatic(), **{name: _format_options(config) for name, config in FORMATS.items()}},
+            descriptions={
+                "auto": "recognise the format from what is there",
+                **{name: (type(config).__doc__ or "").splitlines()[0] for name, config in FORMATS.items()},
+            },
+            prefix_names=False,
+        )
+    ]
+
+
+def open_dataset(data: Path, dataset_format: DatasetFormat) -> EventDataParser:
+    """The parser of a dataset.
+
+    Raises:
+        DataError: its format is not recognised.
+    """
+    config = FORMATS[recognise(data)] if isinstance(dataset_format, Automatic) else dataset_format
+    return replace(config, data=data).setup()
