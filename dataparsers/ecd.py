@@ -144,7 +144,7 @@ class EcdDataParser(EventDataParser):
     def read_frames(self) -> FrameSequence:
         frames = self._read_all_but_poses()
         has_poses = (Path(self.config.data) / "groundtruth.txt").exists()
-        return replace(frames, recording=self.read_recording() if has_poses else None)
+        return replace(frames, recording=self.recording if has_poses else None)
 
     def _read_all_but_poses(self) -> FrameSequence:
         folder = Path(self.config.data)

@@ -150,7 +150,7 @@ class EventDataParser(DataParser):
         Raises:
             DataError: a file is missing or its content cannot be used.
         """
-        recording = self.read_recording()
+        recording = self.recording
         timed = {v.time: v.file for views in recording.reference_views.values() for v in views if v.time is not None}
         return FrameSequence(
             event_file=recording.event_file,
@@ -164,11 +164,12 @@ class EventDataParser(DataParser):
         )
 
     @cached_property
-    def _recording(self) -> Recording:
+    def recording(self) -> Recording:
+        """What :meth:`read_recording` gives, read once."""
         return self.read_recording()
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: object) -> DataparserOutputs:
-        recording = self._recording
+        recording = self.recording
         start, end = self._time_window(recording)
         trajectory = recording.trajectory.between(start, end).mapped(lambda poses: poses @ OPENCV_TO_OPENGL)
         transform, scale, scene_box = self._world_transform(trajectory, recording.scene_box)

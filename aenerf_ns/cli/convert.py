@@ -77,7 +77,7 @@ class Convert:
         if self.poses == "colmap":
             recording, report = _with_estimated_poses(parser.read_frames(), self._within, self.data, self.seed)
         else:
-            recording = parser.read_recording()
+            recording = parser.recording
         events = FilteredEventFile(recording.event_file, filters)
         trajectory = self._cut(recording, events)
         views = {

@@ -7,6 +7,7 @@ import sys
 import tyro
 
 from aenerf_ns.cli.bench import Bench
+from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
@@ -20,6 +21,7 @@ def main() -> None:
         {
             "simulate": Simulate,
             "convert": Convert,
+            "check": Check,
             "evaluate": Evaluate,
             "export-trajectory": ExportTrajectory,
             "bench": Bench,

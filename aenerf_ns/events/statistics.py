@@ -1,0 +1,100 @@
+"""What a stream of events is like, in one pass and bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.events.stream import EventStream
+
+_NEVER = np.iinfo(np.int64).min
+# Pairs that are kept as a sample: every one until there are twice as many, then every second, every fourth ...
+_MAX_PAIRS = 100_000
+
+
+@dataclass(frozen=True)
+class EventStatistics:
+    """Counts over a stream.
+
+    Attributes:
+        counts: (height, width) int64 number of events of every pixel.
+        num_positive: events of polarity +1.
+        num_repeated: events of a pixel and a time that another event has too.
+        rate: (N,) int64 number of events in equal parts of the time span.
+        pair_times: (M, 2) int64 times in nanoseconds of an even sample of the pairs of consecutive events of a pixel.
+        start: time of the first event in nanoseconds.
+        end: time of the last event in nanoseconds.
+    """
+
+    counts: NDArray[np.int64]
+    num_positive: int
+    num_repeated: int
+    rate: NDArray[np.int64]
+    pair_times: NDArray[np.int64]
+    start: int
+    end: int
+
+    @property
+    def num_events(self) -> int:
+        """Number of events in the stream."""
+        return int(self.counts.sum())
+
+
+def event_statistics(
+    chunks: Iterable[EventStream], width: int, height: int, time_span: tuple[int, int], num_parts: int
+) -> EventStatistics:
+    """Reads a stream through and counts.
+
+    Args:
+        chunks: the stream in pieces, in the order of time.
+        width: number of pixel columns.
+        height: number of pixel rows.
+        time_span: times of the first and the last event in nanoseconds.
+        num_parts: parts of the time span in which events are counted.
+    """
+    counts, last_time = np.zeros(width * height, np.int64), np.full(width * height, _NEVER, np.int64)
+    rate = np.zeros(num_parts, np.int64)
+    sample, state = np.empty((2 * _MAX_PAIRS, 2), np.int64), np.array([0, 0, 1], np.int64)
+    start, end = time_span
+    num_positive = num_repeated = 0
+    for chunk in chunks:
+        num_positive += int((chunk.p > 0).sum())
+        num_repeated += _count(chunk.x, chunk.y, chunk.t, width, counts, last_time, sample, state)
+        # Exact in integers up to 292 years: float64 seconds since 1970 would put events into other parts.
+        part = (chunk.t - start) // max(-(-(end - start + 1) // num_parts), 1)
+        rate += np.bincount(part.clip(0, num_parts - 1), minlength=num_parts)
+    return EventStatistics(
+        counts.reshape(height, width), num_positive, num_repeated, rate, sample[: state[1]].copy(), start, end
+    )
+
+
+@numba.njit(cache=True)
+def _count(x, y, t, width, counts, last_time, sample, state):
+    """Continues the counts with one chunk, and returns the number of repeated events. ``state`` holds the number of
+    pairs, that of the sampled ones, and the step between two of these."""
+    repeated = 0
+    for i in range(t.shape[0]):
+        pixel = np.int64(y[i]) * width + x[i]
+        counts[pixel] += 1
+        previous = last_time[pixel]
+        last_time[pixel] = t[i]
+        if previous == t[i]:
+            repeated += 1
+        elif previous != _NEVER:
+            if state[0] % state[2] == 0:
+                if state[1] == sample.shape[0]:
+                    half = sample.shape[0] // 2
+                    for k in range(half):
+                        sample[k] = sample[2 * k]
+                    state[1] = half
+                    state[2] *= 2
+                if state[0] % state[2] == 0:
+                    sample[state[1], 0] = previous
+                    sample[state[1], 1] = t[i]
+                    state[1] += 1
+            state[0] += 1
+    return repeated

@@ -1,0 +1,289 @@
+"""The check of a dataset: true poses beat wrong ones, and a planted mistake is named."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_stream
+from PIL import Image
+
+from aenerf_ns.cli import check as command
+from aenerf_ns.cli.check import Check
+from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
+from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventWriter
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.dataparsers.recording import Recording
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.events.statistics import event_statistics
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.trajectory.rotation import quaternion_from_rotation, rotation_from_quaternion
+from aenerf_ns.trajectory.trajectory import Trajectory
+from aenerf_ns.warped_events import WarpedEvents, clock_hypothesis
+
+# Part of the simulated recording that is looked at, in nanoseconds.
+PART = 1_300_000_000
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("check") / "room"
+    Simulate(folder, width=64, height=48, max_displacement=1.0, train_images=2, validation_views=1, test_views=1).main()
+    return folder
+
+
+def all_events(recording: Recording) -> EventStream:
+    chunks = list(recording.event_file.chunks())
+    columns = (np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in ("x", "y", "t", "p"))
+    return EventStream(*columns, chunks[0].width, chunks[0].height)
+
+
+@pytest.fixture(scope="module")
+def simulated(room: Path) -> tuple[Recording, EventStream]:
+    recording = NativeDataParserConfig(data=room).setup().read_recording()
+    return recording, all_events(recording).between(0, PART)
+
+
+def named(events: EventStream, trajectory: Trajectory, recording: Recording) -> list[str]:
+    """Alternatives that are clearly better, the best first."""
+    covered = events.between(trajectory.start, trajectory.end)
+    warped = WarpedEvents([covered], trajectory, recording.event_camera)
+    return [c.hypothesis.name for c in warped.comparisons() if c.is_clearly_better]
+
+
+Change = Callable[[EventStream, Trajectory], tuple[EventStream, Trajectory]]
+
+
+def with_poses(function: Callable[[torch.Tensor], torch.Tensor]) -> Change:
+    return lambda events, trajectory: (events, trajectory.mapped(function))
+
+
+def axes(*signs: float) -> torch.Tensor:
+    return torch.diag(torch.tensor([*signs, 1.0], dtype=torch.float64))
+
+
+def shifted(seconds: float) -> Change:
+    offset = round(seconds * 1e9)
+    return lambda events, trajectory: (events, Trajectory(trajectory.times + offset, trajectory.camera_to_worlds))
+
+
+def with_pixels(function: Callable[[EventStream], tuple[np.ndarray, np.ndarray]]) -> Change:
+    def change(events: EventStream, trajectory: Trajectory) -> tuple[EventStream, Trajectory]:
+        x, y = (values.astype(np.uint16) for values in function(events))
+        inside = (x < events.width) & (y < events.height)
+        t, p = events.t[inside], events.p[inside]
+        return EventStream(x[inside], y[inside], t, p, events.width, events.height), trajectory
+
+    return change
+
+
+def read_with_w_first(poses: torch.Tensor) -> torch.Tensor:
+    """What is read when qw qx qy qz are taken for qx qy qz qw."""
+    wrong = quaternion_from_rotation(poses[:, :3, :3]).roll(1, -1)
+    return torch.cat([torch.cat([rotation_from_quaternion(wrong), poses[:, :3, 3:]], -1), poses[:, 3:]], 1)
+
+
+MISTAKES = {
+    "the poses have OpenGL camera axes (y up, z backward)": with_poses(lambda poses: poses @ axes(1, -1, -1)),
+    "the camera axes x and y are flipped (a camera upside down)": with_poses(lambda poses: poses @ axes(-1, -1, 1)),
+    "the camera axes x and z are flipped": with_poses(lambda poses: poses @ axes(-1, 1, -1)),
+    "the poses are world-to-camera": with_poses(torch.linalg.inv),
+    "the poses are world-to-camera with OpenGL camera axes": with_poses(
+        lambda poses: torch.linalg.inv(poses @ axes(1, -1, -1))
+    ),
+    "the quaternions have w first": with_poses(read_with_w_first),
+    "the pixels are mirrored in x": with_pixels(lambda events: (events.width - 1 - events.x, events.y)),
+    "the pixels are mirrored in y": with_pixels(lambda events: (events.x, events.height - 1 - events.y)),
+    "x and y of the events are swapped": with_pixels(lambda events: (events.y, events.x)),
+}
+CLOCKS = {"ahead of": 0.2, "behind": -0.2}
+
+
+def test_nothing_is_named_where_nothing_is_wrong(simulated: tuple[Recording, EventStream]) -> None:
+    recording, events = simulated
+    warped = WarpedEvents([events], recording.trajectory, recording.event_camera)
+    assert warped.without_motion().is_clearly_worse
+    comparisons = warped.comparisons()
+    assert not [c.hypothesis.name for c in comparisons if c.is_clearly_better]
+    assert {c.hypothesis.name for c in comparisons if c.contrast < 0.8 * c.given} >= MISTAKES.keys()
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_planted_mistake_is_named(mistake: str, simulated: tuple[Recording, EventStream]) -> None:
+    recording, events = simulated
+    found = named(*MISTAKES[mistake](events, recording.trajectory), recording)
+    assert found[:1] == [mistake]
+
+
+@pytest.mark.parametrize("side", CLOCKS)
+def test_a_shifted_clock_is_named_and_measured(side: str, simulated: tuple[Recording, EventStream]) -> None:
+    recording, events = simulated
+    best, *_ = named(*shifted(CLOCKS[side])(events, recording.trajectory), recording)
+    seconds = best.removeprefix("the clock of the poses is ").removesuffix(f" s {side} that of the events")
+    assert float(seconds) == pytest.approx(0.2, abs=0.05)
+
+
+def test_the_real_recording_prefers_its_poses(slider_depth: Path) -> None:
+    recording = EcdDataParserConfig(data=slider_depth).setup().read_recording()
+    trajectory = recording.trajectory
+    events = all_events(recording).between(trajectory.start, trajectory.end)
+    warped = WarpedEvents([events], trajectory, recording.event_camera)
+    assert warped.without_motion().is_clearly_worse
+    found = {c.hypothesis.name: c for c in warped.comparisons()}
+    # The camera moves along its x axis and does not turn: what leaves that axis alone does not show.
+    unseen = {"the poses have OpenGL camera axes (y up, z backward)", "the pixels are mirrored in y"}
+    for name in MISTAKES:
+        assert found[name].is_untold if name in unseen else found[name].is_clearly_worse, name
+    for offset in (100_000_000, 500_000_000):
+        late = warped.compare(clock_hypothesis(offset))
+        assert late is not None
+        assert late.is_clearly_worse
+
+
+def test_mistakes_planted_in_the_real_recording_are_named(slider_depth: Path) -> None:
+    recording = EcdDataParserConfig(data=slider_depth).setup().read_recording()
+    events = all_events(recording)
+    for name in ("the poses are world-to-camera", "the camera axes x and z are flipped"):
+        assert name in named(*MISTAKES[name](events, recording.trajectory), recording)
+    # The first pose is where the camera still gathers speed; then its speed is constant, which tells no time.
+    (best, *_) = named(*shifted(-0.1)(events, recording.trajectory), recording)
+    assert "behind that of the events" in best
+
+
+def run(folder: Path, **options: Path) -> tuple[int, str]:
+    """Exit status of the check, and what it printed."""
+    with command.CONSOLE.capture() as output:
+        try:
+            Check(folder, **options).main()
+        except SystemExit as end:
+            return int(end.code or 0), output.get()
+    return 0, output.get()
+
+
+@pytest.fixture
+def shorter(room: Path, tmp_path: Path) -> Path:
+    """The simulated room with a part of its events."""
+    folder = shutil.copytree(room, tmp_path / "room")
+    recording = NativeDataParserConfig(data=folder).setup().read_recording()
+    rewrite(folder, all_events(recording).between(0, PART))
+    return folder
+
+
+def rewrite(folder: Path, events: EventStream) -> None:
+    with Hdf5EventWriter(folder / "events.h5") as writer:
+        writer.append(events)
+
+
+def test_the_command_finds_nothing_wrong_and_draws_a_picture(shorter: Path, tmp_path: Path) -> None:
+    status, output = run(shorter, picture=tmp_path / "warped.png")
+    assert status == 0, output
+    assert "No problems found" in output
+    count = len(all_events(NativeDataParserConfig(data=shorter).setup().read_recording()))
+    assert f"Events: {count:,} in 1." in output
+    assert "Events with a pose: 100.0%" in output
+    # The camera is well inside a room of some metres.
+    near, far = (float(output.split("What is seen is ")[1].split()[i]) for i in (0, 2))
+    assert 0.3 < near < 2 < far < 8
+    with Image.open(tmp_path / "warped.png") as picture:
+        assert picture.size == (128 * 10, 480)
+
+
+def test_the_command_names_mistakes_and_remedies(shorter: Path) -> None:
+    path = shorter / "trajectory_estimated.txt"
+    write_tum_trajectory(path, read_tum_trajectory(path).mapped(torch.linalg.inv))
+    events = all_events(NativeDataParserConfig(data=shorter).setup().read_recording())
+    rng = np.random.default_rng(0)
+    t = np.concatenate([events.t, np.sort(rng.integers(0, PART, 6000))])
+    order = np.argsort(t, kind="stable")
+    x, y = np.append(events.x, np.full(6000, 11, np.uint16)), np.append(events.y, np.full(6000, 7, np.uint16))
+    p = np.append(events.p, np.ones(6000, np.int8))
+    rewrite(shorter, EventStream(x[order], y[order], t[order], p[order], 64, 48))
+    status, output = run(shorter)
+    assert status == 1
+    assert "2 problems" in output
+    assert "as if the poses are world-to-camera" in output
+    assert "invert each" in output
+    assert "hot pixels make" in output
+    assert "--drop-hot-pixels" in output
+    assert "(11, 7) 6," in output
+
+
+def test_the_command_reports_gaps_and_poses_that_end_early(shorter: Path) -> None:
+    path = shorter / "trajectory_estimated.txt"
+    poses = read_tum_trajectory(path)
+    kept = (poses.times < 200_000_000) | ((poses.times > 400_000_000) & (poses.times < 560_000_000))
+    write_tum_trajectory(path, Trajectory(poses.times[kept], poses.camera_to_worlds[kept]))
+    events = all_events(NativeDataParserConfig(data=shorter).setup().read_recording())
+    one = np.ones(len(events), np.int8)
+    rewrite(shorter, EventStream(events.x, events.y, events.t, one, 64, 48))
+    status, output = run(shorter)
+    assert status == 1
+    assert "Gaps between poses: 1" in output
+    assert "of the events fall in gaps" in output
+    assert "of the events have a pose, the others are not used" in output
+    assert "100.0% of the events are positive" in output
+
+
+def test_what_cannot_be_read_is_one_line_and_status_2(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    folder = shutil.copytree(room, tmp_path / "broken")
+    (folder / "trajectory_estimated.txt").write_text("0 0 0\n")
+    for data in (tmp_path / "nothing", tmp_path, folder):
+        assert run(data)[0] == 2
+        error = capsys.readouterr().err
+        assert error.startswith("Error: ")
+        assert error.count("\n") == 1
+        assert str(data) in error
+
+
+def test_statistics_are_those_of_brute_force_however_the_stream_is_cut() -> None:
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(10, 200, 400))
+    rows = list(
+        zip(
+            rng.integers(0, 5, 400).tolist(),
+            rng.integers(0, 4, 400).tolist(),
+            t.tolist(),
+            rng.choice([-1, 1], 400).tolist(),
+            strict=True,
+        )
+    )
+    events = make_stream(rows, 5, 4)
+    counts = np.zeros((4, 5), int)
+    np.add.at(counts, (events.y, events.x), 1)
+    previous: dict[tuple[int, int], int] = {}
+    pairs, repeated = [], 0
+    for x, y, time, _ in rows:
+        if previous.get((x, y)) == time:
+            repeated += 1
+        elif (x, y) in previous:
+            pairs.append([previous[x, y], time])
+        previous[x, y] = time
+    for cuts in ([], [1, 7, 100]):
+        edges = [0, *cuts, 400]
+        chunks = (events[a:b] for a, b in zip(edges, edges[1:], strict=False))
+        found = event_statistics(chunks, 5, 4, (int(t[0]), int(t[-1])), 6)
+        np.testing.assert_array_equal(found.counts, counts)
+        assert (found.num_events, found.num_repeated) == (400, repeated)
+        assert found.num_positive == sum(row[3] > 0 for row in rows)
+        assert found.pair_times.tolist() == pairs
+        assert found.rate.sum() == 400
+
+
+def test_the_sample_of_pairs_is_even_and_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aenerf_ns.events.statistics._MAX_PAIRS", 8)
+    n = 1000
+    zeros = np.zeros(n, np.uint16)
+    events = EventStream(zeros, zeros, np.arange(n), np.ones(n, np.int8), 1, 1)
+    found = event_statistics([events[:300], events[300:]], 1, 1, (0, n - 1), 4)
+    steps = np.diff(found.pair_times[:, 0])
+    assert 8 <= len(found.pair_times) <= 16
+    assert len(set(steps.tolist())) == 1
+    np.testing.assert_array_equal(found.pair_times[:, 1] - found.pair_times[:, 0], 1)
+    assert found.rate.tolist() == [250] * 4
