@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -267,7 +268,7 @@ def test_statistics_are_those_of_brute_force_however_the_stream_is_cut() -> None
         previous[x, y] = time
     for cuts in ([], [1, 7, 100]):
         edges = [0, *cuts, 400]
-        chunks = (events[a:b] for a, b in zip(edges, edges[1:], strict=False))
+        chunks = (events[a:b] for a, b in pairwise(edges))
         found = event_statistics(chunks, 5, 4, (int(t[0]), int(t[-1])), 6)
         np.testing.assert_array_equal(found.counts, counts)
         assert (found.num_events, found.num_repeated) == (400, repeated)

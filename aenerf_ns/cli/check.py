@@ -157,8 +157,8 @@ def _check_events(recording: Recording, statistics: EventStatistics) -> list[str
     camera = recording.event_camera
     _print(
         f"Events: {count:,} in {seconds:.3f} s (from {statistics.start} to {statistics.end} ns), "
-        f"{count / seconds:,.0f} a second, {count / statistics.counts.size:.1f} a pixel of {camera.width} x {camera.height}; "
-        f"{(statistics.counts == 0).mean():.1%} of the pixels have none"
+        f"{count / seconds:,.0f} a second, {count / statistics.counts.size:.1f} a pixel of {camera.width} x "
+        f"{camera.height}; {(statistics.counts == 0).mean():.1%} of the pixels have none"
     )
     rate = statistics.rate / seconds * _RATE_PARTS
     _print(f"Rate over time, 0 to {rate.max():,.0f} events a second:\n  |{_histogram(statistics.rate)}|")

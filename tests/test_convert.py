@@ -1,0 +1,320 @@
+"""Converting to the native format: nothing changes but what is asked for, and nothing is left half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_dataparsers import (
+    ECD_FAULTS,
+    END,
+    NATIVE_FAULTS,
+    START,
+    make_trajectory,
+    write_ecd,
+    write_native,
+)
+
+from aenerf_ns.cli import convert as command
+from aenerf_ns.cli.convert import Convert
+from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
+from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.dataparsers.recording import EventDataParserConfig, Recording
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.structure_from_motion import EstimatedPoses
+from aenerf_ns.trajectory.noise import perturb
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+
+def columns(recording: Recording) -> dict[str, np.ndarray]:
+    chunks = list(recording.event_file.chunks())
+    return {name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in "xytp"}
+
+
+def convert(data: Path, output: Path, **options: object) -> Recording:
+    Convert(data, output, **options).main()
+    return NativeDataParserConfig(data=output).setup().read_recording()
+
+
+def assert_same(one: Recording, other: Recording) -> None:
+    """Events, poses, lenses, sensor and images are the same."""
+    for name, values in columns(one).items():
+        np.testing.assert_array_equal(values, columns(other)[name])
+    for name in ("trajectory", "ground_truth"):
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a is None) == (b is None)
+        if a is not None:
+            assert torch.equal(a.times, b.times)
+            torch.testing.assert_close(a.camera_to_worlds, b.camera_to_worlds, rtol=0, atol=1e-9)
+    assert one.event_camera == other.event_camera
+    assert one.frame_camera == other.frame_camera
+    assert one.sensor == other.sensor
+    assert one.image_encoding == other.image_encoding
+    for split, views in one.reference_views.items():
+        assert len(views) == len(other.reference_views[split])
+        for a, b in zip(views, other.reference_views[split], strict=True):
+            assert a.file.read_bytes() == b.file.read_bytes()
+            assert a.time == b.time
+            torch.testing.assert_close(a.camera_to_world, b.camera_to_world, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("box", [None, np.array([[-1.0, -2.0, 0.0], [3.0, 4.0, 5.0]])])
+def test_a_native_dataset_converts_to_itself(box: np.ndarray | None, tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made", box)
+    noisy = perturb(make_trajectory(), 1.0, 0.02, 0.2, 0)
+    write_tum_trajectory(data / "trajectory_estimated.txt", noisy)
+    before = NativeDataParserConfig(data=data).setup()
+    after = convert(data, tmp_path / "converted")
+    assert_same(before.read_recording(), after)
+    assert (box is None) == (after.scene_box is None)
+    if box is not None and after.scene_box is not None:
+        np.testing.assert_array_equal(after.scene_box.numpy(), box)
+    # Rays, as Nerfstudio is given them.
+    converted = NativeDataParserConfig(data=tmp_path / "converted").setup()
+    for split in ("train", "val", "test"):
+        one, other = (parser.get_dataparser_outputs(split).cameras for parser in (before, converted))
+        rays = [c.generate_rays(torch.arange(len(c))[:, None], keep_shape=True) for c in (one, other)]
+        torch.testing.assert_close(rays[0].origins, rays[1].origins, rtol=0, atol=1e-6)
+        torch.testing.assert_close(rays[0].directions, rays[1].directions, rtol=0, atol=1e-6)
+
+
+def test_text_files_convert(tmp_path: Path) -> None:
+    data = write_ecd(tmp_path / "made")
+    given = tmp_path / "other.txt"
+    write_tum_trajectory(given, perturb(read_tum_trajectory(data / "groundtruth.txt"), 2.0, 0.1, 0.1, 0))
+    for name, config in (("plain", EcdDataParserConfig()), ("other", EcdDataParserConfig(trajectory=given))):
+        config.data = data
+        after = convert(data, tmp_path / name, format=config)
+        assert_same(config.setup().read_recording(), after)
+        # An image that is in several splits is there once.
+        assert len(list((tmp_path / name / "images").rglob("*.png"))) == 4
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_real_recording_converts(slider_depth: Path, tmp_path: Path) -> None:
+    before = EcdDataParserConfig(data=slider_depth).setup().read_recording()
+    assert_same(before, convert(slider_depth, tmp_path / "converted"))
+
+
+def test_another_frame_camera_and_other_image_files_are_carried_over(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    meta = json.loads((data / "transforms.json").read_text())
+    meta.update(w=8, h=5, fl_x=9.0, fl_y=9.5, cx=4.1, cy=2.4, camera_model="OPENCV_FISHEYE", k1=0.1, k4=-0.2)
+    for key in ("k2", "k3", "p1", "p2"):
+        meta.pop(key)
+    for index, frame in enumerate(meta["frames"]):
+        (data / frame["file_path"]).unlink()
+        old, new = frame["file_path"], f"images/{index}.jpg"
+        Image.fromarray(np.full((5, 8), 30 * index, np.uint8)).save(data / new)
+        for split in ("train", "val", "test"):
+            meta[f"{split}_filenames"] = [new if name == old else name for name in meta[f"{split}_filenames"]]
+        frame["file_path"] = new
+    (data / "transforms.json").write_text(json.dumps(meta))
+    before = NativeDataParserConfig(data=data).setup().read_recording()
+    assert before.frame_camera.lens_model == "fisheye"
+    assert_same(before, convert(data, tmp_path / "converted"))
+
+
+def test_filters_cut_events_camera_poses_and_images(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    before = NativeDataParserConfig(data=data).setup().read_recording()
+    start, end = START + 100_000_000, START + 1_450_000_000
+    after = convert(
+        data, tmp_path / "converted", start_time_ns=start, end_time_ns=end, region=(2, 0, 3, 2), pixel_share=0.9, seed=3
+    )
+    x, y, t, p = columns(before).values()
+    inside = (t >= start) & (t <= end) & (x >= 2) & (x < 5) & (y < 2)
+    kept = columns(after)
+    found = {*zip(*(values.tolist() for values in kept.values()), strict=True)}
+    expected = {*zip((x[inside] - 2).tolist(), y[inside].tolist(), t[inside].tolist(), p[inside].tolist(), strict=True)}
+    assert found < expected
+    pixels = {row[:2] for row in found}
+    assert found == {row for row in expected if row[:2] in pixels}
+    assert after.event_camera == before.event_camera.cropped(2, 0, 3, 2)
+    assert after.frame_camera == before.frame_camera
+    assert (after.trajectory.start, after.trajectory.end) == (start, START + 1_500_000_000)
+    # Of three train images one is within the window; those without a time stay.
+    assert [len(after.reference_views[split]) for split in ("train", "val", "test")] == [1, 1, 2]
+
+
+def test_hot_pixels_are_named(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    rng = np.random.default_rng(1)
+    n = 3000
+    t = np.sort(rng.integers(START, END, n))
+    x, y = rng.integers(0, 6, n).astype(np.uint16), rng.integers(0, 4, n).astype(np.uint16)
+    x[::2], y[::2] = 3, 1
+    with Hdf5EventWriter(data / "events.h5") as writer:
+        writer.append(EventStream(x, y, t, np.ones(n, np.int8), 6, 4))
+    with command.CONSOLE.capture() as output:
+        after = convert(data, tmp_path / "converted", drop_hot_pixels=True)
+    assert "Hot pixels: 1, with 5" in output.get()
+    assert "(3, 1) 1,5" in output.get()
+    kept = columns(after)
+    hot = (x == 3) & (y == 1)
+    np.testing.assert_array_equal(kept["t"], t[~hot])
+
+
+def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # COLMAP itself is tested elsewhere; here a stand-in places all frames but the last.
+    def place(files: list[Path], times: list[int], camera: object, source: Path, seed: int) -> EstimatedPoses:
+        assert [file.name for file in files] == ["0.png", "1.png", "2.png", "3.png"]
+        poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+        poses[:, 0, 3] = torch.arange(3)
+        trajectory = Trajectory(times[:3], poses, source)
+        return EstimatedPoses(np.array(times), trajectory, [3], 9, 0.5, 100.0, 1.0)
+
+    monkeypatch.setattr(command, "estimate_poses", place)
+    data = write_ecd(tmp_path / "made")
+    with command.CONSOLE.capture() as output:
+        with_truth = convert(data, tmp_path / "with_truth", poses="colmap")
+    assert "of arbitrary position, orientation and scale" in output.get()
+    assert "3 of 4 frames registered" in output.get()
+    times = [50_000_000, 150_000_000, 250_000_000]
+    assert with_truth.trajectory.times.tolist() == times
+    truth = read_tum_trajectory(data / "groundtruth.txt")
+    assert with_truth.ground_truth is not None
+    torch.testing.assert_close(with_truth.ground_truth.camera_to_worlds, truth.camera_to_worlds)
+    report = json.loads((tmp_path / "with_truth" / "poses_report.json").read_text())
+    assert report["registered_frames"] == 3
+    # Both move straight on at constant speed.
+    assert report["errors"]["translation_error"] < 1e-9
+    # The images keep the true poses, and are all there.
+    assert [len(with_truth.reference_views[split]) for split in ("train", "val", "test")] == [4, 2, 2]
+    (data / "groundtruth.txt").unlink()
+    without = convert(data, tmp_path / "without", poses="colmap")
+    assert without.ground_truth is None
+    assert without.trajectory.times.tolist() == times
+    assert [len(without.reference_views[split]) for split in ("train", "val", "test")] == [3, 2, 1]
+    np.testing.assert_array_equal(columns(without)["t"], columns(with_truth)["t"])
+    with pytest.raises(DataError, match=r"groundtruth.txt: there is no such file"):
+        convert(data, tmp_path / "given")
+
+
+def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    meta = json.loads((data / "transforms.json").read_text())
+    meta["fl_x"] = 4.0
+    (data / "transforms.json").write_text(json.dumps(meta))
+    with pytest.raises(DataError, match="frames are of another camera than its events"):
+        convert(data, tmp_path / "converted", poses="colmap")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"pixel_share": 0.0}, "aenerf convert: the share of pixels must be above 0"),
+        ({"region": (0, 0, 7, 4)}, "region of interest 0 0 7 4 .* beyond its 6 x 4 pixels"),
+        ({"region": (1, 0, 4, 4)}, "from pixel 1 0 of a colour sensor; begin it at an even"),
+        ({"end_time_ns": START - 1}, "events are from .* all outside the time window; widen"),
+        ({"start_time_ns": 5, "end_time_ns": 4}, "time window ends at 4 ns, before"),
+        ({"region": (4, 2, 2, 2), "start_time_ns": END - 1_000}, "no event is left"),
+        ({"poses": "colmap", "end_time_ns": START + 1}, "1 frames; poses can be estimated from two"),
+    ],
+)
+def test_options_that_cannot_be_met_are_one_clear_line(options: dict, message: str, tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    with pytest.raises(DataError, match=message) as error:
+        convert(data, tmp_path / "converted", **options)
+    assert "\n" not in str(error.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+FAULTS = [
+    *(("ecd", name, *fault) for name, fault in ECD_FAULTS.items()),
+    *(("native", name, *fault) for name, fault in NATIVE_FAULTS.items()),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "change", "message"), FAULTS, ids=[f"{f[0]} {f[1]}" for f in FAULTS])
+def test_malformed_datasets_are_one_clear_line_and_leave_nothing(
+    kind: str, name: str, change: Callable[[Path], None], message: str, tmp_path: Path
+) -> None:
+    data = (write_ecd if kind == "ecd" else write_native)(tmp_path / "made")
+    change(data)
+    config: EventDataParserConfig = EcdDataParserConfig() if kind == "ecd" else NativeDataParserConfig()
+    with pytest.raises(DataError, match=message) as error:
+        convert(data, tmp_path / "converted", format=config)
+    assert "\n" not in str(error.value)
+    assert [path.name for path in tmp_path.iterdir() if path != data] == []
+
+
+def test_an_existing_folder_and_an_impossible_place_are_refused(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    before = sorted((path, path.stat().st_mtime_ns) for path in data.rglob("*"))
+    with pytest.raises(DataError, match="the folder exists already; remove it"):
+        convert(data, data)
+    assert sorted((path, path.stat().st_mtime_ns) for path in data.rglob("*")) == before
+    with pytest.raises(DataError, match="it cannot be created"):
+        convert(data, data / "transforms.json" / "below")
+    with pytest.raises(DataError, match=r"none of .* is there; name the format"):
+        convert(tmp_path, tmp_path / "converted")
+
+
+def run(*arguments: str | Path) -> subprocess.Popen:
+    script = Path(sys.executable).parent / "aenerf"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
+    return subprocess.Popen(
+        [script, "convert", *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def test_the_command_converts_and_says_what_is_wrong_on_stderr(tmp_path: Path) -> None:
+    data = write_ecd(tmp_path / "made")
+    good = run("--data", data, "--output", tmp_path / "good", "ecd-data", "--refractory-period-ns", "7")
+    (data / "broken").mkdir()
+    bad = run("--data", data / "broken", "--output", tmp_path / "bad")
+    printed, _ = good.communicate(timeout=300)
+    assert good.returncode == 0
+    assert "4 of 4 events, 5 poses, images: 4 train, 2 val, 2 test." in printed
+    assert NativeDataParserConfig(data=tmp_path / "good").setup().read_recording().sensor.refractory_period == 7
+    _, complaint = bad.communicate(timeout=300)
+    assert bad.returncode == 1
+    assert "Traceback" not in complaint
+    assert complaint.strip().splitlines()[-1].startswith(f"Error: {data / 'broken'}: ")
+    assert not (tmp_path / "bad").exists()
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_a_killed_command_leaves_no_dataset(end: signal.Signals, tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    n = 30_000_000
+    with Hdf5EventWriter(data / "events.h5") as writer:
+        step = (END - START) // n
+        for begin in range(0, n, n // 10):
+            t = START + step * np.arange(begin, begin + n // 10)
+            zeros = (t % 4).astype(np.uint16)
+            writer.append(EventStream(zeros, zeros, t, np.ones(len(t), np.int8), 6, 4))
+    output, partial = tmp_path / "converted", tmp_path / ".converted.partial"
+    process = run("--data", data, "--output", output)
+    while not (partial / "events.h5").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(end)
+    process.communicate(timeout=100)
+    assert process.returncode != 0
+    assert not output.exists()
+    if end is signal.SIGTERM:
+        assert not partial.exists()
+    # What the other leaves behind is cleared by the next attempt.
+    with Hdf5EventWriter(data / "events.h5") as writer:
+        zeros = np.zeros(2, np.uint16)
+        writer.append(EventStream(zeros, zeros, np.array([START, END]), np.ones(2, np.int8), 6, 4))
+    convert(data, output)
+    assert Hdf5EventFile(output / "events.h5", 6, 4).count() == 2
+    assert not partial.exists()
+    shutil.rmtree(output)
