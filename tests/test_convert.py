@@ -134,7 +134,7 @@ def test_filters_cut_events_camera_poses_and_images(tmp_path: Path) -> None:
     before = NativeDataParserConfig(data=data).setup().read_recording()
     start, end = START + 100_000_000, START + 1_450_000_000
     after = convert(
-        data, tmp_path / "converted", start_time_ns=start, end_time_ns=end, region=(2, 0, 3, 2), pixel_share=0.9, seed=3
+        data, tmp_path / "converted", start_time_ns=start, end_time_ns=end, region=(2, 0, 3, 2), pixel_share=0.5, seed=3
     )
     x, y, t, p = columns(before).values()
     inside = (t >= start) & (t <= end) & (x >= 2) & (x < 5) & (y < 2)
@@ -222,7 +222,7 @@ def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
         ({"region": (1, 0, 4, 4)}, "from pixel 1 0 of a colour sensor; begin it at an even"),
         ({"end_time_ns": START - 1}, "events are from .* all outside the time window; widen"),
         ({"start_time_ns": 5, "end_time_ns": 4}, "time window ends at 4 ns, before"),
-        ({"region": (4, 2, 2, 2), "start_time_ns": END - 1_000}, "no event is left"),
+        ({"pixel_share": 1e-9}, "no event is left; widen"),
         ({"poses": "colmap", "end_time_ns": START + 1}, "1 frames; poses can be estimated from two"),
     ],
 )
@@ -278,11 +278,11 @@ def test_the_command_converts_and_says_what_is_wrong_on_stderr(tmp_path: Path) -
     good = run("--data", data, "--output", tmp_path / "good", "ecd-data", "--refractory-period-ns", "7")
     (data / "broken").mkdir()
     bad = run("--data", data / "broken", "--output", tmp_path / "bad")
-    printed, _ = good.communicate(timeout=300)
+    printed, _ = good.communicate(timeout=600)
     assert good.returncode == 0
     assert "4 of 4 events, 5 poses, images: 4 train, 2 val, 2 test." in printed
     assert NativeDataParserConfig(data=tmp_path / "good").setup().read_recording().sensor.refractory_period == 7
-    _, complaint = bad.communicate(timeout=300)
+    _, complaint = bad.communicate(timeout=600)
     assert bad.returncode == 1
     assert "Traceback" not in complaint
     assert complaint.strip().splitlines()[-1].startswith(f"Error: {data / 'broken'}: ")
@@ -292,7 +292,7 @@ def test_the_command_converts_and_says_what_is_wrong_on_stderr(tmp_path: Path) -
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
 def test_a_killed_command_leaves_no_dataset(end: signal.Signals, tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
-    n = 30_000_000
+    n = 8_000_000
     with Hdf5EventWriter(data / "events.h5") as writer:
         step = (END - START) // n
         for begin in range(0, n, n // 10):
@@ -305,7 +305,7 @@ def test_a_killed_command_leaves_no_dataset(end: signal.Signals, tmp_path: Path)
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(end)
-    process.communicate(timeout=100)
+    process.communicate(timeout=600)
     assert process.returncode != 0
     assert not output.exists()
     if end is signal.SIGTERM:

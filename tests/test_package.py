@@ -103,7 +103,7 @@ def test_lower_floors_import_none_above_them() -> None:
         {"errors", "progress"},
         {"events", "trajectory", "scenes", "image_encoding", "event_camera", "box_collider", "hash_encoding"},
         {"field", "temporal", "losses", "color_correction", "image_metrics"},
-        {"dataset", "simulation", "structure_from_motion"},
+        {"dataset", "simulation", "structure_from_motion", "warped_events"},
         {"ray_sampler"},
         {"pose_correction", "sensor_parameters"},
         {"datamanager", "model"},

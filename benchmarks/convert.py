@@ -1,0 +1,131 @@
+"""Throughput and peak memory of aenerf convert.
+
+    python benchmarks/convert.py --output benchmarks/results/NAME.json
+
+Each measurement runs in a process of its own, so that the peak of its resident memory is its own. The dataset is made
+beforehand: events at random pixels of a 1280 x 720 sensor, uncompressed, which no real recording is as hard to compress
+as.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import h5py
+import numpy as np
+import torch
+import tyro
+
+from aenerf_ns.bench.environment import environment
+from aenerf_ns.cli.convert import Convert
+from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile
+from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+_WIDTH, _HEIGHT = 1280, 720
+_CHUNK = 1 << 22
+# Nanoseconds between events, on average.
+_STEP = 100
+_VARIANTS: dict[str, dict] = {
+    "plain": {},
+    "filtered": {"shortest_interval_ns": 1_000_000, "pixel_share": 0.5, "drop_hot_pixels": True},
+}
+
+
+def make_dataset(folder: Path, num_events: int) -> None:
+    """A dataset of random events."""
+    camera = EventCamera(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2)
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[1, 0, 3] = 1
+    with NativeDatasetWriter(folder, camera, SensorModel(), "srgb") as writer:
+        writer.add_trajectories(Trajectory([0, 2 * _STEP * num_events], poses))
+        zero = np.zeros(1, np.uint16)
+        writer.events.append(EventStream(zero, zero, zero.astype(np.int64), np.ones(1, np.int8), _WIDTH, _HEIGHT))
+    rng = np.random.default_rng(0)
+    start = 0
+    with h5py.File(folder / "events.h5", "w") as file:
+        columns = {
+            name: file.create_dataset(f"events/{name}", (num_events,), dtype)
+            for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.int8))
+        }
+        for begin in range(0, num_events, _CHUNK):
+            part = slice(begin, min(begin + _CHUNK, num_events))
+            count = part.stop - begin
+            t = start + np.cumsum(rng.integers(0, 2 * _STEP, count))
+            start = int(t[-1])
+            columns["t"][part] = t
+            columns["x"][part] = rng.integers(0, _WIDTH, count, dtype=np.uint16)
+            columns["y"][part] = rng.integers(0, _HEIGHT, count, dtype=np.uint16)
+            columns["p"][part] = 2 * rng.integers(0, 2, count, dtype=np.int8) - 1
+
+
+def measure(what: str, folder: Path) -> dict:
+    """Runs one measurement in this process: "nothing", or a variant."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    written = 0
+    if what != "nothing":
+        output = folder.parent / what
+        Convert(folder, output, **_VARIANTS[what]).main()
+        written = Hdf5EventFile(output / "events.h5", _WIDTH, _HEIGHT).count()
+    return {
+        "seconds": time.perf_counter() - wall,
+        "cpu_seconds": time.process_time() - cpu,
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "written_events": written,
+    }
+
+
+@dataclass
+class ConvertBenchmark:
+    """Measure aenerf convert."""
+
+    output: Path
+    """JSON file to write."""
+    sizes: tuple[int, ...] = (10_000_000, 100_000_000)
+    """Numbers of events."""
+
+    def main(self) -> None:
+        """Measures and writes the figures."""
+        rows = []
+        for size in self.sizes:
+            with TemporaryDirectory() as temporary:
+                folder = Path(temporary) / "dataset"
+                make_dataset(folder, size)
+                results = {}
+                for what in ("nothing", *_VARIANTS):
+                    command = [sys.executable, __file__, "--measure", what, str(folder)]
+                    done = subprocess.run(command, check=True, capture_output=True, text=True)
+                    results[what] = json.loads(done.stdout.splitlines()[-1])
+            idle = results.pop("nothing")
+            for what, result in results.items():
+                row = {
+                    "events": size,
+                    "variant": what,
+                    "options": _VARIANTS[what],
+                    **result,
+                    "million_events_per_second": size / result["seconds"] / 1e6,
+                    "million_events_per_cpu_second": size / result["cpu_seconds"] / 1e6,
+                    "peak_gib_of_the_process_without_conversion": idle["peak_gib"],
+                }
+                rows.append(row)
+                print(json.dumps(row, indent=2))
+        self.output.write_text(
+            json.dumps({"sensor": [_WIDTH, _HEIGHT], "rows": rows, **environment()}, indent=2) + "\n"
+        )
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--measure"]:
+        print(json.dumps(measure(sys.argv[2], Path(sys.argv[3]))))
+    else:
+        tyro.cli(ConvertBenchmark).main()
