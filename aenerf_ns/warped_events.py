@@ -45,10 +45,10 @@ _MIN_USABLE = 0.5
 # An alternative with less than this share of the given contrast in a third of the slices is not tried on the others.
 _HOPELESS = 0.85
 
-# An alternative is clearly better by so many standard errors and so large a factor,
-_CLEAR_ERRORS, _CLEAR_FACTOR = 4.0, 1.03
-# and cannot be told apart below these.
-_SAME_ERRORS = 2.0
+# One contrast is clearly higher than another by so many standard errors and so large a factor: either of these.
+_CLEAR = ((4.0, 1.03), (2.5, 1.15))
+# What differs by less cannot be told apart.
+_SAME_ERRORS, _SAME_FACTOR = 2.0, 1.03
 
 _CLOCK_OFFSETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 # Between these.
@@ -182,23 +182,28 @@ class Comparison:
 
     @property
     def is_clearly_better(self) -> bool:
-        return self.difference > _CLEAR_ERRORS and self.contrast > _CLEAR_FACTOR * max(self.given, 0)
+        return _is_clear(self.difference, self.contrast, self.given)
 
     @property
     def is_clearly_worse(self) -> bool:
-        return self.difference < -_CLEAR_ERRORS and self.given > _CLEAR_FACTOR * max(self.contrast, 0)
+        return _is_clear(-self.difference, self.given, self.contrast)
 
     @property
     def is_untold(self) -> bool:
         """Whether it fits about as well as what is given."""
-        return abs(self.difference) < _SAME_ERRORS and self.is_like_contrast(self.given)
+        return abs(self.difference) < _SAME_ERRORS and _about_equal(self.contrast, self.given)
 
     def is_like(self, other: Comparison) -> bool:
-        """Whether another alternative fits about as well."""
-        return self.is_like_contrast(other.contrast)
+        """Whether it fits about as well as another alternative."""
+        return _about_equal(self.contrast, other.contrast)
 
-    def is_like_contrast(self, contrast: float) -> bool:
-        return abs(self.contrast - contrast) < (_CLEAR_FACTOR - 1) * max(self.contrast, contrast)
+
+def _is_clear(difference: float, higher: float, lower: float) -> bool:
+    return any(difference > errors and higher > factor * max(lower, 0) for errors, factor in _CLEAR)
+
+
+def _about_equal(one: float, other: float) -> bool:
+    return abs(one - other) < (_SAME_FACTOR - 1) * max(one, other)
 
 
 def num_slices(num_events: int, camera: EventCamera) -> int:
@@ -388,7 +393,7 @@ class WarpedEvents:
         points, polarity, index, relative, intrinsics, _ = self._prepared(events, GIVEN)
         shape = (self._height, self._width)
         net, total = np.zeros((2, *shape), np.float32)
-        depth_of_pixel = np.kron(depth, np.ones((_TILE, _TILE)))[: shape[0], : shape[1]]
+        depth_of_pixel = np.kron(depth, np.ones((_TILE, _TILE)))
         still = np.tile(np.eye(3, 4), (_POSES, 1, 1))
         _accumulate(_lines(points, index, still, intrinsics), polarity, np.float32(0), net, total)
         lines = _lines(points, index, relative, intrinsics)
@@ -400,8 +405,8 @@ class WarpedEvents:
 
 
 def _selected(events: EventStream, index: NDArray) -> EventStream:
-    columns = (getattr(events, name)[index] for name in ("x", "y", "t", "p"))
-    return EventStream(*columns, events.width, events.height, events.source)
+    columns = {name: getattr(events, name)[index] for name in ("x", "y", "t", "p")}
+    return EventStream(**columns, width=events.width, height=events.height, source=events.source)
 
 
 def _contrast(slices) -> float:
@@ -413,11 +418,11 @@ def _residuals(one: WarpedSlice, slices) -> NDArray[np.float64]:
     return (one.energy - _contrast(slices) * one.brightness) / max(sum(s.brightness.sum() for s in slices), 1e-30)
 
 
-def _smooth(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def _smooth(image: NDArray) -> NDArray:
     return cv2.blur(cv2.blur(image, (_COARSE, _COARSE)), (_COARSE, _COARSE))
 
 
-def _edges(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def _edges(image: NDArray) -> NDArray:
     return cv2.GaussianBlur(image, (0, 0), _FINE) - _smooth(image)
 
 
@@ -429,7 +434,7 @@ def _noise_energy() -> float:
     return float(np.square(_edges(impulse)).sum())
 
 
-def _tile_sums(image: NDArray[np.float32]) -> NDArray[np.float64]:
+def _tile_sums(image: NDArray) -> NDArray[np.float64]:
     height, width = image.shape
     return image.reshape(height // _TILE, _TILE, width // _TILE, _TILE).sum((1, 3), dtype=np.float64)
 

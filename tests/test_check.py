@@ -28,7 +28,7 @@ from aenerf_ns.trajectory.trajectory import Trajectory
 from aenerf_ns.warped_events import WarpedEvents, clock_hypothesis
 
 # Part of the simulated recording that is looked at, in nanoseconds.
-PART = 1_300_000_000
+PART = 2_600_000_000
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +185,7 @@ def test_the_command_finds_nothing_wrong_and_draws_a_picture(shorter: Path, tmp_
     assert status == 0, output
     assert "No problems found" in output
     count = len(all_events(NativeDataParserConfig(data=shorter).setup().read_recording()))
-    assert f"Events: {count:,} in 1." in output
+    assert f"Events: {count:,} in 2." in output
     assert "Events with a pose: 100.0%" in output
     # The camera is well inside a room of some metres.
     near, far = (float(output.split("What is seen is ")[1].split()[i]) for i in (0, 2))

@@ -12,11 +12,10 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
-from aenerf_ns.cli.convert import hot_pixel_summary
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
 from aenerf_ns.dataparsers.recording import EventDataParser, Recording
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.filters import find_hot_pixels
+from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
 from aenerf_ns.events.stream import EventFile, EventStream
@@ -87,10 +86,12 @@ class Check:
             progress.add_task("Warping events", total=None)
             warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
             still, alternatives = warped.without_motion(), warped.comparisons()
-        problems += _check_contrast(warped, still, alternatives)
+        contrast_problems = _check_contrast(warped, still, alternatives)
+        problems += contrast_problems
         depth = None
-        if still.is_clearly_worse:
-            depth = _print_depth(warped, recording, outputs[0].dataparser_scale, problems)
+        if not contrast_problems:
+            depth, box_problems = _check_depth(warped, recording, outputs[0].dataparser_scale)
+            problems += box_problems
         _print_motion(recording, statistics, depth)
         if self.picture is not None:
             _write_picture(self.picture, warped)
@@ -131,21 +132,21 @@ def _read_runs(recording: Recording, num_covered: int) -> list[EventStream]:
     count = num_slices(num_covered, camera)
     length = num_covered if count == 1 else slice_size(camera)
     begins = np.linspace(0, num_covered - length, count).astype(np.int64)
-    parts: list[list[EventStream]] = [[] for _ in begins]
+    parts: list[list[dict[str, np.ndarray]]] = [[] for _ in begins]
     position = 0
     for chunk in _tracked(recording.event_file, "Choosing events"):
         covered = chunk.between(trajectory.start, trajectory.end)
         for part, begin in zip(parts, begins - position, strict=True):
             taken = covered[max(begin, 0) : max(begin + length, 0)]
-            if len(taken):
-                part.append(taken)
+            # Copies: views would keep whole chunks in memory.
+            part.append({name: getattr(taken, name).copy() for name in ("x", "y", "t", "p")})
         position += len(covered)
     return [
         EventStream(
-            *(np.concatenate([getattr(events, name) for events in part]) for name in ("x", "y", "t", "p")),
-            camera.width,
-            camera.height,
-            recording.event_file.path,
+            **{name: np.concatenate([columns[name] for columns in part]) for name in ("x", "y", "t", "p")},
+            width=camera.width,
+            height=camera.height,
+            source=recording.event_file.path,
         )
         for part in parts
     ]
@@ -262,8 +263,9 @@ def _check_contrast(warped: WarpedEvents, still: Comparison, alternatives: list[
     return []
 
 
-def _print_depth(warped: WarpedEvents, recording: Recording, scale: float, problems: list[str]) -> float | None:
-    """Prints from where to where there is something to see; returns the median depth in the poses' unit."""
+def _check_depth(warped: WarpedEvents, recording: Recording, scale: float) -> tuple[float | None, list[str]]:
+    """Prints from where to where there is something to see; returns the median depth in the poses' unit, and what is
+    wrong with the scene box."""
     contrast = sum(s.energy.sum() for s in warped.given) / sum(s.brightness.sum() for s in warped.given)
     depths, points, weights = [], [], []
     for one in warped.given:
@@ -273,7 +275,7 @@ def _print_depth(warped: WarpedEvents, recording: Recording, scale: float, probl
         weights.append(one.energy[trusted])
     depth, point, weight = (np.concatenate(values) for values in (depths, points, weights))
     if len(depth) == 0:
-        return None
+        return None, []
     near, median, far = _quantiles(depth, weight, (0.03, 0.5, 0.97))
     low, high = (np.array([_quantiles(point[:, axis], weight, (q,))[0] for axis in range(3)]) for q in (0.03, 0.97))
     _print(
@@ -290,9 +292,9 @@ def _print_depth(warped: WarpedEvents, recording: Recording, scale: float, probl
         inside = ((point >= box[0].numpy()) & (point <= box[1].numpy())).all(1)
         share = weight[inside].sum() / weight.sum()
         _print(f"Within the scene box: {share:.1%} of it")
-        if share < _MIN_IN_BOX_SHARE and not problems:
-            problems.append(f"the scene box holds only {share:.1%} of what is seen: state a larger scene_box, or none")
-    return median
+        if share < _MIN_IN_BOX_SHARE:
+            return median, [f"the scene box holds only {share:.1%} of what is seen: state a larger scene_box, or none"]
+    return median, []
 
 
 def _quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> list[float]:

@@ -10,20 +10,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
 from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
 from aenerf_ns.dataparsers.recording import FrameSequence, Recording, ReferenceView, Split, check_image
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.filters import EventFilters, FilteredEventFile
+from aenerf_ns.events.filters import EventFilters, FilteredEventFile, hot_pixel_summary
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.structure_from_motion import compare_with_truth, estimate_poses
 from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
-
-_MAX_SHOWN = 10
 
 
 @dataclass
@@ -169,21 +166,9 @@ def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDat
             num_written += len(chunk)
     if num_written == 0:
         raise events.empty_error()
-    if events.hot_pixels is not None:
+    if events.hot_pixels is not None and events.counts is not None:
         CONSOLE.print(hot_pixel_summary(events.hot_pixels, events.counts), highlight=False)
     return num_read, num_written
-
-
-def hot_pixel_summary(hot: np.ndarray, counts: np.ndarray) -> str:
-    """One line about (height, width) hot pixels and the number of events of all pixels."""
-    if not hot.any():
-        return "Hot pixels: none."
-    rows, columns = np.nonzero(hot)
-    order = np.argsort(-counts[hot], kind="stable")[:_MAX_SHOWN]
-    named = ", ".join(f"({columns[i]}, {rows[i]}) {counts[rows[i], columns[i]]:,}" for i in order)
-    more = f", and {len(rows) - len(order)} more" if len(rows) > len(order) else ""
-    share = counts[hot].sum() / counts.sum()
-    return f"Hot pixels: {len(rows)}, with {share:.2%} of the events. (x, y) and events: {named}{more}."
 
 
 def _with_estimated_poses(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, make_dataclass, replace
+from copy import copy
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, cast, get_type_hints
 
 import tyro
 
@@ -20,9 +21,9 @@ class Automatic:
 def _format_options(config: EventDataParserConfig) -> Any:
     """The config with those options hidden that make a scene of a recording: these commands keep its world."""
     kind = type(config)
-    hints = get_type_hints(kind)
+    hints, suppress = get_type_hints(kind), cast(Any, tyro.conf.Suppress)
     hidden = [
-        (option.name, tyro.conf.Suppress[hints[option.name]], field(default=getattr(config, option.name)))
+        (option.name, suppress[hints[option.name]], field(default=getattr(config, option.name)))
         for option in fields(EventDataParserConfig)
     ]
     options = make_dataclass(kind.__name__, hidden, bases=(kind,), namespace={"__doc__": kind.__doc__})
@@ -50,5 +51,6 @@ def open_dataset(data: Path, dataset_format: DatasetFormat) -> EventDataParser:
     Raises:
         DataError: its format is not recognised.
     """
-    config = FORMATS[recognise(data)] if isinstance(dataset_format, Automatic) else dataset_format
-    return replace(config, data=data).setup()
+    config = copy(FORMATS[recognise(data)] if isinstance(dataset_format, Automatic) else dataset_format)
+    config.data = data
+    return config.setup()

@@ -19,6 +19,7 @@ _NEVER = np.iinfo(np.int64).min
 _HOT_FACTOR = 4.0
 # and by so many standard deviations: of what pixels that see alike differ by, at least of a Poisson process.
 _HOT_DEVIATIONS = 6.0
+_MAX_SHOWN = 10
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,18 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
     excess = 2 * (np.sqrt(counts + 0.375) - np.sqrt(around + 0.375))
     spread = max(1.4826 * float(np.median(np.abs(excess))), 1.0)
     return (counts > _HOT_FACTOR * around) & (excess > _HOT_DEVIATIONS * spread)
+
+
+def hot_pixel_summary(hot: NDArray[np.bool_], counts: NDArray[np.integer]) -> str:
+    """One line about (height, width) hot pixels and the number of events of all pixels."""
+    if not hot.any():
+        return "Hot pixels: none."
+    rows, columns = np.nonzero(hot)
+    order = np.argsort(-counts[hot], kind="stable")[:_MAX_SHOWN]
+    named = ", ".join(f"({columns[i]}, {rows[i]}) {counts[rows[i], columns[i]]:,}" for i in order)
+    more = f", and {len(rows) - len(order)} more" if len(rows) > len(order) else ""
+    share = counts[hot].sum() / counts.sum()
+    return f"Hot pixels: {len(rows)}, with {share:.2%} of the events. (x, y) and events: {named}{more}."
 
 
 class FilteredEventFile(EventFile):
