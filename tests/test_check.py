@@ -158,12 +158,13 @@ def test_mistakes_planted_in_the_real_recording_are_named(slider_depth: Path) ->
 
 def run(folder: Path, **options: Path) -> tuple[int, str]:
     """Exit status of the check, and what it printed."""
+    status = 0
     with command.CONSOLE.capture() as output:
         try:
             Check(folder, **options).main()
         except SystemExit as end:
-            return int(end.code or 0), output.get()
-    return 0, output.get()
+            status = int(end.code or 0)
+    return status, output.get()
 
 
 @pytest.fixture
