@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
@@ -48,6 +48,8 @@ class NativeDataParserConfig(EventDataParserConfig):
     """C-, in place of the dataset's."""
     refractory_period_ns: int | None = None
     """Time for which a pixel is blind after each event, in place of the dataset's."""
+    poses: Literal["estimated", "ground-truth"] = "estimated"
+    """Which trajectory to train on. The true one shows what the errors of the estimated one cost."""
 
 
 class NativeDataParser(EventDataParser):
@@ -60,8 +62,9 @@ class NativeDataParser(EventDataParser):
         meta = _Metadata.read(folder / "transforms.json")
         block = meta.block("event_camera")
         event_camera = _camera(block, "width", "height")
-        trajectory = read_tum_trajectory(folder / "trajectory_estimated.txt")
         true_poses = folder / "trajectory_ground_truth.txt"
+        trained_on = folder / "trajectory_estimated.txt" if self.config.poses == "estimated" else true_poses
+        trajectory = read_tum_trajectory(trained_on)
         ground_truth = read_tum_trajectory(true_poses) if true_poses.exists() else None
         frames = meta.get("frames", list, [])
         sensor = self._sensor(block)

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -110,7 +111,14 @@ class NativeDatasetWriter:
         (self._partial / "poses_report.json").write_text(text + "\n", encoding="utf-8")
 
     def add_image(
-        self, split: Split, image: NDArray[np.uint8], camera_to_world: Tensor, time: int | None = None
+        self,
+        split: Split,
+        image: NDArray[np.uint8],
+        camera_to_world: Tensor,
+        time: int | None = None,
+        *,
+        linear: NDArray[np.uint16] | None = None,
+        depth: NDArray[np.float32] | None = None,
     ) -> None:
         """Adds a reference image.
 
@@ -119,6 +127,9 @@ class NativeDatasetWriter:
             image: (height, width, 3) display values.
             camera_to_world: (4, 4) pose, OpenCV camera axes.
             time: in nanoseconds, when the image was taken on the trajectory.
+            linear: (height, width, 3) the same in linear radiance.
+            depth: (height, width) along the optical axis, in the unit of the poses' lengths; not finite where there is
+                none. What is beyond 65.535 cannot be stored and becomes unknown.
         """
         names = self._meta[f"{split}_filenames"]
         name = f"images/{split}/{len(names):05d}.png"
@@ -128,6 +139,17 @@ class NativeDatasetWriter:
             "file_path": name,
             "transform_matrix": (camera_to_world.double() @ OPENCV_TO_OPENGL).tolist(),
         }
+        for key, values in (("linear", linear), ("depth", depth)):
+            if values is not None:
+                frame[f"{key}_file_path"] = f"{key}/{split}/{len(names):05d}.png"
+                (self._partial / frame[f"{key}_file_path"]).parent.mkdir(parents=True, exist_ok=True)
+        if linear is not None:
+            cv2.imwrite(str(self._partial / frame["linear_file_path"]), linear[..., ::-1])
+        if depth is not None:
+            # Nerfstudio's convention: 16 bits of thousandths, 0 for unknown.
+            thousandths = np.rint(np.where(np.isfinite(depth), depth, 0) * 1000.0)
+            thousandths[thousandths > np.iinfo(np.uint16).max] = 0
+            cv2.imwrite(str(self._partial / frame["depth_file_path"]), thousandths.astype(np.uint16))
         if time is not None:
             frame["timestamp"] = format_seconds(time)
         self._meta["frames"].append(frame)

@@ -45,7 +45,8 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
         ]
         for run in rows:
             if run.table == "methods" and run.row == OURS:
-                files.append(_paths(folder / "runs" / run.name, output / f"{stem}_paths.png"))
+                data, corrected = folder / "datasets" / run.dataset.name, folder / "runs" / run.name / "corrected.txt"
+                files.append(_paths(data, corrected, output / f"{stem}_paths.png"))
     return files
 
 
@@ -83,7 +84,7 @@ def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[
     return (colormaps["inferno"](np.clip(4 * error, 0, 1))[..., :3] * 255).round().astype(np.uint8)
 
 
-def _paths(run: Path, file: Path) -> Path:
+def _paths(data: Path, corrected: Path, file: Path) -> Path:
     """The given and the corrected path from above, aligned with the true one, and their errors over time."""
     import torch
     from matplotlib.figure import Figure
@@ -91,12 +92,13 @@ def _paths(run: Path, file: Path) -> Path:
     from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
     from aenerf_ns.trajectory.alignment import align, rotation_angle
 
-    truth = read_tum_trajectory(run / "ground-truth.txt")
+    truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
     figure = Figure(figsize=(9, 4), layout="constrained")
     above, over_time = figure.subplots(1, 2)
     above.plot(*truth.camera_to_worlds[:, :2, 3].T, color="black")
-    for poses, color in (("estimated", "tab:red"), ("corrected", "tab:blue")):
-        trajectory = read_tum_trajectory(run / f"{poses}.txt")
+    drawn = {"estimated": (data / "trajectory_estimated.txt", "tab:red"), "corrected": (corrected, "tab:blue")}
+    for poses, (path, color) in drawn.items():
+        trajectory = read_tum_trajectory(path)
         times = trajectory.knots_covered_by(truth)
         reference = truth.interpolate(times)
         aligned = align(trajectory.interpolate(times), reference)(trajectory.interpolate(times))
