@@ -51,7 +51,9 @@ class Simulation:
         easy_duration: seconds that the path takes at constant speed.
         max_displacement: pixels that the image may move between two rendered frames.
         contrast_threshold_spread: standard deviation of the thresholds over the pixels.
-        seed: of the sensor's thresholds.
+        seed: of the sensor's thresholds and noise.
+        leak_rate: see :class:`~aenerf_ns.events.esim.EventSimulator`.
+        shot_noise_rate: likewise.
 
     Raises:
         ValueError: an argument is out of range.
@@ -67,6 +69,8 @@ class Simulation:
         max_displacement: float,
         contrast_threshold_spread: float,
         seed: int,
+        leak_rate: float = 0.0,
+        shot_noise_rate: float = 0.0,
     ) -> None:
         self._scene = scene
         self._camera = camera
@@ -74,7 +78,13 @@ class Simulation:
         self._profile = SpeedProfile(speed, easy_duration)
         width, height = camera.width, camera.height
         self._simulator = EventSimulator(
-            width, height, sensor, contrast_threshold_spread=contrast_threshold_spread, seed=seed
+            width,
+            height,
+            sensor,
+            contrast_threshold_spread=contrast_threshold_spread,
+            leak_rate=leak_rate,
+            shot_noise_rate=shot_noise_rate,
+            seed=seed,
         )
         self._frames = frame_parameters(scene.renderer, scene.path, self._intrinsics, width, height, max_displacement)
         self._times = _nanoseconds(self._profile.time(self._frames))

@@ -62,6 +62,10 @@ class Simulate:
     """Standard deviation of the thresholds over the pixels."""
     refractory_period_ns: int = 0
     """Time for which a pixel is blind after each event, in nanoseconds."""
+    leak_rate: float = 0.0
+    """Positive events a second that every pixel fires without reason, for its reference leaks (real: 0.1 to 1)."""
+    shot_noise_rate: float = 0.0
+    """Events a second that a dark pixel fires at random; a bright one, a quarter of them (real: up to 10)."""
     bayer_pattern: BayerPattern = ""
     """RGGB for a colour sensor."""
     max_displacement: float = 0.5
@@ -106,6 +110,8 @@ class Simulate:
                 self.max_displacement,
                 self.contrast_threshold_spread,
                 self.seed,
+                self.leak_rate,
+                self.shot_noise_rate,
             )
             truth = simulation.trajectory(self.pose_rate)
             estimated, report = self._estimate(simulation, camera, truth)
