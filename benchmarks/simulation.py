@@ -2,9 +2,9 @@
 
     python benchmarks/simulation.py --scenes room scenes/*/scene.json --output benchmarks/results/simulation_cpu2.json
 
-The first frames of each scene's path are rendered and turned into events, as ``aenerf simulate`` does. The self-test takes
-the log-radiance of some pixels in every frame, and compares how much it moved between two events of a pixel with the contrast
-threshold. What remains is the rounding of the events' times to nanoseconds.
+The first frames of each scene's path are rendered and turned into events, as ``aenerf simulate`` does. The self-test
+takes the log-radiance of some pixels in every frame, and compares how much it moved between two events of a pixel with
+the contrast threshold. What remains is the rounding of the events' times to nanoseconds.
 """
 
 from __future__ import annotations
