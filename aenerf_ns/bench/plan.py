@@ -16,8 +16,8 @@ _SIMULATE = {
     "full": ("--width", "346", "--height", "260", "--validation-views", "100", "--test-views", "100"),
     "tiny": ("--width", "96", "--height", "72", "--validation-views", "20", "--test-views", "20"),
 }
-# Noise about as large as what COLMAP leaves on the benchmark's scenes: 0.5 degrees and 4 cm at easy speed, 1.1 degrees and
-# 8 cm at hard (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json).
+# Noise about as large as what COLMAP leaves on the benchmark's scenes: 0.5 degrees and 4 cm at easy speed, 1.1 degrees
+# and 8 cm at hard (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json).
 _POSES = {
     "noise": ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03"),
     "colmap": ("--poses", "colmap"),
