@@ -54,6 +54,11 @@ class NativeDataParser(EventDataParser):
     """Reads a dataset folder that holds transforms.json, an event file and trajectory_estimated.txt."""
 
     config: NativeDataParserConfig
+    layout = "transforms.json with trajectory_estimated.txt"
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        return all((data / name).is_file() for name in ("transforms.json", "trajectory_estimated.txt"))
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)
@@ -69,6 +74,9 @@ class NativeDataParser(EventDataParser):
         if encoding not in ("srgb", "linear"):
             raise DataError(meta.path, f'image_encoding is "{encoding}"', 'use "srgb" or "linear"')
         box = meta.get("scene_box", list, None)
+        max_pose_gap = meta.get("max_pose_gap_ns", int, None)
+        if max_pose_gap is not None and max_pose_gap <= 0:
+            raise meta.error("max_pose_gap_ns", f"is {max_pose_gap}, not a positive number of nanoseconds")
         return Recording(
             event_file=Hdf5EventFile(folder / block.get("file", str), event_camera.width, event_camera.height),
             event_camera=event_camera,
@@ -85,6 +93,7 @@ class NativeDataParser(EventDataParser):
             image_encoding=encoding,
             scene_box=None if box is None else _scene_box(meta, box),
             ground_truth=ground_truth,
+            max_pose_gap=max_pose_gap,
         )
 
     def _sensor(self, block: _Metadata) -> SensorModel:

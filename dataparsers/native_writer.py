@@ -36,6 +36,7 @@ class NativeDatasetWriter:
         sensor: its contrast thresholds, refractory period and Bayer pattern.
         image_encoding: of the images to come.
         scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
+        max_pose_gap: nanoseconds between poses beyond which the way between them is not known, or None.
 
     Raises:
         DataError: the folder exists.
@@ -51,6 +52,7 @@ class NativeDatasetWriter:
         sensor: SensorModel,
         image_encoding: ImageEncoding,
         scene_box: NDArray[np.float64] | None = None,
+        max_pose_gap: int | None = None,
     ) -> None:
         if folder.exists():
             raise DataError(folder, "the folder exists already", "remove it or choose another --output")
@@ -80,6 +82,8 @@ class NativeDatasetWriter:
         }
         if scene_box is not None:
             self._meta["scene_box"] = scene_box.tolist()
+        if max_pose_gap is not None:
+            self._meta["max_pose_gap_ns"] = max_pose_gap
 
     def __enter__(self) -> NativeDatasetWriter:
         return self
