@@ -21,6 +21,7 @@ from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.dataparsers.views import read_image_list, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
 
 _CHUNK_LINES = 1_000_000
@@ -88,10 +89,6 @@ class EcdDataParserConfig(PublishedDataParserConfig):
     """Event Camera Dataset (text files)."""
 
     _target: type = field(default_factory=lambda: EcdDataParser)
-    positive_contrast_threshold: float = 0.5
-    """C+: the dataset does not state it. It only sets the scale of the log-radiance, which colour correction finds."""
-    negative_contrast_threshold: float = 0.5
-    """C-: likewise; its ratio to C+ matters."""
 
 
 class EcdDataParser(EventDataParser):
@@ -115,7 +112,7 @@ class EcdDataParser(EventDataParser):
         return Recording(
             event_file=EcdEventFile(folder / "events.txt", camera.width, camera.height),
             event_camera=camera,
-            sensor=self.config.sensor(),
+            sensor=self.config.sensor(SensorModel(0.5, 0.5)),
             trajectory=trajectory,
             ground_truth=ground_truth,
             frame_camera=camera,

@@ -37,7 +37,7 @@ _XYTP_RECORDS = EventLayout({name: ("", name) for name in "xytp"}, time_unit=Non
 
 _CHUNK_LINES = 1_000_000
 # What zipfile and NumPy raise for files that are damaged or not theirs.
-_NPZ_ERRORS = (
+NPZ_ERRORS = (
     ValueError,
     OSError,
     EOFError,
@@ -64,7 +64,7 @@ class NpyEventFile(EventTableFile):
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, NDArray]]:
         self.require()
-        yield {"": _load_npy(self.path)}
+        yield {"": load_npy(self.path)}
 
 
 class CsvEventFile(EventFile):
@@ -166,7 +166,7 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
     if not path.is_file():
         raise DataError(path, "there is no such event file", "check the path of the dataset")
     if path.suffix == ".npy":
-        layout = XYTP_MATRIX if _load_npy(path).dtype.names is None else _XYTP_RECORDS
+        layout = XYTP_MATRIX if load_npy(path).dtype.names is None else _XYTP_RECORDS
         return NpyEventFile(path, width, height, layout, time_unit)
     names = npz_members(path)
     for layout in (XYTP_MEMBERS, POSITION_TIMESTAMP_POLARITY):
@@ -204,7 +204,7 @@ def read_npz_member(path: Path, name: str) -> NDArray:
             with archive.open(entry) as member:
                 if entry.compress_type != zipfile.ZIP_STORED:
                     return np.lib.format.read_array(member, allow_pickle=False)
-                shape, fortran, dtype = _read_npy_header(member)
+                shape, fortran, dtype = read_npy_header(member)
                 header = member.tell()
             if dtype.hasobject or 0 in shape or shape == ():
                 with archive.open(entry) as member:
@@ -214,7 +214,7 @@ def read_npz_member(path: Path, name: str) -> NDArray:
                 file.seek(entry.header_offset + 26)
                 start = entry.header_offset + 30 + sum(struct.unpack("<HH", file.read(4))) + header
             return np.memmap(path, dtype, "r", start, shape, "F" if fortran else "C")
-        except _NPZ_ERRORS as error:
+        except NPZ_ERRORS as error:
             raise DataError(path, f"its array {name} cannot be read ({error})", "write or copy it again") from None
 
 
@@ -227,14 +227,19 @@ def _open_npz(path: Path) -> zipfile.ZipFile:
         raise DataError(path, f"not a readable .npz file ({error})", "write or copy it again") from None
 
 
-def _read_npy_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+def read_npy_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         return np.lib.format.read_array_header_1_0(file)
     return np.lib.format.read_array_header_2_0(file)
 
 
-def _load_npy(path: Path) -> NDArray:
+def load_npy(path: Path) -> NDArray:
+    """The array of an .npy file, mapped into memory.
+
+    Raises:
+        DataError: the file is malformed, or an array of Python objects.
+    """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:

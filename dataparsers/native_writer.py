@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventWriter
-from aenerf_ns.dataparsers.native import LENS_MODELS
+from aenerf_ns.dataparsers.metadata import LENS_MODELS
 from aenerf_ns.dataparsers.recording import Split
 from aenerf_ns.dataparsers.text import format_seconds
 from aenerf_ns.dataparsers.tum_trajectory import write_tum_trajectory

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -19,7 +19,7 @@ from torch import Tensor
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import REFERENCE_SECONDS, TRAJECTORY_SECONDS, EventCamera
-from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.image_encoding import ImageEncoding
 from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
@@ -123,36 +123,57 @@ class EventDataParserConfig(DataParserConfig):
 
 @dataclass
 class PublishedDataParserConfig(EventDataParserConfig):
-    """What the formats have in common that know neither the sensor nor how well they know the poses."""
+    """What the formats of other projects have in common."""
 
     _target: type = field(default_factory=lambda: EventDataParser)
     auto_scale_poses: bool = False
     """Poses are in metres, and slow recordings move little compared to the scene's distance."""
-    positive_contrast_threshold: float = 0.25
-    """C+. The size of both only sets the scale of the log-radiance, which colour correction finds."""
-    negative_contrast_threshold: float = 0.25
-    """C-: likewise; its ratio to C+ matters."""
-    refractory_period_ns: int = 0
-    """Time for which a pixel is blind after each event, in nanoseconds."""
+    positive_contrast_threshold: float | None = None
+    """C+, in place of the dataset's or of what is assumed of its sensor. The size of both thresholds only sets the
+    scale of the log-radiance, which colour correction finds."""
+    negative_contrast_threshold: float | None = None
+    """C-, likewise; its ratio to C+ matters."""
+    refractory_period_ns: int | None = None
+    """Time for which a pixel is blind after each event, in nanoseconds, likewise."""
     trajectory: Path | None = None
     """Estimated poses of the event camera, as t tx ty tz qx qy qz qw in seconds, camera-to-world, to be used in place
     of the dataset's. The dataset's then only serve to evaluate them."""
 
-    def sensor(self, bayer_pattern: BayerPattern = "") -> SensorModel:
-        """The sensor of these options.
+    def sensor(self, stated: SensorModel) -> SensorModel:
+        """The sensor, with what the options give in place of what the dataset states.
 
         Raises:
             DataError: a value cannot be.
         """
-        thresholds = (self.positive_contrast_threshold, self.negative_contrast_threshold)
+        given = {
+            "positive_contrast_threshold": self.positive_contrast_threshold,
+            "negative_contrast_threshold": self.negative_contrast_threshold,
+            "refractory_period": self.refractory_period_ns,
+        }
         try:
-            return SensorModel(*thresholds, self.refractory_period_ns, bayer_pattern)
+            return replace(stated, **{name: value for name, value in given.items() if value is not None})
         except ValueError as error:
             raise DataError(str(self.data), str(error), "correct it among the options") from None
 
     def estimated(self, reference: Trajectory) -> tuple[Trajectory, Trajectory | None]:
         """The estimated trajectory and, where that is another, the true one, of the dataset's own trajectory."""
         return (reference, None) if self.trajectory is None else (read_tum_trajectory(self.trajectory), reference)
+
+
+@dataclass
+class ObjectDataParserConfig(PublishedDataParserConfig):
+    """The formats of objects on a uniform background."""
+
+    scene_half_extent: float | None = None
+    """Half the side of a cube around the origin that holds the whole scene, in the units of the poses; 0 for a scene
+    without bounds. By default as the dataset's authors have it."""
+
+    def scene_box(self, stated: float) -> Tensor | None:
+        """The (2, 3) corners of the cube, where there is one."""
+        half = stated if self.scene_half_extent is None else self.scene_half_extent
+        if half < 0:
+            raise DataError(str(self.data), f"scene_half_extent is {half}", "give a length, or 0 for no bounds")
+        return torch.tensor([[-half] * 3, [half] * 3], dtype=torch.float64) if half else None
 
 
 class EventDataParser(DataParser):

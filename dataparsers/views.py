@@ -10,7 +10,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from aenerf_ns.dataparsers.recording import ReferenceView, Split
-from aenerf_ns.dataparsers.text import parse_times, read_rows
+from aenerf_ns.dataparsers.text import TimeUnit, parse_times, read_rows
 from aenerf_ns.errors import DataError
 from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
@@ -40,17 +40,22 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
     return [(int(time), path.parent / name) for time, (_, name) in zip(times, rows, strict=True)]
 
 
-def pair_with_times(files: Sequence[Path], times: Sequence[int], source: Path) -> list[tuple[int, Path]]:
-    """Times in nanoseconds and files, of lists in the same order.
+def read_image_times(folder: Path, path: Path, unit: TimeUnit) -> list[tuple[int, Path]]:
+    """Times in nanoseconds and files of a folder's images in the order of their names, of which another file lists the
+    times. None where the folder holds no images.
 
     Raises:
-        DataError: they are not as many.
+        DataError: the list is missing, or not as long.
     """
+    files = image_files(folder)
+    if not files:
+        return []
+    times = parse_times(path, [row[0] for row in read_rows(path, "t")], unit).tolist()
     if len(files) != len(times):
         raise DataError(
-            source, f"it has {len(times)} times for {len(files)} images", "copy all images and the list of their times"
+            path, f"it has {len(times)} times for {len(files)} images", "copy all images and the list of their times"
         )
-    return list(zip(map(int, times), files, strict=True))
+    return list(zip(times, files, strict=True))
 
 
 def views_on_trajectory(
@@ -58,6 +63,7 @@ def views_on_trajectory(
     trajectory: Trajectory,
     event_from_frame: Tensor | None = None,
     max_views: int | None = _MAX_VIEWS,
+    max_pose_gap: int | None = None,
 ) -> dict[Split, list[ReferenceView]]:
     """The images that were taken within the span of the poses, each at the interpolated pose of its time. They
     alternate between the validation and the test split.
@@ -68,8 +74,14 @@ def views_on_trajectory(
         event_from_frame: (4, 4) float64, takes points from the frame camera's to the event camera's coordinates, or
             None where one sensor takes both.
         max_views: how many to keep at most, evenly spread, or None for all.
+        max_pose_gap: nanoseconds between poses beyond which no image there is kept, or None.
     """
-    kept = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
+    gaps = [] if max_pose_gap is None else trajectory.gaps(max_pose_gap)
+    kept = [
+        (time, file)
+        for time, file in images
+        if trajectory.start <= time <= trajectory.end and not any(first < time < last for first, last in gaps)
+    ]
     if len(kept) < len(images):
         CONSOLE.print(
             f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses."
