@@ -232,9 +232,8 @@ def _read_json(path: Path) -> _Calibration:
         raise
     except ValueError as error:
         raise block.error("sensor:", str(error)) from None
-    return _Calibration(
-        event, read_camera(meta, "w", "h") if "w" in meta else event, frame_from_event, sensor, encoding
-    )
+    frame = read_camera(meta, "w", "h") if "w" in meta else event
+    return _Calibration(event, frame, frame_from_event, sensor, encoding)
 
 
 def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -87,7 +87,7 @@ def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[
         try:
             time = Decimal(field) * NANOSECONDS[unit]
             good = abs(time) < _MAX_TIME
-        except InvalidOperation:
+        except ArithmeticError:
             good = False
         if not good:
             name = _UNIT_NAMES[unit]
