@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 # Units that the native file may state; its times are integers.
-_UNITS = ("ns", "us", "ms")
+_UNITS: tuple[TimeUnit, ...] = ("ns", "us", "ms")
 # The code under which Prophesee's compression of events registers itself.
 _ECF = 0x8ECF
 # Events read at once: 50 MB.
@@ -56,7 +56,7 @@ class Hdf5EventFile(EventFile):
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
         if not isinstance(offset, (int, np.integer)):
             raise DataError(self.path, f"its time offset is {offset!r}", "use an integer in the unit of the times")
-        tick = NANOSECONDS[unit]
+        tick = NANOSECONDS[unit]  # type: ignore[index]
         return columns, tick, int(offset) * tick
 
     def read_chunks(self) -> Iterator[EventStream]:
@@ -107,12 +107,13 @@ class Hdf5TableFile(EventTableFile):
             for name, array in arrays.items():
                 if not hasattr(array, "dtype"):
                     raise DataError(self.path, f"there is no dataset /{name}", "see the formats in the docs")
-            offset = None if self._layout.time_offset is None else file.get(self._layout.time_offset)
-            if offset is not None:
+            name = self._layout.time_offset
+            offset = None if name is None else file.get(name)
+            if name is not None and offset is not None:
                 value = _scalar(offset[()]) if hasattr(offset, "dtype") else None
                 if not isinstance(value, (int, np.integer)):
-                    raise DataError(self.path, f"its {self._layout.time_offset} is {value!r}", "store an integer")
-                arrays[self._layout.time_offset] = int(value)
+                    raise DataError(self.path, f"its {name} is {value!r}", "store an integer")
+                arrays[name] = int(value)
             yield arrays
 
     def read_array(self, array: h5py.Dataset, piece: slice) -> NDArray:

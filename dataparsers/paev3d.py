@@ -109,11 +109,11 @@ def _camera_pose(path: Path) -> Tensor:
                 raise DataError(
                     path, f"its camera's pose has type {pose.dtype} and shape {pose.shape}", "copy it again"
                 )
-            pose = torch.from_numpy(pose.astype(np.float64))
-            if not pose.isfinite().all():
+            matrix = torch.from_numpy(pose.astype(np.float64))
+            if not matrix.isfinite().all():
                 raise DataError(path, "its camera's pose is not finite", "drop it, and its image")
-            require_rigid(pose[None], path)
-            return pose
+            require_rigid(matrix[None], path)
+            return matrix
     raise DataError(path, "its object_poses hold no 'Camera'", "render it with VisionBlender again")
 
 

@@ -145,7 +145,7 @@ class PublishedDataParserConfig(EventDataParserConfig):
         Raises:
             DataError: a value cannot be.
         """
-        given = {
+        given: dict[str, Any] = {
             "positive_contrast_threshold": self.positive_contrast_threshold,
             "negative_contrast_threshold": self.negative_contrast_threshold,
             "refractory_period": self.refractory_period_ns,

@@ -114,8 +114,10 @@ def _read_calibration(path: Path) -> tuple[EventCamera, SensorModel]:
         camera = EventCamera(
             int(single["img_width"]),
             int(single["img_height"]),
-            *(float(matrix[index]) for index in ((0, 0), (1, 1))),
-            *(float(matrix[index]) + 0.5 for index in ((0, 2), (1, 2))),
+            float(matrix[0, 0]),
+            float(matrix[1, 1]),
+            float(matrix[0, 2]) + 0.5,
+            float(matrix[1, 2]) + 0.5,
             lens,
             tuple(distortion),
         )
