@@ -56,7 +56,7 @@ class Hdf5EventFile(EventFile):
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
         if not isinstance(offset, (int, np.integer)):
             raise DataError(self.path, f"its time offset is {offset!r}", "use an integer in the unit of the times")
-        tick = NANOSECONDS[unit]  # type: ignore[index]
+        tick = NANOSECONDS[unit]
         return columns, tick, int(offset) * tick
 
     def read_chunks(self) -> Iterator[EventStream]:
@@ -107,13 +107,13 @@ class Hdf5TableFile(EventTableFile):
             for name, array in arrays.items():
                 if not hasattr(array, "dtype"):
                     raise DataError(self.path, f"there is no dataset /{name}", "see the formats in the docs")
-            name = self._layout.time_offset
-            offset = None if name is None else file.get(name)
-            if name is not None and offset is not None:
+            offset_name = self._layout.time_offset
+            offset = None if offset_name is None else file.get(offset_name)
+            if offset_name is not None and offset is not None:
                 value = _scalar(offset[()]) if hasattr(offset, "dtype") else None
                 if not isinstance(value, (int, np.integer)):
-                    raise DataError(self.path, f"its {name} is {value!r}", "store an integer")
-                arrays[name] = int(value)
+                    raise DataError(self.path, f"its {offset_name} is {value!r}", "store an integer")
+                arrays[offset_name] = int(value)
             yield arrays
 
     def read_array(self, array: h5py.Dataset, piece: slice) -> NDArray:
