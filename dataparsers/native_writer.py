@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventWriter
-from aenerf_ns.dataparsers.native import LENS_MODELS
+from aenerf_ns.dataparsers.metadata import LENS_MODELS
 from aenerf_ns.dataparsers.recording import Split
 from aenerf_ns.dataparsers.text import format_seconds
 from aenerf_ns.dataparsers.tum_trajectory import write_tum_trajectory
@@ -37,6 +37,7 @@ class NativeDatasetWriter:
         sensor: its contrast thresholds, refractory period and Bayer pattern.
         image_encoding: of the images to come.
         scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
+        max_pose_gap: nanoseconds between poses beyond which the way between them is not known, or None.
 
     Raises:
         DataError: the folder exists.
@@ -52,6 +53,7 @@ class NativeDatasetWriter:
         sensor: SensorModel,
         image_encoding: ImageEncoding,
         scene_box: NDArray[np.float64] | None = None,
+        max_pose_gap: int | None = None,
     ) -> None:
         if folder.exists():
             raise DataError(folder, "the folder exists already", "remove it or choose another --output")
@@ -81,6 +83,8 @@ class NativeDatasetWriter:
         }
         if scene_box is not None:
             self._meta["scene_box"] = scene_box.tolist()
+        if max_pose_gap is not None:
+            self._meta["max_pose_gap_ns"] = max_pose_gap
 
     def __enter__(self) -> NativeDatasetWriter:
         return self

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.ffmpeg import provide_ffmpeg
 
 ROOT = Path(__file__).parents[1]
@@ -46,7 +47,7 @@ def test_the_wheel_holds_the_package_and_nothing_generic(wheel: zipfile.ZipFile)
 def test_the_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
     text = next(wheel.read(name).decode() for name in wheel.namelist() if name.endswith("entry_points.txt"))
     targets = [line.split("=")[1].strip() for line in text.splitlines() if "=" in line]
-    assert len(targets) == 6
+    assert len(targets) == 14
     for target in targets:
         module, attribute = target.split(":")
         assert attribute in wheel.read(module.replace(".", "/") + ".py").decode()
@@ -54,7 +55,7 @@ def test_the_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
 
 def test_the_dataparsers_are_registered() -> None:
     names = {point.name for point in entry_points(group="nerfstudio.dataparser_configs")}
-    assert {"aenerf-data", "ecd-data"} <= names
+    assert {"event-data", *FORMATS} <= names
 
 
 def test_importing_the_package_costs_nothing() -> None:
