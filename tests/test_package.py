@@ -105,7 +105,7 @@ def test_lower_floors_import_none_above_them() -> None:
         {"events", "trajectory", "scenes", "image_encoding", "event_camera", "box_collider", "hash_encoding"},
         {"field", "temporal", "losses", "color_correction", "image_metrics"},
         {"dataset", "simulation", "structure_from_motion"},
-        {"ray_sampler"},
+        {"ray_sampler", "simulated_poses"},
         {"pose_correction", "sensor_parameters"},
         {"datamanager", "model"},
         {"pose_refinement"},
