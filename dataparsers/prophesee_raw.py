@@ -1,0 +1,99 @@
+"""RAW files of Prophesee cameras, in the encodings EVT 2.0 and EVT 3.0.
+
+https://docs.prophesee.ai/stable/data/file_formats/raw.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.dataparsers.prophesee_header import PropheseeHeader, read_header
+from aenerf_ns.dataparsers.sensor_size import sensor_size
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream
+
+if TYPE_CHECKING:
+    from aenerf_ns.dataparsers.evt_words import Columns, Encoding
+
+# Words read at once.
+_BLOCK = 1 << 20
+
+
+class PropheseeRawFile(EventFile):
+    """A RAW file: a text header, then the words that the camera sent.
+
+    Args:
+        path: the file.
+        width: pixel columns of the sensor; needed where the header does not tell them.
+        height: pixel rows, likewise.
+
+    Raises:
+        DataError: the file is missing, its encoding is not one of EVT 2.0 and EVT 3.0, or the size of the sensor is
+            not known.
+    """
+
+    def __init__(self, path: Path, width: int | None = None, height: int | None = None) -> None:
+        header = read_header(path)
+        self._encoding_name = _encoding_name(path, header)
+        self._begin = header.end
+        super().__init__(path, *sensor_size(path, header.size, width, height))
+
+    def _encoding(self) -> Encoding:
+        # Late, for every command of every method would wait for numba.
+        from aenerf_ns.dataparsers.evt_words import EVT2, EVT3
+
+        return EVT2 if self._encoding_name == "EVT2" else EVT3
+
+    def _blocks(self, dtype: np.dtype) -> Iterator[NDArray]:
+        self.require()
+        if (self.path.stat().st_size - self._begin) % dtype.itemsize:
+            raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
+        with self.path.open("rb") as file:
+            file.seek(self._begin)
+            while len(block := np.fromfile(file, dtype, _BLOCK)):
+                yield block
+
+    def _decoded(self) -> Iterator[Columns]:
+        from aenerf_ns.dataparsers.evt_words import decode_words, initial_state
+
+        encoding = self._encoding()
+        return decode_words(self._blocks(encoding.dtype), encoding, initial_state(), self.path)
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        for x, y, t, p in self._decoded():
+            yield EventStream(x, y, t, p, self.width, self.height, self.path)
+
+    def time_span(self) -> tuple[int, int]:
+        # Only the lower bits of times are in the file, so that it must be gone through to count how often they wrap.
+        start = end = None
+        for _, _, t, _ in self._decoded():
+            start = int(t[0]) if start is None else start
+            end = int(t[-1])
+        if start is None or end is None:
+            raise self.empty_error()
+        return start, end
+
+
+def _encoding_name(path: Path, header: PropheseeHeader) -> str:
+    """EVT2 or EVT3."""
+    options = header.format_options
+    version = header.fields.get("evt", "")
+    name = options["name"] or {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}.get(version, version)
+    if not name:
+        raise DataError(
+            path,
+            "its header does not tell the encoding of the events",
+            'add the line "% evt 2.0" or "% evt 3.0", or convert it with metavision_file_to_dat',
+        )
+    if name not in ("EVT2", "EVT3") or options.get("endianness", "little") != "little":
+        raise DataError(
+            path,
+            f"its events are encoded as {header.fields.get('format', version)}; EVT2 and EVT3, little-endian, are read",
+            "convert it with metavision_file_to_dat",
+        )
+    return name
