@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, NoReturn
 from xml.etree import ElementTree
@@ -26,9 +27,24 @@ _MAGIC = b"#!AER-DAT4.0\r\n"
 # Microseconds.
 _EVENT = np.dtype([("time", "<i8"), ("x", "<u2"), ("y", "<u2"), ("on", "u1"), ("padding", "V3")])
 _MAX_MICROSECONDS = np.iinfo(np.int64).max // 1000
+_COMPRESSIONS = ("none", "lz4", "lz4", "zstd", "zstd")
 # Places of the fields in their tables.
 _HEADER_COMPRESSION, _HEADER_TABLE_POSITION, _HEADER_INFO = range(3)
 _ROW_STREAM, _ROW_COUNT = 1, 2
+
+
+@dataclass(frozen=True)
+class _Header:
+    """Places in bytes of the first packet, of the end of packets and of their table, if there is one; the compression;
+    and the number of the stream of events with the size of its sensor, where it is told.
+    """
+
+    begin: int
+    end: int
+    table: int | None
+    compression: str
+    stream: int
+    size: tuple[int, int] | None
 
 
 class Aedat4File(EventFile):
@@ -36,66 +52,79 @@ class Aedat4File(EventFile):
 
     Args:
         path: the file.
-        width: pixel columns of the sensor; needed where the file does not tell them.
+        width: pixel columns of the sensor; needed where the file does not tell them. With both sizes given, the file
+            is not opened before its events are asked for.
         height: pixel rows, likewise.
         stream: number of the stream, or None when only one holds events.
 
     Raises:
-        DataError: the file is missing, its header cannot be read, it holds no such stream, or the size of the sensor
-            is not known.
+        DataError: a size is not given, and the file is missing or its header does not tell it.
     """
 
     def __init__(
         self, path: Path, width: int | None = None, height: int | None = None, stream: str | None = None
     ) -> None:
         self.path = path
-        self.require()
-        with path.open("rb") as file:
-            magic = file.read(len(_MAGIC))
-            if magic != _MAGIC:
-                raise DataError(path, "it does not begin as an AEDAT4 file does", "convert older ones with DV")
-            length = int.from_bytes(file.read(4), "little")
-            self._begin = file.tell() + length
-            if self._begin > path.stat().st_size:
-                self._fail("it ends within its header")
-            header = file.read(length)
-        try:
-            root = _root(header, 0)
-            compression = _number(header, root, _HEADER_COMPRESSION, "<i", 0)
-            self._table_position = _number(header, root, _HEADER_TABLE_POSITION, "<q", -1)
-            streams = _event_streams(header, root)
-        except (struct.error, ValueError, ElementTree.ParseError) as error:
-            self._fail(f"its header cannot be read ({error})")
-        if compression not in range(5):
-            self._fail(f"its compression is number {compression}")
-        self._compression = ("none", "lz4", "lz4", "zstd", "zstd")[compression]
-        if stream is None and len(streams) == 1:
-            stream = next(iter(streams))
-        if stream not in streams:
-            problem = "several streams hold events" if streams else "no stream holds events"
-            if stream is not None:
-                problem = f"stream {stream} holds no events"
-            remedy = f"choose one of {', '.join(streams)}" if streams else "record the events too"
-            raise DataError(path, problem, remedy)
-        self._stream = int(stream)
-        super().__init__(path, *sensor_size(path, streams[stream], width, height))
+        self._chosen = stream
+        if width is None or height is None:
+            width, height = sensor_size(path, self._read_header().size, width, height)
+        super().__init__(path, width, height)
 
     def _fail(self, problem: str) -> NoReturn:
         raise DataError(self.path, problem, "copy it again, or export it again with DV")
 
-    def _decompressor(self) -> Callable[[bytes], bytes]:
+    def _read_header(self) -> _Header:
+        self.require()
+        file_size = self.path.stat().st_size
+        with self.path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise DataError(self.path, "it does not begin as an AEDAT4 file does", "convert older ones with DV")
+            length = int.from_bytes(file.read(4), "little")
+            begin = file.tell() + length
+            if begin > file_size:
+                self._fail("it ends within its header")
+            data = file.read(length)
+        try:
+            root = _root(data, 0)
+            compression = _number(data, root, _HEADER_COMPRESSION, "<i", 0)
+            table = _number(data, root, _HEADER_TABLE_POSITION, "<q", -1)
+            streams = _event_streams(data, root)
+        except (struct.error, ValueError, ElementTree.ParseError) as error:
+            self._fail(f"its header cannot be read ({error})")
+        if not 0 <= compression < len(_COMPRESSIONS):
+            self._fail(f"its compression is number {compression}")
+        if table > file_size:
+            self._fail(f"it ends before its table of packets at byte {table}")
+        stream = self._chosen
+        if stream is None and len(streams) == 1:
+            stream = next(iter(streams))
+        if stream not in streams:
+            problem = "several streams hold events" if stream is None else f"stream {stream} holds no events"
+            if not streams:
+                raise DataError(self.path, "no stream holds events", "record the events too")
+            raise DataError(self.path, problem, f"choose one of {', '.join(streams)}")
+        # A recording that was interrupted has no table.
+        place = table if table > 0 else None
+        return _Header(begin, place or file_size, place, _COMPRESSIONS[compression], int(stream), streams[stream])
+
+    def _checked_header(self) -> _Header:
+        header = self._read_header()
+        sensor_size(self.path, header.size, self.width, self.height)
+        return header
+
+    def _decompressor(self, compression: str) -> Callable[[bytes], bytes]:
         """What decompresses packets and raises DataErrors."""
         try:
-            if self._compression == "lz4":
+            if compression == "lz4":
                 from lz4.frame import decompress
-            elif self._compression == "zstd":
+            elif compression == "zstd":
                 from backports.zstd import decompress
             else:
                 decompress = bytes
         except ImportError as error:
             raise DataError(
                 self.path,
-                f"its packets are compressed ({self._compression}), and the package for it is missing ({error})",
+                f"its packets are compressed ({compression}), and the package for it is missing ({error})",
                 "pip install 'aenerf-ns[aedat4]'",
             ) from None
 
@@ -108,28 +137,25 @@ class Aedat4File(EventFile):
 
         return checked
 
-    def _packets(self, file: BinaryIO) -> Iterator[tuple[int, int]]:
+    def _packets(self, file: BinaryIO, header: _Header) -> Iterator[tuple[int, int]]:
         """Place and size in bytes of each packet of the stream."""
-        end = size = self.path.stat().st_size
-        if self._table_position > 0:
-            end = self._table_position
-        position = self._begin
-        while position < end:
+        position = header.begin
+        while position < header.end:
             file.seek(position)
-            header = file.read(8)
-            stream, length = struct.unpack("<2i", header) if len(header) == 8 else (0, -1)
-            if length < 0 or position + 8 + length > min(end, size):
+            head = file.read(8)
+            stream, length = struct.unpack("<2i", head) if len(head) == 8 else (0, -1)
+            if length < 0 or position + 8 + length > header.end:
                 self._fail(f"it ends within the packet at byte {position}, or is damaged there")
-            if stream == self._stream and length:
+            if stream == header.stream and length:
                 yield position + 8, length
             position += 8 + length
 
     def _event_packets(self, backwards: bool = False) -> Iterator[NDArray]:
         """(N,) events of each packet that has any."""
-        self.require()
-        decompress = self._decompressor()
+        header = self._checked_header()
+        decompress = self._decompressor(header.compression)
         with self.path.open("rb") as file:
-            packets: Iterable[tuple[int, int]] = self._packets(file)
+            packets: Iterable[tuple[int, int]] = self._packets(file, header)
             for position, length in reversed(list(packets)) if backwards else packets:
                 file.seek(position)
                 data = decompress(file.read(length))
@@ -179,12 +205,12 @@ class Aedat4File(EventFile):
 
     def count(self) -> int | None:
         """From the table of packets, which is missing where a recording was interrupted."""
-        self.require()
-        if self._table_position <= 0:
+        header = self._checked_header()
+        if header.table is None:
             return None
         with self.path.open("rb") as file:
-            file.seek(self._table_position)
-            data = self._decompressor()(file.read())
+            file.seek(header.table)
+            data = self._decompressor(header.compression)(file.read())
         try:
             begin, rows = _vector(data, _root(data, 4), 0)
             if 4 * rows > len(data):
@@ -192,7 +218,7 @@ class Aedat4File(EventFile):
             total = 0
             for place in range(begin, begin + 4 * rows, 4):
                 row = place + struct.unpack_from("<I", data, place)[0]
-                if _number(data, row, _ROW_STREAM, "<i", -1) == self._stream:
+                if _number(data, row, _ROW_STREAM, "<i", -1) == header.stream:
                     total += _number(data, row, _ROW_COUNT, "<q", 0)
             return total
         except (struct.error, ValueError) as error:

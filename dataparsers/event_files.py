@@ -15,11 +15,24 @@ from aenerf_ns.dataparsers.sensor_size import sensor_size
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 
+_FORMAT_OF_SUFFIX = {
+    ".raw": "raw",
+    ".dat": "dat",
+    ".aedat4": "aedat4",
+    ".bag": "bag",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".txt": "text",
+}
+
 
 def open_event_file(
     path: Path, width: int | None = None, height: int | None = None, topic: str | None = None
 ) -> EventFile:
-    """Opens an event file in the format that its first bytes tell (text: its suffix).
+    """Opens an event file in the format that its first bytes tell (text, and files that are missing: its suffix).
+
+    With both sizes given, nothing but the first bytes is read before the events are asked for, and a missing file is
+    an error only then: a trained run opens without its events.
 
     Args:
         path: the file.
@@ -28,32 +41,47 @@ def open_event_file(
         topic: the topic of a bag, or the number of the stream of an AEDAT4 file, where several hold events.
 
     Raises:
-        DataError: the file is missing or empty, its format is not known, its header cannot be read, or the size of the
-            sensor is not known or not the one given.
+        DataError: the format is not known, or a size is not given and the file is missing or does not tell it.
     """
     if path.is_dir():
         raise DataError(path, "it is a folder", "name the event file in it (bags of ROS 2: convert them to ROS 1)")
-    if not path.is_file():
-        raise DataError(path, "there is no such event file", "check the path of the dataset")
-    with path.open("rb") as file:
-        beginning = file.read(16)
-    if not beginning:
-        raise DataError(path, "the file is empty", "record or copy it again")
-    if beginning.startswith(b"#!AER-DAT"):
+    name = _format(path)
+    if name == "aedat4":
         return Aedat4File(path, width, height, topic)
-    if beginning.startswith(b"#ROSBAG"):
+    if name == "bag":
         return RosbagEventFile(path, width, height, topic)
     if topic is not None:
         raise DataError(path, f"only bags and AEDAT4 files have topics, but {topic} was given", "leave it out")
-    if beginning.startswith(b"% "):
-        is_raw = {"evt", "format"} & set(read_header(path).fields) or path.suffix.lower() == ".raw"
-        return (PropheseeRawFile if is_raw else PropheseeDatFile)(path, width, height)
+    if name == "raw":
+        return PropheseeRawFile(path, width, height)
+    if name == "dat":
+        return PropheseeDatFile(path, width, height)
+    size = sensor_size(path, None, width, height)
+    return Hdf5EventFile(path, *size) if name == "hdf5" else EcdEventFile(path, *size)
+
+
+def _format(path: Path) -> str:
+    suffix = path.suffix.lower()
+    beginning = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            beginning = file.read(16)
+        if not beginning:
+            raise DataError(path, "the file is empty", "record or copy it again")
+    if beginning.startswith(b"#!AER-DAT"):
+        return "aedat4"
+    if beginning.startswith(b"#ROSBAG"):
+        return "bag"
     if beginning.startswith(b"\x89HDF\r\n\x1a\n"):
-        return Hdf5EventFile(path, *sensor_size(path, None, width, height))
-    if path.suffix.lower() == ".txt":
-        return EcdEventFile(path, *sensor_size(path, None, width, height))
+        return "hdf5"
+    if beginning.startswith(b"% "):
+        is_raw = suffix == ".raw" or {"evt", "format"} & set(read_header(path).fields)
+        return "raw" if is_raw else "dat"
+    # A binary format would have been recognised.
+    if suffix in _FORMAT_OF_SUFFIX and (not beginning or suffix == ".txt"):
+        return _FORMAT_OF_SUFFIX[suffix]
     raise DataError(
         path,
-        f"its format is not known (it begins with {beginning[:8]!r})",
+        f"its format is not known (it begins with {beginning[:8]!r})" if beginning else "there is no such event file",
         "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS 1, HDF5 and text are read",
     )

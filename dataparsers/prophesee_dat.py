@@ -31,41 +31,47 @@ class PropheseeDatFile(EventFile):
 
     Args:
         path: the file.
-        width: pixel columns of the sensor; needed where the header does not tell them.
+        width: pixel columns of the sensor; needed where the header does not tell them. With both sizes given, the file
+            is not opened before its events are asked for.
         height: pixel rows, likewise.
 
     Raises:
-        DataError: the file is missing or truncated, it holds something else than events, or the size of the sensor is
-            not known.
+        DataError: a size is not given, and the file is missing or its header does not tell it.
     """
 
     def __init__(self, path: Path, width: int | None = None, height: int | None = None) -> None:
-        header = read_header(path)
+        if width is None or height is None:
+            width, height = sensor_size(path, read_header(path).size, width, height)
+        super().__init__(path, width, height)
+
+    def _records(self) -> tuple[int, int]:
+        """Place of the first record, and the number of records."""
+        header = read_header(self.path)
+        sensor_size(self.path, header.size, self.width, self.height)
         version = header.fields.get("version", "none")
         if version != "2":
-            raise DataError(path, f"its version is {version}; version 2 is read", "convert it with Metavision")
-        with path.open("rb") as file:
+            raise DataError(self.path, f"its version is {version}; version 2 is read", "convert it with Metavision")
+        with self.path.open("rb") as file:
             file.seek(header.end)
             kind = file.read(2)
         if len(kind) < 2 or kind[0] not in _EVENT_TYPES or kind[1] != _RECORD.itemsize:
             raise DataError(
-                path, f"its records are of type and size {kind.hex(' ') or 'none'}, not of events", "record it again"
+                self.path, f"its records are of type and size {kind.hex(' ') or 'none'}, not events", "record it again"
             )
-        self._begin = header.end + len(kind)
-        super().__init__(path, *sensor_size(path, header.size, width, height))
-
-    def count(self) -> int:
-        self.require()
-        count, rest = divmod(self.path.stat().st_size - self._begin, _RECORD.itemsize)
+        begin = header.end + len(kind)
+        count, rest = divmod(self.path.stat().st_size - begin, _RECORD.itemsize)
         if rest:
             raise DataError(self.path, f"it ends within a record of {_RECORD.itemsize} bytes", "copy it again")
-        return count
+        return begin, count
+
+    def count(self) -> int:
+        return self._records()[1]
 
     def read_chunks(self) -> Iterator[EventStream]:
         previous = None
-        count = self.count()
+        begin, count = self._records()
         with self.path.open("rb") as file:
-            file.seek(self._begin)
+            file.seek(begin)
             for _ in range(0, count, _CHUNK):
                 records = np.fromfile(file, _RECORD, _CHUNK)
                 time = _unwrapped(records["time"], previous)
@@ -82,10 +88,10 @@ class PropheseeDatFile(EventFile):
                 )
 
     def time_span(self) -> tuple[int, int]:
-        count = self.count()
+        begin, count = self._records()
         if count == 0:
             raise self.empty_error()
-        records = np.memmap(self.path, _RECORD, "r", self._begin, (count,))
+        records = np.memmap(self.path, _RECORD, "r", begin, (count,))
         samples = records["time"][:: max(1, count // _MAX_SAMPLES)]
         time = _unwrapped(np.append(samples, records["time"][-1]), None)
         return int(time[0]) * 1000, int(time[-1]) * 1000

@@ -18,7 +18,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 
 if TYPE_CHECKING:
-    from aenerf_ns.dataparsers.evt_words import Columns, Encoding
+    from aenerf_ns.dataparsers.evt_words import Columns
 
 # Words read at once.
 _BLOCK = 1 << 20
@@ -29,40 +29,38 @@ class PropheseeRawFile(EventFile):
 
     Args:
         path: the file.
-        width: pixel columns of the sensor; needed where the header does not tell them.
+        width: pixel columns of the sensor; needed where the header does not tell them. With both sizes given, the file
+            is not opened before its events are asked for.
         height: pixel rows, likewise.
 
     Raises:
-        DataError: the file is missing, its encoding is not one of EVT 2.0 and EVT 3.0, or the size of the sensor is
-            not known.
+        DataError: a size is not given, and the file is missing, its header does not tell it or tells that the file
+            cannot be read.
     """
 
     def __init__(self, path: Path, width: int | None = None, height: int | None = None) -> None:
-        header = read_header(path)
-        self._encoding_name = _encoding_name(path, header)
-        self._begin = header.end
-        super().__init__(path, *sensor_size(path, header.size, width, height))
-
-    def _encoding(self) -> Encoding:
-        # Late, for every command of every method would wait for numba.
-        from aenerf_ns.dataparsers.evt_words import EVT2, EVT3
-
-        return EVT2 if self._encoding_name == "EVT2" else EVT3
-
-    def _blocks(self, dtype: np.dtype) -> Iterator[NDArray]:
-        self.require()
-        if (self.path.stat().st_size - self._begin) % dtype.itemsize:
-            raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
-        with self.path.open("rb") as file:
-            file.seek(self._begin)
-            while len(block := np.fromfile(file, dtype, _BLOCK)):
-                yield block
+        if width is None or height is None:
+            header = read_header(path)
+            _encoding_name(path, header)
+            width, height = sensor_size(path, header.size, width, height)
+        super().__init__(path, width, height)
 
     def _decoded(self) -> Iterator[Columns]:
-        from aenerf_ns.dataparsers.evt_words import decode_words, initial_state
+        # Late, for every command of every method would wait for numba.
+        from aenerf_ns.dataparsers.evt_words import EVT2, EVT3, decode_words, initial_state
 
-        encoding = self._encoding()
-        return decode_words(self._blocks(encoding.dtype), encoding, initial_state(), self.path)
+        header = read_header(self.path)
+        sensor_size(self.path, header.size, self.width, self.height)
+        encoding = EVT2 if _encoding_name(self.path, header) == "EVT2" else EVT3
+        yield from decode_words(self._blocks(header.end, encoding.dtype), encoding, initial_state(), self.path)
+
+    def _blocks(self, begin: int, dtype: np.dtype) -> Iterator[NDArray]:
+        if (self.path.stat().st_size - begin) % dtype.itemsize:
+            raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
+        with self.path.open("rb") as file:
+            file.seek(begin)
+            while len(block := np.fromfile(file, dtype, _BLOCK)):
+                yield block
 
     def read_chunks(self) -> Iterator[EventStream]:
         for x, y, t, p in self._decoded():

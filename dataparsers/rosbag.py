@@ -63,26 +63,27 @@ class RosbagEventFile(EventFile):
 
     Args:
         path: the bag.
-        width: pixel columns of the sensor; the messages tell them.
+        width: pixel columns of the sensor. Messages tell them; but with both sizes given, the bag is not opened before
+            its events are asked for.
         height: pixel rows, likewise.
         topic: the topic, or None when only one holds events.
 
     Raises:
-        DataError: the bag is missing, cannot be read or holds no such topic, or the package rosbags is missing.
+        DataError: a size is not given, and the bag is missing, cannot be read or holds no such topic, or the package
+            rosbags is missing.
     """
 
     def __init__(
         self, path: Path, width: int | None = None, height: int | None = None, topic: str | None = None
     ) -> None:
         self.path = path
-        with closing(self._open()) as reader:
-            connection = _choose(path, reader.connections, topic)
-        self.topic = connection.topic
-        self._holds_packets = connection.msgtype == _PACKET_TYPE
-        first = next(self._messages(), None)
-        if first is None:
-            raise self.empty_error()
-        super().__init__(path, *sensor_size(path, (first.width, first.height), width, height))
+        self._topic = topic
+        if width is None or height is None:
+            first = next(self._messages(), None)
+            if first is None:
+                raise self.empty_error()
+            width, height = sensor_size(path, (first.width, first.height), width, height)
+        super().__init__(path, width, height)
 
     def _open(self) -> Reader:
         self.require()
@@ -107,36 +108,37 @@ class RosbagEventFile(EventFile):
     def _messages(self, start: int | None = None) -> Iterator[_Message]:
         """The topic's messages in the order in which they were received, from a time in nanoseconds on."""
         with closing(self._open()) as reader:
-            connections = [connection for connection in reader.connections if connection.topic == self.topic]
+            chosen = _choose(self.path, reader.connections, self._topic)
+            connections = [connection for connection in reader.connections if connection.topic == chosen.topic]
             messages = reader.messages(connections, start=start)
             while True:
                 try:
-                    _, _, data = next(messages)
+                    connection, _, data = next(messages)
                 except StopIteration:
                     return
                 except Exception as error:
                     raise self._damaged(error) from None
                 try:
-                    yield _parse(data, self._holds_packets)
+                    yield _parse(data, connection.msgtype == _PACKET_TYPE)
                 except (struct.error, IndexError):
                     raise DataError(
-                        self.path, f"a message of {self.topic} does not have the parts of its type", "copy it again"
+                        self.path, f"a message of {chosen.topic} does not have the parts of its type", "copy it again"
                     ) from None
 
     def _sized_messages(self, start: int | None) -> Iterator[_Message]:
         for message in self._messages(start):
-            if (message.width, message.height) != (self.width, self.height):
-                raise DataError(
-                    self.path,
-                    f"the sensor of {self.topic} changes from {self.width} x {self.height} to "
-                    f"{message.width} x {message.height} pixels",
-                    "record each camera to a topic of its own",
-                )
+            sensor_size(self.path, (message.width, message.height), self.width, self.height)
             yield message
 
     def _columns(self, start: int | None = None) -> Iterator[Columns]:
         """Columns x, y, t (nanoseconds) and p (±1) of the messages received from a time on."""
-        return self._columns_of_packets(start) if self._holds_packets else self._columns_of_arrays(start)
+        first = next(self._messages(), None)
+        if first is None:
+            return
+        if first.sequence is None:
+            yield from self._columns_of_arrays(start)
+        else:
+            yield from self._columns_of_packets(start)
 
     def _columns_of_arrays(self, start: int | None) -> Iterator[Columns]:
         waiting: list[NDArray] = []
@@ -179,11 +181,11 @@ class RosbagEventFile(EventFile):
         if message.encoding != "evt3":
             raise DataError(
                 self.path,
-                f"the packets of {self.topic} are encoded as {message.encoding!r}; evt3 is read",
+                f"its packets are encoded as {message.encoding!r}; evt3 is read",
                 "convert the topic to dvs_msgs/EventArray with event_camera_tools",
             )
         if len(message.payload) % _WORD.itemsize:
-            raise DataError(self.path, f"a packet of {self.topic} ends within a word", "copy it again")
+            raise DataError(self.path, "a packet ends within a word", "copy it again")
         # Copied, so that the decoder is compiled for one kind of array.
         return np.frombuffer(message.payload, _WORD).copy()
 
