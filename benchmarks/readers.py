@@ -26,7 +26,6 @@ import tyro
 from numpy.typing import NDArray
 
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.dataparsers.event_files import open_event_file
 
 _WIDTH, _HEIGHT = 1280, 720
 _START = 1_600_000_000_000_000
@@ -149,6 +148,8 @@ WRITERS: dict[str, Callable[[Path, int], None]] = {
 def count_events(reader: str, path: Path) -> int:
     """Reads a file from end to end, in pieces."""
     if reader == "aenerf":
+        from aenerf_ns.dataparsers.event_files import open_event_file
+
         return sum(map(len, open_event_file(path).chunks()))
     import faery
 
@@ -169,10 +170,20 @@ def measure(reader: str, small: Path, path: Path) -> dict:
         "peak_mib_of_the_process_before": before,
     }
     if reader == "aenerf":
+        from aenerf_ns.dataparsers.event_files import open_event_file
+
         begin = time.process_time()
         open_event_file(path).time_span()
         row["seconds_of_time_span"] = time.process_time() - begin
     return row
+
+
+def _run(*arguments: object) -> str:
+    """Runs a part in a process of its own: this one must stay small, for the peak memory of a process counts that of
+    the process it was forked from.
+    """
+    command = [sys.executable, __file__, *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 def _peak_mib() -> float:
@@ -185,30 +196,24 @@ class Readers:
 
     output: Path
     """JSON file to write."""
-    sizes: tuple[int, ...] = (2_000_000, 20_000_000)
+    sizes: tuple[int, ...] = (1_000_000, 10_000_000)
     """Numbers of events."""
 
     def main(self) -> None:
         """Measures and writes the figures."""
         rows = []
         with tempfile.TemporaryDirectory() as folder:
-            for name, write in WRITERS.items():
+            for name in WRITERS:
                 small, path = Path(folder) / f"small_{name}", Path(folder) / name
-                write(small, 1000)
+                _run("--write", name, small, 1000)
                 for size in self.sizes:
                     path.unlink(missing_ok=True)
-                    write(path, size)
+                    _run("--write", name, path, size)
                     for reader in ("aenerf", "faery"):
                         if reader == "faery" and (path.suffix not in _FAERY or not find_spec("faery")):
                             continue
-                        command = [sys.executable, __file__, "--measure", reader, str(small), str(path)]
-                        done = subprocess.run(command, check=True, capture_output=True, text=True)
-                        row = {
-                            "file": name,
-                            "reader": reader,
-                            "mib": path.stat().st_size / 2**20,
-                            **json.loads(done.stdout.splitlines()[-1]),
-                        }
+                        measured = json.loads(_run("--measure", reader, small, path).splitlines()[-1])
+                        row = {"file": name, "reader": reader, "mib": path.stat().st_size / 2**20, **measured}
                         rows.append(row)
                         print(json.dumps(row, indent=2))
         self.output.write_text(
@@ -217,7 +222,9 @@ class Readers:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--measure"]:
+    if sys.argv[1:2] == ["--write"]:
+        WRITERS[sys.argv[2]](Path(sys.argv[3]), int(sys.argv[4]))
+    elif sys.argv[1:2] == ["--measure"]:
         print(json.dumps(measure(sys.argv[2], Path(sys.argv[3]), Path(sys.argv[4]))))
     else:
         tyro.cli(Readers).main()

@@ -182,7 +182,7 @@ class RosbagEventFile(EventFile):
             raise DataError(
                 self.path,
                 f"its packets are encoded as {message.encoding!r}; evt3 is read",
-                "convert the topic to dvs_msgs/EventArray with event_camera_tools",
+                "republish them as dvs_msgs/EventArray with event_camera_tools",
             )
         if len(message.payload) % _WORD.itemsize:
             raise DataError(self.path, "a packet ends within a word", "copy it again")
