@@ -314,7 +314,11 @@ def test_words_before_the_first_time_are_left_out(folder: Path) -> None:
     np.testing.assert_array_equal(read(open_event_file(path)), [[9, 7, (0x1002) * 1000, -1]])
 
 
-def test_the_upper_bits_of_a_time_take_effect_before_the_lower_ones_follow(folder: Path) -> None:
+@pytest.mark.parametrize("block", [1, 100])
+def test_the_upper_bits_of_a_time_take_effect_before_the_lower_ones_follow(
+    block: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prophesee_raw, "_BLOCK", block)
     path = folder / "upper.raw"
     words = [0x8001, 0x6FFF, 0x0007, 0x2001, 0x8002, 0x2002, 0x8002, 0x6003, 0x8002, 0x2003]
     path.write_bytes(b"% evt 3.0\n% geometry 64x48\n" + np.array(words, "<u2").tobytes())
