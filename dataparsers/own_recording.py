@@ -14,9 +14,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.dataparsers.ecd import EcdEventFile
-from aenerf_ns.dataparsers.event_arrays import open_array_events
-from aenerf_ns.dataparsers.event_hdf5 import open_hdf5_events
+from aenerf_ns.dataparsers.event_files import SUFFIXES, open_event_file
 from aenerf_ns.dataparsers.kalibr import read_camchain
 from aenerf_ns.dataparsers.metadata import Metadata, read_camera
 from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
@@ -31,30 +29,6 @@ from aenerf_ns.image_encoding import ImageEncoding
 from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous, require_rigid
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml")
-_HDF5 = (".h5", ".hdf5")
-_ARRAYS = (".npz", ".npy", ".csv")
-_EVENT_SUFFIXES = (*_HDF5, *_ARRAYS, ".txt")
-
-
-def open_event_file(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
-    """A file of events in any format known here, by its name and its content.
-
-    Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
-        time_unit: of its times, where the format states none.
-
-    Raises:
-        DataError: the file is missing, malformed, or of no known format.
-    """
-    if path.suffix in _HDF5:
-        return open_hdf5_events(path, width, height, time_unit)
-    if path.suffix in _ARRAYS:
-        return open_array_events(path, width, height, time_unit)
-    if path.suffix == ".txt":
-        return EcdEventFile(path, width, height)
-    raise DataError(path, "no known format of events", f"its name must end with {', '.join(_EVENT_SUFFIXES)}")
 
 
 @dataclass
@@ -64,6 +38,8 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     _target: type = field(default_factory=lambda: OwnRecordingDataParser)
     events: Path | None = None
     """The file of events. By default the one in the folder that is named "events", whatever its format."""
+    event_topic: str | None = None
+    """Topic of a bag, or number of the stream of an AEDAT4 file, where several hold events."""
     event_time_unit: TimeUnit | None = None
     """Unit of the times of npz, npy and csv. By default whole numbers are microseconds and decimals seconds."""
     calibration: Path | None = None
@@ -87,7 +63,7 @@ class OwnRecordingDataParser(EventDataParser):
 
     config: OwnRecordingDataParserConfig
     layout = (
-        f"events{{{','.join(_EVENT_SUFFIXES)}}} with {' or '.join(_CALIBRATIONS)} and trajectory.txt or a COLMAP model "
+        f"events{{{','.join(SUFFIXES)}}} with {' or '.join(_CALIBRATIONS)} and trajectory.txt or a COLMAP model "
         "in colmap"
     )
 
@@ -145,31 +121,32 @@ class OwnRecordingDataParser(EventDataParser):
     def _event_file(self, folder: Path, camera: EventCamera) -> EventFile:
         path = self.config.events
         if path is None:
-            found = sorted(folder / f"events{suffix}" for suffix in _EVENT_SUFFIXES)
+            found = sorted(folder / f"events{suffix}" for suffix in SUFFIXES)
             found = [file for file in found if file.is_file()]
             if len(found) != 1:
                 raise DataError(
                     folder,
-                    f"it holds {len(found)} files events{{{','.join(_EVENT_SUFFIXES)}}}",
+                    f"it holds {len(found)} files events{{{','.join(SUFFIXES)}}}",
                     "give the file of events as --events",
                 )
             path = found[0]
         # So that opening a trained run needs no events.
         self.config.events = path
-        return _LateEventFile(path, camera.width, camera.height, self.config.event_time_unit)
+        return _LateEventFile(path, camera, self.config.event_topic, self.config.event_time_unit)
 
 
 class _LateEventFile(EventFile):
     """A file whose format is found out when its events are asked for: a trained run is opened without them."""
 
-    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None) -> None:
-        super().__init__(path, width, height)
+    def __init__(self, path: Path, camera: EventCamera, topic: str | None, time_unit: TimeUnit | None) -> None:
+        super().__init__(path, camera.width, camera.height)
+        self._topic = topic
         self._time_unit = time_unit
 
     @cached_property
     def _file(self) -> EventFile:
         self.require()
-        return open_event_file(self.path, self.width, self.height, self._time_unit)
+        return open_event_file(self.path, self.width, self.height, self._topic, self._time_unit)
 
     def read_chunks(self) -> Iterator[EventStream]:
         return self._file.read_chunks()

@@ -68,9 +68,9 @@ def test_importing_the_package_costs_nothing() -> None:
 def test_the_registered_modules_leave_the_heaviest_imports_for_later() -> None:
     # What the framework itself imports at every command is no cost of ours.
     code = (
-        "import sys, nerfstudio.configs.method_configs as framework;"
+        "import sys, nerfstudio.configs.method_configs as framework, aenerf_ns.dataparsers.event_files;"
         "assert {'aenerf', 'aenerf-mlp', 'aenerf-small'} <= set(framework.all_methods);"
-        "print({'numba', 'torchmetrics', 'h5py', 'pycolmap'} & set(sys.modules))"
+        "print({'numba', 'torchmetrics', 'h5py', 'pycolmap', 'rosbags'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd="/")
     assert done.stdout.strip().splitlines()[-1] == "set()"

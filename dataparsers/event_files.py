@@ -1,0 +1,102 @@
+"""Opening an event file of any format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from aenerf_ns.dataparsers.aedat4 import Aedat4File
+from aenerf_ns.dataparsers.ecd import EcdEventFile
+from aenerf_ns.dataparsers.event_arrays import open_array_events
+from aenerf_ns.dataparsers.event_hdf5 import open_hdf5_events
+from aenerf_ns.dataparsers.prophesee_dat import PropheseeDatFile
+from aenerf_ns.dataparsers.prophesee_header import read_header
+from aenerf_ns.dataparsers.prophesee_raw import PropheseeRawFile
+from aenerf_ns.dataparsers.rosbag import RosbagEventFile
+from aenerf_ns.dataparsers.sensor_size import sensor_size
+from aenerf_ns.dataparsers.text import TimeUnit
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile
+
+_FORMAT_OF_SUFFIX = {
+    ".raw": "raw",
+    ".dat": "dat",
+    ".aedat4": "aedat4",
+    ".bag": "bag",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".npz": "arrays",
+    ".npy": "arrays",
+    ".csv": "arrays",
+    ".txt": "text",
+}
+_WITHOUT_MAGIC = ("arrays", "text")
+
+SUFFIXES = tuple(_FORMAT_OF_SUFFIX)
+"""The endings of names of event files."""
+
+
+def open_event_file(
+    path: Path,
+    width: int | None = None,
+    height: int | None = None,
+    topic: str | None = None,
+    time_unit: TimeUnit | None = None,
+) -> EventFile:
+    """Opens an event file in the format that its first bytes tell (NumPy's, text, and files that are missing: its
+    suffix).
+
+    Args:
+        path: the file.
+        width: pixel columns of the sensor; needed where the file does not tell them.
+        height: pixel rows, likewise.
+        topic: the topic of a bag, or the number of the stream of an AEDAT4 file, where several hold events.
+        time_unit: of the times of HDF5, npz, npy and csv, where the file states none.
+
+    Raises:
+        DataError: the format is not known, or a size is not given and the file is missing or does not tell it.
+    """
+    if path.is_dir():
+        raise DataError(path, "it is a folder", "name the event file in it (bags of ROS 2: convert them to ROS 1)")
+    name = _format(path)
+    if name == "aedat4":
+        return Aedat4File(path, width, height, topic)
+    if name == "bag":
+        return RosbagEventFile(path, width, height, topic)
+    if topic is not None:
+        raise DataError(path, f"only bags and AEDAT4 files have topics, but {topic} was given", "leave it out")
+    if name == "raw":
+        return PropheseeRawFile(path, width, height)
+    if name == "dat":
+        return PropheseeDatFile(path, width, height)
+    size = sensor_size(path, None, width, height)
+    if name == "hdf5":
+        return open_hdf5_events(path, *size, time_unit)
+    return open_array_events(path, *size, time_unit) if name == "arrays" else EcdEventFile(path, *size)
+
+
+def _format(path: Path) -> str:
+    suffix = path.suffix.lower()
+    beginning = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            beginning = file.read(16)
+        if not beginning:
+            raise DataError(path, "the file is empty", "record or copy it again")
+    if beginning.startswith(b"#!AER-DAT"):
+        return "aedat4"
+    if beginning.startswith(b"#ROSBAG"):
+        return "bag"
+    if beginning.startswith(b"\x89HDF\r\n\x1a\n"):
+        return "hdf5"
+    if beginning.startswith(b"% "):
+        is_raw = suffix == ".raw" or {"evt", "format"} & set(read_header(path).fields)
+        return "raw" if is_raw else "dat"
+    # A binary format would have been recognised.
+    by_suffix = _FORMAT_OF_SUFFIX.get(suffix)
+    if by_suffix is not None and (not beginning or by_suffix in _WITHOUT_MAGIC):
+        return by_suffix
+    raise DataError(
+        path,
+        f"its format is not known (it begins with {beginning[:8]!r})" if beginning else "there is no such event file",
+        "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS 1, HDF5, npz, npy, csv and text are read",
+    )
