@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from aenerf_ns.dataparsers.aedat4 import Aedat4File
@@ -15,7 +16,7 @@ from aenerf_ns.dataparsers.rosbag import RosbagEventFile
 from aenerf_ns.dataparsers.sensor_size import sensor_size
 from aenerf_ns.dataparsers.text import TimeUnit
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile
+from aenerf_ns.events.stream import EventFile, EventStream
 
 _FORMAT_OF_SUFFIX = {
     ".raw": "raw",
@@ -42,8 +43,10 @@ def open_event_file(
     topic: str | None = None,
     time_unit: TimeUnit | None = None,
 ) -> EventFile:
-    """Opens an event file in the format that its first bytes tell (NumPy's, text, and files that are missing: its
-    suffix).
+    """Opens an event file in the format that its first bytes tell (NumPy's and text: its suffix).
+
+    With both sizes given, a missing file is an error only when its events are asked for: a trained run opens without
+    them.
 
     Args:
         path: the file.
@@ -55,6 +58,8 @@ def open_event_file(
     Raises:
         DataError: the format is not known, or a size is not given and the file is missing or does not tell it.
     """
+    if not path.exists() and width is not None and height is not None:
+        return _MissingEventFile(path, width, height)
     if path.is_dir():
         raise DataError(path, "it is a folder", "name the event file in it (bags of ROS 2: convert them to ROS 1)")
     name = _format(path)
@@ -74,14 +79,24 @@ def open_event_file(
     return open_array_events(path, *size, time_unit) if name == "arrays" else EcdEventFile(path, *size)
 
 
+class _MissingEventFile(EventFile):
+    def read_chunks(self) -> Iterator[EventStream]:
+        self.require()
+        raise AssertionError("the file appeared while it was open")
+
+    def time_span(self) -> tuple[int, int]:
+        self.require()
+        raise AssertionError("the file appeared while it was open")
+
+
 def _format(path: Path) -> str:
+    if not path.is_file():
+        raise DataError(path, "there is no such event file", "check the path of the dataset")
     suffix = path.suffix.lower()
-    beginning = b""
-    if path.is_file():
-        with path.open("rb") as file:
-            beginning = file.read(16)
-        if not beginning:
-            raise DataError(path, "the file is empty", "record or copy it again")
+    with path.open("rb") as file:
+        beginning = file.read(16)
+    if not beginning:
+        raise DataError(path, "the file is empty", "record or copy it again")
     if beginning.startswith(b"#!AER-DAT"):
         return "aedat4"
     if beginning.startswith(b"#ROSBAG"):
@@ -93,10 +108,10 @@ def _format(path: Path) -> str:
         return "raw" if is_raw else "dat"
     # A binary format would have been recognised.
     by_suffix = _FORMAT_OF_SUFFIX.get(suffix)
-    if by_suffix is not None and (not beginning or by_suffix in _WITHOUT_MAGIC):
+    if by_suffix in _WITHOUT_MAGIC:
         return by_suffix
     raise DataError(
         path,
-        f"its format is not known (it begins with {beginning[:8]!r})" if beginning else "there is no such event file",
+        f"its format is not known (it begins with {beginning[:8]!r})",
         "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS 1, HDF5, npz, npy, csv and text are read",
     )

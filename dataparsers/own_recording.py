@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,7 @@ from aenerf_ns.dataparsers.views import read_image_list, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventFile
 from aenerf_ns.image_encoding import ImageEncoding
 from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous, require_rigid
 
@@ -132,30 +130,8 @@ class OwnRecordingDataParser(EventDataParser):
             path = found[0]
         # So that opening a trained run needs no events.
         self.config.events = path
-        return _LateEventFile(path, camera, self.config.event_topic, self.config.event_time_unit)
-
-
-class _LateEventFile(EventFile):
-    """A file whose format is found out when its events are asked for: a trained run is opened without them."""
-
-    def __init__(self, path: Path, camera: EventCamera, topic: str | None, time_unit: TimeUnit | None) -> None:
-        super().__init__(path, camera.width, camera.height)
-        self._topic = topic
-        self._time_unit = time_unit
-
-    @cached_property
-    def _file(self) -> EventFile:
-        self.require()
-        return open_event_file(self.path, self.width, self.height, self._topic, self._time_unit)
-
-    def read_chunks(self) -> Iterator[EventStream]:
-        return self._file.read_chunks()
-
-    def time_span(self) -> tuple[int, int]:
-        return self._file.time_span()
-
-    def count(self) -> int | None:
-        return self._file.count()
+        config = self.config
+        return open_event_file(path, camera.width, camera.height, config.event_topic, config.event_time_unit)
 
 
 @dataclass(frozen=True)

@@ -380,7 +380,7 @@ def test_one_of_several_streams_of_aedat4(folder: Path) -> None:
 
 
 def test_a_trained_run_opens_without_its_events(folder: Path) -> None:
-    for suffix in ("raw", "dat", "aedat4", "bag", "h5", "txt"):
+    for suffix in ("raw", "dat", "aedat4", "bag", "h5", "npy", "txt"):
         file = open_event_file(folder / f"gone.{suffix}", _WIDTH, _HEIGHT)
         assert (file.width, file.height) == (_WIDTH, _HEIGHT)
         with pytest.raises(DataError, match="there is no such event file"):
