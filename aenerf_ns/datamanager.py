@@ -50,6 +50,9 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             super().__init__(config, device=device, test_mode=test_mode, **kwargs)
         except DataError as error:
             raise SystemExit(f"Error: {error}") from None
+        # A run is opened with what the dataparser has made of its options, such as the format it recognised.
+        config.dataparser = self.dataparser.config
+        config.data = config.dataparser.data
 
     def create_eval_dataset(self) -> EventDataset | None:
         """The reference views. Where there are none, none while training, and else the places on the trajectory, so

@@ -51,6 +51,7 @@ class EventDataset(InputDataset):
                 refractory_period=self.metadata["sensor"].refractory_period,
                 start=start,
                 end=end,
+                gaps=self.metadata["pose_gaps"],
                 expected_events=count,
             )
         CONSOLE.print(f"{event_file.path.name}: {pairs.summary()}.")

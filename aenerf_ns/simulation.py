@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -26,6 +26,20 @@ _EVENT_SAMPLES = 4
 _REFERENCE_SAMPLES = 16
 
 
+class ReferencePicture(NamedTuple):
+    """What is seen from a pose, grey for a monochrome sensor.
+
+    Attributes:
+        display: (height, width, 3) uint8, sRGB.
+        linear: (height, width, 3) uint16, linear radiance; 65535 is 1, what display white shows.
+        depth: (height, width) float32 along the optical axis at the pixels' centres, inf where nothing is hit.
+    """
+
+    display: NDArray[np.uint8]
+    linear: NDArray[np.uint16]
+    depth: NDArray[np.float32]
+
+
 class Simulation:
     """One pass of an event camera along a scene's path.
 
@@ -37,7 +51,9 @@ class Simulation:
         easy_duration: seconds that the path takes at constant speed.
         max_displacement: pixels that the image may move between two rendered frames.
         contrast_threshold_spread: standard deviation of the thresholds over the pixels.
-        seed: of the sensor's thresholds.
+        seed: of the sensor's thresholds and noise.
+        leak_rate: see :class:`~aenerf_ns.events.esim.EventSimulator`.
+        shot_noise_rate: likewise.
 
     Raises:
         ValueError: an argument is out of range.
@@ -53,6 +69,8 @@ class Simulation:
         max_displacement: float,
         contrast_threshold_spread: float,
         seed: int,
+        leak_rate: float = 0.0,
+        shot_noise_rate: float = 0.0,
     ) -> None:
         self._scene = scene
         self._camera = camera
@@ -60,7 +78,13 @@ class Simulation:
         self._profile = SpeedProfile(speed, easy_duration)
         width, height = camera.width, camera.height
         self._simulator = EventSimulator(
-            width, height, sensor, contrast_threshold_spread=contrast_threshold_spread, seed=seed
+            width,
+            height,
+            sensor,
+            contrast_threshold_spread=contrast_threshold_spread,
+            leak_rate=leak_rate,
+            shot_noise_rate=shot_noise_rate,
+            seed=seed,
         )
         self._frames = frame_parameters(scene.renderer, scene.path, self._intrinsics, width, height, max_displacement)
         self._times = _nanoseconds(self._profile.time(self._frames))
@@ -139,21 +163,28 @@ class Simulation:
         seconds = middle + exposure * ((np.arange(steps) + 0.5) / steps - 0.5)
         parameters = self._profile.parameter(seconds).clip(0, 1)
         radiance = [self._render(self._scene.path(float(s)), _EVENT_SAMPLES) for s in parameters]
-        return self._picture(np.mean(radiance, axis=0))
+        seen = to_channels(torch.from_numpy(np.mean(radiance, axis=0)), self._sensor.num_channels)
+        return _display(seen.squeeze(-1))
 
-    def reference_image(self, camera_to_world: NDArray[np.float64] | Tensor) -> NDArray[np.uint8]:
-        """The (height, width, 3) sRGB picture from a pose, grey for a monochrome sensor."""
-        picture = self._picture(self._render(np.asarray(camera_to_world), _REFERENCE_SAMPLES))
-        return picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, -1)
-
-    def _picture(self, radiance: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """The 8-bit sRGB picture (height, width) or (height, width, 3) that the sensor's channels see."""
-        seen = to_channels(torch.from_numpy(radiance), self._sensor.num_channels)
-        return (encode(seen, "srgb") * 255).round().to(torch.uint8).squeeze(-1).numpy()
+    def reference_picture(self, camera_to_world: NDArray[np.float64] | Tensor) -> ReferencePicture:
+        """What is seen from a (4, 4) pose, without noise or blur."""
+        pose = np.asarray(camera_to_world)
+        seen = to_channels(torch.from_numpy(self._render(pose, _REFERENCE_SAMPLES)), self._sensor.num_channels)
+        seen = seen.expand(-1, -1, 3)
+        linear = (encode(seen, "linear") * 65535).round().numpy().astype(np.uint16)
+        return ReferencePicture(_display(seen), linear, self._view(pose, 1)[1])
 
     def _render(self, camera_to_world: NDArray[np.float64], samples: int) -> NDArray[np.float32]:
+        return self._view(camera_to_world, samples)[0]
+
+    def _view(self, camera_to_world: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float32], ...]:
         camera = self._camera
-        return self._scene.renderer.render(camera_to_world, self._intrinsics, camera.width, camera.height, samples)[0]
+        return self._scene.renderer.render(camera_to_world, self._intrinsics, camera.width, camera.height, samples)
+
+
+def _display(radiance: Tensor) -> NDArray[np.uint8]:
+    """The 8-bit sRGB picture of linear radiance."""
+    return (encode(radiance, "srgb") * 255).round().to(torch.uint8).numpy()
 
 
 def _nanoseconds(seconds: NDArray[np.float64]) -> NDArray[np.int64]:

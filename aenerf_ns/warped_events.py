@@ -257,7 +257,7 @@ class WarpedEvents:
                 for begin in (np.arange(count) + 0.5) / count * (len(run) - length):
                     events = run[int(begin) : int(begin) + length]
                     if len(events) > _MAX_EVENTS:
-                        events = _selected(events, np.sort(rng.choice(len(events), _MAX_EVENTS, replace=False)))
+                        events = events[np.sort(rng.choice(len(events), _MAX_EVENTS, replace=False))]
                     slices.append(events)
             if _contrast([self._warp(events, _STILL) for events in slices]) < _SMEARED:
                 break
@@ -288,7 +288,7 @@ class WarpedEvents:
             usable = seen & (times >= self._trajectory.start) & (times <= self._trajectory.end)
             if usable.sum() < max(_MIN_USABLE * seen.sum(), 2):
                 continue
-            part = _selected(events, usable)
+            part = events[usable]
             given.append(as_given if usable.all() else self._warp(part, GIVEN))
             alternative.append(self._warp(part, hypothesis))
         if not given:
@@ -402,11 +402,6 @@ class WarpedEvents:
             _accumulate(lines, polarity, np.float32(1 / value), net, total)
             warped[depth_of_pixel == value] = net[depth_of_pixel == value]
         return np.concatenate([unwarped, warped], 1)
-
-
-def _selected(events: EventStream, index: NDArray) -> EventStream:
-    columns = {name: getattr(events, name)[index] for name in ("x", "y", "t", "p")}
-    return EventStream(**columns, width=events.width, height=events.height, source=events.source)
 
 
 def _contrast(slices) -> float:

@@ -13,27 +13,18 @@ from pathlib import Path
 
 import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
-from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
-from aenerf_ns.dataparsers.recording import (
-    EventDataParser,
-    EventDataParserConfig,
-    FrameSequence,
-    Recording,
-    ReferenceView,
-)
-from aenerf_ns.dataparsers.text import parse_numbers, parse_seconds, read_rows
+from aenerf_ns.dataparsers.recording import EventDataParser, FrameSequence, PublishedDataParserConfig, Recording
+from aenerf_ns.dataparsers.text import first_and_last_row, is_row, parse_numbers, read_rows
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.dataparsers.views import read_image_list, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
 _CHUNK_LINES = 1_000_000
-# Longer than any line of events.txt.
-_TAIL_BYTES = 4096
 
 
 class EcdEventFile(EventFile):
@@ -68,7 +59,7 @@ class EcdEventFile(EventFile):
         for name, column, good, remedy in checks:
             if not good.all():
                 row = int(np.argmin(good))
-                line = [i for i, text in enumerate(block) if _is_row(text.encode("ascii", "replace"))][row]
+                line = [i for i, text in enumerate(block) if is_row(text.encode("ascii", "replace"))][row]
                 raise DataError(self.path, f"line {lines_before + line + 1} has {name} {table[row, column]:g}", remedy)
         return EventStream(
             table[:, 1].astype(np.uint16),
@@ -82,20 +73,11 @@ class EcdEventFile(EventFile):
 
     def time_span(self) -> tuple[int, int]:
         self.require()
-        with self.path.open("rb") as file:
-            first = next((line for line in file if _is_row(line)), b"")
-            file.seek(0, 2)
-            file.seek(max(file.tell() - _TAIL_BYTES, 0))
-            last = next((line for line in reversed(file.read().splitlines()) if _is_row(line)), b"")
+        first, last = first_and_last_row(self.path)
         if not first or not last:
             raise self.empty_error()
-        start, end = (int(self._parse([line.decode("ascii", "replace")], 0).t[0]) for line in (first, last))
+        start, end = (int(self._parse([line], 0).t[0]) for line in (first, last))
         return start, end
-
-
-def _is_row(line: bytes) -> bool:
-    """Whether a line is neither empty nor a comment."""
-    return bool(line.split(b"#", 1)[0].strip())
 
 
 def _is_pixel(values: np.ndarray, size: int) -> np.ndarray:
@@ -103,41 +85,35 @@ def _is_pixel(values: np.ndarray, size: int) -> np.ndarray:
 
 
 @dataclass
-class EcdDataParserConfig(EventDataParserConfig):
+class EcdDataParserConfig(PublishedDataParserConfig):
     """Event Camera Dataset (text files)."""
 
     _target: type = field(default_factory=lambda: EcdDataParser)
-    auto_scale_poses: bool = False
-    """Poses of this dataset are in metres, and slow recordings move little compared to the scene's distance."""
-    positive_contrast_threshold: float = 0.5
-    """C+: the dataset does not state it. It only sets the scale of the log-radiance, which colour correction finds."""
-    negative_contrast_threshold: float = 0.5
-    """C-: likewise; its ratio to C+ matters."""
-    trajectory: Path | None = None
-    """Estimated poses in the format of groundtruth.txt, to be used in its place. groundtruth.txt then only serves to
-    evaluate them."""
-    refractory_period_ns: int = 0
-    """Time for which a pixel is blind after each event, in nanoseconds."""
 
 
 class EcdDataParser(EventDataParser):
     """Reads a folder of the Event Camera Dataset. Its images alternate between the validation and the test split."""
 
     config: EcdDataParserConfig
+    layout = "events.txt with groundtruth.txt and calib.txt"
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        return all((data / name).is_file() for name in ("events.txt", "groundtruth.txt", "calib.txt"))
 
     def read_recording(self) -> Recording:
         frames = self._read_all_but_poses()
-        folder, given = Path(self.config.data), self.config.trajectory
-        reference = read_tum_trajectory(folder / "groundtruth.txt")
-        images = _views(frames, reference)
+        reference = read_tum_trajectory(Path(self.config.data) / "groundtruth.txt")
+        trajectory, ground_truth = self.config.estimated(reference)
+        images = list(zip(frames.times, frames.files, strict=True))
         return Recording(
             event_file=frames.event_file,
             event_camera=frames.event_camera,
             sensor=frames.sensor,
-            trajectory=reference if given is None else read_tum_trajectory(given),
-            ground_truth=None if given is None else reference,
+            trajectory=trajectory,
+            ground_truth=ground_truth,
             frame_camera=frames.frame_camera,
-            reference_views={"train": images, "val": images[::2], "test": images[1::2]},
+            reference_views=views_on_trajectory(images, reference, max_views=None),
             image_encoding=frames.image_encoding,
         )
 
@@ -150,49 +126,18 @@ class EcdDataParser(EventDataParser):
         folder = Path(self.config.data)
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
-        times, files = _list_images(folder)
-        camera = _read_calibration(folder / "calib.txt", _image_size(files[0] if files else None))
+        images = read_image_list(folder / "images.txt") if (folder / "images.txt").exists() else []
+        camera = _read_calibration(folder / "calib.txt", _image_size(images[0][1] if images else None))
         return FrameSequence(
             event_file=EcdEventFile(folder / "events.txt", camera.width, camera.height),
             event_camera=camera,
-            sensor=SensorModel(
-                self.config.positive_contrast_threshold,
-                self.config.negative_contrast_threshold,
-                self.config.refractory_period_ns,
-            ),
+            sensor=self.config.sensor(SensorModel(0.5, 0.5)),
             frame_camera=camera,
-            files=files,
-            times=times,
+            files=[file for _, file in images],
+            times=[time for time, _ in images],
             image_encoding="linear",
             recording=None,
         )
-
-
-def _list_images(folder: Path) -> tuple[list[int], list[Path]]:
-    """Times and files of the frames."""
-    path = folder / "images.txt"
-    if not path.exists():
-        return [], []
-    rows = read_rows(path, "t file")
-    for _, name in rows:
-        if not (folder / name).is_file():
-            raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
-    return parse_seconds(path, [row[0] for row in rows]).tolist(), [folder / name for _, name in rows]
-
-
-def _views(frames: FrameSequence, trajectory: Trajectory) -> list[ReferenceView]:
-    """The frames that were taken within the span of the poses."""
-    views = [
-        ReferenceView(file, homogeneous(trajectory.interpolate(time)), time)
-        for time, file in zip(frames.times, frames.files, strict=True)
-        if trajectory.start <= time <= trajectory.end
-    ]
-    if len(views) < len(frames.files):
-        CONSOLE.print(
-            f"{len(frames.files) - len(views)} of {len(frames.files)} images are left out: they were taken outside "
-            "the poses."
-        )
-    return views
 
 
 def _image_size(image: Path | None) -> tuple[int, int]:

@@ -1,14 +1,17 @@
-"""Events in HDF5: the event file of the native dataset format."""
+"""Events in HDF5: the event file of the native dataset format, and those of other projects."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from aenerf_ns.dataparsers.event_table import EventLayout, EventTableFile
+from aenerf_ns.dataparsers.text import NANOSECONDS, TimeUnit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 
@@ -16,7 +19,10 @@ if TYPE_CHECKING:
     import h5py
 
 _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
-_NANOSECONDS = {"ns": 1, "us": 1_000, "ms": 1_000_000}
+# Units that the native file may state; its times are integers.
+_UNITS: tuple[TimeUnit, ...] = ("ns", "us", "ms")
+# The code under which Prophesee's compression of events registers itself.
+_ECF = 0x8ECF
 # Events read at once: 50 MB.
 _CHUNK = 1 << 22
 # Events collected before they are written: many small writes are slow.
@@ -27,19 +33,6 @@ class Hdf5EventFile(EventFile):
     """/events/{x u16, y u16, t i64, p i8}, with the attributes ``time_unit`` ("ns", "us" or "ms") and ``time_offset``
     (an integer in that unit, added to every time) on /events.
     """
-
-    def _open(self) -> h5py.File:
-        # Late, for every command of every method would wait for it.
-        import h5py
-
-        with suppress(ImportError):
-            # Registers Blosc and other compression filters, where the extra is installed.
-            import hdf5plugin  # noqa: F401
-        self.require()
-        try:
-            return h5py.File(self.path, "r")
-        except OSError as error:
-            raise DataError(self.path, f"not a readable HDF5 file ({error})", "write or copy it again") from None
 
     def _columns(self, file: h5py.File) -> tuple[dict[str, h5py.Dataset], int, int]:
         """The four columns, the nanoseconds of a tick, and the offset in nanoseconds."""
@@ -59,41 +52,138 @@ class Hdf5EventFile(EventFile):
         attributes = file["events"].attrs
         unit, offset = (_scalar(attributes.get(*item)) for item in (("time_unit", "ns"), ("time_offset", 0)))
         unit = unit.decode() if isinstance(unit, bytes) else unit
-        if not isinstance(unit, str) or unit not in _NANOSECONDS:
-            raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_NANOSECONDS)}")
+        if unit not in _UNITS:
+            raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
         if not isinstance(offset, (int, np.integer)):
             raise DataError(self.path, f"its time offset is {offset!r}", "use an integer in the unit of the times")
-        return columns, _NANOSECONDS[unit], int(offset) * _NANOSECONDS[unit]
-
-    def _read(self, column: h5py.Dataset, index: slice | int) -> Any:
-        try:
-            return column[index]
-        except OSError as error:
-            raise DataError(
-                self.path,
-                f"{column.name} cannot be read ({error})",
-                "where a compression filter is missing, pip install 'aenerf-ns[hdf5-filters]'; else copy it again",
-            ) from None
+        tick = NANOSECONDS[unit]
+        return columns, tick, int(offset) * tick
 
     def read_chunks(self) -> Iterator[EventStream]:
-        with self._open() as file:
+        with _open(self.path) as file:
             columns, tick, offset = self._columns(file)
             for begin in range(0, len(columns["t"]), _CHUNK):
-                part = {name: self._read(column, slice(begin, begin + _CHUNK)) for name, column in columns.items()}
+                piece = slice(begin, begin + _CHUNK)
+                part = {name: _read(self.path, column, piece) for name, column in columns.items()}
                 part["t"] = part["t"] * tick + offset
                 yield EventStream(**part, width=self.width, height=self.height, source=self.path)
 
     def time_span(self) -> tuple[int, int]:
-        with self._open() as file:
+        with _open(self.path) as file:
             columns, tick, offset = self._columns(file)
             if len(columns["t"]) == 0:
                 raise self.empty_error()
-            first, last = (int(self._read(columns["t"], index)) for index in (0, -1))
+            first, last = (int(_read(self.path, columns["t"], index)) for index in (0, -1))
             return first * tick + offset, last * tick + offset
 
     def count(self) -> int:
-        with self._open() as file:
+        with _open(self.path) as file:
             return len(self._columns(file)[0]["t"])
+
+
+def _columns_of(group: str) -> dict[str, tuple[str, None]]:
+    return {name: (f"{group}{name}", None) for name in _DTYPES}
+
+
+# DSEC, and TUM-VIE, which has no offset.
+COLUMNS_IN_GROUP = EventLayout(_columns_of("events/"), time_offset="t_offset")
+# EDS.
+COLUMNS_AT_TOP = EventLayout(_columns_of(""), time_offset="t_offset")
+# PAEv3D.
+TXYP_MATRIX = EventLayout({name: ("events", index) for index, name in enumerate("txyp")}, time_unit=None)
+# Prophesee's Metavision.
+PROPHESEE_RECORDS = EventLayout({name: ("CD/events", name) for name in _DTYPES})
+
+_LAYOUTS = (PROPHESEE_RECORDS, COLUMNS_IN_GROUP, COLUMNS_AT_TOP, TXYP_MATRIX)
+
+
+class Hdf5TableFile(EventTableFile):
+    """HDF5 of another project."""
+
+    @contextmanager
+    def open_arrays(self) -> Iterator[dict[str, Any]]:
+        with _open(self.path) as file:
+            arrays = {name: file.get(name) for name in self._layout.arrays}
+            for name, array in arrays.items():
+                if not hasattr(array, "dtype"):
+                    raise DataError(self.path, f"there is no dataset /{name}", "see the formats in the docs")
+            offset_name = self._layout.time_offset
+            offset = None if offset_name is None else file.get(offset_name)
+            if offset_name is not None and offset is not None:
+                value = _scalar(offset[()]) if hasattr(offset, "dtype") else None
+                if not isinstance(value, (int, np.integer)):
+                    raise DataError(self.path, f"its {offset_name} is {value!r}", "store an integer")
+                arrays[offset_name] = int(value)
+            yield arrays
+
+    def read_array(self, array: h5py.Dataset, piece: slice) -> NDArray:
+        return _read(self.path, array, piece)
+
+
+def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
+    """An HDF5 file of events: the native one, or one of DSEC, TUM-VIE, EDS, Prophesee or PAEv3D, told from its content.
+
+    Args:
+        path: the file.
+        width: number of pixel columns of the sensor.
+        height: number of pixel rows of the sensor.
+        time_unit: of its times, where the format states none.
+
+    Raises:
+        DataError: the file is missing or not HDF5, or holds no events in a known layout.
+    """
+    with _open(path) as file:
+        columns = [file.get(f"events/{name}") for name in _DTYPES]
+        native = all(
+            getattr(column, "dtype", None) == dtype for column, dtype in zip(columns, _DTYPES.values(), strict=True)
+        )
+        if native and not {"ms_to_idx", "t_offset"} & set(file):
+            return Hdf5EventFile(path, width, height)
+        for layout in _LAYOUTS:
+            if all(hasattr(file.get(name), "dtype") for name in layout.arrays):
+                return Hdf5TableFile(path, width, height, layout, time_unit)
+        raise DataError(
+            path,
+            f"it holds {', '.join(sorted(file)) or 'nothing'}",
+            "events must be in /events/{x,y,t,p}, in /x, /y, /t and /p, in /CD/events, or in a matrix /events",
+        )
+
+
+def _open(path: Path) -> h5py.File:
+    # Late, for every command of every method would wait for it.
+    import h5py
+
+    with suppress(ImportError):
+        # Registers Blosc and other compression filters, where the extra is installed.
+        import hdf5plugin  # noqa: F401
+    if not path.is_file():
+        raise DataError(path, "there is no such event file", "check the path of the dataset")
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise DataError(path, f"not a readable HDF5 file ({error})", "write or copy it again") from None
+
+
+def _read(path: Path, array: h5py.Dataset, index: slice | int) -> Any:
+    try:
+        return array[index]
+    except OSError as error:
+        raise DataError(path, f"{array.name} cannot be read ({error})", _filter_remedy(array)) from None
+
+
+def _filter_remedy(array: h5py.Dataset) -> str:
+    """What to do about a dataset that cannot be read, by the compression filters it was written with."""
+    import h5py
+
+    settings = array.id.get_create_plist()
+    missing = {settings.get_filter(i)[0] for i in range(settings.get_nfilters())}
+    missing = {code for code in missing if not h5py.h5z.filter_avail(code)}
+    if _ECF in missing:
+        return (
+            "it is compressed by Prophesee's ECF filter: install that plugin of HDF5 "
+            "(github.com/prophesee-ai/hdf5_ecf) and set HDF5_PLUGIN_PATH to its folder, or record or export to RAW"
+        )
+    return "pip install 'aenerf-ns[hdf5-filters]' for its compression filter" if missing else "copy it again"
 
 
 def _scalar(attribute: Any) -> Any:

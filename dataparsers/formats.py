@@ -1,32 +1,77 @@
-"""All dataset formats by name, and which one a folder is in."""
+"""All dataset formats by their names, and which of them a folder has."""
 
 from __future__ import annotations
 
+from copy import deepcopy
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
-from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.dataparsers.recording import EventDataParserConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.dataparsers.ecd import ecd_dataparser
+from aenerf_ns.dataparsers.eds import eds_dataparser
+from aenerf_ns.dataparsers.enerf_esim import enerf_esim_dataparser
+from aenerf_ns.dataparsers.eventnerf import eventnerf_dataparser
+from aenerf_ns.dataparsers.native import native_dataparser
+from aenerf_ns.dataparsers.own_recording import own_recording_dataparser
+from aenerf_ns.dataparsers.paev3d import paev3d_dataparser
+from aenerf_ns.dataparsers.recording import EventDataParser, EventDataParserConfig
+from aenerf_ns.dataparsers.robust_enerf import robust_enerf_dataparser
+from aenerf_ns.dataparsers.tum_vie import tum_vie_dataparser
 from aenerf_ns.errors import DataError
 
-# The names that the dataparsers are registered by.
+# Under the names they are registered with, those first that are taken where a folder has several.
 FORMATS: dict[str, EventDataParserConfig] = {
-    "aenerf-data": NativeDataParserConfig(),
-    "ecd-data": EcdDataParserConfig(),
+    "aenerf-data": native_dataparser.config,
+    "ecd-data": ecd_dataparser.config,
+    "robust-enerf-data": robust_enerf_dataparser.config,
+    "tum-vie-data": tum_vie_dataparser.config,
+    "eds-data": eds_dataparser.config,
+    "enerf-esim-data": enerf_esim_dataparser.config,
+    "eventnerf-data": eventnerf_dataparser.config,
+    "paev3d-data": paev3d_dataparser.config,
+    "event-recording-data": own_recording_dataparser.config,
 }
-
-_SIGNS = {"aenerf-data": "transforms.json", "ecd-data": "events.txt"}
 
 
 def recognise(data: Path) -> str:
-    """The name of the format that a dataset is in.
+    """The name of the format that a folder has, from the names of its files.
 
     Raises:
-        DataError: it is in none.
+        DataError: it does not exist, or has none of the formats.
     """
-    if not data.exists():
-        raise DataError(data, "there is no such folder", "check the path of the dataset")
-    for name, file in _SIGNS.items():
-        if (data / file).is_file():
+    parsers: dict[str, type[EventDataParser]] = {name: config._target for name, config in FORMATS.items()}
+    for name, parser in parsers.items():
+        if parser.recognises(data):
             return name
-    raise DataError(data, f"none of {', '.join(_SIGNS.values())} is there", f"name the format: {', '.join(FORMATS)}")
+    if not data.exists():
+        raise DataError(data, "there is no such folder", "give the folder of a dataset as --data")
+    known = "; ".join(f"{name}: {parser.layout}" for name, parser in parsers.items())
+    raise DataError(data, "no known format of recordings", f"looked for {known}")
+
+
+@dataclass
+class AutomaticDataParserConfig(DataParserConfig):
+    """A recording in whichever format. The formats have options: name the format to set them."""
+
+    _target: type = field(default_factory=lambda: EventDataParser)
+
+    def setup(self, **kwargs: Any) -> Any:
+        """The dataparser of the format that ``data`` has, with that format's default configuration.
+
+        Raises:
+            DataError: it has none of the formats.
+        """
+        name = recognise(Path(self.data))
+        config = deepcopy(FORMATS[name])
+        config.data = self.data
+        CONSOLE.print(f"{self.data} is in the format {name}.")
+        return config.setup(**kwargs)
+
+
+automatic_dataparser = DataParserSpecification(
+    config=AutomaticDataParserConfig(), description="event camera recordings in whichever format"
+)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
@@ -14,6 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile
+from aenerf_ns.dataparsers.metadata import Metadata, read_camera
 from aenerf_ns.dataparsers.recording import (
     EventDataParser,
     EventDataParserConfig,
@@ -23,16 +23,9 @@ from aenerf_ns.dataparsers.recording import (
 )
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import EventCamera, LensModel
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.image_encoding import ImageEncoding
 from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous, require_rigid
-
-# The lens and the names of its distortion parameters, in OpenCV's order, for Nerfstudio's names of camera models.
-LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
-    "OPENCV": ("radial_tangential", ("k1", "k2", "p1", "p2", "k3")),
-    "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4")),
-}
 
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
@@ -48,20 +41,28 @@ class NativeDataParserConfig(EventDataParserConfig):
     """C-, in place of the dataset's."""
     refractory_period_ns: int | None = None
     """Time for which a pixel is blind after each event, in place of the dataset's."""
+    poses: Literal["estimated", "ground-truth"] = "estimated"
+    """Which trajectory to train on. The true one shows what the errors of the estimated one cost."""
 
 
 class NativeDataParser(EventDataParser):
     """Reads a dataset folder that holds transforms.json, an event file and trajectory_estimated.txt."""
 
     config: NativeDataParserConfig
+    layout = "transforms.json with trajectory_estimated.txt"
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        return all((data / name).is_file() for name in ("transforms.json", "trajectory_estimated.txt"))
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)
-        meta = _Metadata.read(folder / "transforms.json")
+        meta = Metadata.read(folder / "transforms.json")
         block = meta.block("event_camera")
-        event_camera = _camera(block, "width", "height")
-        trajectory = read_tum_trajectory(folder / "trajectory_estimated.txt")
+        event_camera = read_camera(block, "width", "height")
         true_poses = folder / "trajectory_ground_truth.txt"
+        trained_on = folder / "trajectory_estimated.txt" if self.config.poses == "estimated" else true_poses
+        trajectory = read_tum_trajectory(trained_on)
         ground_truth = read_tum_trajectory(true_poses) if true_poses.exists() else None
         frames = meta.get("frames", list, [])
         sensor = self._sensor(block)
@@ -69,12 +70,15 @@ class NativeDataParser(EventDataParser):
         if encoding not in ("srgb", "linear"):
             raise DataError(meta.path, f'image_encoding is "{encoding}"', 'use "srgb" or "linear"')
         box = meta.get("scene_box", list, None)
+        max_pose_gap = meta.get("max_pose_gap_ns", int, None)
+        if max_pose_gap is not None and max_pose_gap <= 0:
+            raise meta.error("max_pose_gap_ns", f"is {max_pose_gap}, not a positive number of nanoseconds")
         return Recording(
             event_file=Hdf5EventFile(folder / block.get("file", str), event_camera.width, event_camera.height),
             event_camera=event_camera,
             sensor=sensor,
             trajectory=trajectory,
-            frame_camera=_camera(meta, "w", "h") if frames else event_camera,
+            frame_camera=read_camera(meta, "w", "h") if frames else event_camera,
             reference_views=_reference_views(
                 meta,
                 frames,
@@ -85,9 +89,10 @@ class NativeDataParser(EventDataParser):
             image_encoding=encoding,
             scene_box=None if box is None else _scene_box(meta, box),
             ground_truth=ground_truth,
+            max_pose_gap=max_pose_gap,
         )
 
-    def _sensor(self, block: _Metadata) -> SensorModel:
+    def _sensor(self, block: Metadata) -> SensorModel:
         """The dataset's sensor, with what the options give in its place."""
         options = self.config
         chosen = {
@@ -104,91 +109,7 @@ class NativeDataParser(EventDataParser):
             raise DataError(block.path, f"event_camera: {error}", "correct it there or among the options") from None
 
 
-class _Metadata:
-    """A JSON object that reports a missing or ill-typed value with its file and name."""
-
-    def __init__(self, path: Path, values: dict[str, Any], prefix: str = "") -> None:
-        self.path = path
-        self._values = values
-        self._prefix = prefix
-
-    @classmethod
-    def read(cls, path: Path) -> _Metadata:
-        if not path.is_file():
-            raise DataError(
-                path, "there is no such file", "give a dataset folder as --data, or name its format after the options"
-            )
-        try:
-            # Decimal keeps every digit of a time stamp; float would drop nanoseconds of the Unix time.
-            values = json.loads(path.read_text(encoding="utf-8"), parse_float=Decimal)
-        except ValueError as error:
-            raise DataError(path, f"not valid JSON ({error})", "correct it there") from None
-        if not isinstance(values, dict):
-            raise DataError(path, "not a JSON object", "see the dataset format in the docs")
-        return cls(path, values)
-
-    def error(self, name: str, problem: str) -> DataError:
-        return DataError(self.path, f"{self._prefix}{name} {problem}", "see the dataset format in the docs")
-
-    def get(self, name: str, kind: type, *default: Any) -> Any:
-        """The value of ``name``, converted to ``kind`` (float also takes integers)."""
-        if name not in self._values:
-            if default:
-                return default[0]
-            raise self.error(name, "is missing")
-        value = self._values[name]
-        accepted = (int, Decimal) if kind is float else kind
-        if not isinstance(value, accepted) or isinstance(value, bool):
-            raise self.error(name, f"is {value!r}, not of type {kind.__name__}")
-        return kind(value)
-
-    def block(self, name: str) -> _Metadata:
-        return _Metadata(self.path, self.get(name, dict), f"{self._prefix}{name}.")
-
-    def matrix(self, name: str) -> Tensor | None:
-        """The (4, 4) float64 matrix ``name``, or None when it is absent."""
-        if name not in self._values:
-            return None
-        return self.numbers(name, self._values[name], (4, 4))
-
-    def numbers(self, name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
-        try:
-            array = torch.tensor(_floats(value), dtype=torch.float64)
-        except (TypeError, ValueError):
-            raise self.error(name, f"is not a table of numbers: {value!r}") from None
-        if array.shape != shape or not array.isfinite().all():
-            raise self.error(name, f"must be {' x '.join(map(str, shape))} finite numbers")
-        return array
-
-
-def _floats(value: Any) -> Any:
-    return [_floats(item) for item in value] if isinstance(value, list) else float(value)
-
-
-def _camera(meta: _Metadata, width: str, height: str) -> EventCamera:
-    """A camera from Nerfstudio's names for intrinsics."""
-    model = meta.get("camera_model", str, "OPENCV")
-    if model not in LENS_MODELS:
-        raise meta.error("camera_model", f"is {model!r}, not one of {', '.join(LENS_MODELS)}")
-    lens, names = LENS_MODELS[model]
-    try:
-        return EventCamera(
-            meta.get(width, int),
-            meta.get(height, int),
-            fx=meta.get("fl_x", float),
-            fy=meta.get("fl_y", float),
-            cx=meta.get("cx", float),
-            cy=meta.get("cy", float),
-            lens_model=lens,
-            distortion=tuple(meta.get(name, float, 0.0) for name in names),
-        )
-    except DataError:
-        raise
-    except ValueError as error:
-        raise meta.error("intrinsics:", str(error)) from None
-
-
-def _scene_box(meta: _Metadata, value: list) -> Tensor:
+def _scene_box(meta: Metadata, value: list) -> Tensor:
     box = meta.numbers("scene_box", value, (2, 3))
     if (box[0] >= box[1]).any():
         raise meta.error("scene_box", f"has corners {box.tolist()}, the first not below the second")
@@ -196,7 +117,7 @@ def _scene_box(meta: _Metadata, value: list) -> Tensor:
 
 
 def _reference_views(
-    meta: _Metadata, frames: list, trajectory: Trajectory, has_ground_truth: bool, frame_from_event: Tensor | None
+    meta: Metadata, frames: list, trajectory: Trajectory, has_ground_truth: bool, frame_from_event: Tensor | None
 ) -> dict[Split, list[ReferenceView]]:
     """The images of each split. A frame without a pose but with a time stamp gets that of the reference trajectory."""
     if frame_from_event is None:
@@ -207,7 +128,7 @@ def _reference_views(
     for index, values in enumerate(frames):
         if not isinstance(values, dict):
             raise meta.error("frames", f"holds {values!r}")
-        frame = _Metadata(meta.path, values, f"frames[{index}].")
+        frame = Metadata(meta.path, values, f"frames[{index}].")
         name = frame.get("file_path", str)
         if name in known:
             raise frame.error("file_path", f"names {name} again")

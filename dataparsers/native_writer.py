@@ -8,13 +8,14 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventWriter
-from aenerf_ns.dataparsers.native import LENS_MODELS
+from aenerf_ns.dataparsers.metadata import LENS_MODELS
 from aenerf_ns.dataparsers.recording import Split
 from aenerf_ns.dataparsers.text import format_seconds
 from aenerf_ns.dataparsers.tum_trajectory import write_tum_trajectory
@@ -36,6 +37,7 @@ class NativeDatasetWriter:
         sensor: its contrast thresholds, refractory period and Bayer pattern.
         image_encoding: of the images to come.
         scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
+        max_pose_gap: nanoseconds between poses beyond which the way between them is not known, or None.
         frame_camera: the lens of the camera that took the images; by default the event camera's.
 
     Raises:
@@ -52,6 +54,7 @@ class NativeDatasetWriter:
         sensor: SensorModel,
         image_encoding: ImageEncoding,
         scene_box: NDArray[np.float64] | None = None,
+        max_pose_gap: int | None = None,
         frame_camera: EventCamera | None = None,
     ) -> None:
         frame_camera = event_camera if frame_camera is None else frame_camera
@@ -86,6 +89,8 @@ class NativeDatasetWriter:
         }
         if scene_box is not None:
             self._meta["scene_box"] = scene_box.tolist()
+        if max_pose_gap is not None:
+            self._meta["max_pose_gap_ns"] = max_pose_gap
 
     def __enter__(self) -> NativeDatasetWriter:
         return self
@@ -116,7 +121,14 @@ class NativeDatasetWriter:
         (self._partial / "poses_report.json").write_text(text + "\n", encoding="utf-8")
 
     def add_image(
-        self, split: Split, image: NDArray[np.uint8], camera_to_world: Tensor, time: int | None = None
+        self,
+        split: Split,
+        image: NDArray[np.uint8],
+        camera_to_world: Tensor,
+        time: int | None = None,
+        *,
+        linear: NDArray[np.uint16] | None = None,
+        depth: NDArray[np.float32] | None = None,
     ) -> None:
         """Adds a reference image.
 
@@ -125,9 +137,24 @@ class NativeDatasetWriter:
             image: (height, width, 3) display values.
             camera_to_world: (4, 4) pose, OpenCV camera axes.
             time: in nanoseconds, when the image was taken on the trajectory.
+            linear: (height, width, 3) the same in linear radiance.
+            depth: (height, width) along the optical axis, in the unit of the poses' lengths; not finite where there is
+                none. What is beyond 65.535 cannot be stored and becomes unknown.
         """
         frame = self._add_frame(split, ".png", camera_to_world, time)
         Image.fromarray(image).save(self._partial / frame["file_path"])
+        name = Path(frame["file_path"]).relative_to("images").as_posix()
+        for key, values in (("linear", linear), ("depth", depth)):
+            if values is not None:
+                frame[f"{key}_file_path"] = f"{key}/{name}"
+                (self._partial / frame[f"{key}_file_path"]).parent.mkdir(parents=True, exist_ok=True)
+        if linear is not None:
+            cv2.imwrite(str(self._partial / frame["linear_file_path"]), linear[..., ::-1])
+        if depth is not None:
+            # Nerfstudio's convention: 16 bits of thousandths, 0 for unknown.
+            thousandths = np.rint(np.where(np.isfinite(depth), depth, 0) * 1000.0)
+            thousandths[thousandths > np.iinfo(np.uint16).max] = 0
+            cv2.imwrite(str(self._partial / frame["depth_file_path"]), thousandths.astype(np.uint16))
 
     def add_image_file(self, split: Split, file: Path, camera_to_world: Tensor, time: int | None = None) -> None:
         """Adds a reference image as it is: its file is copied, once when it is added to several splits.

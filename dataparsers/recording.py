@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import REFERENCE_SECONDS, TRAJECTORY_SECONDS, EventCamera
 from aenerf_ns.events.sensor import SensorModel
@@ -64,6 +65,9 @@ class Recording:
             without bounds.
         ground_truth: the true trajectory, camera-to-world, OpenCV camera axes, in a world of any position, orientation
             and scale, or None where it is not known. It serves evaluation only.
+        max_pose_gap: nanoseconds; where poses are further apart, the camera's way between them is not known. None:
+            poses are interpolated however far apart they are.
+        image_background: RGB in [0, 1] behind images that have an alpha channel, or None where that is ignored.
     """
 
     event_file: EventFile
@@ -75,6 +79,8 @@ class Recording:
     image_encoding: ImageEncoding
     scene_box: Tensor | None = None
     ground_truth: Trajectory | None = None
+    max_pose_gap: int | None = None
+    image_background: tuple[float, float, float] | None = None
 
     @property
     def reference_trajectory(self) -> Trajectory:
@@ -126,14 +132,89 @@ class EventDataParserConfig(DataParserConfig):
     or pose, whichever is later. A run's saved configuration holds the value that was used."""
     end_time_ns: int | None = None
     """Leave out what happened after this time, likewise."""
+    max_pose_gap_ns: int | None = None
+    """Leave out what happened between consecutive poses that are further apart than this, in nanoseconds. By default
+    what the dataset states, and else poses are interpolated however far apart they are."""
+
+    def setup(self, **kwargs: Any) -> Any:
+        """The dataparser."""
+        for option in fields(self):
+            path = getattr(self, option.name)
+            if isinstance(path, Path):
+                # A run's saved configuration is also read in other working directories.
+                setattr(self, option.name, path.absolute())
+        return super().setup(**kwargs)
+
+
+@dataclass
+class PublishedDataParserConfig(EventDataParserConfig):
+    """What the formats of other projects have in common."""
+
+    _target: type = field(default_factory=lambda: EventDataParser)
+    auto_scale_poses: bool = False
+    """Poses are in metres, and slow recordings move little compared to the scene's distance."""
+    positive_contrast_threshold: float | None = None
+    """C+, in place of the dataset's or of what is assumed of its sensor. The size of both thresholds only sets the
+    scale of the log-radiance, which colour correction finds."""
+    negative_contrast_threshold: float | None = None
+    """C-, likewise; its ratio to C+ matters."""
+    refractory_period_ns: int | None = None
+    """Time for which a pixel is blind after each event, in nanoseconds, likewise."""
+    trajectory: Path | None = None
+    """Estimated poses of the event camera, as t tx ty tz qx qy qz qw in seconds, camera-to-world, to be used in place
+    of the dataset's. The dataset's then only serve to evaluate them."""
+
+    def sensor(self, stated: SensorModel) -> SensorModel:
+        """The sensor, with what the options give in place of what the dataset states.
+
+        Raises:
+            DataError: a value cannot be.
+        """
+        given: dict[str, Any] = {
+            "positive_contrast_threshold": self.positive_contrast_threshold,
+            "negative_contrast_threshold": self.negative_contrast_threshold,
+            "refractory_period": self.refractory_period_ns,
+        }
+        try:
+            return replace(stated, **{name: value for name, value in given.items() if value is not None})
+        except ValueError as error:
+            raise DataError(str(self.data), str(error), "correct it among the options") from None
+
+    def estimated(self, reference: Trajectory) -> tuple[Trajectory, Trajectory | None]:
+        """The estimated trajectory and, where that is another, the true one, of the dataset's own trajectory."""
+        return (reference, None) if self.trajectory is None else (read_tum_trajectory(self.trajectory), reference)
+
+
+@dataclass
+class ObjectDataParserConfig(PublishedDataParserConfig):
+    """The formats of objects on a uniform background."""
+
+    scene_half_extent: float | None = None
+    """Half the side of a cube around the origin that holds the whole scene, in the units of the poses; 0 for a scene
+    without bounds. By default as the dataset's authors have it."""
+
+    def scene_box(self, stated: float) -> Tensor | None:
+        """The (2, 3) corners of the cube, where there is one."""
+        half = stated if self.scene_half_extent is None else self.scene_half_extent
+        if half < 0:
+            raise DataError(str(self.data), f"scene_half_extent is {half}", "give a length, or 0 for no bounds")
+        return torch.tensor([[-half] * 3, [half] * 3], dtype=torch.float64) if half else None
 
 
 class EventDataParser(DataParser):
     """Gives Nerfstudio places on the estimated trajectory as training cameras and the reference views of a split for
-    evaluation. A format implements :meth:`read_recording` and nothing else.
+    evaluation. A format implements :meth:`read_recording`, and those that are found without being named
+    :meth:`recognises`.
     """
 
     config: EventDataParserConfig
+    layout: ClassVar[str] = ""
+    """The files that :meth:`recognises` looks for, for messages."""
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        """Whether ``data`` looks like this format, from the names of its files alone."""
+        return False
 
     @abstractmethod
     def read_recording(self) -> Recording:
@@ -172,6 +253,7 @@ class EventDataParser(DataParser):
         recording = self.recording
         start, end = self._time_window(recording)
         trajectory = recording.trajectory.between(start, end).mapped(lambda poses: poses @ OPENCV_TO_OPENGL)
+        gaps = self._pose_gaps(recording, start, end, say=split == "train")
         transform, scale, scene_box = self._world_transform(trajectory, recording.scene_box)
 
         def to_scene(poses: Tensor) -> Tensor:
@@ -188,7 +270,7 @@ class EventDataParser(DataParser):
             cameras = recording.event_camera.cameras(trajectory.interpolate(times))
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
         else:
-            views = _views_within(recording.reference_views[_as_split(split)], start, end)
+            views = _views_within(recording.reference_views[_as_split(split)], start, end, gaps)
             for view in views:
                 check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
@@ -205,6 +287,7 @@ class EventDataParser(DataParser):
             scene_box=SceneBox(aabb=scene_box.float()),
             dataparser_transform=transform.float(),
             dataparser_scale=scale,
+            alpha_color=None if recording.image_background is None else torch.tensor(recording.image_background),
             metadata={
                 "trajectory": trajectory,
                 "ground_truth": ground_truth,
@@ -212,6 +295,7 @@ class EventDataParser(DataParser):
                 "event_file": recording.event_file,
                 "sensor": recording.sensor,
                 "time_window": (start, end),
+                "pose_gaps": gaps,
                 "camera_times": times,
                 "has_image": [index in images for index in range(len(cameras))],
                 "image_encoding": recording.image_encoding,
@@ -242,6 +326,22 @@ class EventDataParser(DataParser):
         covered = recording.trajectory.between(start, end)
         config.start_time_ns, config.end_time_ns = max(start, covered.start), min(end, covered.end)
         return config.start_time_ns, config.end_time_ns
+
+    def _pose_gaps(self, recording: Recording, start: int, end: int, say: bool) -> list[tuple[int, int]]:
+        """Where within the time window the poses are too far apart for interpolation."""
+        longest = self.config.max_pose_gap_ns
+        longest = recording.max_pose_gap if longest is None else longest
+        if longest is None:
+            return []
+        gaps = [gap for gap in recording.trajectory.gaps(longest) if gap[0] < end and gap[1] > start]
+        if gaps and say:
+            seconds = sum(last - first for first, last in gaps) * 1e-9
+            first, last = max(gaps, key=lambda gap: gap[1] - gap[0])
+            CONSOLE.print(
+                f"The poses have {len(gaps)} gap(s) of more than {longest * 1e-9:g} s, {seconds:.1f} s in all, the "
+                f"longest from {first * 1e-9:.3f} to {last * 1e-9:.3f} s: what happened there is left out."
+            )
+        return gaps
 
     def _world_transform(self, trajectory: Trajectory, box: Tensor | None) -> tuple[Tensor, float, Tensor]:
         """The (3, 4) motion and then the scale that bring the world to the scene's frame, and the scene box there.
@@ -303,12 +403,17 @@ def _check_distance(poses: Tensor, reference: Trajectory) -> None:
         )
 
 
-def _views_within(views: list[ReferenceView], start: int, end: int) -> list[ReferenceView]:
-    kept = [view for view in views if view.time is None or start <= view.time <= end]
+def _views_within(views: list[ReferenceView], start: int, end: int, gaps: list[tuple[int, int]]) -> list[ReferenceView]:
+    kept = [
+        view
+        for view in views
+        if view.time is None
+        or (start <= view.time <= end and not any(first < view.time < last for first, last in gaps))
+    ]
     if len(kept) < len(views):
         CONSOLE.print(
             f"{len(views) - len(kept)} of {len(views)} reference images are left out: they were taken outside the "
-            f"events' {start} to {end} ns."
+            f"events' {start} to {end} ns or in a gap of the poses."
         )
     return kept
 

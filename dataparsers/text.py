@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
+
+TimeUnit = Literal["ns", "us", "ms", "s"]
+NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+_UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
+
+# In nanoseconds: what an int64 holds, which is 285 years.
+_MAX_TIME = 9 * 10**18
+
+# Longer than any line of a file of events.
+_TAIL_BYTES = 4096
 
 
 def read_rows(path: Path, columns: str) -> list[list[str]]:
@@ -38,6 +49,21 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     return rows
 
 
+def first_and_last_row(path: Path) -> tuple[str, str]:
+    """The first and the last line that are neither empty nor a comment, "" where there is none."""
+    with path.open("rb") as file:
+        first = next((line for line in file if is_row(line)), b"")
+        file.seek(0, 2)
+        file.seek(max(file.tell() - _TAIL_BYTES, 0))
+        last = next((line for line in reversed(file.read().splitlines()) if is_row(line)), b"")
+    return first.decode("ascii", "replace"), last.decode("ascii", "replace")
+
+
+def is_row(line: bytes) -> bool:
+    """Whether a line is neither empty nor a comment."""
+    return bool(line.split(b"#", 1)[0].strip())
+
+
 def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:
     """(N, M) float64 numbers of the rows' fields.
 
@@ -50,24 +76,24 @@ def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:
         raise DataError(path, f"not a number ({error})", "write plain decimal numbers") from None
 
 
-def parse_seconds(path: Path, fields: list[str]) -> NDArray[np.int64]:
-    """Exact (N,) nanoseconds of decimal seconds: float64 cannot hold the nanoseconds of the Unix time.
+def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[np.int64]:
+    """Exact (N,) nanoseconds of decimal times: float64 cannot hold the nanoseconds of the Unix time.
 
     Raises:
         DataError: a field is not a finite number.
     """
-    try:
-        return np.array([int((Decimal(field) * 1_000_000_000).to_integral_value()) for field in fields], dtype=np.int64)
-    except (InvalidOperation, ValueError, OverflowError):
-        bad = next(field for field in fields if not _is_time(field))
-        raise DataError(path, f"{bad} is not a time in seconds", "write plain decimal seconds") from None
-
-
-def _is_time(field: str) -> bool:
-    try:
-        return abs(Decimal(field)) < 9_000_000_000
-    except InvalidOperation:
-        return False
+    times = np.empty(len(fields), dtype=np.int64)
+    for index, field in enumerate(fields):
+        try:
+            time = Decimal(field) * NANOSECONDS[unit]
+            good = abs(time) < _MAX_TIME
+        except ArithmeticError:
+            good = False
+        if not good:
+            name = _UNIT_NAMES[unit]
+            raise DataError(path, f"{field[:40]} is not a time in {name}", f"write plain decimal {name}")
+        times[index] = int(time.to_integral_value())
+    return times
 
 
 def format_seconds(nanoseconds: int) -> str:

@@ -6,21 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
-from aenerf_ns.dataparsers.text import format_seconds, parse_numbers, parse_seconds, read_rows
+from aenerf_ns.dataparsers.text import TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
 from aenerf_ns.errors import DataError
 from aenerf_ns.trajectory.rotation import quaternion_from_rotation, rotation_from_quaternion
-from aenerf_ns.trajectory.trajectory import Trajectory
+from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
 # Trajectories are commonly printed with six or more digits.
 _MAX_NORM_ERROR = 1e-3
 
 
-def read_tum_trajectory(path: Path) -> Trajectory:
+def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     """Reads a trajectory.
 
     Args:
         path: text file of t tx ty tz qx qy qz qw; # starts a comment.
+        unit: of its times. Some datasets have the same rows with other units.
 
     Returns:
         Camera-to-world poses with the axes of the file.
@@ -32,24 +35,33 @@ def read_tum_trajectory(path: Path) -> Trajectory:
     rows = read_rows(path, "t tx ty tz qx qy qz qw")
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
-    times = parse_seconds(path, [row[0] for row in rows])
+    times = parse_times(path, [row[0] for row in rows], unit)
     values = parse_numbers(path, [row[1:] for row in rows])
-    bad = ~np.isfinite(values).all(1)
+    return Trajectory(times, poses_from_quaternions(path, values[:, :3], values[:, 3:]), path)
+
+
+def poses_from_quaternions(source: Path, positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> Tensor:
+    """(N, 4, 4) float64 poses of (N, 3) positions and (N, 4) quaternions with w last.
+
+    Raises:
+        DataError: a value is not finite, or a quaternion is not of unit length.
+    """
+    bad = ~(np.isfinite(positions).all(1) & np.isfinite(quaternions).all(1))
     if bad.any():
         index = int(np.argmax(bad))
-        raise DataError(path, f"pose {index} holds {' '.join(rows[index][1:])}", "drop poses that are not finite")
-    norms = np.linalg.norm(values[:, 3:], axis=1)
+        values = " ".join(f"{value:g}" for value in (*positions[index], *quaternions[index]))
+        raise DataError(source, f"pose {index} holds {values}", "drop poses that are not finite")
+    norms = np.linalg.norm(quaternions, axis=1)
     bad = np.abs(norms - 1) > _MAX_NORM_ERROR
     if bad.any():
         index = int(np.argmax(bad))
         raise DataError(
-            path,
+            source,
             f"the quaternion of pose {index} has length {norms[index]:.6g}",
             "write unit quaternions in the order qx qy qz qw",
         )
-    rotations = rotation_from_quaternion(torch.from_numpy(values[:, 3:] / norms[:, None]))
-    poses = torch.cat([rotations, torch.from_numpy(values[:, :3, None])], -1)
-    return Trajectory(times, poses, path)
+    rotations = rotation_from_quaternion(torch.from_numpy(quaternions / norms[:, None]))
+    return homogeneous(torch.cat([rotations, torch.from_numpy(positions[:, :, None])], -1))
 
 
 def write_tum_trajectory(path: Path, trajectory: Trajectory) -> None:

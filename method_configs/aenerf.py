@@ -7,7 +7,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.datamanager import EventDataManagerConfig
-from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.dataparsers.formats import AutomaticDataParserConfig
 from aenerf_ns.ffmpeg import provide_ffmpeg
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipelineConfig
@@ -29,7 +29,7 @@ aenerf = MethodSpecification(
         steps_per_eval_batch=500,
         steps_per_eval_image=500,
         pipeline=AENeRFPipelineConfig(
-            datamanager=EventDataManagerConfig(dataparser=NativeDataParserConfig()),
+            datamanager=EventDataManagerConfig(dataparser=AutomaticDataParserConfig()),
             model=AENeRFModelConfig(camera_optimizer=PoseCorrectionConfig(mode="spline")),
         ),
         optimizers={

@@ -24,6 +24,15 @@ def slider_depth() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def tum_vie_calibration() -> Path:
+    """The folder of the real calibration files of TUM-VIE."""
+    folder = _SHARED_DATA / "tum_vie_calibration"
+    if not folder.is_dir():
+        pytest.skip("the calibration files of TUM-VIE are not at ../shared/data/tum_vie_calibration")
+    return folder
+
+
 @pytest.fixture
 def random_poses() -> torch.Tensor:
     """(8, 3, 4) float64 random camera-to-world poses with rotations up to 2.5 rad."""

@@ -40,9 +40,11 @@ def test_the_plan_has_every_run_once() -> None:
     assert rows == {OURS: 8, WITHOUT_CORRECTION: 8, TRUE_POSES: 8, CEILING: 8, **dict.fromkeys(LOSSES, 4)}
     # The bounds are of true poses, all else of estimated ones; the paper's ablation of losses is of hard speed.
     for run in runs:
-        assert (run.dataset.poses == "exact") == (run.row in (TRUE_POSES, CEILING))
+        assert run.true_poses == (run.row in (TRUE_POSES, CEILING))
         assert run.table == "methods" or run.dataset.speed == "hard"
-        assert ("--poses" in run.dataset.options) == (run.dataset.poses == "colmap")
+    # One simulation serves all rows.
+    assert len({run.dataset for run in runs}) == 2 * 2
+    assert all(run.dataset.options[-2:] == ("--poses", "colmap") for run in small_plan(poses="colmap"))
 
 
 def test_whatever_a_run_depends_on_is_in_its_name() -> None:
@@ -142,8 +144,13 @@ def test_figures_are_drawn_of_whatever_seed_there_is(tmp_path: Path) -> None:
         figures[run.name] = {**figures_of(run, 20.0, "large", (1.0, 0.5)), "curve": [(10, 15.0)]}
     drawn = draw(tmp_path, small_plan(tables=("losses",)), figures)
     names = [f"{scene}_hard_losses_{kind}.png" for scene in ("room", "object") for kind in ("views", "psnr")]
-    assert [path.name for path in drawn] == names
+    assert [path.name for path in drawn] == ["hard_losses.jpg", *names]
+    # The truth and four rows, of two scenes.
+    assert Image.open(drawn[0]).size == (5 * 192 + 4 * 4, 14 + 2 * 144 + 4)
     assert all(path.stat().st_size > 0 for path in drawn)
+    # Not even one scene is complete.
+    half = {run.name: figures[run.name] for run in made if (run.dataset.scene == "room") == (run.row == "all")}
+    assert len(draw(tmp_path, small_plan(tables=("losses",)), half)) == len(names)
 
 
 @pytest.mark.slow
@@ -178,5 +185,5 @@ def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path)
     report = (tmp_path / "bench" / "report.md").read_text()
     assert "missing" not in report
     drawn = sorted(path.name for path in (tmp_path / "bench" / "figures").iterdir())
-    assert drawn == [f"object_easy_methods_{kind}.png" for kind in ("paths", "psnr", "views")]
-    assert Image.open(tmp_path / "bench" / "figures" / drawn[2]).size == (5 * 192 + 4 * 4, 14 + 2 * 144 + 4)
+    assert drawn == ["easy_methods.jpg", *(f"object_easy_methods_{kind}.png" for kind in ("paths", "psnr", "views"))]
+    assert Image.open(tmp_path / "bench" / "figures" / drawn[3]).size == (5 * 192 + 4 * 4, 14 + 2 * 144 + 4)

@@ -1,13 +1,11 @@
 """The benchmark's scenes: geometry against truth, what they are composed of, and what a missing asset says."""
 
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 
 FOLDER = Path(__file__).parent.parent / "benchmarks" / "scenes"
@@ -18,7 +16,6 @@ import furnishings  # noqa: E402
 import meshes  # noqa: E402
 import object_scenes  # noqa: E402
 import place_scenes  # noqa: E402
-import settings  # noqa: E402
 
 PLAIN = meshes.Material("plain", np.full((2, 2, 3), 128, np.uint8))
 
@@ -153,16 +150,6 @@ def test_glb_files_hold_the_model(tmp_path):
         meshes.write_glb(
             tmp_path / "c.glb", model + meshes.box((0, 0, 0), (1, 1, 1), meshes.Material("picture", picture[::-1]))
         )
-
-
-def test_settings_name_every_scene_and_only_options_of_simulate():
-    assert set(settings.DURATIONS) == set(catalogue.SCENES)
-    known = {field.name for field in fields(Simulate)}
-    for name in catalogue.SCENES:
-        full, tiny = (settings.simulate_options(name, size) for size in ("full", "tiny"))
-        assert set(full) == set(tiny) <= known
-        assert full["width"] > tiny["width"]
-        assert min(full["test_views"], tiny["test_views"], tiny["duration"]) > 0
 
 
 def test_credits_name_every_asset_of_every_scene(monkeypatch):

@@ -19,7 +19,7 @@ from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
-from aenerf_ns.dataparsers.text import format_seconds, parse_seconds
+from aenerf_ns.dataparsers.text import format_seconds, parse_times
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.dataset import EventDataset
 from aenerf_ns.errors import DataError
@@ -262,9 +262,9 @@ def test_tum_trajectories_round_trip_to_the_nanosecond(tmp_path: Path) -> None:
 
 def test_seconds_are_parsed_and_printed_exactly() -> None:
     texts = ["1600000000.123456789", "0", "1e-9", "-0.5", "12."]
-    parsed = parse_seconds(Path("t"), texts)
+    parsed = parse_times(Path("t"), texts)
     assert parsed.tolist() == [1_600_000_000_123_456_789, 0, 1, -500_000_000, 12_000_000_000]
-    assert parse_seconds(Path("t"), [format_seconds(int(t)) for t in parsed]).tolist() == parsed.tolist()
+    assert parse_times(Path("t"), [format_seconds(int(t)) for t in parsed]).tolist() == parsed.tolist()
 
 
 def test_ecd_text_reads(tmp_path: Path) -> None:

@@ -203,6 +203,68 @@ def test_threshold_spread() -> None:
     assert abs(np.corrcoef(positive.ravel(), negative.ravel())[0, 1]) < 0.02
 
 
+def test_a_leaking_reference_fires_in_steady_light() -> None:
+    simulator = make_simulator(
+        50, 40, positive_contrast_threshold=0.2, negative_contrast_threshold=0.2,
+        contrast_threshold_spread=0.03, leak_rate=4.0, seed=1,
+    )  # fmt: skip
+    start = 1_700_000_000 * 10**9
+    images = np.full((3, 40, 50), 0.3)
+    x, y, t, p = simulate(simulator, images, start + np.array([0, 10**9, 5 * 10**9]))
+    assert (p == 1).all()
+    threshold = simulator.positive_contrast_threshold
+    for row, column in ((0, 0), (7, 3), (39, 49)):
+        mine = (x == column) & (y == row)
+        period = threshold[row, column] / (4.0 * 0.2)
+        np.testing.assert_allclose((t[mine] - start) * 1e-9, period * np.arange(1, mine.sum() + 1), atol=2e-8)
+        assert mine.sum() == int(5 / period)
+
+
+def test_shot_noise_comes_at_its_rate_and_less_in_the_light() -> None:
+    image = np.zeros((80, 100))
+    image[:, 50:] = 1.0
+    simulator = make_simulator(
+        100, 80, positive_contrast_threshold=0.2, negative_contrast_threshold=0.2, shot_noise_rate=2.0
+    )
+    x, y, t, p = simulate(simulator, np.stack([image] * 11), np.arange(11) * 5 * 10**8)
+    seconds, pixels = 5.0, 80 * 50
+    dark, bright = (x < 50).sum(), (x >= 50).sum()
+    for count, rate in ((dark, 2.0), (bright, 0.5)):
+        expected = rate * seconds * pixels
+        assert abs(count - expected) < 4 * math.sqrt(expected)
+    assert abs(p.sum()) < 4 * math.sqrt(len(p))
+    assert abs(t.mean() - 2.5e9) < 4 * 5e9 / math.sqrt(12 * len(t))
+    # Poisson: the variance of a pixel's count is its mean.
+    counts = np.bincount(y.astype(int) * 100 + x, minlength=8000).reshape(80, 100)[:, :50]
+    assert abs(counts.var() / counts.mean() - 1) < 0.1
+
+
+@pytest.mark.parametrize("refractory", [0, 40_000_000])
+def test_shot_noise_moves_the_reference_as_any_event(refractory: int) -> None:
+    # A signal that rises and falls by many thresholds: between two events of noise there are others.
+    times = np.arange(9) * 10**8
+    log_frames = np.array([0, 1, -1, 0.5, 0.3, 2, 2.1, -1, 0.0]) - 1
+    images = to_images(np.broadcast_to(log_frames[:, None, None], (9, HEIGHT, WIDTH)))
+    settings = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.3}
+    simulator = make_simulator(WIDTH, HEIGHT, shot_noise_rate=8.0, refractory_period=refractory, **settings)
+    x, y, t, p = simulate(simulator, images, times)
+    signal = log_of(images)[:, 0, 0]
+    noise = 0
+    for row in range(HEIGHT):
+        for column in range(WIDTH):
+            mine = (x == column) & (y == row)
+            change = np.interp(t[mine][1:], times, signal) - np.interp(t[mine][:-1] + refractory, times, signal)
+            regular = np.abs(change - np.where(p[mine][1:] > 0, 0.2, -0.3)) < 1e-6
+            # Whatever is not a threshold's step is noise, and never a larger step than a threshold.
+            assert (change[~regular] < 0.2).all()
+            assert (change[~regular] > -0.3).all()
+            assert (np.diff(t[mine]) > (refractory or -1)).all()
+            noise += (~regular).sum()
+    expected = 8.0 * 0.8 * WIDTH * HEIGHT
+    assert 0.1 * expected < noise < expected
+    assert len(t) - noise > 3 * WIDTH * HEIGHT
+
+
 def test_seed_decides_everything() -> None:
     rng = np.random.default_rng(5)
     images, times = rng.uniform(0, 1, (5, HEIGHT, WIDTH)), np.arange(5) * 10**6
@@ -215,6 +277,7 @@ def test_seed_decides_everything() -> None:
             negative_contrast_threshold=0.2,
             contrast_threshold_spread=0.02,
             refractory_period=1000,
+            shot_noise_rate=10_000.0,
             seed=seed,
         )
         streams.append(b"".join(column.tobytes() for column in simulate(simulator, images, times)))
@@ -235,6 +298,8 @@ def test_single_precision_frames_are_accepted_as_they_are() -> None:
     ("change", "message"),
     [
         ({"contrast_threshold_spread": -0.1}, "contrast_threshold_spread must not be negative, got -0.1"),
+        ({"leak_rate": -1.0}, "leak_rate must not be negative, got -1.0"),
+        ({"shot_noise_rate": math.nan}, "shot_noise_rate must not be negative, got nan"),
         ({"log_epsilon": 0.0}, "log_epsilon must be positive, got 0.0"),
         ({"width": 0}, "width and height must be in 1..65536, got 0 x 6"),
     ],

@@ -69,6 +69,19 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     assert len(pairs) + pairs.num_first + pairs.num_within_refractory_period == distinct
 
 
+def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:
+    rows = [(1, 2, t, 1) for t in (0, 10, 11, 15, 20, 20, 25, 40)]
+    expected = [(0, 10), (20, 25), (25, 40)]
+    for gaps in ([(10, 20)], [(-9, -3), (10, 20), (50, 60)]):
+        for sizes in ([8], [1] * 8, [3, 5]):
+            pairs = pair_events(cut(make_stream(rows), sizes), gaps=gaps)
+            assert list(zip(pairs.previous_time.tolist(), pairs.time.tolist(), strict=True)) == expected
+            assert (pairs.num_outside, pairs.num_first, pairs.num_merged) == (2, 2, 1)
+    # What a gap leaves of the time window.
+    pairs = pair_events([make_stream(rows)], start=10, end=25, gaps=[(5, 11), (20, 30)])
+    assert list(zip(pairs.previous_time.tolist(), pairs.time.tolist(), strict=True)) == [(11, 15), (15, 20)]
+
+
 @given(EVENTS, st.integers(0, 30), st.integers(0, 30))
 @settings(max_examples=100, deadline=None)
 def test_events_outside_the_time_window_are_left_out_and_counted(

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.ffmpeg import provide_ffmpeg
 
 ROOT = Path(__file__).parents[1]
@@ -46,7 +47,7 @@ def test_the_wheel_holds_the_package_and_nothing_generic(wheel: zipfile.ZipFile)
 def test_the_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
     text = next(wheel.read(name).decode() for name in wheel.namelist() if name.endswith("entry_points.txt"))
     targets = [line.split("=")[1].strip() for line in text.splitlines() if "=" in line]
-    assert len(targets) == 6
+    assert len(targets) == 14
     for target in targets:
         module, attribute = target.split(":")
         assert attribute in wheel.read(module.replace(".", "/") + ".py").decode()
@@ -54,7 +55,7 @@ def test_the_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
 
 def test_the_dataparsers_are_registered() -> None:
     names = {point.name for point in entry_points(group="nerfstudio.dataparser_configs")}
-    assert {"aenerf-data", "ecd-data"} <= names
+    assert {"event-data", *FORMATS} <= names
 
 
 def test_importing_the_package_costs_nothing() -> None:
@@ -67,9 +68,9 @@ def test_importing_the_package_costs_nothing() -> None:
 def test_the_registered_modules_leave_the_heaviest_imports_for_later() -> None:
     # What the framework itself imports at every command is no cost of ours.
     code = (
-        "import sys, nerfstudio.configs.method_configs as framework;"
+        "import sys, nerfstudio.configs.method_configs as framework, aenerf_ns.dataparsers.event_files;"
         "assert {'aenerf', 'aenerf-mlp', 'aenerf-small'} <= set(framework.all_methods);"
-        "print({'numba', 'torchmetrics', 'h5py', 'pycolmap'} & set(sys.modules))"
+        "print({'numba', 'torchmetrics', 'h5py', 'pycolmap', 'rosbags'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd="/")
     assert done.stdout.strip().splitlines()[-1] == "set()"
@@ -104,7 +105,7 @@ def test_lower_floors_import_none_above_them() -> None:
         {"events", "trajectory", "scenes", "image_encoding", "event_camera", "box_collider", "hash_encoding"},
         {"field", "temporal", "losses", "color_correction", "image_metrics"},
         {"dataset", "simulation", "structure_from_motion", "warped_events"},
-        {"ray_sampler"},
+        {"ray_sampler", "simulated_poses"},
         {"pose_correction", "sensor_parameters"},
         {"datamanager", "model"},
         {"pose_refinement"},

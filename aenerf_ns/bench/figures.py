@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw
 
 from aenerf_ns.bench.plan import OURS, Run, scene_name
 
+_TRUTH = "truth"
 _GAP = 4
 _LABEL = 14
 _MIN_WIDTH = 190
@@ -19,8 +20,8 @@ _MIN_WIDTH = 190
 
 
 def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]]) -> list[Path]:
-    """Draws all figures of the runs that have been made into ``folder / "figures"``, one of each kind for every scene
-    and speed.
+    """Draws all figures of the runs that have been made into ``folder / "figures"``: one of each kind for every scene
+    and speed, and a view of every scene beside each other.
 
     Args:
         folder: of the benchmark.
@@ -34,6 +35,9 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
     output.mkdir(exist_ok=True)
     made = [run for run in runs if run.name in figures]
     files = []
+    for speed, table in dict.fromkeys((run.dataset.speed, run.table) for run in made):
+        rows = [run for run in made if (run.dataset.speed, run.table) == (speed, table)]
+        files += _scenes(folder, rows, output / f"{speed}_{table}.jpg")
     for scene, speed, table in dict.fromkeys((run.dataset.scene, run.dataset.speed, run.table) for run in made):
         rows = [run for run in made if (run.dataset.scene, run.dataset.speed, run.table) == (scene, speed, table)]
         # Of several seeds one will do: the first there is.
@@ -45,33 +49,64 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
         ]
         for run in rows:
             if run.table == "methods" and run.row == OURS:
-                files.append(_paths(folder / "runs" / run.name, output / f"{stem}_paths.png"))
+                data, corrected = folder / "datasets" / run.dataset.name, folder / "runs" / run.name / "corrected.txt"
+                files.append(_paths(data, corrected, output / f"{stem}_paths.png"))
     return files
 
 
 def _views(folder: Path, runs: Sequence[Run], file: Path) -> Path:
     """A test view: the truth, and what each run made of it with the error below."""
-    columns: list[tuple[str, list[NDArray[np.uint8]]]] = []
+    columns: dict[str, list[NDArray[np.uint8]]] = {}
     for run in runs:
-        pictures = sorted((folder / "runs" / run.name / "pictures").glob("eval_img_*.png"))
-        both = np.asarray(Image.open(pictures[len(pictures) // 2]).convert("RGB"))
-        truth, rendered = np.split(both, 2, axis=1)
-        if not columns:
-            columns.append(("truth", [truth, np.zeros_like(truth)]))
-        columns.append((run.row, [rendered, error_map(rendered, truth)]))
-    height, width = columns[0][1][0].shape[:2]
+        truth, rendered = _view(folder, run)
+        columns.setdefault(_TRUTH, [truth, np.zeros_like(truth)])
+        columns[run.row] = [rendered, error_map(rendered, truth)]
+    _grid(columns).save(file, optimize=True)
+    return file
+
+
+def _scenes(folder: Path, runs: Sequence[Run], file: Path) -> list[Path]:
+    """A test view of every scene of which all rows have been made: the truth, and what each run made of it."""
+    names = list(dict.fromkeys(run.row for run in runs))
+    columns: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in (_TRUTH, *names)}
+    for scene in dict.fromkeys(run.dataset.scene for run in runs):
+        # Of several seeds, the first.
+        rows = {run.row: run for run in reversed(runs) if run.dataset.scene == scene}
+        if set(rows) == set(names):
+            views = {name: _view(folder, rows[name]) for name in names}
+            columns[_TRUTH].append(views[names[0]][0])
+            for name, (_, rendered) in views.items():
+                columns[name].append(rendered)
+    if not columns[_TRUTH]:
+        return []
+    _grid(columns).save(file, quality=88)
+    return [file]
+
+
+def _view(folder: Path, run: Run) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """The truth and the rendering of the middle one of a run's test views."""
+    pictures = sorted((folder / "runs" / run.name / "pictures").glob("eval_img_*.png"))
+    both = np.asarray(Image.open(pictures[len(pictures) // 2]).convert("RGB"))
+    truth, rendered = np.split(both, 2, axis=1)
+    return truth, rendered
+
+
+def _grid(columns: Mapping[str, Sequence[NDArray[np.uint8]]]) -> Image.Image:
+    """Columns of pictures of one size, with their names above."""
+    height, width = next(iter(columns.values()))[0].shape[:2]
     factor = -(-_MIN_WIDTH // width)
     height, width = factor * height, factor * width
-    picture = Image.new("RGB", (len(columns) * (width + _GAP) - _GAP, _LABEL + 2 * height + _GAP), "white")
+    count = max(map(len, columns.values()))
+    size = (len(columns) * (width + _GAP) - _GAP, _LABEL + count * (height + _GAP) - _GAP)
+    picture = Image.new("RGB", size, "white")
     pen = ImageDraw.Draw(picture)
-    for index, (name, tiles) in enumerate(columns):
+    for index, (name, tiles) in enumerate(columns.items()):
         left = index * (width + _GAP)
         pen.text((left + 2, 1), name, fill="black")
         for row, tile in enumerate(tiles):
             enlarged = Image.fromarray(tile).resize((width, height), Image.Resampling.NEAREST)
             picture.paste(enlarged, (left, _LABEL + row * (height + _GAP)))
-    picture.save(file, optimize=True)
-    return file
+    return picture
 
 
 def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -83,7 +118,7 @@ def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[
     return (colormaps["inferno"](np.clip(4 * error, 0, 1))[..., :3] * 255).round().astype(np.uint8)
 
 
-def _paths(run: Path, file: Path) -> Path:
+def _paths(data: Path, corrected: Path, file: Path) -> Path:
     """The given and the corrected path from above, aligned with the true one, and their errors over time."""
     import torch
     from matplotlib.figure import Figure
@@ -91,12 +126,13 @@ def _paths(run: Path, file: Path) -> Path:
     from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
     from aenerf_ns.trajectory.alignment import align, rotation_angle
 
-    truth = read_tum_trajectory(run / "ground-truth.txt")
+    truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
     figure = Figure(figsize=(9, 4), layout="constrained")
     above, over_time = figure.subplots(1, 2)
     above.plot(*truth.camera_to_worlds[:, :2, 3].T, color="black")
-    for poses, color in (("estimated", "tab:red"), ("corrected", "tab:blue")):
-        trajectory = read_tum_trajectory(run / f"{poses}.txt")
+    drawn = {"estimated": (data / "trajectory_estimated.txt", "tab:red"), "corrected": (corrected, "tab:blue")}
+    for poses, (path, color) in drawn.items():
+        trajectory = read_tum_trajectory(path)
         times = trajectory.knots_covered_by(truth)
         reference = truth.interpolate(times)
         aligned = align(trajectory.interpolate(times), reference)(trajectory.interpolate(times))

@@ -6,7 +6,7 @@ Everything lies in one folder, which can be worked on again and by several proce
     outputs/RUN/            what was trained, as ns-train leaves it
     logs/                   what the commands printed
     runs/RUN.json           the figures of a run; a run that has them is not made again
-    runs/RUN/               pictures of the test views, and trajectories
+    runs/RUN/               pictures of the test views, and the corrected trajectory
 """
 
 from __future__ import annotations
@@ -18,16 +18,20 @@ import shutil
 import subprocess
 import sys
 import time
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
-from aenerf_ns.bench.environment import environment
-from aenerf_ns.bench.plan import CEILING, Dataset, Run, scene_name
-from aenerf_ns.errors import DataError
+from filelock import FileLock
 
-_CURVE_POINTS = 8
+from aenerf_ns.bench.environment import environment
+from aenerf_ns.bench.plan import CEILING, OURS, Dataset, Run, scene_name
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, homogeneous
+
+_CURVE_POINTS = 5
 _CURVE = "Eval Images Metrics Dict (all images)/psnr"
-_POSES = ("estimated", "corrected", "ground-truth")
 _NERFACTO = (sys.executable, "-m", "aenerf_ns.bench.nerfacto")
 
 
@@ -76,7 +80,7 @@ class Runner:
             "scene": scene_name(run.dataset.scene),
             "kind": "object" if "scene_box" in json.loads((data / "transforms.json").read_text("utf8")) else "large",
             "speed": run.dataset.speed,
-            "poses": run.dataset.poses,
+            "poses": "true" if run.true_poses else run.dataset.poses,
             "method": run.method,
             "seed": run.seed,
             "simulate": " ".join(("aenerf", "simulate", *run.dataset.command)),
@@ -97,20 +101,13 @@ class Runner:
 
     def _dataset(self, dataset: Dataset) -> Path:
         folder = self._folder / "datasets" / dataset.name
-        if not folder.exists():
-            # Another process may be making the same: whoever is first gives it its name.
-            partial = folder.with_name(f".{dataset.name}.{os.getpid()}")
-            shutil.rmtree(partial, ignore_errors=True)
-            # A built-in scene's name has no suffix; the path of a file is relative to where the benchmark was started.
-            scene = str(Path(dataset.scene).resolve()) if Path(dataset.scene).suffix else dataset.scene
-            options = ("--scene", scene, *dataset.command[2:])
-            self._call(dataset.name, _script("aenerf"), "simulate", "--output", str(partial.resolve()), *options)
-            try:
-                partial.rename(folder)
-            except OSError:
-                if not folder.exists():
-                    raise
-                shutil.rmtree(partial)
+        # Where another process is making the same, its work is waited for.
+        with FileLock(folder.with_name(f".{dataset.name}.lock")):
+            if not folder.exists():
+                # A built-in scene's name has no suffix; a file's path is relative to where the benchmark was started.
+                scene = str(Path(dataset.scene).resolve()) if Path(dataset.scene).suffix else dataset.scene
+                options = ("--scene", scene, *dataset.command[2:])
+                self._call(dataset.name, _script("aenerf"), "simulate", "--output", str(folder.resolve()), *options)
         return folder
 
     def _train(self, run: Run, data: Path) -> None:
@@ -124,10 +121,12 @@ class Runner:
             # Of the framework's implementations, the one that needs no CUDA extension.
             options = ("--pipeline.model.implementation", "torch", "--pipeline.model.camera-optimizer.mode", "off",
                        "--pipeline.model.use-appearance-embedding", "False")  # fmt: skip
-            data_options = ("--data", path, "nerfstudio-data")
+            data_options = ("nerfstudio-data", "--data", str(_with_true_poses(data).resolve()))
             self._call(run.name, *_NERFACTO, "ns-train", *common, *options, *run.options, *data_options)
         else:
-            self._call(run.name, _script("ns-train"), *common, *run.options, "--data", path)
+            poses = "ground-truth" if run.true_poses else "estimated"
+            data_options = ("aenerf-data", "--data", path, "--poses", poses)
+            self._call(run.name, _script("ns-train"), *common, *run.options, *data_options)
 
     def _evaluate(self, run: Run, config: Path) -> dict[str, Any]:
         relative = str(config.relative_to(self._folder))
@@ -141,11 +140,11 @@ class Runner:
         if run.row == CEILING:
             # JSON has no NaN.
             return {name: None if math.isnan(value) else value for name, value in results.items()}
-        for poses in _POSES:
+        if run.row == OURS:
+            corrected = str(folder / "corrected.txt")
             self._call(
-                run.name, _script("aenerf"), "export-trajectory", "--load-config", relative, "--poses", poses,
-                "--output", str(folder / f"{poses}.txt"),
-            )  # fmt: skip
+                run.name, _script("aenerf"), "export-trajectory", "--load-config", relative, "--output", corrected
+            )
         return results
 
     def _call(self, log: str, *command: str) -> None:
@@ -166,6 +165,21 @@ class Runner:
 def _script(name: str) -> str:
     """A console script of this environment."""
     return str(Path(sys.executable).parent / name)
+
+
+def _with_true_poses(data: Path) -> Path:
+    """A transforms.json whose train images have their true poses, beside the dataset's own, for image methods."""
+    file = data / "transforms_ground_truth.json"
+    truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
+    meta = json.loads((data / "transforms.json").read_text("utf8"), parse_float=Decimal)
+    for frame in meta["frames"]:
+        if frame["file_path"] in meta["train_filenames"]:
+            pose = homogeneous(truth.interpolate(int(frame["timestamp"] * 10**9))) @ OPENCV_TO_OPENGL
+            frame["transform_matrix"] = pose.tolist()
+    partial = file.with_suffix(f".{os.getpid()}")
+    partial.write_text(json.dumps(meta, default=float), "utf8")
+    partial.rename(file)
+    return file
 
 
 def _curve(run: Path) -> list[tuple[int, float]]:

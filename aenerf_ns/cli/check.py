@@ -24,6 +24,8 @@ from aenerf_ns.trajectory.alignment import rotation_angle
 from aenerf_ns.trajectory.trajectory import Trajectory
 from aenerf_ns.warped_events import Comparison, WarpedEvents, num_slices, slice_size
 
+Gaps = list[tuple[int, int]]
+
 _RATE_PARTS = 60
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _MAX_SHOWN = 5
@@ -75,13 +77,13 @@ class Check:
         """Prints the figures and returns the problems."""
         # What training and evaluation will ask for.
         outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
-        recording = parser.recording
-        statistics, num_covered = _read(recording)
-        problems = _check_events(recording, statistics) + _check_poses(recording, statistics, num_covered)
+        recording, left_out = parser.recording, outputs[0].metadata["pose_gaps"]
+        statistics, num_covered = _read(recording, left_out)
+        problems = _check_events(recording, statistics) + _check_poses(recording, statistics, num_covered, left_out)
         if num_covered < _MIN_EVENTS:
             _print(f"Contrast of warped events: not computed, for only {num_covered} events have a pose.")
             return problems
-        runs = _read_runs(recording, num_covered)
+        runs = _read_runs(recording, num_covered, left_out)
         with progress_bar() as progress:
             progress.add_task("Warping events", total=None)
             warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
@@ -110,15 +112,23 @@ def _tracked(event_file: EventFile, description: str) -> Iterator[EventStream]:
             progress.advance(task, len(chunk))
 
 
-def _read(recording: Recording) -> tuple[EventStatistics, int]:
-    """Statistics of the events, and how many lie within the span of the poses."""
-    event_file, trajectory = recording.event_file, recording.trajectory
+def _covered(events: EventStream, trajectory: Trajectory, gaps: Gaps) -> EventStream:
+    """The events within the span of the poses and in none of the gaps."""
+    kept = (events.t >= trajectory.start) & (events.t <= trajectory.end)
+    for first, last in gaps:
+        kept &= (events.t <= first) | (events.t >= last)
+    return events[kept]
+
+
+def _read(recording: Recording, gaps: Gaps) -> tuple[EventStatistics, int]:
+    """Statistics of the events, and how many of them have a pose."""
+    event_file = recording.event_file
     num_covered = 0
 
     def chunks() -> Iterator[EventStream]:
         nonlocal num_covered
         for chunk in _tracked(event_file, "Reading events"):
-            num_covered += len(chunk.between(trajectory.start, trajectory.end))
+            num_covered += len(_covered(chunk, recording.trajectory, gaps))
             yield chunk
 
     span = event_file.time_span()
@@ -126,16 +136,16 @@ def _read(recording: Recording) -> tuple[EventStatistics, int]:
     return statistics, num_covered
 
 
-def _read_runs(recording: Recording, num_covered: int) -> list[EventStream]:
-    """Runs of events within the span of the poses, evenly spread over these."""
-    camera, trajectory = recording.event_camera, recording.trajectory
+def _read_runs(recording: Recording, num_covered: int, gaps: Gaps) -> list[EventStream]:
+    """Runs of events that have a pose, evenly spread over these."""
+    camera = recording.event_camera
     count = num_slices(num_covered, camera)
     length = num_covered if count == 1 else slice_size(camera)
     begins = np.linspace(0, num_covered - length, count).astype(np.int64)
     parts: list[list[dict[str, np.ndarray]]] = [[] for _ in begins]
     position = 0
     for chunk in _tracked(recording.event_file, "Choosing events"):
-        covered = chunk.between(trajectory.start, trajectory.end)
+        covered = _covered(chunk, recording.trajectory, gaps)
         for part, begin in zip(parts, begins - position, strict=True):
             taken = covered[max(begin, 0) : max(begin + length, 0)]
             # Copies: views would keep whole chunks in memory.
@@ -192,7 +202,7 @@ def _histogram(values: np.ndarray) -> str:
     return "".join(_BLOCKS[level] for level in levels)
 
 
-def _check_poses(recording: Recording, statistics: EventStatistics, num_covered: int) -> list[str]:
+def _check_poses(recording: Recording, statistics: EventStatistics, num_covered: int, left_out: Gaps) -> list[str]:
     problems = []
     trajectory = recording.trajectory
     times = trajectory.times.numpy()
@@ -214,7 +224,9 @@ def _check_poses(recording: Recording, statistics: EventStatistics, num_covered:
             f"only {covered:.1%} of the events have a pose, the others are not used: check the clocks of events and "
             "poses, or cut the recording"
         )
-    gaps = np.flatnonzero(intervals > _GAP_FACTOR * median)
+    # Those that training leaves out were told when the dataset was opened.
+    known = np.isin(times[:-1], [first for first, _ in left_out])
+    gaps = np.flatnonzero((intervals > _GAP_FACTOR * median) & ~known)
     if len(gaps):
         # Of the sampled pairs, by their later event.
         segment = np.searchsorted(times, statistics.pair_times[:, 1]) - 1
@@ -225,7 +237,7 @@ def _check_poses(recording: Recording, statistics: EventStatistics, num_covered:
         if share > _MAX_GAP_SHARE:
             problems.append(
                 f"{share:.1%} of the events fall in gaps between poses, where they are interpolated: give the missing "
-                "poses, or leave the gaps out (aenerf convert --start-time-ns, --end-time-ns)"
+                "poses, or leave the gaps out (--max-pose-gap-ns of the dataparser)"
             )
     return problems
 

@@ -100,8 +100,9 @@ class Convert:
                     camera,
                     recording.sensor,
                     recording.image_encoding,
-                    None if recording.scene_box is None else recording.scene_box.numpy(),
-                    recording.frame_camera,
+                    scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
+                    max_pose_gap=recording.max_pose_gap,
+                    frame_camera=recording.frame_camera,
                 ) as writer,
             ):
                 writer.add_trajectories(trajectory, recording.ground_truth)
@@ -119,6 +120,7 @@ class Convert:
             f"Look it over with: aenerf check --data {self.output}\n"
             f"Train with: ns-train aenerf --data {self.output}",
             highlight=False,
+            soft_wrap=True,
         )
 
     def _within(self, time: int) -> bool:
@@ -167,7 +169,7 @@ def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDat
     if num_written == 0:
         raise events.empty_error()
     if events.hot_pixels is not None and events.counts is not None:
-        CONSOLE.print(hot_pixel_summary(events.hot_pixels, events.counts), highlight=False)
+        CONSOLE.print(hot_pixel_summary(events.hot_pixels, events.counts), highlight=False, soft_wrap=True)
     return num_read, num_written
 
 
@@ -184,10 +186,11 @@ def _with_estimated_poses(
     kept = [(time, file) for time, file in zip(frames.times, frames.files, strict=True) if within(time)]
     found = estimate_poses([file for _, file in kept], [time for time, _ in kept], frames.frame_camera, source, seed)
     trajectory, report, given = found.trajectory, found.report(), frames.recording
-    CONSOLE.print(found.summary(), highlight=False)
+    CONSOLE.print(found.summary(), highlight=False, soft_wrap=True)
     CONSOLE.print(
         "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale: frames of one camera "
-        "tell no lengths."
+        "tell no lengths.",
+        soft_wrap=True,
     )
     if given is not None:
         truth = given.reference_trajectory
@@ -200,9 +203,10 @@ def _with_estimated_poses(
                 f"Compared with the given poses, which are kept as ground truth: mean errors "
                 f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units.",
                 highlight=False,
+                soft_wrap=True,
             )
-        # A box in the world of the given poses is none in COLMAP's.
-        return replace(given, trajectory=trajectory, ground_truth=truth, scene_box=None), report
+        # A box in the world of the given poses is none in COLMAP's, and their gaps are not COLMAP's.
+        return replace(given, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None), report
     placed = [(time, file) for time, file in kept if trajectory.start <= time <= trajectory.end]
     views = [ReferenceView(file, homogeneous(trajectory.interpolate(time)), time) for time, file in placed]
     splits: dict[Split, list[ReferenceView]] = {"train": views, "val": views[::2], "test": views[1::2]}

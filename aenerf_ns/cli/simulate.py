@@ -11,13 +11,13 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.dataparsers.recording import Split
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.scenes import open_scene
+from aenerf_ns.simulated_poses import poses_from_frames
 from aenerf_ns.simulation import Simulation
-from aenerf_ns.structure_from_motion import compare_with_truth, estimate_poses
-from aenerf_ns.trajectory.alignment import pose_errors
 from aenerf_ns.trajectory.noise import perturb
 from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
@@ -37,8 +37,8 @@ class Simulate:
     """Pixel columns of the sensor."""
     height: int = 260
     """Pixel rows of the sensor."""
-    duration: float = 4.0
-    """Seconds that the path takes at constant speed."""
+    duration: float | None = None
+    """Seconds that the path takes at constant speed; by default what a scene.json says, else 4."""
     pose_rate: float = 250.0
     """Poses a second in the trajectories; with --poses colmap, in the true one."""
     poses: Literal["noise", "colmap"] = "noise"
@@ -62,6 +62,10 @@ class Simulate:
     """Standard deviation of the thresholds over the pixels."""
     refractory_period_ns: int = 0
     """Time for which a pixel is blind after each event, in nanoseconds."""
+    leak_rate: float = 0.0
+    """Positive events a second that every pixel fires without reason, for its reference leaks (real: 0.1 to 1)."""
+    shot_noise_rate: float = 0.0
+    """Events a second that a dark pixel fires at random; a bright one, a quarter of them (real: up to 10)."""
     bayer_pattern: BayerPattern = ""
     """RGGB for a colour sensor."""
     max_displacement: float = 0.5
@@ -85,8 +89,10 @@ class Simulate:
         scene = open_scene(self.scene, self.seed)
         for note in scene.notes:
             CONSOLE.print(note, highlight=False, markup=False)
-        validation = torch.from_numpy(scene.validation_views(self.validation_views))
-        test = torch.from_numpy(scene.test_views(self.test_views, self.seed))
+        held_out: dict[Split, torch.Tensor] = {
+            "val": torch.from_numpy(scene.validation_views(self.validation_views)),
+            "test": torch.from_numpy(scene.test_views(self.test_views, self.seed)),
+        }
         try:
             camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
             sensor = SensorModel(
@@ -100,10 +106,12 @@ class Simulate:
                 camera,
                 sensor,
                 self.speed,
-                self.duration,
+                scene.duration if self.duration is None else self.duration,
                 self.max_displacement,
                 self.contrast_threshold_spread,
                 self.seed,
+                self.leak_rate,
+                self.shot_noise_rate,
             )
             truth = simulation.trajectory(self.pose_rate)
             estimated, report = self._estimate(simulation, camera, truth)
@@ -122,11 +130,12 @@ class Simulate:
             for time in np.linspace(estimated.start, estimated.end, self.train_images, dtype=np.int64).tolist():
                 # The picture shows what is true; the pose beside it is what the user of the dataset is given.
                 pose = homogeneous(estimated.interpolate(time))
-                writer.add_image("train", simulation.reference_image(simulation.pose(time)), pose, time)
-            for pose in validation:
-                writer.add_image("val", simulation.reference_image(pose), pose)
-            for pose in test:
-                writer.add_image("test", simulation.reference_image(pose), pose)
+                seen = simulation.reference_picture(simulation.pose(time))
+                writer.add_image("train", seen.display, pose, time, linear=seen.linear, depth=seen.depth)
+            for split, poses in held_out.items():
+                for pose in poses:
+                    seen = simulation.reference_picture(pose)
+                    writer.add_image(split, seen.display, pose, linear=seen.linear, depth=seen.depth)
         seconds = (truth.end - truth.start) * 1e-9
         CONSOLE.print(
             f"{self.output}: {num_events:,} events in {seconds:.2f} s, {len(estimated)} poses, {self.train_images} "
@@ -147,19 +156,8 @@ class Simulate:
                 f"pose noise {noise} with --poses colmap",
                 "leave it out: COLMAP errs by itself",
             )
-        times = simulation.frame_times(self.frame_rate, self.exposure)
-        frames = (simulation.blurred_frame(int(time), self.exposure) for time in times)
-        found = estimate_poses(frames, times, camera, "frames of aenerf simulate", self.seed)
-        true_poses = torch.stack([simulation.pose(time)[:3] for time in found.trajectory.times.tolist()])
-        # Only the world's position, orientation and scale, which no picture tells, are taken from the truth.
-        estimated, errors = compare_with_truth(found.trajectory, true_poses)
-        knots = truth.knots_covered_by(estimated)
-        between = pose_errors(estimated.interpolate(knots), truth.interpolate(knots))
-        CONSOLE.print(
-            f"{found.summary()}\nMean errors {errors['rotation_error_degrees']:.2f} degrees and "
-            f"{errors['translation_error']:.2g} m at the frames, {between['rotation_error_degrees']:.2f} degrees and "
-            f"{between['translation_error']:.2g} m interpolated between them; {errors['misplaced_frames']} frames "
-            f"misplaced, {errors['flipped_frames']} of them flipped."
+        estimated, report, summary = poses_from_frames(
+            simulation, camera, truth, self.frame_rate, self.exposure, self.seed
         )
-        settings = {"frame_rate": self.frame_rate, "exposure_seconds": self.exposure}
-        return estimated, {**settings, **found.report(), "errors": errors, "errors_between_frames": between}
+        CONSOLE.print(summary)
+        return estimated, report

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from aenerf_ns.events.sensor import LUMINANCE, RGGB, SensorModel
 
 MINIMUM_CONTRAST_THRESHOLD = 0.01
+_BRIGHT_REDUCTION = 0.75
 
 Events = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
 
@@ -56,13 +57,14 @@ def _pixel_events(
     positive_threshold,
     negative_threshold,
     refractory_period,
+    frame_time,
     time_shift,
     pixel_key,
     keys,
     position,
     write,
 ):
-    """Events of one pixel in one frame interval: the new reference and the position after the last event.
+    """Events of one pixel while its log-intensity is linear: the new reference and the position after the last event.
 
     ``reference_time`` lies before ``start_time`` for an armed pixel. Otherwise the reference is still to be taken, at
     that time: the initial one, or the end of a refractory period, be it in this interval or in a later one.
@@ -87,7 +89,7 @@ def _pixel_events(
         crossing = start_time + np.int64(np.rint(duration * ((crossing_log - start_log) / rise)))
         time = min(max(crossing, earliest + 1), end_time)
         if write:
-            keys[position] = (time - start_time) << time_shift | pixel_key | (polarity > 0)
+            keys[position] = (time - frame_time) << time_shift | pixel_key | (polarity > 0)
         position += 1
         if refractory_period > 0:
             # Counted from the rounded time stamp: the interval [t_prev + refractory period, t] a reader of the
@@ -95,6 +97,59 @@ def _pixel_events(
             reference_time = time + refractory_period
         else:
             reference_log = crossing_log
+    return reference_log, reference_time, position
+
+
+@numba.njit(cache=True)
+def _noisy_pixel_events(
+    start_log,
+    end_log,
+    start_time,
+    end_time,
+    reference_log,
+    reference_time,
+    positive_threshold,
+    negative_threshold,
+    refractory_period,
+    noise_times,
+    noise_polarities,
+    time_shift,
+    pixel_key,
+    keys,
+    position,
+    write,
+):
+    """Events of one pixel in one frame interval, which events of noise cut into pieces: after each, as after any other,
+    the pixel is blind for the refractory period or takes the log-intensity of that moment as its reference."""
+    piece_log, piece_time = start_log, start_time
+    for i in range(len(noise_times) + 1):
+        time = noise_times[i] if i < len(noise_times) else end_time
+        log = start_log + (end_log - start_log) * ((time - start_time) / (end_time - start_time))
+        reference_log, reference_time, position = _pixel_events(
+            piece_log,
+            log if time < end_time else end_log,
+            piece_time,
+            time,
+            reference_log,
+            reference_time,
+            positive_threshold,
+            negative_threshold,
+            refractory_period,
+            start_time,
+            time_shift,
+            pixel_key,
+            keys,
+            position,
+            write,
+        )
+        piece_log, piece_time = log, time
+        if i < len(noise_times) and reference_time < time:
+            if write:
+                keys[position] = (time - start_time) << time_shift | pixel_key | (noise_polarities[i] > 0)
+            position += 1
+            reference_log = log
+            if refractory_period > 0:
+                reference_time = time + refractory_period
     return reference_log, reference_time, position
 
 
@@ -109,51 +164,45 @@ def _frame_events(
     positive_threshold,
     negative_threshold,
     refractory_period,
+    noise_pixels,
+    noise_times,
+    noise_polarities,
 ):
     """Two passes, count and fill. Returns keys of time, y, x and polarity, from the highest bits to the lowest: their
-    order is that of the stream."""
+    order is that of the stream. Events of noise come in the order of their pixels, row by row, then of time."""
     height, width = start_log.shape
     x_bits, y_bits = _bits(width), _bits(height)
-    no_keys = np.empty(0, np.int64)
-    count = 0
-    for y in range(height):
-        for x in range(width):
-            count = _pixel_events(
-                start_log[y, x],
-                end_log[y, x],
-                start_time,
-                end_time,
-                reference_log[y, x],
-                reference_time[y, x],
-                positive_threshold[y, x],
-                negative_threshold[y, x],
-                refractory_period,
-                x_bits + y_bits + 1,
-                0,
-                no_keys,
-                count,
-                False,
-            )[2]
-    keys = np.empty(count, np.int64)
+    keys = np.empty(0, np.int64)
     position = 0
-    for y in range(height):
-        for x in range(width):
-            reference_log[y, x], reference_time[y, x], position = _pixel_events(
-                start_log[y, x],
-                end_log[y, x],
-                start_time,
-                end_time,
-                reference_log[y, x],
-                reference_time[y, x],
-                positive_threshold[y, x],
-                negative_threshold[y, x],
-                refractory_period,
-                x_bits + y_bits + 1,
-                (y << x_bits | x) << 1,
-                keys,
-                position,
-                True,
-            )
+    for write in (False, True):
+        if write:
+            keys = np.empty(position, np.int64)
+        position, last = 0, 0
+        for y in range(height):
+            for x in range(width):
+                first = last
+                while last < len(noise_pixels) and noise_pixels[last] == y * width + x:
+                    last += 1
+                log, time, position = _noisy_pixel_events(
+                    start_log[y, x],
+                    end_log[y, x],
+                    start_time,
+                    end_time,
+                    reference_log[y, x],
+                    reference_time[y, x],
+                    positive_threshold[y, x],
+                    negative_threshold[y, x],
+                    refractory_period,
+                    noise_times[first:last],
+                    noise_polarities[first:last],
+                    x_bits + y_bits + 1,
+                    (y << x_bits | x) << 1,
+                    keys,
+                    position,
+                    write,
+                )
+                if write:
+                    reference_log[y, x], reference_time[y, x] = log, time
     return keys
 
 
@@ -187,7 +236,11 @@ class EventSimulator:
         contrast_threshold_spread: standard deviation of the static per-pixel thresholds, drawn once from
             N(C, spread) and clipped at 0.01.
         log_epsilon: added to the intensity before the logarithm.
-        seed: of the thresholds and of the initial reference times.
+        leak_rate: positive events a second that a pixel of threshold C+ fires in steady light, because its reference
+            leaks: here the log-intensity seems to rise by leak_rate · C+ each second.
+        shot_noise_rate: events of either polarity a second that a dark pixel fires at random; one of intensity 1 and
+            more, a quarter of them (v2e, Hu et al. 2021). Like any event they move the reference.
+        seed: of the thresholds, of the initial reference times, and of the noise.
 
     Raises:
         ValueError: on a size, spread or epsilon outside its range.
@@ -201,6 +254,8 @@ class EventSimulator:
         *,
         contrast_threshold_spread: float = 0.0,
         log_epsilon: float = 1e-3,
+        leak_rate: float = 0.0,
+        shot_noise_rate: float = 0.0,
         seed: int = 0,
     ) -> None:
         if not (0 < width <= 65536 and 0 < height <= 65536):
@@ -209,9 +264,14 @@ class EventSimulator:
             raise ValueError(f"log_epsilon must be positive, got {log_epsilon}")
         if not 0.0 <= contrast_threshold_spread < math.inf:
             raise ValueError(f"contrast_threshold_spread must not be negative, got {contrast_threshold_spread}")
+        for name, rate in (("leak_rate", leak_rate), ("shot_noise_rate", shot_noise_rate)):
+            if not 0.0 <= rate < math.inf:
+                raise ValueError(f"{name} must not be negative, got {rate}")
         self.width, self.height = width, height
         self.sensor = sensor
         self.log_epsilon = log_epsilon
+        self.shot_noise_rate = shot_noise_rate
+        self._leak = leak_rate * sensor.positive_contrast_threshold * 1e-9
         self._rng = np.random.default_rng(seed)
         spread = contrast_threshold_spread
         self.positive_contrast_threshold = self._draw_thresholds(sensor.positive_contrast_threshold, spread)
@@ -234,8 +294,13 @@ class EventSimulator:
         Raises:
             ValueError: on a wrong shape, a negative or non-finite radiance, or a time that does not increase.
         """
-        log_intensity = self._to_log_intensity(np.asarray(image))
+        intensity = self._to_intensity(np.asarray(image))
         time_ns = int(time_ns)
+        # NumPy's logarithm is vectorised, numba's is not.
+        log_intensity = np.log(intensity + self.log_epsilon)
+        if self._log_intensity is None:
+            self._start_ns = time_ns
+        log_intensity += self._leak * (time_ns - self._start_ns)
         if self._log_intensity is None:
             self._reference_log = log_intensity.copy()
             self._reference_time = np.full(log_intensity.shape, time_ns, np.int64)
@@ -258,6 +323,7 @@ class EventSimulator:
                 self.positive_contrast_threshold,
                 self.negative_contrast_threshold,
                 self.sensor.refractory_period,
+                *self._shot_noise(intensity, time_ns),
             )
             keys.sort()
         events = _unpack(keys, self._time_ns, self.height, self.width)
@@ -268,7 +334,22 @@ class EventSimulator:
         thresholds = self._rng.normal(mean, spread, (self.height, self.width))
         return np.maximum(thresholds, MINIMUM_CONTRAST_THRESHOLD)
 
-    def _to_log_intensity(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
+    def _shot_noise(self, intensity: NDArray[np.float64], time_ns: int) -> tuple[NDArray[np.int64], ...]:
+        """Pixels, row by row, times within the frame interval and polarities of the events of noise."""
+        if self.shot_noise_rate == 0:
+            nothing = np.empty(0, np.int64)
+            return nothing, nothing, nothing
+        seconds = (time_ns - self._time_ns) * 1e-9
+        count = self._rng.poisson(self.shot_noise_rate * seconds * intensity.size)
+        pixels = self._rng.integers(0, intensity.size, count)
+        kept = self._rng.random(count) < 1 - _BRIGHT_REDUCTION * np.minimum(intensity.ravel()[pixels], 1)
+        times = self._rng.integers(self._time_ns + 1, time_ns + 1, count)
+        polarities = self._rng.integers(0, 2, count) * 2 - 1
+        order = np.lexsort((times, pixels))
+        order = order[kept[order]]
+        return pixels[order], times[order], polarities[order]
+
+    def _to_intensity(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
         size = (self.height, self.width)
         if image.shape == (*size, 3):
             weights = np.broadcast_to(LUMINANCE, (2, 2, 3))
@@ -286,5 +367,4 @@ class EventSimulator:
         invalid = _filter(image, np.ascontiguousarray(weights, np.float64), intensity)
         if invalid:
             raise ValueError(f"radiance must be finite and not negative, got {invalid} other values")
-        # NumPy's logarithm is vectorised, numba's is not.
-        return np.log(intensity + self.log_epsilon)
+        return intensity

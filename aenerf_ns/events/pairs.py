@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numba
@@ -13,6 +13,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 
 _NEVER = np.iinfo(np.int64).min
+_MAX_TIME = np.iinfo(np.int64).max - 1
 _MAX_MERGED = 255
 
 
@@ -30,7 +31,7 @@ class EventPairs:
         num_positive: (N,) uint8, positive events at ``time``.
         num_negative: (N,) uint8, negative events at ``time``.
         num_events: events in the stream.
-        num_outside: events outside the time window, which are left out.
+        num_outside: events outside the time window or in a gap, which are left out.
         num_first: events left out because they are the first of their pixel.
         num_merged: events merged into another of the same pixel and time.
         num_within_refractory_period: events that follow the previous one of their pixel by no more than the
@@ -61,8 +62,8 @@ class EventPairs:
         """One line that accounts for every event of the stream."""
         return (
             f"{self.num_events:,} events gave {len(self):,} pairs; left out: {self.num_outside:,} outside the time "
-            f"window, {self.num_first:,} first of their pixel, {self.num_within_refractory_period:,} within the "
-            f"refractory period; {self.num_merged:,} merged with one of the same pixel and time"
+            f"window or the poses, {self.num_first:,} first of their pixel, {self.num_within_refractory_period:,} "
+            f"within the refractory period; {self.num_merged:,} merged with one of the same pixel and time"
         )
 
 
@@ -112,6 +113,7 @@ def pair_events(
     refractory_period: int = 0,
     start: int | None = None,
     end: int | None = None,
+    gaps: Sequence[tuple[int, int]] = (),
     expected_events: int | None = None,
 ) -> EventPairs:
     """Pairs each event with the previous event of its pixel, in one pass over the stream.
@@ -123,6 +125,8 @@ def pair_events(
         refractory_period: τ in nanoseconds; an event that follows its pixel's previous one by no more gives no pair.
         start: events before this time in nanoseconds are left out.
         end: events after this time in nanoseconds are left out.
+        gaps: events between these times in nanoseconds, the times themselves excluded, are left out, in the order of
+            time; no pair spans one.
         expected_events: the number of events, when known, which saves growing the arrays.
 
     Returns:
@@ -134,42 +138,48 @@ def pair_events(
     dtypes = (np.uint16, np.uint16, np.int64, np.int64, np.uint8, np.uint8)
     # numpy.empty only reserves addresses: memory is used as the pairs are written.
     records: list[NDArray] = [np.empty(expected_events or 0, dtype) for dtype in dtypes]
-    size = total = outside = first = merged = refractory = 0
+    windows = _windows(_NEVER + 1 if start is None else start, _MAX_TIME if end is None else end, gaps)
+    window = size = total = outside = first = merged = refractory = 0
     last_time = last_record = None
     source: object = "events"
     for full_chunk in chunks:
         total += len(full_chunk)
+        outside += len(full_chunk)
         source = full_chunk.source
-        chunk = full_chunk.between(
-            _NEVER + 1 if start is None else start, np.iinfo(np.int64).max - 1 if end is None else end
-        )
-        outside += len(full_chunk) - len(chunk)
         if last_time is None or last_record is None:
-            last_time = np.full(chunk.width * chunk.height, _NEVER, dtype=np.int64)
-            last_record = np.full(chunk.width * chunk.height, -1, dtype=np.int64)
-        if size + len(chunk) > len(records[0]):
-            capacity = max(size + len(chunk), 3 * len(records[0]) // 2)
-            # One at a time: the old and the new of all would be too much at once.
-            for column, record in enumerate(records):
-                records[column] = np.concatenate([record[:size], np.empty(capacity - size, record.dtype)])
-        new_size, chunk_first, chunk_merged, chunk_refractory = _pair_chunk(
-            (chunk.x, chunk.y, chunk.t, chunk.p),
-            chunk.width,
-            refractory_period,
-            last_time,
-            last_record,
-            tuple(records),
-            size,
-        )
-        if new_size < 0:
-            raise DataError(
-                chunk.source,
-                f"more than {_MAX_MERGED} events of one polarity at pixel ({chunk.x[chunk_first]}, "
-                f"{chunk.y[chunk_first]}) share the time {chunk.t[chunk_first]} ns",
-                "check the unit of the times",
+            last_time = np.full(full_chunk.width * full_chunk.height, _NEVER, dtype=np.int64)
+            last_record = np.full(full_chunk.width * full_chunk.height, -1, dtype=np.int64)
+        for index, chunk in enumerate(full_chunk.between(*times) for times in windows):
+            if len(chunk) == 0:
+                continue
+            outside -= len(chunk)
+            if index != window:
+                # Behind a gap every pixel begins anew.
+                window = index
+                last_time.fill(_NEVER)
+            if size + len(chunk) > len(records[0]):
+                capacity = max(size + len(chunk), 3 * len(records[0]) // 2)
+                # One at a time: the old and the new of all would be too much at once.
+                for column, record in enumerate(records):
+                    records[column] = np.concatenate([record[:size], np.empty(capacity - size, record.dtype)])
+            new_size, chunk_first, chunk_merged, chunk_refractory = _pair_chunk(
+                (chunk.x, chunk.y, chunk.t, chunk.p),
+                chunk.width,
+                refractory_period,
+                last_time,
+                last_record,
+                tuple(records),
+                size,
             )
-        size = new_size
-        first, merged, refractory = first + chunk_first, merged + chunk_merged, refractory + chunk_refractory
+            if new_size < 0:
+                raise DataError(
+                    chunk.source,
+                    f"more than {_MAX_MERGED} events of one polarity at pixel ({chunk.x[chunk_first]}, "
+                    f"{chunk.y[chunk_first]}) share the time {chunk.t[chunk_first]} ns",
+                    "check the unit of the times",
+                )
+            size = new_size
+            first, merged, refractory = first + chunk_first, merged + chunk_merged, refractory + chunk_refractory
     if total == outside:
         raise DataError(
             str(source),
@@ -190,3 +200,10 @@ def pair_events(
         num_merged=merged,
         num_within_refractory_period=refractory,
     )
+
+
+def _windows(start: int, end: int, gaps: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """What is left of [start, end] between the gaps, both ends included."""
+    edges = [start, *(time for gap in gaps for time in gap), end]
+    windows = ((max(first, start), min(last, end)) for first, last in zip(edges[::2], edges[1::2], strict=True))
+    return [(first, last) for first, last in windows if first <= last]

@@ -81,8 +81,8 @@ class EventStream:
     def __len__(self) -> int:
         return len(self.t)
 
-    def __getitem__(self, index: slice) -> EventStream:
-        """The events of a slice, as views."""
+    def __getitem__(self, index: slice | NDArray) -> EventStream:
+        """The events of a slice, as views, or copies of those that an array of indices or booleans selects."""
         columns = {name: getattr(self, name)[index] for name in _COLUMNS}
         return EventStream(**columns, width=self.width, height=self.height, source=self.source)
 

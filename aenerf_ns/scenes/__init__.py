@@ -28,6 +28,7 @@ class SimulationScene:
         background: (3,) linear RGB behind the scene; None where every ray hits something.
         validation_views: number of views to poses (n, 4, 4) around the path.
         test_views: number of views and seed to random poses (n, 4, 4).
+        duration: seconds that the path takes at constant speed.
         notes: what the user should know was assumed, a line each.
     """
 
@@ -39,6 +40,7 @@ class SimulationScene:
     background: Array | None
     validation_views: Callable[[int], Array]
     test_views: Callable[[int, int], Array]
+    duration: float = 4.0
     notes: tuple[str, ...] = ()
 
     def intrinsics(self, width: int, height: int) -> tuple[float, float, float, float]:

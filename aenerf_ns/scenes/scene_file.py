@@ -33,6 +33,7 @@ _BACKGROUND = [0.5, 0.5, 0.5]
 _RADIUS = 4.0
 _RADII = 3.6
 """Distance from which an object is looked at by default: in metres, and in half diagonals of its bounds."""
+_DURATION = 4.0
 _BRIGHTEST = 0.9
 """What the brightest surface that probes of the path see is brought to: it leaves room for what they miss."""
 
@@ -67,7 +68,9 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
     scale = _positive(path, values, "scale", 1.0)
     light = _light(path, values.get("light", {"sky": _SKY}))
     background = _background(path, values.get("background", _BACKGROUND), light)
-    kind = _kind(path, values.get("path", {"kind": "around"}))
+    route = values.get("path", {"kind": "around"})
+    kind = _kind(path, route)
+    duration = _positive(path, route, "duration", _DURATION)
     focal_ratio = _positive(path, values, "focal_ratio", _FOCAL_RATIO[kind])
     box = _box(path, values.get("box"), kind)
 
@@ -91,7 +94,7 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
         notes.append(f"{file}: {coincident} faces coincide with others; where they do, the first in the file is seen")
 
     caster = RayCaster(mesh.vertices, mesh.faces)
-    views = _views(path, values.get("path", {"kind": "around"}), bounds, caster)
+    views = _views(path, route, bounds, caster)
     behind = np.zeros(3) if background is None else background
     if light is None:
         renderer = baked_mesh(mesh, caster, behind)
@@ -106,6 +109,7 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
         background=background,
         validation_views=views.validation,
         test_views=views.test,
+        duration=duration,
         notes=tuple(notes),
     )
     return scene if light is None else replace(scene, renderer=_exposed(scene, renderer))
@@ -187,7 +191,10 @@ def _light(path: Path, light: Any) -> tuple[Environment, list[AreaLight]] | None
 
 
 def _kind(path: Path, value: Any) -> str:
-    known = {"around": {"kind", "centre", "radius", "turns"}, "walk": {"kind", "positions", "targets"}}
+    known = {
+        "around": {"kind", "centre", "radius", "turns", "duration"},
+        "walk": {"kind", "positions", "targets", "duration"},
+    }
     kind = value.get("kind") if isinstance(value, dict) else None
     if kind not in known:
         raise DataError(path, f"path.kind is {kind!r}", 'give "around" or "walk"')

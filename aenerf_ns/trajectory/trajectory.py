@@ -184,6 +184,12 @@ class Trajectory(nn.Module):
             )
         return Trajectory(self.times[first : last + 1], self.camera_to_worlds[first : last + 1], self.source)
 
+    def gaps(self, longest: int) -> list[tuple[int, int]]:
+        """The pairs of consecutive knots that are more than ``longest`` nanoseconds apart: between them the poses are
+        not known."""
+        wide = (self.times[1:] - self.times[:-1] > longest).nonzero()[:, 0]
+        return [(int(self.times[i]), int(self.times[i + 1])) for i in wide]
+
     def knots_covered_by(self, reference: Trajectory) -> Tensor:
         """Times in nanoseconds of the knots within the span of a reference trajectory.
 

@@ -27,6 +27,7 @@ class BenchmarkScene:
         turn_degrees: by which the environment is turned.
         lamps: further lights, as in a scene file.
         walk: positions and targets of a walk; None: the camera goes around it.
+        duration: seconds that the path takes at constant speed.
         show_environment: whether the environment is seen where there is nothing else; else it is grey.
     """
 
@@ -36,6 +37,7 @@ class BenchmarkScene:
     turn_degrees: float = 0.0
     lamps: tuple[dict[str, list[float]], ...] = ()
     walk: tuple[list[list[float]], list[list[float]]] | None = None
+    duration: float = 4.0
     show_environment: bool = False
 
     def model(self, library: Library) -> Model:
@@ -50,6 +52,7 @@ class BenchmarkScene:
         path: dict[str, object] = {"kind": "around", "centre": [0, 0, 0], "radius": _DISTANCE, "turns": 4}
         if self.walk is not None:
             path = {"kind": "walk", "positions": self.walk[0], "targets": self.walk[1]}
+        path["duration"] = self.duration
         light: dict[str, object] = {
             "environment": environment,
             "turn_degrees": self.turn_degrees,
@@ -110,16 +113,26 @@ SCENES: dict[str, BenchmarkScene] = {
         show_environment=True,
     ),
     "terrace": BenchmarkScene(
-        place_scenes.terrace, "park", turn_degrees=200, walk=loop(2.7, 2.0, 1.55, 0.8, 0.85), show_environment=True
+        place_scenes.terrace,
+        "park",
+        turn_degrees=200,
+        walk=loop(2.7, 2.0, 1.55, 0.8, 0.85),
+        duration=6.0,
+        show_environment=True,
     ),
     "gallery": BenchmarkScene(
-        place_scenes.gallery, "lobby", lamps=place_scenes.GALLERY_LAMPS, walk=loop(6.1, 1.55, 1.6, 0.75, 1.35)
+        place_scenes.gallery,
+        "lobby",
+        lamps=place_scenes.GALLERY_LAMPS,
+        walk=loop(6.1, 1.55, 1.6, 0.75, 1.35),
+        duration=8.0,
     ),
     "workshop": BenchmarkScene(
         place_scenes.workshop,
         "venice",
         lamps=place_scenes.WORKSHOP_LAMPS,
         walk=loop(2.0, 1.55, 1.6, 0.9, 1.0),
+        duration=5.0,
         show_environment=True,
     ),
 }

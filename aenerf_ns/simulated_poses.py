@@ -1,0 +1,53 @@
+"""Poses as structure from motion estimates them from the frames of a simulated camera, and how wrong they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.simulation import Simulation
+from aenerf_ns.structure_from_motion import compare_with_truth, estimate_poses
+from aenerf_ns.trajectory.alignment import pose_errors
+from aenerf_ns.trajectory.trajectory import Trajectory
+
+
+def poses_from_frames(
+    simulation: Simulation, camera: EventCamera, truth: Trajectory, frame_rate: float, exposure: float, seed: int
+) -> tuple[Trajectory, dict[str, Any], str]:
+    """Runs COLMAP on the frames of a camera beside the event sensor, as in a DAVIS.
+
+    Only what no picture tells is taken from the truth: the world's position, orientation and scale.
+
+    Args:
+        simulation: the pass of the camera.
+        camera: its lens.
+        truth: the true trajectory.
+        frame_rate: frames a second.
+        exposure: seconds for which a frame is exposed, and blurred by motion.
+        seed: of COLMAP.
+
+    Returns:
+        The estimated trajectory, a report of how it was made and of its errors, and a summary for people.
+
+    Raises:
+        ValueError: frame rate and exposure do not fit each other or the path.
+        DataError: COLMAP finds no poses.
+    """
+    times = simulation.frame_times(frame_rate, exposure)
+    frames = (simulation.blurred_frame(int(time), exposure) for time in times)
+    found = estimate_poses(frames, times, camera, "frames of aenerf simulate", seed)
+    true_poses = torch.stack([simulation.pose(time)[:3] for time in found.trajectory.times.tolist()])
+    estimated, errors = compare_with_truth(found.trajectory, true_poses)
+    knots = truth.knots_covered_by(estimated)
+    between = pose_errors(estimated.interpolate(knots), truth.interpolate(knots))
+    settings = {"frame_rate": frame_rate, "exposure_seconds": exposure}
+    report = {**settings, **found.report(), "errors": errors, "errors_between_frames": between}
+    summary = (
+        f"{found.summary()}\nMean errors {errors['rotation_error_degrees']:.2f} degrees and "
+        f"{errors['translation_error']:.2g} m at the frames, {between['rotation_error_degrees']:.2f} degrees and "
+        f"{between['translation_error']:.2g} m interpolated between them; {errors['misplaced_frames']} frames "
+        f"misplaced, {errors['flipped_frames']} of them flipped."
+    )
+    return estimated, report, summary

@@ -1,0 +1,230 @@
+"""Throughput and peak memory of the readers of event files.
+
+    python benchmarks/readers.py --output benchmarks/results/NAME.json
+
+Each file holds the same random events, and is in the page cache. Each measurement runs in a process of its own, after
+the reader has read a small file, so that neither compilation nor imports count. Time is that of the processor, so that
+other work on the machine does not count either. Beside it, where it is installed and reads the format: faery.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from aenerf_ns.bench.environment import environment
+
+_WIDTH, _HEIGHT = 1280, 720
+_START = 1_600_000_000_000_000
+_FAERY = (".raw", ".dat", ".aedat4")
+
+
+def events(count: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """x, y, t (microseconds from zero) and p (0 or 1): one event a microsecond on average, at random pixels."""
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.integers(0, 3, count))
+    return rng.integers(0, _WIDTH, count), rng.integers(0, _HEIGHT, count), t, rng.integers(0, 2, count)
+
+
+def write_evt2(path: Path, count: int) -> None:
+    """Writes the upper bits of the time whenever they change."""
+    x, y, t, p = events(count)
+    words = (p << 28 | (t & 0x3F) << 22 | x << 11 | y).astype("<u4")
+    high = t >> 6
+    places = np.flatnonzero(np.diff(high, prepend=-1))
+    words = np.insert(words, places, (0x8 << 28 | high[places]).astype("<u4"))
+    path.write_bytes(f"% evt 2.0\n% geometry {_WIDTH}x{_HEIGHT}\n% end\n".encode() + words.tobytes())
+
+
+def evt3_words(count: int) -> NDArray[np.uint16]:
+    """A time, a row and a column for each event: no vectors, the worst case."""
+    x, y, t, p = events(count)
+    words = np.stack([0x6000 | t & 0xFFF, y, 0x2000 | p << 11 | x], -1).astype("<u2").reshape(-1)
+    high = t >> 12
+    places = np.flatnonzero(np.diff(high, prepend=-1))
+    return np.insert(words, 3 * places, (0x8000 | high[places] & 0xFFF).astype("<u2"))
+
+
+def write_evt3(path: Path, count: int) -> None:
+    """Writes the words after a header."""
+    header = f"% evt 3.0\n% geometry {_WIDTH}x{_HEIGHT}\n% end\n".encode()
+    path.write_bytes(header + evt3_words(count).tobytes())
+
+
+def write_dat(path: Path, count: int) -> None:
+    """Writes version 2."""
+    x, y, t, p = events(count)
+    words = np.stack([t, p << 28 | y << 14 | x], -1).astype("<u4")
+    header = f"% Data file containing CD events\n% Version 2\n% Width {_WIDTH}\n% Height {_HEIGHT}\n".encode()
+    path.write_bytes(header + b"\x0c\x08" + words.tobytes())
+
+
+def write_aedat4(path: Path, count: int) -> None:
+    """Writes LZ4 packets of 10 ms, without a table."""
+    from lz4.frame import compress
+
+    x, y, t, p = events(count)
+    records = np.zeros(count, [("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("padding", "V3")])
+    records["t"], records["x"], records["y"], records["p"] = t + _START, x, y, p
+    info = (
+        '<dv version="2.0"><node name="outInfo" path="/"><node name="0" path="/0/"><attr key="compression" '
+        'type="string">LZ4</attr><attr key="typeIdentifier" type="string">EVTS</attr><node name="info" path="/0/info/">'
+        f'<attr key="sizeX" type="int">{_WIDTH}</attr><attr key="sizeY" type="int">{_HEIGHT}</attr></node></node>'
+        "</node></dv>"
+    ).encode()
+    # FlatBuffers: the place of the table, an identifier, the places of the table's fields, the table.
+    header = struct.pack("<I4s5H2xiiqII", 20, b"IOHE", 10, 24, 4, 8, 16, 12, 1, -1, 4, len(info)) + info + b"\0"
+    with path.open("wb") as file:
+        file.write(b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header)
+        for part in np.split(records, np.searchsorted(t, np.arange(10_000, t[-1], 10_000))):
+            table = struct.pack("<I4sHHHHiII", 16, b"EVTS", 0, 6, 8, 4, 6, 4, len(part)) + part.tobytes()
+            packet = compress(struct.pack("<I", len(table)) + table)
+            file.write(struct.pack("<2i", 0, len(packet)) + packet)
+
+
+def _write_bag(path: Path, kind: str, messages: list[tuple[int, bytes]]) -> None:
+    from rosbags.rosbag1 import Writer
+
+    with Writer(path) as writer:
+        connection = writer.add_connection("/events", kind, msgdef="# see the type's package", md5sum="0" * 32)
+        for stamp, data in messages:
+            seconds, nanoseconds = divmod(stamp, 10**9)
+            header = struct.pack("<4I", 0, seconds, nanoseconds, 0) + struct.pack("<2I", _HEIGHT, _WIDTH)
+            writer.write(connection, stamp, header + data)
+
+
+def write_arrays(path: Path, count: int) -> None:
+    """Writes dvs_msgs/EventArray of 10 ms."""
+    x, y, t, p = events(count)
+    t += _START
+    records = np.zeros(count, [("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
+    records["x"], records["y"], records["p"] = x, y, p
+    records["s"], records["ns"] = t // 1_000_000, t % 1_000_000 * 1000
+    parts = np.split(records, np.searchsorted(t, np.arange(t[0] + 10_000, t[-1], 10_000)))
+    messages = [
+        (int(part["s"][0]) * 10**9 + int(part["ns"][0]), struct.pack("<I", len(part)) + part.tobytes())
+        for part in parts
+    ]
+    _write_bag(path, "dvs_msgs/msg/EventArray", messages)
+
+
+def write_packets(path: Path, count: int) -> None:
+    """Writes event_camera_msgs/EventPacket of 60,000 bytes of EVT 3.0, about 10 ms."""
+    parts = np.split(evt3_words(count), range(30_000, 3 * count, 30_000))
+    messages = [
+        (
+            _START * 1000 + 10_000_000 * i,
+            struct.pack("<2QI", i, 0, 4) + b"evt3\0" + struct.pack("<I", part.nbytes) + part.tobytes(),
+        )
+        for i, part in enumerate(parts)
+        if len(part)
+    ]
+    _write_bag(path, "event_camera_msgs/msg/EventPacket", messages)
+
+
+WRITERS: dict[str, Callable[[Path, int], None]] = {
+    "evt2.raw": write_evt2,
+    "evt3.raw": write_evt3,
+    "cd.dat": write_dat,
+    "lz4.aedat4": write_aedat4,
+    "arrays.bag": write_arrays,
+    "packets.bag": write_packets,
+}
+
+
+def count_events(reader: str, path: Path) -> int:
+    """Reads a file from end to end, in pieces."""
+    if reader == "aenerf":
+        from aenerf_ns.dataparsers.event_files import open_event_file
+
+        return sum(map(len, open_event_file(path).chunks()))
+    import faery
+
+    return sum(map(len, faery.events_stream_from_file(path)))
+
+
+def measure(reader: str, small: Path, path: Path) -> dict:
+    """Runs one measurement in this process."""
+    count_events(reader, small)
+    before = _peak_mib()
+    begin = time.process_time()
+    count = count_events(reader, path)
+    seconds = time.process_time() - begin
+    row = {
+        "events": count,
+        "million_events_per_second": count / seconds / 1e6,
+        "peak_mib": _peak_mib(),
+        "peak_mib_of_the_process_before": before,
+    }
+    if reader == "aenerf":
+        from aenerf_ns.dataparsers.event_files import open_event_file
+
+        begin = time.process_time()
+        open_event_file(path).time_span()
+        row["seconds_of_time_span"] = time.process_time() - begin
+    return row
+
+
+def _run(*arguments: object) -> str:
+    """Runs a part in a process of its own: this one must stay small, for the peak memory of a process counts that of
+    the process it was forked from.
+    """
+    command = [sys.executable, __file__, *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def _peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+
+
+@dataclass
+class Readers:
+    """Measure the readers of event files."""
+
+    output: Path
+    """JSON file to write."""
+    sizes: tuple[int, ...] = (1_000_000, 10_000_000)
+    """Numbers of events."""
+
+    def main(self) -> None:
+        """Measures and writes the figures."""
+        rows = []
+        with tempfile.TemporaryDirectory() as folder:
+            for name in WRITERS:
+                small, path = Path(folder) / f"small_{name}", Path(folder) / name
+                _run("--write", name, small, 1000)
+                for size in self.sizes:
+                    path.unlink(missing_ok=True)
+                    _run("--write", name, path, size)
+                    for reader in ("aenerf", "faery"):
+                        if reader == "faery" and (path.suffix not in _FAERY or not find_spec("faery")):
+                            continue
+                        measured = json.loads(_run("--measure", reader, small, path).splitlines()[-1])
+                        row = {"file": name, "reader": reader, "mib": path.stat().st_size / 2**20, **measured}
+                        rows.append(row)
+                        print(json.dumps(row, indent=2))
+        self.output.write_text(
+            json.dumps({"sensor": [_WIDTH, _HEIGHT], "rows": rows, **environment()}, indent=2) + "\n"
+        )
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--write"]:
+        WRITERS[sys.argv[2]](Path(sys.argv[3]), int(sys.argv[4]))
+    elif sys.argv[1:2] == ["--measure"]:
+        print(json.dumps(measure(sys.argv[2], Path(sys.argv[3]), Path(sys.argv[4]))))
+    else:
+        tyro.cli(Readers).main()

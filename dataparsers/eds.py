@@ -1,0 +1,103 @@
+"""EDS (Hidalgo-Carrió et al. 2022) as it is downloaded: a Prophesee event camera and a frame camera behind a beam
+splitter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
+
+from aenerf_ns.dataparsers.event_hdf5 import COLUMNS_AT_TOP, Hdf5TableFile
+from aenerf_ns.dataparsers.kalibr import read_camchain
+from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.dataparsers.views import read_image_times, views_on_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+
+# The authors' calibration of the recordings ("03_calib" in uzh-rpg/bundles-eds), which the sequences do not contain:
+# k1, k2, p1, p2, and what takes points from the frame camera's to the event camera's coordinates.
+_EVENT_CAMERA = EventCamera(
+    640,
+    480,
+    560.8520948927032,
+    560.6295819972383,
+    313.00733235019237 + 0.5,
+    217.32858679842997 + 0.5,
+    "radial_tangential",
+    (-0.09776467241921379, 0.2143738428636279, -0.004710710105172864, -0.004215916089401789, 0.0),
+)
+_FRAME_CAMERA = EventCamera(
+    640,
+    480,
+    766.536025127154,
+    767.5749459126396,
+    291.0503512057777 + 0.5,
+    227.4060484950132 + 0.5,
+    "radial_tangential",
+    (-0.36965913545735024, 0.17414034009883844, 0.003915245015812422, 0.003666687416655559, 0.0),
+)
+_EVENT_FROM_FRAME = (
+    (0.9998964430808897, -0.0020335804041023736, -0.014246672065022661, -0.00011238613157578769),
+    (0.001703024953250547, 0.9997299470300024, -0.023176123864880376, -0.0005981481496958399),
+    (0.014289955220253567, 0.02314946137886846, 0.9996298813149167, -0.004416681577516066),
+    (0.0, 0.0, 0.0, 1.0),
+)
+
+
+@dataclass
+class EdsDataParserConfig(PublishedDataParserConfig):
+    """EDS (raw download)."""
+
+    _target: type = field(default_factory=lambda: EdsDataParser)
+    calibration: Path | None = None
+    """Kalibr's camchain with the frame camera as cam0 and the event camera as cam1, in place of the authors'."""
+
+
+class EdsDataParser(EventDataParser):
+    """Reads a sequence: its events, the poses of the event camera, and every image of the frame camera."""
+
+    config: EdsDataParserConfig
+    layout = "events.h5 with stamped_groundtruth.txt"
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        return all((data / name).is_file() for name in ("events.h5", "stamped_groundtruth.txt"))
+
+    def read_recording(self) -> Recording:
+        folder = Path(self.config.data)
+        reference = read_tum_trajectory(folder / "stamped_groundtruth.txt")
+        trajectory, ground_truth = self.config.estimated(reference)
+        event_camera, frame_camera, event_from_frame = self._calibration()
+        return Recording(
+            event_file=Hdf5TableFile(folder / "events.h5", event_camera.width, event_camera.height, COLUMNS_AT_TOP),
+            event_camera=event_camera,
+            sensor=self.config.sensor(SensorModel()),
+            trajectory=trajectory,
+            ground_truth=ground_truth,
+            frame_camera=frame_camera,
+            reference_views=views_on_trajectory(
+                read_image_times(folder / "images", folder / "images_timestamps.txt", "us"), reference, event_from_frame
+            ),
+            image_encoding="linear",
+        )
+
+    def _calibration(self) -> tuple[EventCamera, EventCamera, Tensor]:
+        path = self.config.calibration
+        if path is None:
+            return _EVENT_CAMERA, _FRAME_CAMERA, torch.tensor(_EVENT_FROM_FRAME, dtype=torch.float64)
+        cameras = read_camchain(path)
+        if not {"cam0", "cam1"} <= set(cameras):
+            raise DataError(path, f"its cameras are {', '.join(cameras)}", "it must hold cam0 and cam1")
+        frame_camera, _ = cameras["cam0"]
+        event_camera, event_from_frame = cameras["cam1"]
+        return event_camera, frame_camera, event_from_frame
+
+
+eds_dataparser = DataParserSpecification(
+    config=EdsDataParserConfig(), description="EDS as downloaded: events.h5 and stamped_groundtruth.txt"
+)

@@ -1,0 +1,111 @@
+"""The synthetic scenes of E-NeRF (Klenk et al. 2023): ESIM's output in NumPy's files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+
+from aenerf_ns.dataparsers.event_arrays import XYTP_MATRIX, NpyEventFile, load_npy
+from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.dataparsers.views import read_image_times, views_on_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventFile, EventStream
+
+
+class EsimEventFolder(EventFile):
+    """A folder of .npy files with rows of x, y, t in nanoseconds and p, one stream in the order of their names."""
+
+    def _files(self) -> list[NpyEventFile]:
+        # By numbers, if they are not padded.
+        paths = sorted(self.path.glob("*.npy"), key=lambda path: [int(n) for n in re.findall(r"\d+", path.name)])
+        if not paths:
+            raise DataError(self.path, "it holds no .npy file", "copy the events of the dataset to it")
+        return [NpyEventFile(path, self.width, self.height, XYTP_MATRIX, "ns") for path in paths]
+
+    def require(self) -> None:
+        if not self.path.is_dir():
+            raise DataError(self.path, "there is no such folder of events", "check the path of the dataset")
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        for file in self._files():
+            yield from file.read_chunks()
+
+    def time_span(self) -> tuple[int, int]:
+        self.require()
+        files = [file for file in self._files() if file.count()]
+        if not files:
+            raise self.empty_error()
+        return files[0].time_span()[0], files[-1].time_span()[1]
+
+    def count(self) -> int:
+        return sum(file.count() for file in self._files())
+
+
+@dataclass
+class ENeRFEsimDataParserConfig(PublishedDataParserConfig):
+    """E-NeRF's ESIM scenes."""
+
+    _target: type = field(default_factory=lambda: ENeRFEsimDataParser)
+
+
+class ENeRFEsimDataParser(EventDataParser):
+    """Reads a scene of E-NeRF. Images are on the event sensor."""
+
+    config: ENeRFEsimDataParserConfig
+    layout = "events/*.npy with *poses_all*.txt and poses_bounds.npy"
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        return (
+            any(data.glob("*poses_all*.txt")) and (data / "poses_bounds.npy").is_file() and (data / "events").is_dir()
+        )
+
+    def read_recording(self) -> Recording:
+        folder = Path(self.config.data)
+        camera = _read_camera(folder / "poses_bounds.npy")
+        lists = sorted(folder.glob("*poses_all*.txt"))
+        if len(lists) != 1:
+            raise DataError(folder, f"it holds {len(lists)} files *poses_all*.txt", "there must be one")
+        reference = read_tum_trajectory(lists[0], "ns")
+        trajectory, ground_truth = self.config.estimated(reference)
+        return Recording(
+            event_file=EsimEventFolder(folder / "events", camera.width, camera.height),
+            event_camera=camera,
+            sensor=self.config.sensor(SensorModel()),
+            trajectory=trajectory,
+            ground_truth=ground_truth,
+            frame_camera=camera,
+            reference_views=views_on_trajectory(
+                read_image_times(folder / "images", folder / "images" / "image_stamps_ns.txt", "ns"), reference
+            ),
+            image_encoding="linear",
+        )
+
+
+def _read_camera(path: Path) -> EventCamera:
+    """The lens in LLFF's poses_bounds.npy: without distortion, its principal point in the middle as ESIM has it."""
+    if not path.is_file():
+        raise DataError(path, "there is no such file", "copy the whole scene")
+    bounds = load_npy(path)
+    if bounds.ndim != 2 or bounds.shape[1] != 17 or len(bounds) == 0 or bounds.dtype.kind != "f":
+        raise DataError(path, f"it has type {bounds.dtype} and shape {bounds.shape}", "it must be N x 17 decimals")
+    # A 3 x 5 matrix, whose last column is height, width and focal length, and two depths.
+    height, width, focal = np.asarray(bounds[0, :15], dtype=np.float64).reshape(3, 5)[:, 4].tolist()
+    try:
+        # ESIM counts from the centre of the first pixel.
+        return EventCamera(int(width), int(height), focal, focal, width / 2 + 0.5, height / 2 + 0.5)
+    except (ValueError, OverflowError) as error:
+        raise DataError(path, str(error), "its fifth column must hold height, width and focal length") from None
+
+
+enerf_esim_dataparser = DataParserSpecification(
+    config=ENeRFEsimDataParserConfig(), description="E-NeRF's ESIM scenes: events/*.npy and poses_all.txt"
+)

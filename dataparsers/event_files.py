@@ -1,0 +1,117 @@
+"""Opening an event file of any format."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from aenerf_ns.dataparsers.aedat4 import Aedat4File
+from aenerf_ns.dataparsers.ecd import EcdEventFile
+from aenerf_ns.dataparsers.event_arrays import open_array_events
+from aenerf_ns.dataparsers.event_hdf5 import open_hdf5_events
+from aenerf_ns.dataparsers.prophesee_dat import PropheseeDatFile
+from aenerf_ns.dataparsers.prophesee_header import read_header
+from aenerf_ns.dataparsers.prophesee_raw import PropheseeRawFile
+from aenerf_ns.dataparsers.rosbag import RosbagEventFile
+from aenerf_ns.dataparsers.sensor_size import sensor_size
+from aenerf_ns.dataparsers.text import TimeUnit
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream
+
+_FORMAT_OF_SUFFIX = {
+    ".raw": "raw",
+    ".dat": "dat",
+    ".aedat4": "aedat4",
+    ".bag": "bag",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".npz": "arrays",
+    ".npy": "arrays",
+    ".csv": "arrays",
+    ".txt": "text",
+}
+_WITHOUT_MAGIC = ("arrays", "text")
+
+SUFFIXES = tuple(_FORMAT_OF_SUFFIX)
+"""The endings of names of event files."""
+
+
+def open_event_file(
+    path: Path,
+    width: int | None = None,
+    height: int | None = None,
+    topic: str | None = None,
+    time_unit: TimeUnit | None = None,
+) -> EventFile:
+    """Opens an event file in the format that its first bytes tell (NumPy's and text: its suffix).
+
+    With both sizes given, a missing file is an error only when its events are asked for: a trained run opens without
+    them.
+
+    Args:
+        path: the file.
+        width: pixel columns of the sensor; needed where the file does not tell them.
+        height: pixel rows, likewise.
+        topic: the topic of a bag, or the number of the stream of an AEDAT4 file, where several hold events.
+        time_unit: of the times of HDF5, npz, npy and csv, where the file states none.
+
+    Raises:
+        DataError: the format is not known, or a size is not given and the file is missing or does not tell it.
+    """
+    if not path.exists() and width is not None and height is not None:
+        return _MissingEventFile(path, width, height)
+    if path.is_dir():
+        raise DataError(path, "it is a folder", "name the event file in it (bags of ROS 2: convert them to ROS 1)")
+    name = _format(path)
+    if name == "aedat4":
+        return Aedat4File(path, width, height, topic)
+    if name == "bag":
+        return RosbagEventFile(path, width, height, topic)
+    if topic is not None:
+        raise DataError(path, f"only bags and AEDAT4 files have topics, but {topic} was given", "leave it out")
+    if name == "raw":
+        return PropheseeRawFile(path, width, height)
+    if name == "dat":
+        return PropheseeDatFile(path, width, height)
+    size = sensor_size(path, None, width, height)
+    if name == "hdf5":
+        return open_hdf5_events(path, *size, time_unit)
+    return open_array_events(path, *size, time_unit) if name == "arrays" else EcdEventFile(path, *size)
+
+
+class _MissingEventFile(EventFile):
+    def read_chunks(self) -> Iterator[EventStream]:
+        self.require()
+        raise AssertionError("the file appeared while it was open")
+
+    def time_span(self) -> tuple[int, int]:
+        self.require()
+        raise AssertionError("the file appeared while it was open")
+
+
+def _format(path: Path) -> str:
+    if not path.is_file():
+        raise DataError(path, "there is no such event file", "check the path of the dataset")
+    suffix = path.suffix.lower()
+    with path.open("rb") as file:
+        beginning = file.read(16)
+    if not beginning:
+        raise DataError(path, "the file is empty", "record or copy it again")
+    if beginning.startswith(b"#!AER-DAT"):
+        return "aedat4"
+    if beginning.startswith(b"#ROSBAG"):
+        return "bag"
+    if beginning.startswith(b"\x89HDF\r\n\x1a\n"):
+        return "hdf5"
+    if beginning.startswith(b"% "):
+        is_raw = suffix == ".raw" or {"evt", "format"} & set(read_header(path).fields)
+        return "raw" if is_raw else "dat"
+    # A binary format would have been recognised.
+    by_suffix = _FORMAT_OF_SUFFIX.get(suffix)
+    if by_suffix in _WITHOUT_MAGIC:
+        return by_suffix
+    raise DataError(
+        path,
+        f"its format is not known (it begins with {beginning[:8]!r})",
+        "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS 1, HDF5, npz, npy, csv and text are read",
+    )

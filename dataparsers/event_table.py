@@ -1,0 +1,229 @@
+"""Events in columns of any numeric type, read piece by piece: what the formats of other projects have in common."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.dataparsers.text import NANOSECONDS, TimeUnit
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream
+
+_COLUMNS = ("x", "y", "t", "p")
+# Events read at once: 32 MB of a matrix of float64.
+_CHUNK = 1 << 20
+# Events looked at to find the unit of their times.
+SAMPLE = 4096
+_MAX_TIME = 9 * 10**18
+
+
+@dataclass(frozen=True)
+class EventLayout:
+    """Where a file has the columns of its events.
+
+    Attributes:
+        columns: for x, y, t and p the name of an array, and None for an array of numbers, the index of a column for a
+            matrix, or the name of a field for an array of records.
+        time_unit: of the times, or None for the rule of :func:`guess_time_unit`.
+        time_offset: name of a number that is to be added to all times, in their unit; 0 where it is missing.
+    """
+
+    columns: Mapping[str, tuple[str, int | str | None]]
+    time_unit: TimeUnit | None = "us"
+    time_offset: str | None = None
+
+    @property
+    def arrays(self) -> set[str]:
+        """The names of the arrays that hold columns."""
+        return {name for name, _ in self.columns.values()}
+
+
+class EventTableFile(EventFile):
+    """A file whose arrays hold events as an :class:`EventLayout` says. Readers implement :meth:`open_arrays`.
+
+    Args:
+        path: the file.
+        width: number of pixel columns of the sensor.
+        height: number of pixel rows of the sensor.
+        layout: where the columns are.
+        time_unit: of the times, in place of the layout's.
+    """
+
+    def __init__(
+        self, path: Path, width: int, height: int, layout: EventLayout, time_unit: TimeUnit | None = None
+    ) -> None:
+        super().__init__(path, width, height)
+        self._layout = layout
+        self._time_unit = layout.time_unit if time_unit is None else time_unit
+
+    @abstractmethod
+    def open_arrays(self) -> AbstractContextManager[Mapping[str, Any]]:
+        """The layout's arrays by their names, and its time offset where there is one. They are sliced along their first
+        dimension.
+
+        Raises:
+            DataError: the file or an array is missing, or cannot be read.
+        """
+
+    def read_array(self, array: Any, piece: slice) -> NDArray:
+        """A piece of one of these arrays."""
+        return array[piece]
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        with self.open_arrays() as arrays:
+            length, tick = self._length(arrays), self._tick(arrays)
+            for first in range(0, length, _CHUNK):
+                yield self._read(arrays, first, first + _CHUNK, tick)
+
+    def time_span(self) -> tuple[int, int]:
+        with self.open_arrays() as arrays:
+            length, tick = self._length(arrays), self._tick(arrays)
+            if length == 0:
+                raise self.empty_error()
+            first, last = (self._read(arrays, index, index + 1, tick) for index in (0, length - 1))
+            return int(first.t[0]), int(last.t[0])
+
+    def count(self) -> int:
+        with self.open_arrays() as arrays:
+            return self._length(arrays)
+
+    def _length(self, arrays: Mapping[str, Any]) -> int:
+        """The number of events, of arrays that have the form the layout says."""
+        lengths = {}
+        for column, (name, place) in self._layout.columns.items():
+            array = arrays[name]
+            expected = 2 if isinstance(place, int) else 1
+            if array.ndim != expected:
+                raise DataError(
+                    self.path,
+                    f"{name or 'the array'} has shape {tuple(array.shape)}",
+                    f"it must have {expected} dimension(s), the first that of the events",
+                )
+            if isinstance(place, int) and array.shape[1] <= place:
+                raise DataError(
+                    self.path,
+                    f"{name or 'the array'} has {array.shape[1]} columns",
+                    f"column {place} must hold {column} of the events",
+                )
+            if isinstance(place, str) and place not in (array.dtype.names or ()):
+                raise DataError(self.path, f"the records of {name or 'the array'} have no field {place}", _DOCS)
+            lengths[name] = len(array)
+        if len(set(lengths.values())) > 1:
+            raise DataError(self.path, f"its columns have lengths {lengths}", "store all with the same length")
+        return next(iter(lengths.values()))
+
+    def _columns(self, arrays: Mapping[str, Any], first: int, last: int) -> dict[str, NDArray]:
+        pieces = {name: self.read_array(arrays[name], slice(first, last)) for name in self._layout.arrays}
+        columns = {}
+        for column, (name, place) in self._layout.columns.items():
+            piece = pieces[name]
+            columns[column] = piece if place is None else piece[place] if isinstance(place, str) else piece[:, place]
+        return columns
+
+    def _tick(self, arrays: Mapping[str, Any]) -> int:
+        """Nanoseconds of the times' unit."""
+        if self._time_unit is None:
+            return NANOSECONDS[guess_time_unit(self._columns(arrays, 0, SAMPLE)["t"])]
+        return NANOSECONDS[self._time_unit]
+
+    def _read(self, arrays: Mapping[str, Any], first: int, last: int, tick: int) -> EventStream:
+        offset = 0 if self._layout.time_offset is None else arrays.get(self._layout.time_offset, 0)
+        return events_from_columns(
+            self._columns(arrays, first, last),
+            width=self.width,
+            height=self.height,
+            tick=tick,
+            offset=offset,
+            source=self.path,
+            first=first,
+        )
+
+
+_DOCS = "see the formats in the docs"
+
+
+def guess_time_unit(times: NDArray) -> TimeUnit:
+    """Microseconds, which event cameras count, for whole numbers; seconds for decimals.
+
+    Args:
+        times: (N,) the first times of a file.
+    """
+    if times.dtype.kind == "f" and (times != np.floor(times)).any():
+        return "s"
+    return "us"
+
+
+def events_from_columns(
+    columns: Mapping[str, NDArray],
+    *,
+    width: int,
+    height: int,
+    tick: int,
+    offset: int = 0,
+    source: str | Path,
+    first: int = 0,
+) -> EventStream:
+    """Events of columns of any numeric type.
+
+    Args:
+        columns: x, y, t and p, (N,) each. Polarities are 0 and 1, or −1 and 1.
+        width: number of pixel columns of the sensor.
+        height: number of pixel rows of the sensor.
+        tick: nanoseconds of the times' unit.
+        offset: added to the times, in their unit.
+        source: where they came from, for messages.
+        first: index of the first of these events there, for messages.
+
+    Raises:
+        DataError: a value cannot be.
+    """
+    for name in _COLUMNS:
+        if columns[name].dtype.kind not in "iufb":
+            raise DataError(source, f"column {name} has type {columns[name].dtype}", "store numbers")
+
+    def error(name: str, bad: NDArray[np.bool_], remedy: str) -> DataError:
+        index = int(np.argmax(bad))
+        return DataError(source, f"event {first + index} has {name} = {columns[name][index]:g}", remedy)
+
+    pixels = {}
+    for name, size in (("x", width), ("y", height)):
+        values = columns[name]
+        good = (values >= 0) & (values < size)
+        if values.dtype.kind == "f":
+            good &= values == np.floor(values)
+        if not good.all():
+            remedy = f"it must be a whole number below {size}: check the sensor size and the order of the columns"
+            raise error(name, ~good, remedy)
+        pixels[name] = values.astype(np.uint16)
+
+    times, polarities = columns["t"], columns["p"]
+    limit = _MAX_TIME // tick - abs(offset)
+    # NaN compares as false.
+    good = (times >= -limit) & (times <= limit) if times.dtype.kind in "if" else times <= max(limit, 0)
+    if not good.all():
+        raise error("t", ~good, "check the unit of the times and the order of the columns")
+    if times.dtype.kind == "f":
+        times = times.astype(np.float64)
+        whole = np.floor(times)
+        # In two parts: nanoseconds since 1970 would be rounded.
+        nanoseconds = (whole.astype(np.int64) + offset) * tick + np.rint((times - whole) * tick).astype(np.int64)
+    else:
+        nanoseconds = (times.astype(np.int64) + offset) * tick
+
+    # Written with care for booleans and unsigned integers.
+    positive, zero = polarities == 1, polarities == 0
+    good = positive | zero | (polarities == -1)
+    if not good.all():
+        raise error("p", ~good, "polarities are 0 and 1, or -1 and 1: check the order of the columns")
+    negative = ~positive
+    if zero.any() and (negative & ~zero).any():
+        raise error("p", zero, "there are events of polarity -1 beside it: use 0 and 1, or -1 and 1")
+    p = np.where(positive, np.int8(1), np.int8(-1))
+    return EventStream(pixels["x"], pixels["y"], nanoseconds, p, width, height, source)

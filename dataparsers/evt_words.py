@@ -1,0 +1,202 @@
+"""Decoding of Prophesee's event encodings EVT 2.0 and EVT 3.0.
+
+https://docs.prophesee.ai/stable/data/encoding_formats/evt2.html and evt3.html
+
+This module imports numba: import it only where events are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+
+# Events given at once: 13 MB.
+_CHUNK = 1 << 20
+# Events in one word, at most.
+_MOST_PER_WORD = 12
+
+# What a decoder remembers from one word to the next.
+_HIGH, _LOW, _ROW, _BASE, _POLARITY, _OFFSET = range(6)
+_UNKNOWN = np.iinfo(np.int64).min
+
+_EVT2_HIGH_BITS = 28
+_EVT3_HIGH_BITS = 12
+# Steps of 4.096 ms by which the upper bits of a time may be behind without having wrapped. Such files are out of order
+# and are rejected; but a smaller value, like a larger one, is a time further ahead, up to 16.7 s.
+_EVT3_BEHIND = 16
+
+Columns = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
+
+
+def initial_state(offset: int = 0) -> NDArray[np.int64]:
+    """The state of a decoder that has seen nothing.
+
+    Args:
+        offset: nanoseconds to add to every time.
+    """
+    state = np.full(6, _UNKNOWN, dtype=np.int64)
+    state[_OFFSET] = offset
+    return state
+
+
+@numba.njit(cache=True)
+def _decode_evt2(words, position, x, y, t, p, n, state):
+    high, offset = state[_HIGH], state[_OFFSET]
+    mask = (1 << _EVT2_HIGH_BITS) - 1
+    half = 1 << (_EVT2_HIGH_BITS - 1)
+    while position < words.shape[0] and n + _MOST_PER_WORD <= x.shape[0]:
+        word = np.int64(words[position])
+        kind = word >> 28
+        if kind <= 0x1:
+            if high != _UNKNOWN:
+                x[n] = (word >> 11) & 0x7FF
+                y[n] = word & 0x7FF
+                t[n] = ((high << 6) | ((word >> 22) & 0x3F)) * 1000 + offset
+                p[n] = 2 * kind - 1
+                n += 1
+        elif kind == 0x8:
+            new = word & mask
+            # The nearest time with these lower bits: the 34 bits of a time wrap every 4.8 h.
+            high = new if high == _UNKNOWN else high + ((new - high + half) & mask) - half
+        elif kind != 0xA and kind != 0xE and kind != 0xF:
+            break
+        position += 1
+    state[_HIGH] = high
+    return position, n
+
+
+@numba.njit(cache=True)
+def _decode_evt3(words, position, x, y, t, p, n, state):
+    high, low, row = state[_HIGH], state[_LOW], state[_ROW]
+    base, polarity, offset = state[_BASE], state[_POLARITY], state[_OFFSET]
+    mask = (1 << _EVT3_HIGH_BITS) - 1
+    time = ((high << 12) | low) * 1000 + offset
+    ready = high != _UNKNOWN and low != _UNKNOWN and row != _UNKNOWN
+    while position < words.shape[0] and n + _MOST_PER_WORD <= x.shape[0]:
+        word = np.int64(words[position])
+        kind = word >> 12
+        value = word & 0xFFF
+        if kind == 0x2:  # an event
+            if ready:
+                x[n] = value & 0x7FF
+                y[n] = row
+                t[n] = time
+                p[n] = 1 if value & 0x800 else -1
+                n += 1
+        elif kind == 0x0:  # the row of what follows
+            row = value & 0x7FF
+            ready = high != _UNKNOWN and low != _UNKNOWN
+        elif kind == 0x6:  # lower 12 bits of the time
+            low = value
+            time = ((high << 12) | low) * 1000 + offset
+            ready = high != _UNKNOWN and row != _UNKNOWN
+        elif kind == 0x8:  # bits 12 to 23 of the time, repeated every 16 us
+            if high == _UNKNOWN:
+                high = value
+                low = _UNKNOWN
+            elif value != high & mask:
+                high += ((value - high + _EVT3_BEHIND) & mask) - _EVT3_BEHIND
+                time = (high << 12) * 1000 + offset
+                if low != _UNKNOWN:
+                    # Only until the lower bits follow.
+                    low = 0
+        elif kind == 0x3:  # where the following vectors begin
+            base = value & 0x7FF
+            polarity = 1 if value & 0x800 else -1
+        elif kind == 0x4 or kind == 0x5:  # 12 or 8 neighbouring pixels of a row
+            length = 12 if kind == 0x4 else 8
+            if ready and base != _UNKNOWN:
+                for bit in range(length):
+                    if (value >> bit) & 1:
+                        # Beyond any sensor, but not so far that it would come round.
+                        x[n] = min(base + bit, 0xFFFF)
+                        y[n] = row
+                        t[n] = time
+                        p[n] = polarity
+                        n += 1
+                base += length
+        elif kind != 0x7 and kind != 0xA and kind != 0xE and kind != 0xF:
+            break
+        position += 1
+    state[_HIGH], state[_LOW], state[_ROW], state[_BASE], state[_POLARITY] = high, low, row, base, polarity
+    return position, n
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """An encoding of events in words.
+
+    Attributes:
+        name: its name, for messages.
+        dtype: type of a word.
+        decode: decodes words from a position on until they end, the columns are full or a word is unknown. Returns
+            the position and the number of events in the columns.
+    """
+
+    name: str
+    dtype: np.dtype
+    decode: Callable
+
+
+# Words that carry no event (triggers and those of vendors) are passed over; kinds that are not documented are not.
+EVT2 = Encoding("EVT 2.0", np.dtype("<u4"), _decode_evt2)
+EVT3 = Encoding("EVT 3.0", np.dtype("<u2"), _decode_evt3)
+
+
+def decode_words(
+    blocks: Iterable[NDArray], encoding: Encoding, state: NDArray[np.int64], source: Path
+) -> Iterator[Columns]:
+    """Decodes words to events. What comes before the first complete time cannot be dated and is left out.
+
+    Args:
+        blocks: (N,) words in pieces; a piece may end anywhere.
+        encoding: the encoding of the words.
+        state: from :func:`initial_state`; whoever makes the blocks may reset it between two of them.
+        source: the file, for messages.
+
+    Yields:
+        Columns x, y, t (nanoseconds) and p (±1) of about a million events each. Their order in time is not checked.
+
+    Raises:
+        DataError: a word is of a kind that the encoding does not have.
+    """
+    num_before = n = 0
+    columns = _empty_columns()
+    for block in blocks:
+        position = 0
+        while True:
+            position, n = encoding.decode(block, position, *columns, n, state)
+            if position == len(block):
+                break
+            if n + _MOST_PER_WORD <= _CHUNK:
+                raise DataError(
+                    source,
+                    f"word {num_before + position} is {block[position]:#x}, which {encoding.name} does not have",
+                    "the file is damaged or in another encoding: copy or record it again",
+                )
+            yield _first(columns, n)
+            columns, n = _empty_columns(), 0
+        num_before += len(block)
+    if n:
+        yield _first(columns, n)
+
+
+def _empty_columns() -> Columns:
+    return (
+        np.empty(_CHUNK, np.uint16),
+        np.empty(_CHUNK, np.uint16),
+        np.empty(_CHUNK, np.int64),
+        np.empty(_CHUNK, np.int8),
+    )
+
+
+def _first(columns: Columns, n: int) -> Columns:
+    x, y, t, p = columns
+    return x[:n], y[:n], t[:n], p[:n]

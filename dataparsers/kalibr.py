@@ -1,0 +1,69 @@
+"""Cameras in the YAML that Kalibr writes ("camchain")."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from aenerf_ns.dataparsers.metadata import Metadata
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera, LensModel
+
+_LENS_MODELS: dict[str, LensModel] = {
+    "radtan": "radial_tangential",
+    "equidistant": "fisheye",
+    "none": "radial_tangential",
+}
+
+
+def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
+    """The cameras of a camchain by their names.
+
+    Returns:
+        For each its lens, and the (4, 4) float64 matrix that takes points from the first camera's to its coordinates.
+
+    Raises:
+        DataError: the file is missing or malformed, or a camera model is not known here.
+    """
+    if not path.is_file():
+        raise DataError(path, "there is no such file", "give the camchain that Kalibr wrote")
+    try:
+        chain: Any = yaml.safe_load(path.read_text(encoding="utf-8", errors="replace"))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "copy it again") from None
+    if not isinstance(chain, dict) or not all(isinstance(block, dict) for block in chain.values()) or not chain:
+        raise DataError(path, "not a list of cameras", "give the camchain that Kalibr wrote")
+    cameras: dict[str, tuple[EventCamera, Tensor]] = {}
+    from_first = torch.eye(4, dtype=torch.float64)
+    for name in sorted(map(str, chain)):
+        meta = Metadata(path, chain[name], f"{name}.")
+        step = meta.matrix("T_cn_cnm1")
+        if cameras and step is not None:
+            from_first = step @ from_first
+        cameras[name] = (_camera(meta), from_first)
+    return cameras
+
+
+def _camera(meta: Metadata) -> EventCamera:
+    if meta.get("camera_model", str, "pinhole") != "pinhole":
+        raise meta.error("camera_model", f"is {meta.get('camera_model', str)!r}, not 'pinhole'")
+    model = meta.get("distortion_model", str, "radtan")
+    if model not in _LENS_MODELS:
+        raise meta.error("distortion_model", f"is {model!r}, not one of {', '.join(_LENS_MODELS)}")
+    lens = _LENS_MODELS[model]
+    fx, fy, cx, cy = meta.numbers("intrinsics", meta.get("intrinsics", list), (4,)).tolist()
+    width, height = meta.numbers("resolution", meta.get("resolution", list), (2,)).tolist()
+    distortion = [0.0] * 4
+    if model != "none":
+        distortion = meta.numbers("distortion_coeffs", meta.get("distortion_coeffs", list), (4,)).tolist()
+    if lens == "radial_tangential":
+        distortion.append(0.0)
+    try:
+        # Kalibr counts from the centre of the first pixel.
+        return EventCamera(int(width), int(height), fx, fy, cx + 0.5, cy + 0.5, lens, tuple(distortion))
+    except ValueError as error:
+        raise meta.error("intrinsics:", str(error)) from None

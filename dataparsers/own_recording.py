@@ -1,0 +1,220 @@
+"""A recording of one's own: a file of events, the camera's calibration, and poses from wherever."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from aenerf_ns.dataparsers.event_files import SUFFIXES, open_event_file
+from aenerf_ns.dataparsers.kalibr import read_camchain
+from aenerf_ns.dataparsers.metadata import Metadata, read_camera
+from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
+from aenerf_ns.dataparsers.text import TimeUnit
+from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.dataparsers.views import read_image_list, views_on_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventFile
+from aenerf_ns.image_encoding import ImageEncoding
+from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous, require_rigid
+
+_CALIBRATIONS = ("calibration.json", "camchain.yaml")
+
+
+@dataclass
+class OwnRecordingDataParserConfig(PublishedDataParserConfig):
+    """A recording of your own."""
+
+    _target: type = field(default_factory=lambda: OwnRecordingDataParser)
+    events: Path | None = None
+    """The file of events. By default the one in the folder that is named "events", whatever its format."""
+    event_topic: str | None = None
+    """Topic of a bag, or number of the stream of an AEDAT4 file, where several hold events."""
+    event_time_unit: TimeUnit | None = None
+    """Unit of the times of npz, npy and csv. By default whole numbers are microseconds and decimals seconds."""
+    calibration: Path | None = None
+    """The cameras: calibration.json, or the camchain.yaml that Kalibr writes. By default the one in the folder."""
+    event_camera: str | None = None
+    """Name of the event camera in a camchain of several cameras, such as cam1."""
+    frame_camera: str | None = None
+    """Name in the camchain of the camera that took the images, where that is another."""
+    poses: Path | None = None
+    """Poses of the event camera as t tx ty tz qx qy qz qw in seconds, camera-to-world, OpenCV camera axes. By default
+    trajectory.txt in the folder."""
+    colmap: Path | None = None
+    """In place of these a COLMAP model, whose images are listed with their times in images.txt. By default the folder's
+    "colmap", where there is no trajectory.txt."""
+    images: Path | None = None
+    """Lines of the time in seconds and the file of an image. By default images.txt in the folder, if it is there."""
+
+
+class OwnRecordingDataParser(EventDataParser):
+    """Reads a folder in which the files have the names that the options say, or those that the options give."""
+
+    config: OwnRecordingDataParserConfig
+    layout = (
+        f"events{{{','.join(SUFFIXES)}}} with {' or '.join(_CALIBRATIONS)} and trajectory.txt or a COLMAP model "
+        "in colmap"
+    )
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        return any((data / name).is_file() for name in _CALIBRATIONS) and (
+            (data / "trajectory.txt").is_file() or (data / "colmap").is_dir()
+        )
+
+    def read_recording(self) -> Recording:
+        folder, config = Path(self.config.data), self.config
+        if not folder.is_dir():
+            raise DataError(folder, "there is no such folder", "give the folder of the recording as --data")
+        calibration = _read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
+        event_camera = calibration.event_camera
+        images = folder / "images.txt" if config.images is None else config.images
+        timed = read_image_list(images) if config.images is not None or images.is_file() else []
+        poses = folder / "trajectory.txt" if config.poses is None else config.poses
+        if config.colmap is not None or (config.poses is None and not poses.is_file() and (folder / "colmap").is_dir()):
+            model = folder / "colmap" if config.colmap is None else config.colmap
+            if not timed:
+                raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
+            reference = _read_colmap(model, timed, images, calibration.frame_from_event)
+        else:
+            reference = read_tum_trajectory(poses)
+        trajectory, ground_truth = config.estimated(reference)
+        return Recording(
+            event_file=self._event_file(folder, event_camera),
+            event_camera=event_camera,
+            sensor=config.sensor(calibration.sensor),
+            trajectory=trajectory,
+            ground_truth=ground_truth,
+            frame_camera=calibration.frame_camera,
+            reference_views=views_on_trajectory(
+                timed,
+                reference,
+                torch.linalg.inv(calibration.frame_from_event),
+                max_pose_gap=config.max_pose_gap_ns,
+            ),
+            image_encoding=calibration.image_encoding,
+        )
+
+    def _calibration_file(self, folder: Path) -> Path:
+        if self.config.calibration is not None:
+            return self.config.calibration
+        found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
+        if len(found) != 1:
+            raise DataError(
+                folder,
+                f"it holds {len(found)} of {' and '.join(_CALIBRATIONS)}",
+                "give the calibration as --calibration",
+            )
+        return found[0]
+
+    def _event_file(self, folder: Path, camera: EventCamera) -> EventFile:
+        path = self.config.events
+        if path is None:
+            found = sorted(folder / f"events{suffix}" for suffix in SUFFIXES)
+            found = [file for file in found if file.is_file()]
+            if len(found) != 1:
+                raise DataError(
+                    folder,
+                    f"it holds {len(found)} files events{{{','.join(SUFFIXES)}}}",
+                    "give the file of events as --events",
+                )
+            path = found[0]
+        # So that opening a trained run needs no events.
+        self.config.events = path
+        config = self.config
+        return open_event_file(path, camera.width, camera.height, config.event_topic, config.event_time_unit)
+
+
+@dataclass(frozen=True)
+class _Calibration:
+    """Both cameras, the sensor, and what takes points from the event camera's to the frame camera's coordinates."""
+
+    event_camera: EventCamera
+    frame_camera: EventCamera
+    frame_from_event: Tensor
+    sensor: SensorModel
+    image_encoding: ImageEncoding
+
+
+def _read_calibration(path: Path, event_camera: str | None, frame_camera: str | None) -> _Calibration:
+    if path.suffix == ".json":
+        return _read_json(path)
+    cameras = read_camchain(path)
+    if event_camera is None and len(cameras) > 1:
+        raise DataError(path, f"its cameras are {', '.join(cameras)}", "name that of the events as --event-camera")
+    event_name = next(iter(cameras)) if event_camera is None else event_camera
+    frame_name = event_name if frame_camera is None else frame_camera
+    for name in (event_name, frame_name):
+        if name not in cameras:
+            raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
+    event, event_from_first = cameras[event_name]
+    frame, frame_from_first = cameras[frame_name]
+    return _Calibration(event, frame, frame_from_first @ torch.linalg.inv(event_from_first), SensorModel(), "linear")
+
+
+def _read_json(path: Path) -> _Calibration:
+    """The names of the native dataset's transforms.json."""
+    meta = Metadata.read(path)
+    block = meta.block("event_camera")
+    event = read_camera(block, "width", "height")
+    frame_from_event = block.matrix("T_frame_event")
+    if frame_from_event is None:
+        frame_from_event = torch.eye(4, dtype=torch.float64)
+    require_rigid(frame_from_event[None], f"{path}: event_camera.T_frame_event")
+    encoding = meta.get("image_encoding", str, "srgb")
+    if encoding not in ("srgb", "linear"):
+        raise meta.error("image_encoding", f'is "{encoding}", not "srgb" or "linear"')
+    default = SensorModel()
+    try:
+        sensor = SensorModel(
+            block.get("positive_contrast_threshold", float, default.positive_contrast_threshold),
+            block.get("negative_contrast_threshold", float, default.negative_contrast_threshold),
+            block.get("refractory_period_ns", int, 0),
+            block.get("bayer_pattern", str, ""),
+        )
+    except DataError:
+        raise
+    except ValueError as error:
+        raise block.error("sensor:", str(error)) from None
+    frame = read_camera(meta, "w", "h") if "w" in meta else event
+    return _Calibration(event, frame, frame_from_event, sensor, encoding)
+
+
+def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:
+    """The event camera's trajectory of the images that a COLMAP model places."""
+    # Late, for every command of every method would wait for it.
+    import pycolmap
+
+    folders = [folder for folder in (model, model / "sparse" / "0", model / "0") if any(folder.glob("images.*"))]
+    if not folders:
+        raise DataError(model, "there is no COLMAP model", "give the folder that holds images.bin or images.txt")
+    try:
+        placed = [image for image in pycolmap.Reconstruction(folders[0]).images.values() if image.has_pose]
+        poses = {image.name: image.cam_from_world().inverse().matrix() for image in placed}
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise DataError(folders[0], f"not a COLMAP model ({' '.join(str(error).split())})", "copy it again") from None
+    known: dict[int, Any] = {}
+    for name, pose in poses.items():
+        times = [time for time, file in timed if file.as_posix().endswith(f"/{name}")]
+        if len(times) != 1:
+            raise DataError(images, f"it lists {name} {len(times)} times", "list every image of the COLMAP model once")
+        known[times[0]] = pose
+    order = sorted(known)
+    if len(order) < len(timed):
+        CONSOLE.print(f"COLMAP placed {len(order)} of the {len(timed)} images: poses are interpolated between these.")
+    frames = homogeneous(torch.from_numpy(np.array([known[time] for time in order]).reshape(-1, 3, 4)))
+    return Trajectory(order, frames @ frame_from_event, folders[0])
+
+
+own_recording_dataparser = DataParserSpecification(
+    config=OwnRecordingDataParserConfig(), description="your own recording: events, calibration and poses"
+)

@@ -1,0 +1,122 @@
+"""The format of PAEv3D (Wang et al. 2024): a matrix of events, and poses as VisionBlender writes them."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
+
+from aenerf_ns.dataparsers.event_arrays import NPZ_ERRORS, read_npy_header
+from aenerf_ns.dataparsers.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
+from aenerf_ns.dataparsers.eventnerf import UNIT_SPHERE, EvenPosesDataParserConfig, read_intrinsics
+from aenerf_ns.dataparsers.recording import EventDataParser, Recording
+from aenerf_ns.dataparsers.views import image_files, views_on_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, require_rigid
+
+_WIDTH, _HEIGHT = 640, 480
+# All that NumPy's arrays and numbers need. A pickle may otherwise run what it likes.
+_HARMLESS = {("_reconstruct", "multiarray"), ("scalar", "multiarray"), ("ndarray", "numpy"), ("dtype", "numpy")}
+
+
+@dataclass
+class PAEv3DDataParserConfig(EvenPosesDataParserConfig):
+    """PAEv3D."""
+
+    _target: type = field(default_factory=lambda: PAEv3DDataParser)
+
+
+class PAEv3DDataParser(EventDataParser):
+    """Reads a scene, of which the folder of events is given, or the dataset's folder where it holds one scene."""
+
+    config: PAEv3DDataParserConfig
+    layout = "H5_Files/SCENE/event.h5 with Render_info/SCENE and Intrinsics"
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        return bool(_scenes(data))
+
+    def read_recording(self) -> Recording:
+        data = Path(self.config.data)
+        scenes = _scenes(data)
+        if not scenes:
+            raise DataError(data, "there is no H5_Files/SCENE", "give the dataset's folder, or H5_Files/SCENE in it")
+        if len(scenes) > 1:
+            raise DataError(data, f"it holds {len(scenes)} scenes", f"give one as --data, such as {scenes[0]}")
+        scene, root = scenes[0], scenes[0].parents[1]
+        camera = read_intrinsics(root / "Intrinsics", _WIDTH, _HEIGHT)
+        event_file = Hdf5TableFile(scene / "event.h5", _WIDTH, _HEIGHT, TXYP_MATRIX, self.config.time_unit)
+        folder = root / "Render_info" / scene.name
+        files = sorted(folder.glob("*.npz"))
+        if not files:
+            raise DataError(folder, "it holds no .npz file", "copy the poses of the scene to it")
+        poses = torch.stack([_camera_pose(file) for file in files])
+        # The first is at the first event, the last at the last.
+        reference = self.config.spread(poses @ OPENCV_TO_OPENGL, event_file, folder)
+        trajectory, ground_truth = self.config.estimated(reference)
+        images = image_files(folder)
+        if images and len(images) != len(files):
+            raise DataError(folder, f"it holds {len(images)} images for {len(files)} poses", "copy all of them")
+        timed = list(zip(reference.times.tolist(), images, strict=True)) if images else []
+        return Recording(
+            event_file=event_file,
+            event_camera=camera,
+            sensor=self.config.sensor(SensorModel()),
+            trajectory=trajectory,
+            ground_truth=ground_truth,
+            frame_camera=camera,
+            reference_views=views_on_trajectory(timed, reference),
+            image_encoding="srgb",
+            scene_box=self.config.scene_box(UNIT_SPHERE),
+        )
+
+
+def _scenes(data: Path) -> list[Path]:
+    """The folders of events. A trained run is opened without them, so the folder suffices."""
+    if data.parent.name == "H5_Files":
+        return [data]
+    return sorted(path for path in data.glob("H5_Files/*") if path.is_dir())
+
+
+class _HarmlessUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (name, module.split(".")[-1]) not in _HARMLESS or module.split(".")[0] != "numpy":
+            raise pickle.UnpicklingError(f"it asks for {module}.{name}")
+        return super().find_class(module, name)
+
+
+def _camera_pose(path: Path) -> Tensor:
+    """(4, 4) camera-to-world pose, OpenGL camera axes, of VisionBlender's object_poses."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("object_poses.npy") as member:
+            _, _, dtype = read_npy_header(member)
+            # An array of dictionaries, which NumPy would unpickle whatever is in it.
+            objects = _HarmlessUnpickler(member).load() if dtype.hasobject else None
+    except (*NPZ_ERRORS, KeyError, pickle.UnpicklingError, AttributeError, ImportError, IndexError, TypeError) as error:
+        raise DataError(path, f"its object_poses cannot be read ({error})", "copy it again") from None
+    for entry in np.asarray(objects, dtype=object).ravel().tolist():
+        if isinstance(entry, dict) and str(entry.get("name")) == "Camera":
+            pose = np.asarray(entry.get("pose"))
+            if pose.shape != (4, 4) or pose.dtype.kind not in "iuf":
+                raise DataError(
+                    path, f"its camera's pose has type {pose.dtype} and shape {pose.shape}", "copy it again"
+                )
+            matrix = torch.from_numpy(pose.astype(np.float64))
+            if not matrix.isfinite().all():
+                raise DataError(path, "its camera's pose is not finite", "drop it, and its image")
+            require_rigid(matrix[None], path)
+            return matrix
+    raise DataError(path, "its object_poses hold no 'Camera'", "render it with VisionBlender again")
+
+
+paev3d_dataparser = DataParserSpecification(
+    config=PAEv3DDataParserConfig(), description="PAEv3D: H5_Files, Render_info and Intrinsics"
+)

@@ -1,0 +1,97 @@
+"""RAW files of Prophesee cameras, in the encodings EVT 2.0 and EVT 3.0.
+
+https://docs.prophesee.ai/stable/data/file_formats/raw.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.dataparsers.prophesee_header import PropheseeHeader, read_header
+from aenerf_ns.dataparsers.sensor_size import sensor_size
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream
+
+if TYPE_CHECKING:
+    from aenerf_ns.dataparsers.evt_words import Columns
+
+# Words read at once.
+_BLOCK = 1 << 20
+
+
+class PropheseeRawFile(EventFile):
+    """A RAW file: a text header, then the words that the camera sent.
+
+    Args:
+        path: the file.
+        width: pixel columns of the sensor; needed where the header does not tell them. With both sizes given, the file
+            is not opened before its events are asked for.
+        height: pixel rows, likewise.
+
+    Raises:
+        DataError: a size is not given, and the file is missing, its header does not tell it or tells that the file
+            cannot be read.
+    """
+
+    def __init__(self, path: Path, width: int | None = None, height: int | None = None) -> None:
+        if width is None or height is None:
+            header = read_header(path)
+            _encoding_name(path, header)
+            width, height = sensor_size(path, header.size, width, height)
+        super().__init__(path, width, height)
+
+    def _decoded(self) -> Iterator[Columns]:
+        # Late, for every command of every method would wait for numba.
+        from aenerf_ns.dataparsers.evt_words import EVT2, EVT3, decode_words, initial_state
+
+        header = read_header(self.path)
+        sensor_size(self.path, header.size, self.width, self.height)
+        encoding = EVT2 if _encoding_name(self.path, header) == "EVT2" else EVT3
+        yield from decode_words(self._blocks(header.end, encoding.dtype), encoding, initial_state(), self.path)
+
+    def _blocks(self, begin: int, dtype: np.dtype) -> Iterator[NDArray]:
+        if (self.path.stat().st_size - begin) % dtype.itemsize:
+            raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
+        with self.path.open("rb") as file:
+            file.seek(begin)
+            while len(block := np.fromfile(file, dtype, _BLOCK)):
+                yield block
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        for x, y, t, p in self._decoded():
+            yield EventStream(x, y, t, p, self.width, self.height, self.path)
+
+    def time_span(self) -> tuple[int, int]:
+        # Only the lower bits of times are in the file, so that it must be gone through to count how often they wrap.
+        start = end = None
+        for _, _, t, _ in self._decoded():
+            start = int(t[0]) if start is None else start
+            end = int(t[-1])
+        if start is None or end is None:
+            raise self.empty_error()
+        return start, end
+
+
+def _encoding_name(path: Path, header: PropheseeHeader) -> str:
+    """EVT2 or EVT3."""
+    options = header.format_options
+    version = header.fields.get("evt", "")
+    name = options["name"] or {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}.get(version, version)
+    if not name:
+        raise DataError(
+            path,
+            "its header does not tell the encoding of the events",
+            'add the line "% evt 2.0" or "% evt 3.0", or convert it with metavision_file_to_dat',
+        )
+    if name not in ("EVT2", "EVT3") or options.get("endianness", "little") != "little":
+        raise DataError(
+            path,
+            f"its events are encoded as {header.fields.get('format', version)}; EVT2 and EVT3, little-endian, are read",
+            "convert it with metavision_file_to_dat",
+        )
+    return name

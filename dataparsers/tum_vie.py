@@ -1,0 +1,152 @@
+"""TUM-VIE (Klenk et al. 2021) as it is downloaded: Prophesee event cameras, motion capture, and kb4 fisheye lenses."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
+
+from aenerf_ns.dataparsers.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
+from aenerf_ns.dataparsers.metadata import Metadata
+from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
+from aenerf_ns.dataparsers.tum_trajectory import poses_from_quaternions, read_tum_trajectory
+from aenerf_ns.dataparsers.views import read_image_times, views_on_trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.events.sensor import SensorModel
+
+_EVENTS = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
+_PARTS = ("-events_left.h5", "-vi_gt_data")
+# Recorded with the first of the two calibrations; all others with the second.
+_SET_A = {"loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"}
+# Places in the calibration's lists.
+_EVENT_CAMERAS = {"left": 2, "right": 3}
+_FRAME_CAMERAS = {"left": 0, "right": 1}
+# As Robust e-NeRF estimated them: C+ / C-, and the refractory period in nanoseconds.
+_SENSOR = SensorModel(1.458 * 0.25, 0.25, 1375)
+
+
+@dataclass
+class TumVieDataParserConfig(PublishedDataParserConfig):
+    """TUM-VIE (raw download)."""
+
+    _target: type = field(default_factory=lambda: TumVieDataParser)
+    max_pose_gap_ns: int | None = 50_000_000
+    """Leave out what happened between consecutive poses that are further apart than this, in nanoseconds. The motion
+    capture at 120 Hz covers only the start and the end of long sequences."""
+
+
+class TumVieDataParser(EventDataParser):
+    """Reads a sequence from the folder that it and the calibration were downloaded to. Where the folder holds several,
+    the event file of one is given in its place; a right one selects the right cameras."""
+
+    config: TumVieDataParserConfig
+    layout = "SEQUENCE-events_left.h5 with SEQUENCE-vi_gt_data"
+
+    @classmethod
+    def recognises(cls, data: Path) -> bool:
+        return bool(_event_files(data))
+
+    def read_recording(self) -> Recording:
+        events, sequence, side = _choose(Path(self.config.data))
+        folder = events.parent
+        which = "A" if sequence in _SET_A else "B"
+        cameras = _read_json(folder, f"camera-calibration{which}.json")
+        mocap = _read_json(folder, f"mocap-imu-calibration{which}.json")
+        event_camera = _camera(cameras, _EVENT_CAMERAS[side])
+        frame_camera = _camera(cameras, _FRAME_CAMERAS[side])
+        imu_from_event = _pose(cameras.entry_block("T_imu_cam", _EVENT_CAMERAS[side]))
+        imu_from_frame = _pose(cameras.entry_block("T_imu_cam", _FRAME_CAMERAS[side]))
+        # Poses are those of the motion capture's marker.
+        marker_from_event = torch.linalg.inv(_pose(mocap.block("T_imu_marker"))) @ imu_from_event
+        ground_truth_folder = folder / f"{sequence}-vi_gt_data"
+        markers = read_tum_trajectory(ground_truth_folder / "mocap_data.txt", "us")
+        reference = markers.mapped(lambda poses: poses @ marker_from_event)
+        image_folder = ground_truth_folder / f"{side}_images"
+        images = read_image_times(image_folder, image_folder / f"image_timestamps_{side}.txt", "us")
+        trajectory, ground_truth = self.config.estimated(reference)
+        return Recording(
+            event_file=Hdf5TableFile(events, event_camera.width, event_camera.height, COLUMNS_IN_GROUP),
+            event_camera=event_camera,
+            sensor=self.config.sensor(_SENSOR),
+            trajectory=trajectory,
+            ground_truth=ground_truth,
+            frame_camera=frame_camera,
+            reference_views=views_on_trajectory(
+                images,
+                reference,
+                torch.linalg.inv(imu_from_event) @ imu_from_frame,
+                max_pose_gap=self.config.max_pose_gap_ns,
+            ),
+            image_encoding="linear",
+            max_pose_gap=self.config.max_pose_gap_ns,
+        )
+
+
+def _event_files(data: Path) -> list[Path]:
+    """Those of the sequences that a folder holds. A trained run is opened without them, so any part will do."""
+    if _EVENTS.fullmatch(data.name):
+        return [data]
+    names = {path.name.removesuffix(suffix) for suffix in _PARTS for path in data.glob(f"?*{suffix}")}
+    return [data / f"{name}-events_left.h5" for name in sorted(names)]
+
+
+def _choose(data: Path) -> tuple[Path, str, str]:
+    """The event file, and its sequence and side."""
+    files = _event_files(data)
+    if not files:
+        raise DataError(data, "there is no SEQUENCE-events_left.h5", "download a sequence to this folder")
+    if len(files) > 1:
+        raise DataError(
+            data, f"it holds {len(files)} sequences", f"give the event file of one as --data, such as {files[0]}"
+        )
+    match = _EVENTS.fullmatch(files[0].name)
+    assert match is not None
+    return files[0], match["sequence"], match["side"]
+
+
+def _read_json(folder: Path, name: str) -> Metadata:
+    """A calibration file, which is beside the sequences or, where each has a folder of its own, one folder up."""
+    place = folder.parent if not (folder / name).is_file() and (folder.parent / name).is_file() else folder
+    if not (place / name).is_file():
+        raise DataError(place / name, "there is no such file", "download the dataset's calibration to this folder")
+    return Metadata.read(place / name).block("value0")
+
+
+def _pose(meta: Metadata) -> Tensor:
+    values = np.array([[meta.get(name, float) for name in ("px", "py", "pz", "qx", "qy", "qz", "qw")]])
+    return poses_from_quaternions(meta.path, values[:, :3], values[:, 3:])[0]
+
+
+def _camera(meta: Metadata, index: int) -> EventCamera:
+    block = meta.entry_block("intrinsics", index)
+    model = block.get("camera_type", str)
+    if model != "kb4":
+        raise block.error("camera_type", f"is {model!r}, not 'kb4'")
+    values = block.block("intrinsics")
+    width, height = meta.numbers(f"resolution[{index}]", meta.entry("resolution", index), (2,)).tolist()
+    try:
+        return EventCamera(
+            int(width),
+            int(height),
+            fx=values.get("fx", float),
+            fy=values.get("fy", float),
+            cx=values.get("cx", float) + 0.5,
+            cy=values.get("cy", float) + 0.5,
+            lens_model="fisheye",
+            distortion=tuple(values.get(name, float) for name in ("k1", "k2", "k3", "k4")),
+        )
+    except DataError:
+        raise
+    except ValueError as error:
+        raise block.error("intrinsics:", str(error)) from None
+
+
+tum_vie_dataparser = DataParserSpecification(
+    config=TumVieDataParserConfig(), description="TUM-VIE as downloaded: events, vi_gt_data and calibration"
+)
