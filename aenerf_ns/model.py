@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -43,8 +42,6 @@ from aenerf_ns.temporal import log_radiance_rate
 
 # ε of the paper's appendix "Model Architecture": the least radiance that can be rendered.
 _RADIANCE_EPSILON = 1e-3
-# softplus of it is 1: of the size of the radiance before training.
-_INITIAL_RAW_BACKGROUND = 0.54
 
 
 @dataclass
@@ -149,7 +146,8 @@ class AENeRFModel(Model):
         else:
             self.collider = NearFarCollider(config.near_plane, config.far_plane, reset_near_plane=False)
 
-        self.field, proposal_networks = self._new_networks(distortion)
+        build = {"hash": self._hash_networks, "mlp": self._mlp_networks}[config.backbone]
+        self.field, proposal_networks = build(distortion)
         self.proposal_networks = nn.ModuleList(proposal_networks)
         self.density_fns = [network.density_fn for network in proposal_networks]
         if config.backbone == "mlp":
@@ -163,10 +161,9 @@ class AENeRFModel(Model):
             initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
         )
         background = config.background if config.background != "auto" else ("learned" if bounded else "none")
+        # softplus(0.54) = 1: of the size of the radiance before training.
         self.raw_background = (
-            Parameter(torch.full((self.sensor.num_channels,), _INITIAL_RAW_BACKGROUND))
-            if background == "learned"
-            else None
+            Parameter(torch.full((self.sensor.num_channels,), 0.54)) if background == "learned" else None
         )
         self.camera_optimizer: PoseCorrection = config.camera_optimizer.setup(
             num_cameras=self.num_train_data,
@@ -183,25 +180,7 @@ class AENeRFModel(Model):
         self.renderer_depth = DepthRenderer(method="median")
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
 
-    def _new_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, Sequence[Field]]:
-        """The field and the proposal networks, untrained."""
-        return {"hash": self._hash_networks, "mlp": self._mlp_networks}[self.config.backbone](distortion)
-
-    @torch.no_grad()
-    def begin_anew(self) -> None:
-        """Makes the field, the proposal networks and the background what they are before training; poses and the
-        sensor's parameters stay. On several processes all get those of the first."""
-        trained = nn.ModuleList([self.field, self.proposal_networks])
-        field, proposal_networks = self._new_networks(self.field.spatial_distortion)
-        untrained = nn.ModuleList([field, nn.ModuleList(proposal_networks)]).to(self.device)
-        for parameter, value in zip(trained.parameters(), untrained.parameters(), strict=True):
-            parameter.copy_(value)
-            if torch.distributed.is_initialized():
-                torch.distributed.broadcast(parameter, 0)
-        if self.raw_background is not None:
-            self.raw_background.fill_(_INITIAL_RAW_BACKGROUND)
-
-    def _hash_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, Sequence[Field]]:
+    def _hash_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, list[Field]]:
         """The field on a hash grid, and the framework's proposal networks."""
         config = self.config
         radiance_field = EventRadianceField(
@@ -236,7 +215,7 @@ class AENeRFModel(Model):
             for resolution in config.proposal_max_resolutions
         ]
 
-    def _mlp_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, Sequence[Field]]:
+    def _mlp_networks(self, distortion: SpatialDistortion | None) -> tuple[EventRadianceField, list[Field]]:
         """The paper's vanilla e-NeRF, and its one proposal e-NeRF (appendix "Model Architecture")."""
         config = self.config
         # On a position in [0, 1], which the framework's encoding multiplies by 2π: NeRF's frequencies on [-1, 1].
@@ -294,30 +273,15 @@ class AENeRFModel(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Schedules the proposal sampler as the framework's own methods do, and where poses are corrected, the restart
-        of the field."""
-        trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
-        restart = None
-        if trainer is not None:
-            restart = self.config.camera_optimizer.restart_step(trainer.config.max_num_iterations)
-
-        def begin_anew(step: int) -> None:
-            self.begin_anew()
-            for group in ("encodings", "networks"):
-                if group in optimizers.optimizers:
-                    # Adam's moments.
-                    optimizers.optimizers[group].state.clear()
+        """Schedules the proposal sampler as the framework's own methods do."""
 
         def set_anneal(step: int) -> None:
-            if restart is not None and step >= restart:
-                step -= restart
             # https://arxiv.org/pdf/2111.12077.pdf, eq. 18
             progress = min(step / max(self.config.proposal_weights_anneal_iterations, 1), 1.0)
             slope = 10.0
             self.proposal_sampler.set_anneal(slope * progress / ((slope - 1) * progress + 1))
 
         return [
-            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], begin_anew, iters=(restart,)),
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], set_anneal, update_every_num_iters=1),
             TrainingCallback(
                 [TrainingCallbackLocation.AFTER_TRAIN_ITERATION],

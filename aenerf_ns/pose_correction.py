@@ -44,13 +44,6 @@ class PoseCorrectionConfig(CameraOptimizerConfig):
     """Seconds between the knots of the spline: it can correct errors that change more slowly."""
     num_frequencies: int = 3
     """Frequencies of the network's sinusoidal encoding."""
-    restart: float = 0.33
-    """Part of the run after which the field begins anew, around the poses as they are corrected by then: one that formed
-    around wrong poses is a fog that keeps its shape when these get better. 0: never."""
-
-    def restart_step(self, max_steps: int) -> int | None:
-        """The step of a run of ``max_steps`` before which the field begins anew, or None where it does not."""
-        return (round(self.restart * max_steps) or None) if self.mode != "off" else None
 
 
 class PoseCorrection(CameraOptimizer):

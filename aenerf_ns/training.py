@@ -13,45 +13,35 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
 
 class _StepsFactor:
-    """Factor on a learning rate that rises linearly and falls at milestones; it may rise once more before these.
+    """Factor on a learning rate that rises linearly and falls at milestones.
 
     An object, since only those go into checkpoints, and of plain numbers, since current torch refuses to load others,
     such as those that the framework's exponential and cosine decay leave there.
     """
 
-    def __init__(self, warm_up: int, milestones: list[int], gamma: float, restart: int) -> None:
+    def __init__(self, warm_up: int, milestones: list[int], gamma: float) -> None:
         self.warm_up = warm_up
         self.milestones = milestones
         self.gamma = gamma
-        self.restart = restart
 
     def __call__(self, step: int) -> float:
-        rise = _rise(_since(step, self.restart), self.warm_up)
-        return rise * self.gamma ** sum(step >= milestone for milestone in self.milestones)
+        return _rise(step, self.warm_up) * self.gamma ** sum(step >= milestone for milestone in self.milestones)
 
 
 class _CosineFactor:
-    """Factor on a learning rate that is zero, rises linearly and falls as half a cosine; it may be zero and rise once
-    more while it falls. An object, see above."""
+    """Factor on a learning rate that is zero, rises linearly and falls as half a cosine. An object, see above."""
 
-    def __init__(self, delay: int, warm_up: int, last_step: int, final_factor: float, restart: int) -> None:
+    def __init__(self, delay: int, warm_up: int, last_step: int, final_factor: float) -> None:
         self.delay = delay
         self.warm_up = warm_up
         self.last_step = last_step
         self.final_factor = final_factor
-        self.restart = restart
 
     def __call__(self, step: int) -> float:
         falling = (1 + math.cos(math.pi * min(step / max(self.last_step, 1), 1.0))) / 2
-        since = _since(step, self.restart)
-        if since < self.delay:
+        if step < self.delay:
             return 0.0
-        return _rise(since - self.delay, self.warm_up) * (self.final_factor + (1 - self.final_factor) * falling)
-
-
-def _since(step: int, restart: int) -> int:
-    """Steps since the beginning or the restart."""
-    return step - restart if step >= restart else step
+        return _rise(step - self.delay, self.warm_up) * (self.final_factor + (1 - self.final_factor) * falling)
 
 
 def _rise(step: int, warm_up: int) -> float:
@@ -72,12 +62,9 @@ class RelativeMultiStepSchedulerConfig(SchedulerConfig):
     gamma: float = 0.33
     """Factor at each milestone."""
     relative_milestones: tuple[float, ...] = (0.5, 0.75, 0.9)
-    """Milestones as parts of the run, or of what is left of it when the field begins anew. The paper's 20,000, 30,000 and
-    36,000 steps are "50 %, 75 % and 90 %"."""
+    """Milestones as parts of the run. The paper's 20,000, 30,000 and 36,000 steps are "50 %, 75 % and 90 %"."""
     max_steps: tyro.conf.Suppress[int] = 0
     """Length of the run, which the trainer's configuration fills in."""
-    restart: tyro.conf.Suppress[int] = 0
-    """When the field begins anew, likewise; 0: never."""
 
 
 class RelativeMultiStepScheduler(Scheduler):
@@ -88,9 +75,8 @@ class RelativeMultiStepScheduler(Scheduler):
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """The schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
-        left = config.max_steps - config.restart
-        milestones = [config.restart + round(part * left) for part in config.relative_milestones]
-        return LambdaLR(optimizer, _StepsFactor(config.warm_up, milestones, config.gamma, config.restart))
+        milestones = [round(part * config.max_steps) for part in config.relative_milestones]
+        return LambdaLR(optimizer, _StepsFactor(config.warm_up, milestones, config.gamma))
 
 
 @dataclass
@@ -111,8 +97,6 @@ class RelativeCosineSchedulerConfig(SchedulerConfig):
     """Factor at the end of the run."""
     max_steps: tyro.conf.Suppress[int] = 0
     """Length of the run, which the trainer's configuration fills in."""
-    restart: tyro.conf.Suppress[int] = 0
-    """When the field begins anew, likewise; 0: never. The rate is zero and rises once more."""
 
 
 class RelativeCosineScheduler(Scheduler):
@@ -123,8 +107,7 @@ class RelativeCosineScheduler(Scheduler):
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """The schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
-        factor = _CosineFactor(config.delay, config.warm_up, config.max_steps, config.final_factor, config.restart)
-        return LambdaLR(optimizer, factor)
+        return LambdaLR(optimizer, _CosineFactor(config.delay, config.warm_up, config.max_steps, config.final_factor))
 
 
 @dataclass
@@ -132,8 +115,6 @@ class AENeRFTrainerConfig(TrainerConfig):
     """A trainer that tells the schedules how long the run is."""
 
     def __post_init__(self) -> None:
-        restart = self.pipeline.model.camera_optimizer.restart_step(self.max_num_iterations) or 0
         for group in self.optimizers.values():
             if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, RelativeCosineSchedulerConfig)):
                 group["scheduler"].max_steps = self.max_num_iterations
-                group["scheduler"].restart = restart
