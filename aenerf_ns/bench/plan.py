@@ -16,14 +16,15 @@ _SIMULATE = {
     "full": ("--width", "346", "--height", "260", "--validation-views", "100", "--test-views", "100"),
     "tiny": ("--width", "96", "--height", "72", "--validation-views", "20", "--test-views", "20"),
 }
-# Noise about as large as what COLMAP leaves on the benchmark's scenes: 0.5 degrees and 4 cm at easy speed, 1.1 degrees
-# and 8 cm at hard (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json).
-_POSES = {
-    "noise": ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03"),
-    "colmap": ("--poses", "colmap"),
+# At full size about what COLMAP leaves on the benchmark's scenes: 0.5 degrees and 4 cm at easy speed, 1.1 degrees and
+# 8 cm at hard (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json). With
+# fewer pixels more, or they would not see it.
+_NOISE = {
+    "full": ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03"),
+    "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
 }
 _METHOD = {"full": "aenerf", "tiny": "aenerf-small"}
-_STEPS = {"full": 30000, "tiny": 1500}
+_STEPS = {"full": 30000, "tiny": 2000}
 
 OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
     "with pose correction",
@@ -140,13 +141,14 @@ def plan(
         tables: "methods" are those of the paper's tables 1 and 3; "losses", its table 4, is of hard speed only.
         seeds: of the trainings.
         scale: "full" or, for a CPU, "tiny".
-        steps: of every training; 30,000 or 1500 by default.
+        steps: of every training; 30,000 or 2000 by default.
         simulate: more options of aenerf simulate.
         train: more options of the event method's trainings.
     """
 
     def dataset(scene: str, speed: str) -> Dataset:
-        return Dataset(scene, speed, poses, (*_SIMULATE[scale], *_POSES[poses], *simulate))
+        estimated = _NOISE[scale] if poses == "noise" else ("--poses", "colmap")
+        return Dataset(scene, speed, poses, (*_SIMULATE[scale], *estimated, *simulate))
 
     event_method, length, runs = _METHOD[scale], steps or _STEPS[scale], []
     for seed in seeds:

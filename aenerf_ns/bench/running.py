@@ -121,12 +121,12 @@ class Runner:
             # Of the framework's implementations, the one that needs no CUDA extension.
             options = ("--pipeline.model.implementation", "torch", "--pipeline.model.camera-optimizer.mode", "off",
                        "--pipeline.model.use-appearance-embedding", "False")  # fmt: skip
-            data_options = ("nerfstudio-data", "--data", str(_with_true_poses(data).resolve()))
-            self._call(run.name, *_NERFACTO, "ns-train", *common, *options, *run.options, *data_options)
+            images = ("nerfstudio-data", "--data", str(_with_true_poses(data).resolve()))
+            self._call(run.name, *_NERFACTO, "ns-train", *common, *options, *run.options, *images)
         else:
             poses = "ground-truth" if run.true_poses else "estimated"
-            data_options = ("aenerf-data", "--data", path, "--poses", poses)
-            self._call(run.name, _script("ns-train"), *common, *run.options, *data_options)
+            events = ("aenerf-data", "--data", path, "--poses", poses)
+            self._call(run.name, _script("ns-train"), *common, *run.options, *events)
 
     def _evaluate(self, run: Run, config: Path) -> dict[str, Any]:
         relative = str(config.relative_to(self._folder))
