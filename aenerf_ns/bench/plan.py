@@ -17,8 +17,8 @@ _SIMULATE = {
     "tiny": ("--width", "96", "--height", "72", "--validation-views", "20", "--test-views", "20"),
 }
 # At full size about what COLMAP leaves on the benchmark's scenes: 0.5 degrees and 4 cm at easy speed, 1.1 degrees and
-# 8 cm at hard (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json). With
-# fewer pixels more, or they would not see it.
+# 8 cm at hard (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json).
+# With fewer pixels more, or they would not see it.
 _NOISE = {
     "full": ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03"),
     "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
