@@ -1006,7 +1006,7 @@ FAULTS: dict[str, dict[str, tuple[Callable[[Path], object], str]]] = {
     },
     "event-recording-data": {
         "no folder": (lambda folder: shutil.rmtree(folder), "made: there is no such folder"),
-        "no events": (remove("events.h5"), r"it holds 0 files events\{.h5"),
+        "no events": (remove("events.h5"), r"it holds 0 files events\{.raw,"),
         "two event files": (text("events.csv", ""), "it holds 2 files events"),
         "no calibration": (remove("calibration.json"), "it holds 0 of calibration.json and camchain.yaml"),
         "no poses": (remove("trajectory.txt"), "trajectory.txt: there is no such file"),

@@ -1,11 +1,9 @@
-"""The path a user goes, through the real commands: simulate, train, resume, evaluate, render, view."""
+"""What a user does with a trained run, through the real commands: evaluate, resume, render, view, export."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -18,35 +16,13 @@ import numpy as np
 import pytest
 import torch
 import websockets.sync.client
+from commands import CPU, newest_config, run, simulate
 
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 
 # Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.
 STEPS = 300
 PSNR_MARGIN = 3.0
-CPU = ("--machine.device-type", "cpu")
-
-
-def run(*command: str | Path, cwd: Path, fails: bool = False) -> str:
-    """Runs a console script of this environment and returns its output, without terminal formatting."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200", "CUDA_VISIBLE_DEVICES": ""}
-    script = Path(sys.executable).parent / str(command[0])
-    done = subprocess.run(
-        [script, *command[1:]], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False
-    )
-    output = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", done.stdout + done.stderr)
-    assert (done.returncode != 0) == fails, output[-3000:]
-    return output
-
-
-def simulate(folder: Path, *options: str) -> Path:
-    size = ("--width", "48", "--height", "36", "--train-images", "4", "--validation-views", "4", "--test-views", "3")
-    run("aenerf", "simulate", "--output", folder, *size, *options, cwd=folder.parent)
-    return folder
-
-
-def newest_config(folder: Path) -> Path:
-    return max(folder.rglob("config.yml"), key=lambda path: path.stat().st_mtime)
 
 
 @pytest.fixture(scope="module")
@@ -79,21 +55,6 @@ def evaluate(config: Path, workspace: Path, name: str) -> dict:
 def evaluated(trained: Path, workspace: Path) -> dict:
     """What ns-eval says of the run that all tests look at."""
     return evaluate(trained, workspace, "trained")
-
-
-def test_simulated_dataset_is_seeded(workspace: Path) -> None:
-    options = ("--speed", "hard", "--pose-noise-degrees", "1", "--pose-noise-translation", "0.05", "--pose-rate", "50")
-    first = simulate(workspace / "first", *options, "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03")
-    again = simulate(workspace / "again", *options, "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03")
-    files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
-    assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
-    for name in files:
-        assert (first / name).read_bytes() == (again / name).read_bytes(), name
-    estimated, truth = (np.loadtxt(first / f"trajectory_{name}.txt") for name in ("estimated", "ground_truth"))
-    np.testing.assert_array_equal(estimated[:, 0], truth[:, 0])
-    error = np.linalg.norm(estimated[:, 1:4] - truth[:, 1:4], axis=1)
-    assert np.sqrt((error**2).mean()) == pytest.approx(0.05, rel=1e-6)
-    assert "folder exists already" in run("aenerf", "simulate", "--output", first, cwd=workspace, fails=True)
 
 
 def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, workspace: Path) -> None:
@@ -279,133 +240,3 @@ def wait_for_page(port: int, viewer: subprocess.Popen, log: Path) -> bytes:
         except OSError:
             assert time.monotonic() < deadline
             time.sleep(0.5)
-
-
-def test_neither_images_nor_ground_truth_are_trained_on(trained: Path, workspace: Path) -> None:
-    changed = workspace / "changed"
-    shutil.copytree(workspace / "room", changed)
-    (changed / "events.gone").rename(changed / "events.h5")
-    original = workspace / "original"
-    shutil.copytree(changed, original)
-    # Other true poses, far from the estimated ones: they may change what is reported and nothing else.
-    truth = np.loadtxt(changed / "trajectory_ground_truth.txt")
-    truth[:, 1:4] = 3 * truth[::-1, 1:4]
-    np.savetxt(changed / "trajectory_ground_truth.txt", truth, fmt="%.9f")
-    for image in changed.rglob("*.png"):
-        imageio.imwrite(image, np.zeros_like(imageio.imread(image)))
-    weights = []
-    for data in (original, changed):
-        run(
-            "ns-train",
-            "aenerf-small",
-            *CPU,
-            "--vis",
-            "tensorboard",
-            "--max-num-iterations",
-            "4",
-            "--optimizers.camera-opt.scheduler.delay",
-            "0",
-            "--data",
-            data,
-            cwd=workspace,
-        )
-        (checkpoint,) = (workspace / "outputs" / data.name).rglob("*.ckpt")
-        weights.append(torch.load(checkpoint, weights_only=True)["pipeline"])
-    for name, value in weights[0].items():
-        if "color_correction" not in name:
-            assert torch.equal(value, weights[1][name]), name
-    assert weights[0]["_model.camera_optimizer.twists.control_twists"].any()
-    assert not torch.equal(*(w["_model.color_correction.offset"] for w in weights))
-
-
-@pytest.mark.parametrize(
-    ("method", "small"),
-    [
-        ("aenerf", ("--pipeline.model.log2-hashmap-size", "12")),
-        ("aenerf-mlp", ("--pipeline.model.hidden-dim", "32", "--pipeline.model.proposal-hidden-dim", "16")),
-    ],
-)
-def test_the_methods_for_gpus_train_too(trained: Path, workspace: Path, method: str, small: tuple[str, ...]) -> None:
-    data = workspace / "original"
-    run(
-        "ns-train",
-        method,
-        *CPU,
-        "--vis",
-        "tensorboard",
-        "--max-num-iterations",
-        "2",
-        "--pipeline.datamanager.train-num-rays-per-batch",
-        "60",
-        *small,
-        "--data",
-        data,
-        cwd=workspace,
-    )
-    assert len(list((workspace / "outputs" / "original" / method).rglob("*.ckpt"))) == 1
-
-
-def test_the_framework_lists_the_methods_and_its_own_still_work(workspace: Path) -> None:
-    output = run("ns-train", "--help", cwd=workspace)
-    assert "aenerf " in output
-    assert "aenerf-mlp" in output
-    assert "aenerf-small" in output
-    assert "nerfacto" in output
-    assert "ecd-data" in run("ns-train", "nerfacto", "--help", cwd=workspace)
-
-
-def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Path) -> None:
-    output = run(
-        "ns-train",
-        "aenerf-small",
-        *CPU,
-        "--vis",
-        "tensorboard",
-        "--data",
-        workspace / "nothing",
-        cwd=workspace,
-        fails=True,
-    )
-    assert "Traceback" not in output
-    errors = [line for line in output.splitlines() if line.startswith("Error: ")]
-    assert len(errors) == 1
-    assert "nothing/transforms.json: there is no such file" in errors[0]
-
-
-def test_training_that_diverges_ends_with_one_line(workspace: Path) -> None:
-    data = simulate(workspace / "diverging")
-    output = run(
-        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "20", "--data", data,
-        "--optimizers.networks.optimizer.lr", "1e30",
-        cwd=workspace, fails=True,
-    )  # fmt: skip
-    assert "Traceback" not in output
-    (error,) = [line for line in output.splitlines() if line.startswith("Error: ")]
-    assert re.match(r"Error: step \d+: (loss|gradient) not finite \(", error)
-
-
-def test_a_recording_without_reference_views_trains_and_says_so_at_evaluation(trained: Path, workspace: Path) -> None:
-    none = ("--train-images", "0", "--validation-views", "0", "--test-views", "0")
-    data = simulate(workspace / "bare", *none, "--scene", "object")
-    run(
-        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "3", "--data", data,
-        cwd=workspace,
-    )  # fmt: skip
-    config = newest_config(workspace / "outputs" / "bare")
-    # What can be evaluated is the poses, as long as the true ones are known.
-    command = ("ns-eval", "--load-config", config, "--output-path", workspace / "none.json")
-    run(*command, cwd=workspace)
-    results = json.loads((workspace / "none.json").read_text())["results"]
-    assert results["num_views"] == 0
-    assert "psnr" not in results
-    assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 1
-    (data / "trajectory_ground_truth.txt").unlink()
-    output = run(*command, cwd=workspace, fails=True)
-    assert "Error: " in output
-    assert "the test split has no reference images to evaluate on" in output
-    # The renderers start from places on the trajectory then.
-    for mode in (("spiral", "--seconds", "0.1"), ("interpolate", "--interpolation-steps", "1")):
-        video = workspace / f"bare_{mode[0]}.mp4"
-        options = ("--load-config", config, "--output-path", video, "--downscale-factor", "4")
-        run("ns-render", *mode, *options, cwd=workspace)
-        assert video.stat().st_size > 0

@@ -1,0 +1,33 @@
+"""Running the real commands, for the tests that do."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+CPU = ("--machine.device-type", "cpu")
+
+
+def run(*command: str | Path, cwd: Path, fails: bool = False) -> str:
+    """Runs a console script of this environment and returns its output, without terminal formatting."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200", "CUDA_VISIBLE_DEVICES": ""}
+    script = Path(sys.executable).parent / str(command[0])
+    done = subprocess.run(
+        [script, *command[1:]], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    output = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", done.stdout + done.stderr)
+    assert (done.returncode != 0) == fails, output[-3000:]
+    return output
+
+
+def simulate(folder: Path, *options: str) -> Path:
+    size = ("--width", "48", "--height", "36", "--train-images", "4", "--validation-views", "4", "--test-views", "3")
+    run("aenerf", "simulate", "--output", folder, *size, *options, cwd=folder.parent)
+    return folder
+
+
+def newest_config(folder: Path) -> Path:
+    return max(folder.rglob("config.yml"), key=lambda path: path.stat().st_mtime)

@@ -1,0 +1,166 @@
+"""Datasets and trainings of all kinds, through the real commands."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+from commands import CPU, newest_config, run, simulate
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("workspace")
+
+
+@pytest.fixture(scope="module")
+def room(workspace: Path) -> Path:
+    """A tiny simulated room."""
+    return simulate(workspace / "room")
+
+
+def test_simulated_dataset_is_seeded(workspace: Path) -> None:
+    options = ("--speed", "hard", "--pose-noise-degrees", "1", "--pose-noise-translation", "0.05", "--pose-rate", "50")
+    first = simulate(workspace / "first", *options, "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03")
+    again = simulate(workspace / "again", *options, "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03")
+    files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
+    assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
+    for name in files:
+        assert (first / name).read_bytes() == (again / name).read_bytes(), name
+    estimated, truth = (np.loadtxt(first / f"trajectory_{name}.txt") for name in ("estimated", "ground_truth"))
+    np.testing.assert_array_equal(estimated[:, 0], truth[:, 0])
+    error = np.linalg.norm(estimated[:, 1:4] - truth[:, 1:4], axis=1)
+    assert np.sqrt((error**2).mean()) == pytest.approx(0.05, rel=1e-6)
+    assert "folder exists already" in run("aenerf", "simulate", "--output", first, cwd=workspace, fails=True)
+
+
+def test_neither_images_nor_ground_truth_are_trained_on(room: Path, workspace: Path) -> None:
+    changed = workspace / "changed"
+    shutil.copytree(room, changed)
+    # Other true poses, far from the estimated ones: they may change what is reported and nothing else.
+    truth = np.loadtxt(changed / "trajectory_ground_truth.txt")
+    truth[:, 1:4] = 3 * truth[::-1, 1:4]
+    np.savetxt(changed / "trajectory_ground_truth.txt", truth, fmt="%.9f")
+    for image in changed.rglob("*.png"):
+        imageio.imwrite(image, np.zeros_like(imageio.imread(image)))
+    weights = []
+    for data in (room, changed):
+        run(
+            "ns-train",
+            "aenerf-small",
+            *CPU,
+            "--vis",
+            "tensorboard",
+            "--max-num-iterations",
+            "4",
+            "--optimizers.camera-opt.scheduler.delay",
+            "0",
+            "--data",
+            data,
+            cwd=workspace,
+        )
+        (checkpoint,) = (workspace / "outputs" / data.name).rglob("*.ckpt")
+        weights.append(torch.load(checkpoint, weights_only=True)["pipeline"])
+    for name, value in weights[0].items():
+        if "color_correction" not in name:
+            assert torch.equal(value, weights[1][name]), name
+    assert weights[0]["_model.camera_optimizer.twists.control_twists"].any()
+    assert not torch.equal(*(w["_model.color_correction.offset"] for w in weights))
+
+
+@pytest.mark.parametrize(
+    ("method", "small"),
+    [
+        ("aenerf", ("--pipeline.model.log2-hashmap-size", "12")),
+        ("aenerf-mlp", ("--pipeline.model.hidden-dim", "32", "--pipeline.model.proposal-hidden-dim", "16")),
+    ],
+)
+def test_the_methods_for_gpus_train_too(room: Path, workspace: Path, method: str, small: tuple[str, ...]) -> None:
+    run(
+        "ns-train",
+        method,
+        *CPU,
+        "--vis",
+        "tensorboard",
+        "--max-num-iterations",
+        "2",
+        "--pipeline.datamanager.train-num-rays-per-batch",
+        "60",
+        *small,
+        "--data",
+        room,
+        cwd=workspace,
+    )
+    assert len(list((workspace / "outputs" / "room" / method).rglob("*.ckpt"))) == 1
+
+
+def test_the_framework_lists_the_methods_and_its_own_still_work(workspace: Path) -> None:
+    output = run("ns-train", "--help", cwd=workspace)
+    assert "aenerf " in output
+    assert "aenerf-mlp" in output
+    assert "aenerf-small" in output
+    assert "nerfacto" in output
+    assert "ecd-data" in run("ns-train", "nerfacto", "--help", cwd=workspace)
+
+
+def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Path) -> None:
+    output = run(
+        "ns-train",
+        "aenerf-small",
+        *CPU,
+        "--vis",
+        "tensorboard",
+        "--data",
+        workspace / "nothing",
+        cwd=workspace,
+        fails=True,
+    )
+    assert "Traceback" not in output
+    errors = [line for line in output.splitlines() if line.startswith("Error: ")]
+    assert len(errors) == 1
+    assert "nothing: there is no such folder; give the folder of a dataset as --data" in errors[0]
+
+
+def test_training_that_diverges_ends_with_one_line(workspace: Path) -> None:
+    data = simulate(workspace / "diverging")
+    output = run(
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "20", "--data", data,
+        "--optimizers.networks.optimizer.lr", "1e30",
+        cwd=workspace, fails=True,
+    )  # fmt: skip
+    assert "Traceback" not in output
+    (error,) = [line for line in output.splitlines() if line.startswith("Error: ")]
+    assert re.match(r"Error: step \d+: (loss|gradient) not finite \(", error)
+
+
+def test_a_recording_without_reference_views_trains_and_says_so_at_evaluation(workspace: Path) -> None:
+    none = ("--train-images", "0", "--validation-views", "0", "--test-views", "0")
+    data = simulate(workspace / "bare", *none, "--scene", "object")
+    run(
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "3", "--data", data,
+        cwd=workspace,
+    )  # fmt: skip
+    config = newest_config(workspace / "outputs" / "bare")
+    # What can be evaluated is the poses, as long as the true ones are known.
+    command = ("ns-eval", "--load-config", config, "--output-path", workspace / "none.json")
+    run(*command, cwd=workspace)
+    results = json.loads((workspace / "none.json").read_text())["results"]
+    assert results["num_views"] == 0
+    assert "psnr" not in results
+    assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 1
+    (data / "trajectory_ground_truth.txt").unlink()
+    output = run(*command, cwd=workspace, fails=True)
+    assert "Error: " in output
+    assert "the test split has no reference images to evaluate on" in output
+    # The renderers start from places on the trajectory then.
+    for mode in (("spiral", "--seconds", "0.1"), ("interpolate", "--interpolation-steps", "1")):
+        video = workspace / f"bare_{mode[0]}.mp4"
+        options = ("--load-config", config, "--output-path", video, "--downscale-factor", "4")
+        run("ns-render", *mode, *options, cwd=workspace)
+        assert video.stat().st_size > 0
