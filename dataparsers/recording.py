@@ -309,13 +309,7 @@ class EventDataParser(DataParser):
         config = self.config
         start, end = config.start_time_ns, config.end_time_ns
         if start is None or end is None:
-            first, last = recording.event_file.time_span()
-            if last < first:
-                raise DataError(
-                    recording.event_file.path,
-                    f"its last event, at {last} ns, is before its first, at {first} ns",
-                    "sort the events by time",
-                )
+            first, last = recording.event_file.ordered_time_span()
             start, end = first if start is None else start, last if end is None else end
         if start >= end:
             raise DataError(

@@ -130,13 +130,7 @@ class Convert:
 
     def _cut(self, recording: Recording, events: FilteredEventFile) -> Trajectory:
         """The poses that cover the time window: all of them without one."""
-        first, last = recording.event_file.time_span()
-        if last < first:
-            raise DataError(
-                recording.event_file.path,
-                f"its last event, at {last} ns, is before its first, at {first} ns",
-                "sort the events by time",
-            )
+        first, last = recording.event_file.ordered_time_span()
         start, end = events.time_span()
         if end < start:
             raise DataError(

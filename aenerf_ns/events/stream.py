@@ -133,6 +133,21 @@ class EventFile(ABC):
             DataError: the file is missing or empty.
         """
 
+    def ordered_time_span(self) -> tuple[int, int]:
+        """Times of the first and the last event, checked to be in order.
+
+        Raises:
+            DataError: the last event is before the first; or as :meth:`time_span`.
+        """
+        first, last = self.time_span()
+        if last < first:
+            raise DataError(
+                self.path,
+                f"its last event, at {last} ns, is before its first, at {first} ns",
+                "sort the events by time",
+            )
+        return first, last
+
     def count(self) -> int | None:
         """Number of events when the file tells it without being read through, else None."""
         return None
