@@ -13,9 +13,14 @@ from pathlib import Path
 
 import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
-from PIL import Image
 
-from aenerf_ns.dataparsers.recording import EventDataParser, FrameSequence, PublishedDataParserConfig, Recording
+from aenerf_ns.dataparsers.recording import (
+    EventDataParser,
+    FrameSequence,
+    PublishedDataParserConfig,
+    Recording,
+    image_size_and_mode,
+)
 from aenerf_ns.dataparsers.text import first_and_last_row, is_row, parse_numbers, read_rows
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.dataparsers.views import read_image_list, views_on_trajectory
@@ -113,7 +118,7 @@ class EcdDataParser(EventDataParser):
             trajectory=trajectory,
             ground_truth=ground_truth,
             frame_camera=frames.frame_camera,
-            reference_views=views_on_trajectory(images, reference, max_views=None),
+            reference_views=views_on_trajectory(images, reference),
             image_encoding=frames.image_encoding,
         )
 
@@ -144,8 +149,7 @@ def _image_size(image: Path | None) -> tuple[int, int]:
     """Size of the sensor: that of its frames, or of the DAVIS240C, which recorded the dataset."""
     if image is None:
         return 240, 180
-    with Image.open(image) as picture:
-        return picture.size
+    return image_size_and_mode(image)[0]
 
 
 def _read_calibration(path: Path, size: tuple[int, int]) -> EventCamera:

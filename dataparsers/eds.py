@@ -14,7 +14,7 @@ from aenerf_ns.dataparsers.event_hdf5 import COLUMNS_AT_TOP, Hdf5TableFile
 from aenerf_ns.dataparsers.kalibr import read_camchain
 from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
-from aenerf_ns.dataparsers.views import read_image_times, views_on_trajectory
+from aenerf_ns.dataparsers.views import MAX_VIEWS, read_image_times, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
@@ -84,6 +84,7 @@ class EdsDataParser(EventDataParser):
                 read_image_times(folder / "images", folder / "images_timestamps.txt", "us"), reference, event_from_frame
             ),
             image_encoding="linear",
+            max_views=MAX_VIEWS,
         )
 
     def _calibration(self) -> tuple[EventCamera, EventCamera, Tensor]:

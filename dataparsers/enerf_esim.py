@@ -13,7 +13,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from aenerf_ns.dataparsers.event_arrays import XYTP_MATRIX, NpyEventFile, load_npy
 from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
-from aenerf_ns.dataparsers.views import read_image_times, views_on_trajectory
+from aenerf_ns.dataparsers.views import MAX_VIEWS, read_image_times, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
@@ -87,6 +87,7 @@ class ENeRFEsimDataParser(EventDataParser):
                 read_image_times(folder / "images", folder / "images" / "image_stamps_ns.txt", "ns"), reference
             ),
             image_encoding="linear",
+            max_views=MAX_VIEWS,
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -124,9 +125,12 @@ class CsvEventFile(EventFile):
         whole = all(field.strip().lstrip("+-").isdigit() for field in first.split("#")[0].split(","))
         for dtype in (np.int64, np.float64) if whole else (np.float64,):
             try:
-                table = np.loadtxt(block, dtype=dtype, delimiter=",", ndmin=2)
+                with warnings.catch_warnings():
+                    # What NumPy says when it cuts the decimals off a later line.
+                    warnings.simplefilter("error", DeprecationWarning)
+                    table = np.loadtxt(block, dtype=dtype, delimiter=",", ndmin=2)
                 break
-            except (ValueError, OverflowError) as failure:
+            except (ValueError, OverflowError, DeprecationWarning) as failure:
                 error = failure
         else:
             raise DataError(self.path, f"it holds what is not a number ({error})", "write numbers only")
@@ -161,11 +165,12 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
     Raises:
         DataError: the file is missing or malformed, or holds no events in a known layout.
     """
-    if path.suffix == ".csv":
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
         return CsvEventFile(path, width, height, time_unit)
     if not path.is_file():
         raise DataError(path, "there is no such event file", "check the path of the dataset")
-    if path.suffix == ".npy":
+    if suffix == ".npy":
         layout = XYTP_MATRIX if load_npy(path).dtype.names is None else _XYTP_RECORDS
         return NpyEventFile(path, width, height, layout, time_unit)
     names = npz_members(path)

@@ -63,6 +63,8 @@ def open_event_file(
     if path.is_dir():
         raise DataError(path, "it is a folder", "name the event file in it (bags of ROS 2: convert them to ROS 1)")
     name = _format(path)
+    if time_unit is not None and name not in ("hdf5", "arrays"):
+        raise DataError(path, f"its format has a time unit, but {time_unit} was given", "leave it out")
     if name == "aedat4":
         return Aedat4File(path, width, height, topic)
     if name == "bag":

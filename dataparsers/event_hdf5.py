@@ -32,7 +32,15 @@ _WRITE_CHUNK = 1 << 18
 class Hdf5EventFile(EventFile):
     """/events/{x u16, y u16, t i64, p i8}, with the attributes ``time_unit`` ("ns", "us" or "ms") and ``time_offset``
     (an integer in that unit, added to every time) on /events.
+
+    Args:
+        path, width, height: see :class:`EventFile`.
+        time_unit: of the times where the file does not state it; "ns" by default.
     """
+
+    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
+        super().__init__(path, width, height)
+        self._time_unit = time_unit
 
     def _columns(self, file: h5py.File) -> tuple[dict[str, h5py.Dataset], int, int]:
         """The four columns, the nanoseconds of a tick, and the offset in nanoseconds."""
@@ -50,8 +58,13 @@ class Hdf5EventFile(EventFile):
         if len(set(lengths.values())) > 1:
             raise DataError(self.path, f"its columns have lengths {lengths}", "store all four with the same length")
         attributes = file["events"].attrs
-        unit, offset = (_scalar(attributes.get(*item)) for item in (("time_unit", "ns"), ("time_offset", 0)))
+        default = self._time_unit or "ns"
+        unit, offset = (_scalar(attributes.get(*item)) for item in (("time_unit", default), ("time_offset", 0)))
         unit = unit.decode() if isinstance(unit, bytes) else unit
+        if self._time_unit not in (None, unit):
+            raise DataError(
+                self.path, f"it states its time unit, {unit!r}, but {self._time_unit} was given", "leave that out"
+            )
         if unit not in _UNITS:
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
         if not isinstance(offset, (int, np.integer)):
@@ -138,7 +151,7 @@ def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | 
             getattr(column, "dtype", None) == dtype for column, dtype in zip(columns, _DTYPES.values(), strict=True)
         )
         if native and not {"ms_to_idx", "t_offset"} & set(file):
-            return Hdf5EventFile(path, width, height)
+            return Hdf5EventFile(path, width, height, time_unit)
         for layout in _LAYOUTS:
             if all(hasattr(file.get(name), "dtype") for name in layout.arrays):
                 return Hdf5TableFile(path, width, height, layout, time_unit)

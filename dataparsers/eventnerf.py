@@ -20,7 +20,7 @@ from aenerf_ns.dataparsers.recording import (
     Split,
 )
 from aenerf_ns.dataparsers.text import TimeUnit
-from aenerf_ns.dataparsers.views import image_files, views_on_trajectory
+from aenerf_ns.dataparsers.views import MAX_VIEWS, image_files, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
@@ -115,6 +115,7 @@ class EventNeRFDataParser(EventDataParser):
             sensor=self.config.sensor(SensorModel(bayer_pattern="RGGB" if self.config.color else "")),
             trajectory=trajectory,
             ground_truth=ground_truth,
+            max_views=MAX_VIEWS,
             frame_camera=camera,
             reference_views=views,
             image_encoding="srgb",

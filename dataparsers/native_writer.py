@@ -149,14 +149,21 @@ class NativeDatasetWriter:
                 frame[f"{key}_file_path"] = f"{key}/{name}"
                 (self._partial / frame[f"{key}_file_path"]).parent.mkdir(parents=True, exist_ok=True)
         if linear is not None:
-            cv2.imwrite(str(self._partial / frame["linear_file_path"]), linear[..., ::-1])
+            _write_16_bits(self._partial / frame["linear_file_path"], linear[..., ::-1])
         if depth is not None:
             # Nerfstudio's convention: 16 bits of thousandths, 0 for unknown.
             thousandths = np.rint(np.where(np.isfinite(depth), depth, 0) * 1000.0)
             thousandths[thousandths > np.iinfo(np.uint16).max] = 0
-            cv2.imwrite(str(self._partial / frame["depth_file_path"]), thousandths.astype(np.uint16))
+            _write_16_bits(self._partial / frame["depth_file_path"], thousandths.astype(np.uint16))
 
-    def add_image_file(self, split: Split, file: Path, camera_to_world: Tensor, time: int | None = None) -> None:
+    def add_image_file(
+        self,
+        split: Split,
+        file: Path,
+        camera_to_world: Tensor,
+        time: int | None = None,
+        background: tuple[float, float, float] | None = None,
+    ) -> None:
         """Adds a reference image as it is: its file is copied, once when it is added to several splits.
 
         Args:
@@ -164,12 +171,24 @@ class NativeDatasetWriter:
             file: the image.
             camera_to_world: (4, 4) pose, OpenCV camera axes; one file has one pose.
             time: in nanoseconds, when the image was taken on the trajectory.
+            background: RGB in [0, 1], in the image's encoding, that an image with an alpha channel is put on, since the
+                dataset format has no such channel; None: that is ignored.
         """
         if file in self._files:
             self._meta[f"{split}_filenames"].append(self._files[file]["file_path"])
             return
-        self._files[file] = self._add_frame(split, file.suffix, camera_to_world, time)
-        shutil.copyfile(file, self._partial / self._files[file]["file_path"])
+        with Image.open(file) as image:
+            opaque = background is None or image.mode != "RGBA"
+            if opaque:
+                self._files[file] = self._add_frame(split, file.suffix, camera_to_world, time)
+                shutil.copyfile(file, self._partial / self._files[file]["file_path"])
+                return
+            values = np.asarray(image, np.float64) / 255
+        alpha = values[..., 3:]
+        composed = values[..., :3] * alpha + np.array(background) * (1 - alpha)
+        self._files[file] = self._add_frame(split, ".png", camera_to_world, time)
+        picture = Image.fromarray(np.rint(composed * 255).astype(np.uint8))
+        picture.save(self._partial / self._files[file]["file_path"])
 
     def _add_frame(self, split: Split, suffix: str, camera_to_world: Tensor, time: int | None) -> dict[str, Any]:
         names = self._meta[f"{split}_filenames"]
@@ -184,6 +203,12 @@ class NativeDatasetWriter:
         self._meta["frames"].append(frame)
         names.append(name)
         return frame
+
+
+def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
+    # OpenCV does not raise.
+    if not cv2.imwrite(str(path), values):
+        raise OSError(f"{path} cannot be written")
 
 
 def _lens(camera: EventCamera) -> dict[str, Any]:

@@ -15,10 +15,10 @@ from torch import Tensor
 from aenerf_ns.dataparsers.event_files import SUFFIXES, open_event_file
 from aenerf_ns.dataparsers.kalibr import read_camchain
 from aenerf_ns.dataparsers.metadata import Metadata, read_camera
-from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
+from aenerf_ns.dataparsers.recording import EventDataParser, FrameSequence, PublishedDataParserConfig, Recording
 from aenerf_ns.dataparsers.text import TimeUnit
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
-from aenerf_ns.dataparsers.views import read_image_list, views_on_trajectory
+from aenerf_ns.dataparsers.views import MAX_VIEWS, read_image_list, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
@@ -39,7 +39,8 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     event_topic: str | None = None
     """Topic of a bag, or number of the stream of an AEDAT4 file, where several hold events."""
     event_time_unit: TimeUnit | None = None
-    """Unit of the times of npz, npy and csv. By default whole numbers are microseconds and decimals seconds."""
+    """Unit of the times of npz, npy and csv, and of HDF5 that states none. By default whole numbers are microseconds
+    and decimals seconds."""
     calibration: Path | None = None
     """The cameras: calibration.json, or the camchain.yaml that Kalibr writes. By default the one in the folder."""
     event_camera: str | None = None
@@ -77,11 +78,11 @@ class OwnRecordingDataParser(EventDataParser):
             raise DataError(folder, "there is no such folder", "give the folder of the recording as --data")
         calibration = _read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
         event_camera = calibration.event_camera
-        images = folder / "images.txt" if config.images is None else config.images
-        timed = read_image_list(images) if config.images is not None or images.is_file() else []
+        timed = self._timed_images(folder)
         poses = folder / "trajectory.txt" if config.poses is None else config.poses
         if config.colmap is not None or (config.poses is None and not poses.is_file() and (folder / "colmap").is_dir()):
             model = folder / "colmap" if config.colmap is None else config.colmap
+            images = self._image_list(folder)
             if not timed:
                 raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
             reference = _read_colmap(model, timed, images, calibration.frame_from_event)
@@ -102,7 +103,32 @@ class OwnRecordingDataParser(EventDataParser):
                 max_pose_gap=config.max_pose_gap_ns,
             ),
             image_encoding=calibration.image_encoding,
+            max_views=MAX_VIEWS,
         )
+
+    def read_frames(self) -> FrameSequence:
+        folder, config = Path(self.config.data), self.config
+        if config.poses or config.colmap or (folder / "trajectory.txt").is_file() or (folder / "colmap").is_dir():
+            return super().read_frames()
+        calibration = _read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
+        timed = self._timed_images(folder)
+        return FrameSequence(
+            event_file=self._event_file(folder, calibration.event_camera),
+            event_camera=calibration.event_camera,
+            sensor=config.sensor(calibration.sensor),
+            frame_camera=calibration.frame_camera,
+            files=[file for _, file in timed],
+            times=[time for time, _ in timed],
+            image_encoding=calibration.image_encoding,
+            recording=None,
+        )
+
+    def _image_list(self, folder: Path) -> Path:
+        return folder / "images.txt" if self.config.images is None else self.config.images
+
+    def _timed_images(self, folder: Path) -> list[tuple[int, Path]]:
+        images = self._image_list(folder)
+        return read_image_list(images) if self.config.images is not None or images.is_file() else []
 
     def _calibration_file(self, folder: Path) -> Path:
         if self.config.calibration is not None:

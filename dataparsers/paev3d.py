@@ -17,7 +17,7 @@ from aenerf_ns.dataparsers.event_arrays import NPZ_ERRORS, read_npy_header
 from aenerf_ns.dataparsers.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
 from aenerf_ns.dataparsers.eventnerf import UNIT_SPHERE, EvenPosesDataParserConfig, read_intrinsics
 from aenerf_ns.dataparsers.recording import EventDataParser, Recording
-from aenerf_ns.dataparsers.views import image_files, views_on_trajectory
+from aenerf_ns.dataparsers.views import MAX_VIEWS, image_files, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, require_rigid
@@ -75,6 +75,7 @@ class PAEv3DDataParser(EventDataParser):
             frame_camera=camera,
             reference_views=views_on_trajectory(timed, reference),
             image_encoding="srgb",
+            max_views=MAX_VIEWS,
             scene_box=self.config.scene_box(UNIT_SPHERE),
         )
 

@@ -67,6 +67,8 @@ class Recording:
             and scale, or None where it is not known. It serves evaluation only.
         max_pose_gap: nanoseconds; where poses are further apart, the camera's way between them is not known. None:
             poses are interpolated however far apart they are.
+        max_views: how many of the views of a split that were taken on the trajectory are used at most, evenly spread
+            over the time window; None: all.
         image_background: RGB in [0, 1] behind images that have an alpha channel, or None where that is ignored.
     """
 
@@ -80,6 +82,7 @@ class Recording:
     scene_box: Tensor | None = None
     ground_truth: Trajectory | None = None
     max_pose_gap: int | None = None
+    max_views: int | None = None
     image_background: tuple[float, float, float] | None = None
 
     @property
@@ -271,6 +274,7 @@ class EventDataParser(DataParser):
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
         else:
             views = _views_within(recording.reference_views[_as_split(split)], start, end, gaps)
+            views = thinned(views, recording.max_views)
             for view in views:
                 check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
@@ -324,6 +328,8 @@ class EventDataParser(DataParser):
     def _pose_gaps(self, recording: Recording, start: int, end: int, say: bool) -> list[tuple[int, int]]:
         """Where within the time window the poses are too far apart for interpolation."""
         longest = self.config.max_pose_gap_ns
+        if longest is not None and longest <= 0:
+            raise DataError(str(self.config.data), f"max_pose_gap_ns is {longest}", "give a positive number")
         longest = recording.max_pose_gap if longest is None else longest
         if longest is None:
             return []
@@ -372,16 +378,29 @@ def _as_split(split: str) -> Split:
 
 
 def check_image(file: Path, camera: EventCamera) -> None:
-    """Raises a DataError for an image that the framework would read wrongly."""
-    with Image.open(file) as image:
-        if image.size != (camera.width, camera.height):
-            raise DataError(
-                file,
-                f"the image has {image.width} x {image.height} pixels, its camera {camera.width} x {camera.height}",
-                "give the intrinsics of the images as they are",
-            )
-        if image.mode not in ("L", "RGB", "RGBA"):
-            raise DataError(file, f"the image is of PIL's mode {image.mode}", "store 8 bits of grey or RGB")
+    """Raises a DataError for an image that the framework cannot read, or would read wrongly."""
+    size, mode = image_size_and_mode(file)
+    if size != (camera.width, camera.height):
+        raise DataError(
+            file,
+            f"the image has {size[0]} x {size[1]} pixels, its camera {camera.width} x {camera.height}",
+            "give the intrinsics of the images as they are",
+        )
+    if mode not in ("L", "RGB", "RGBA"):
+        raise DataError(file, f"the image is of PIL's mode {mode}", "store 8 bits of grey or RGB")
+
+
+def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:
+    """Width and height in pixels, and PIL's name of what the pixels hold.
+
+    Raises:
+        DataError: the file is missing or no image.
+    """
+    try:
+        with Image.open(file) as image:
+            return image.size, image.mode
+    except OSError as error:
+        raise DataError(file, f"not an image that can be read ({error})", "copy it again") from None
 
 
 def _check_distance(poses: Tensor, reference: Trajectory) -> None:
@@ -410,6 +429,15 @@ def _views_within(views: list[ReferenceView], start: int, end: int, gaps: list[t
             f"events' {start} to {end} ns or in a gap of the poses."
         )
     return kept
+
+
+def thinned(views: list[ReferenceView], max_views: int | None) -> list[ReferenceView]:
+    """The views, of those that were taken on the trajectory at most ``max_views``, evenly spread over them."""
+    timed = [view for view in views if view.time is not None]
+    if max_views is None or len(timed) <= max_views:
+        return views
+    kept = [timed[round(i * (len(timed) - 1) / max(max_views - 1, 1))] for i in range(max_views)]
+    return [*kept, *(view for view in views if view.time is None)]
 
 
 def _training_views(trajectory: Trajectory, views: list[ReferenceView]) -> tuple[Tensor, dict[int, Path]]:

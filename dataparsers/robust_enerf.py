@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from numpy.typing import NDArray
-from PIL import Image
 
 from aenerf_ns.dataparsers.event_arrays import POSITION_TIMESTAMP_POLARITY, NpzEventFile, read_npz_member
 from aenerf_ns.dataparsers.metadata import Metadata
@@ -19,6 +18,7 @@ from aenerf_ns.dataparsers.recording import (
     Recording,
     ReferenceView,
     Split,
+    image_size_and_mode,
 )
 from aenerf_ns.dataparsers.tum_trajectory import poses_from_quaternions
 from aenerf_ns.dataparsers.views import IMAGE_SUFFIXES
@@ -184,8 +184,7 @@ def _read_view(frame: Metadata, folder: Path) -> ReferenceView:
 
 
 def _view_camera(meta: Metadata, image: Path) -> EventCamera:
-    with Image.open(image) as picture:
-        width, height = picture.size
+    width, height = image_size_and_mode(image)[0]
     try:
         if "camera_angle_x" in meta:
             focal = width / 2 / math.tan(meta.get("camera_angle_x", float) / 2)

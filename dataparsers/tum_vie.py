@@ -15,7 +15,7 @@ from aenerf_ns.dataparsers.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
 from aenerf_ns.dataparsers.metadata import Metadata
 from aenerf_ns.dataparsers.recording import EventDataParser, PublishedDataParserConfig, Recording
 from aenerf_ns.dataparsers.tum_trajectory import poses_from_quaternions, read_tum_trajectory
-from aenerf_ns.dataparsers.views import read_image_times, views_on_trajectory
+from aenerf_ns.dataparsers.views import MAX_VIEWS, read_image_times, views_on_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
@@ -84,6 +84,7 @@ class TumVieDataParser(EventDataParser):
                 max_pose_gap=self.config.max_pose_gap_ns,
             ),
             image_encoding="linear",
+            max_views=MAX_VIEWS,
             max_pose_gap=self.config.max_pose_gap_ns,
         )
 

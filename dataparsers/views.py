@@ -16,8 +16,9 @@ from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
-# Each is rendered to fit the colour correction or to evaluate, and cameras take thousands.
-_MAX_VIEWS = 40
+MAX_VIEWS = 20
+"""Images of a split that are used at most: each is rendered to fit the colour correction or to evaluate, and cameras
+take thousands."""
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -62,7 +63,6 @@ def views_on_trajectory(
     images: Sequence[tuple[int, Path]],
     trajectory: Trajectory,
     event_from_frame: Tensor | None = None,
-    max_views: int | None = _MAX_VIEWS,
     max_pose_gap: int | None = None,
 ) -> dict[Split, list[ReferenceView]]:
     """The images that were taken within the span of the poses, each at the interpolated pose of its time. They
@@ -73,7 +73,6 @@ def views_on_trajectory(
         trajectory: of the event camera, camera-to-world, OpenCV camera axes.
         event_from_frame: (4, 4) float64, takes points from the frame camera's to the event camera's coordinates, or
             None where one sensor takes both.
-        max_views: how many to keep at most, evenly spread, or None for all.
         max_pose_gap: nanoseconds between poses beyond which no image there is kept, or None.
     """
     gaps = [] if max_pose_gap is None else trajectory.gaps(max_pose_gap)
@@ -86,8 +85,6 @@ def views_on_trajectory(
         CONSOLE.print(
             f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses."
         )
-    if max_views is not None and len(kept) > max_views:
-        kept = [kept[round(i * (len(kept) - 1) / (max_views - 1))] for i in range(max_views)]
     if event_from_frame is None:
         event_from_frame = torch.eye(4, dtype=torch.float64)
     views = [

@@ -31,6 +31,7 @@ from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
 from aenerf_ns.dataparsers.recording import EventDataParserConfig, Recording
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.errors import DataError
@@ -127,6 +128,26 @@ def test_another_frame_camera_and_other_image_files_are_carried_over(tmp_path: P
     before = NativeDataParserConfig(data=data).setup().read_recording()
     assert before.frame_camera.lens_model == "fisheye"
     assert_same(before, convert(data, tmp_path / "converted"))
+
+
+def test_an_image_with_alpha_is_put_on_its_background(tmp_path: Path) -> None:
+    recording = NativeDataParserConfig(data=write_native(tmp_path / "made")).setup().read_recording()
+    pixels = np.zeros((4, 6, 4), np.uint8)
+    pixels[:, 3:] = (255, 0, 0, 255)
+    pixels[0, 0] = (0, 0, 0, 51)
+    Image.fromarray(pixels).save(tmp_path / "alpha.png")
+    camera, trajectory = recording.event_camera, recording.trajectory
+    with NativeDatasetWriter(tmp_path / "out", camera, recording.sensor, "linear") as writer:
+        writer.add_trajectories(trajectory)
+        pose = torch.eye(4, dtype=torch.float64)
+        for split in ("val", "test"):
+            writer.add_image_file(split, tmp_path / "alpha.png", pose, background=(1.0, 0.5, 1.0))
+    (file,) = (tmp_path / "out" / "images").rglob("*.png")
+    written = np.asarray(Image.open(file))
+    assert written.shape == (4, 6, 3)
+    assert written[1, 1].tolist() == [255, 128, 255]
+    assert written[1, 4].tolist() == [255, 0, 0]
+    assert written[0, 0].tolist() == [204, 102, 204]
 
 
 def test_filters_cut_events_camera_poses_and_images(tmp_path: Path) -> None:

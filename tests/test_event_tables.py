@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.dataparsers.event_arrays import NpzEventFile, open_array_events
+from aenerf_ns.dataparsers.event_files import open_event_file
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile, Hdf5EventWriter, open_hdf5_events
 from aenerf_ns.dataparsers.event_table import events_from_columns
 from aenerf_ns.errors import DataError
@@ -160,6 +161,33 @@ def test_the_unit_of_times_may_be_given(tmp_path: Path) -> None:
         assert open_array_events(tmp_path / name, WIDTH, HEIGHT).time_span() == (0, 299_000)
         assert open_array_events(tmp_path / name, WIDTH, HEIGHT, "ns").time_span() == (0, 299)
         assert open_array_events(tmp_path / name, WIDTH, HEIGHT, "s").time_span() == (0, 299 * 10**9)
+
+
+@pytest.mark.parametrize("name", ["events.csv", "EVENTS.CSV"])
+def test_decimals_behind_a_whole_number_in_csv_are_kept(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_text("x,y,t,p\n1,2,0,1\n3,2,0.000123,0\n3,2,0.25,1\n1,2,1.5,0\n")
+    file = open_array_events(path, WIDTH, HEIGHT)
+    (events,) = file.chunks()
+    assert events.t.tolist() == [0, 123_000, 250_000_000, 1_500_000_000]
+    assert file.time_span() == (0, 1_500_000_000)
+
+
+def test_a_stated_unit_counts_where_the_file_states_none(tmp_path: Path) -> None:
+    columns = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        for name, dtype in columns.items():
+            file[f"events/{name}"] = np.array([1, 1_000_000] if name == "t" else [1, 1], dtype)
+    path = tmp_path / "events.h5"
+    assert open_hdf5_events(path, WIDTH, HEIGHT).time_span() == (1, 1_000_000)
+    assert open_hdf5_events(path, WIDTH, HEIGHT, "us").time_span() == (1_000, 1_000_000_000)
+    with h5py.File(path, "a") as file:
+        file["events"].attrs["time_unit"] = "ns"
+    with pytest.raises(DataError, match="it states its time unit, 'ns', but us was given"):
+        open_hdf5_events(path, WIDTH, HEIGHT, "us").time_span()
+    (tmp_path / "events.txt").write_text("0.1 1 2 1\n")
+    with pytest.raises(DataError, match="its format has a time unit, but us was given"):
+        open_event_file(tmp_path / "events.txt", WIDTH, HEIGHT, time_unit="us")
 
 
 def test_whole_numbers_in_csv_are_exact_beyond_float64(tmp_path: Path) -> None:

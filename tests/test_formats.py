@@ -1148,3 +1148,37 @@ def test_no_text_crashes_the_trajectory_reader(
         read_tum_trajectory(path, unit)  # type: ignore[arg-type]
     except DataError as error:
         assert "\n" not in str(error)  # noqa: PT017
+
+
+def test_images_are_thinned_out_within_the_time_window(tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    write_images(truth.data / "images", 200, (60, 40))
+    start, length = START * 1_000, DURATION * 1_000
+    stamps = seconds(start + np.linspace(0, length, 200).astype(np.int64))
+    lines = [f"{stamp} images/{index:05d}.png\n" for index, stamp in enumerate(stamps)]
+    (truth.data / "images.txt").write_text("".join(lines))
+    config = config_of("event-recording-data", truth.data)
+    assert [len(outputs_of(config, split).image_filenames) for split in ("val", "test")] == [20, 20]
+    # A tenth of the time, and all of its images.
+    window = {"start_time_ns": start + length // 2, "end_time_ns": start + length * 6 // 10}
+    windowed = config_of("event-recording-data", truth.data, **window)
+    assert [len(outputs_of(windowed, split).image_filenames) for split in ("val", "test")] == [10, 10]
+    # Poses are estimated from all of them, also where there are none yet.
+    assert len(config.setup().read_frames().files) == 200
+    (truth.data / "trajectory.txt").unlink()
+    frames = config.setup().read_frames()
+    assert len(frames.files) == 200
+    assert frames.recording is None
+
+
+def test_a_broken_image_is_one_clear_line(tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    (truth.data / "images" / "00001.png").write_bytes(b"no picture")
+    with pytest.raises(DataError, match=r"00001.png: not an image that can be read"):
+        outputs_of(config_of("event-recording-data", truth.data), "test")
+
+
+def test_a_pose_gap_must_be_positive(tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    with pytest.raises(DataError, match="max_pose_gap_ns is 0"):
+        outputs_of(config_of("event-recording-data", truth.data, max_pose_gap_ns=0))

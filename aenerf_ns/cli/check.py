@@ -81,7 +81,8 @@ class Check:
         statistics, num_covered = _read(recording, left_out)
         problems = _check_events(recording, statistics) + _check_poses(recording, statistics, num_covered, left_out)
         if num_covered < _MIN_EVENTS:
-            _print(f"Contrast of warped events: not computed, for only {num_covered} events have a pose.")
+            unseen = "" if self.picture is None else " No picture is written."
+            _print(f"Contrast of warped events: not computed, for only {num_covered} events have a pose.{unseen}")
             return problems
         runs = _read_runs(recording, num_covered, left_out)
         with progress_bar() as progress:

@@ -14,7 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
 from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
-from aenerf_ns.dataparsers.recording import FrameSequence, Recording, ReferenceView, Split, check_image
+from aenerf_ns.dataparsers.recording import FrameSequence, Recording, ReferenceView, Split, check_image, thinned
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile, hot_pixel_summary
 from aenerf_ns.events.stream import EventFile, EventStream
@@ -70,6 +70,7 @@ class Convert:
         except ValueError as error:
             raise DataError("aenerf convert", str(error), "see aenerf convert --help") from None
         parser = open_dataset(self.data, self.format)
+        longest_gap = parser.config.max_pose_gap_ns
         report = None
         if self.poses == "colmap":
             recording, report = _with_estimated_poses(parser.read_frames(), self._within, self.data, self.seed)
@@ -78,7 +79,9 @@ class Convert:
         events = FilteredEventFile(recording.event_file, filters)
         trajectory = self._cut(recording, events)
         views = {
-            split: [view for view in views if view.time is None or self._within(view.time)]
+            split: thinned(
+                [view for view in views if view.time is None or self._within(view.time)], recording.max_views
+            )
             for split, views in recording.reference_views.items()
         }
         for file in {view.file for split in views.values() for view in split}:
@@ -101,7 +104,7 @@ class Convert:
                     recording.sensor,
                     recording.image_encoding,
                     scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
-                    max_pose_gap=recording.max_pose_gap,
+                    max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
                     frame_camera=recording.frame_camera,
                 ) as writer,
             ):
@@ -110,15 +113,19 @@ class Convert:
                     writer.add_poses_report(report)
                 for split, kept in views.items():
                     for view in kept:
-                        writer.add_image_file(split, view.file, view.camera_to_world, view.time)
+                        background = recording.image_background
+                        writer.add_image_file(split, view.file, view.camera_to_world, view.time, background)
                 num_read, num_written = _copy_events(recording.event_file, events, writer)
         except OSError as error:
             raise DataError(self.output, f"it cannot be written ({error})", "check the space and the rights") from None
+        # What the format does by default goes on.
+        keeps_scale = not parser.config.auto_scale_poses and recording.scene_box is None
+        unscaled = "aenerf-data --auto-scale-poses False " if keeps_scale else ""
         counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
         CONSOLE.print(
             f"{self.output}: {num_written:,} of {num_read:,} events, {len(trajectory)} poses, images: {counts}.\n"
             f"Look it over with: aenerf check --data {self.output}\n"
-            f"Train with: ns-train aenerf --data {self.output}",
+            f"Train with: ns-train aenerf {unscaled}--data {self.output}",
             highlight=False,
             soft_wrap=True,
         )

@@ -25,6 +25,8 @@ def _format_options(config: EventDataParserConfig) -> Any:
     hidden = [
         (option.name, suppress[hints[option.name]], field(default=getattr(config, option.name)))
         for option in fields(EventDataParserConfig)
+        # Which is about the recording.
+        if option.name != "max_pose_gap_ns"
     ]
     options = make_dataclass(kind.__name__, hidden, bases=(kind,), namespace={"__doc__": kind.__doc__})
     return options(**{option.name: getattr(config, option.name) for option in fields(config)})
