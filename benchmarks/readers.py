@@ -26,10 +26,14 @@ import tyro
 from numpy.typing import NDArray
 
 from aenerf_ns.bench.environment import environment
+from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventWriter
+from aenerf_ns.events.stream import EventStream
 
 _WIDTH, _HEIGHT = 1280, 720
 _START = 1_600_000_000_000_000
 _FAERY = (".raw", ".dat", ".aedat4")
+# Slow to write, and measured at the smallest size only.
+_TEXT = (".csv", ".txt")
 
 
 def events(count: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -135,6 +139,53 @@ def write_packets(path: Path, count: int) -> None:
     _write_bag(path, "event_camera_msgs/msg/EventPacket", messages)
 
 
+def _table(count: int) -> NDArray[np.int64]:
+    return np.stack(events(count), -1)
+
+
+def write_native(path: Path, count: int) -> None:
+    """Writes the dataset format of this project (gzip)."""
+    x, y, t, p = events(count)
+    with Hdf5EventWriter(path) as writer:
+        columns = x.astype(np.uint16), y.astype(np.uint16), t * 1000, (2 * p - 1).astype(np.int8)
+        writer.append(EventStream(*columns, _WIDTH, _HEIGHT))
+
+
+def write_blosc(path: Path, count: int) -> None:
+    """Writes the layout of TUM-VIE and DSEC (Blosc)."""
+    import h5py
+    import hdf5plugin
+
+    dtypes = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
+    with h5py.File(path, "w") as file:
+        for (name, dtype), values in zip(dtypes.items(), events(count), strict=True):
+            file.create_dataset(f"events/{name}", data=values.astype(dtype), chunks=(1 << 16,), **hdf5plugin.Blosc())
+        file["ms_to_idx"] = np.zeros(1, np.uint64)
+        file["t_offset"] = _START
+
+
+def write_npy(path: Path, count: int) -> None:
+    """Writes a matrix of float64, as E-NeRF's ESIM scenes have it."""
+    np.save(path, _table(count).astype(np.float64))
+
+
+def write_npz(path: Path, count: int) -> None:
+    """Writes an array for each column, compressed where the name says so."""
+    save = np.savez_compressed if "compressed" in path.name else np.savez
+    save(path, **dict(zip("xytp", events(count), strict=True)))
+
+
+def write_csv(path: Path, count: int) -> None:
+    """Writes whole microseconds."""
+    np.savetxt(path, _table(count), fmt="%d", delimiter=",", header="x,y,t,p", comments="")
+
+
+def write_text(path: Path, count: int) -> None:
+    """Writes the Event Camera Dataset's lines, in seconds."""
+    table = _table(count)
+    np.savetxt(path, np.column_stack([table[:, 2] * 1e-6, table[:, [0, 1, 3]]]), fmt=["%.6f", "%d", "%d", "%d"])
+
+
 WRITERS: dict[str, Callable[[Path, int], None]] = {
     "evt2.raw": write_evt2,
     "evt3.raw": write_evt3,
@@ -142,6 +193,13 @@ WRITERS: dict[str, Callable[[Path, int], None]] = {
     "lz4.aedat4": write_aedat4,
     "arrays.bag": write_arrays,
     "packets.bag": write_packets,
+    "native.h5": write_native,
+    "blosc.h5": write_blosc,
+    "matrix.npy": write_npy,
+    "plain.npz": write_npz,
+    "compressed.npz": write_npz,
+    "whole.csv": write_csv,
+    "ecd.txt": write_text,
 }
 
 
@@ -150,7 +208,7 @@ def count_events(reader: str, path: Path) -> int:
     if reader == "aenerf":
         from aenerf_ns.dataparsers.event_files import open_event_file
 
-        return sum(map(len, open_event_file(path).chunks()))
+        return sum(map(len, open_event_file(path, _WIDTH, _HEIGHT).chunks()))
     import faery
 
     return sum(map(len, faery.events_stream_from_file(path)))
@@ -173,7 +231,7 @@ def measure(reader: str, small: Path, path: Path) -> dict:
         from aenerf_ns.dataparsers.event_files import open_event_file
 
         begin = time.process_time()
-        open_event_file(path).time_span()
+        open_event_file(path, _WIDTH, _HEIGHT).time_span()
         row["seconds_of_time_span"] = time.process_time() - begin
     return row
 
@@ -206,7 +264,7 @@ class Readers:
             for name in WRITERS:
                 small, path = Path(folder) / f"small_{name}", Path(folder) / name
                 _run("--write", name, small, 1000)
-                for size in self.sizes:
+                for size in self.sizes if path.suffix not in _TEXT else (min(self.sizes),):
                     path.unlink(missing_ok=True)
                     _run("--write", name, path, size)
                     for reader in ("aenerf", "faery"):

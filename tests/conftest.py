@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,9 @@ import torch
 
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.trajectory.rotation import rotation_from_vector
+
+# Examples of each test that feeds readers with damaged and random input; many more when they are set to.
+FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 
 # Third-party recordings, which are not part of the project.
 _SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import FUZZ_EXAMPLES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -22,8 +22,6 @@ from aenerf_ns.events.stream import EventFile
 
 _VENDOR_FILES = Path(__file__).parents[2] / "shared" / "data" / "vendor_formats"
 _WIDTH, _HEIGHT = 64, 48
-# More for a thorough search.
-_FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 
 # Rows x, y, t in microseconds, p.
 Rows = list[tuple[int, int, int, int]]
@@ -782,7 +780,7 @@ def test_damaged_files_raise_nothing_but_clear_errors(folder: Path) -> None:
     files = made_files(folder)
     path = folder / "fuzz"
 
-    @settings(max_examples=_FUZZ_EXAMPLES * 5, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=FUZZ_EXAMPLES * 5, deadline=None, suppress_health_check=list(HealthCheck))
     @given(st.sampled_from(sorted(files)), _EDITS)
     def check(name: str, edits: list[tuple[str, float, int]]) -> None:
         path.write_bytes(edited(files[name], edits))
@@ -813,7 +811,7 @@ def test_real_files_that_are_damaged_raise_nothing_but_clear_errors(folder: Path
     files = {name: beginning_of(name) for name in ("evt3.raw", "gen4.dat", "davis346.aedat4")}
     path = folder / "fuzz_real"
 
-    @settings(max_examples=_FUZZ_EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=FUZZ_EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
     @given(st.sampled_from(sorted(files)), _EDITS)
     def check(name: str, edits: list[tuple[str, float, int]]) -> None:
         path.write_bytes(edited(files[name], edits))
@@ -830,7 +828,7 @@ def test_bytes_after_a_beginning_raise_nothing_but_clear_errors(folder: Path) ->
     path = folder / "fuzz_magic"
     magics = [HEADER2, HEADER3, dat([]), b"% ", b"#!AER-DAT4.0\r\n", b"#ROSBAG V2.0\n", b""]
 
-    @settings(max_examples=_FUZZ_EXAMPLES, deadline=None)
+    @settings(max_examples=FUZZ_EXAMPLES, deadline=None)
     @given(st.sampled_from(magics), st.binary(max_size=400))
     def check(magic: bytes, content: bytes) -> None:
         path.write_bytes(magic + content)

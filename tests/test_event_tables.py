@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from conftest import FUZZ_EXAMPLES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -335,7 +336,7 @@ def test_blosc_without_its_filter_names_the_extra(tmp_path: Path) -> None:
     assert "pip install 'aenerf-ns[hdf5-filters]'" in done.stderr.splitlines()[-1]
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=5 * FUZZ_EXAMPLES, deadline=None)
 @given(st.text(alphabet='xytp,0123456789.-+e#\n" nai²', max_size=80), st.booleans())
 def test_no_text_crashes_the_csv_reader(tmp_path_factory: pytest.TempPathFactory, text: str, header: bool) -> None:
     path = tmp_path_factory.getbasetemp() / "fuzzed.csv"
@@ -350,7 +351,7 @@ def test_no_text_crashes_the_csv_reader(tmp_path_factory: pytest.TempPathFactory
 NUMBERS = st.sampled_from([np.int8, np.uint8, np.int16, np.uint32, np.int64, np.uint64, np.float32, np.float64, bool])
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=5 * FUZZ_EXAMPLES, deadline=None)
 @given(st.data())
 def test_columns_of_any_type_give_events_or_a_clear_error(data: st.DataObject) -> None:
     size = data.draw(st.integers(0, 4))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from conftest import FUZZ_EXAMPLES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
@@ -1118,7 +1119,7 @@ def damage(data: st.DataObject, value: object) -> object:
     return copy
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=3 * FUZZ_EXAMPLES, deadline=None)
 @given(st.data())
 def test_no_calibration_crashes_its_readers(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     folder = tmp_path_factory.getbasetemp() / "fuzzed"
@@ -1137,7 +1138,7 @@ def test_no_calibration_crashes_its_readers(tmp_path_factory: pytest.TempPathFac
             assert "\n" not in str(error)  # noqa: PT017
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=3 * FUZZ_EXAMPLES, deadline=None)
 @given(st.text(alphabet="0123456789.-+e#\n  nai²", max_size=60), st.booleans(), st.sampled_from(["s", "us", "ns"]))
 def test_no_text_crashes_the_trajectory_reader(
     tmp_path_factory: pytest.TempPathFactory, content: str, begun: bool, unit: str
