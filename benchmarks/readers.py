@@ -159,7 +159,7 @@ def write_blosc(path: Path, count: int) -> None:
     dtypes = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
     with h5py.File(path, "w") as file:
         for (name, dtype), values in zip(dtypes.items(), events(count), strict=True):
-            file.create_dataset(f"events/{name}", data=values.astype(dtype), chunks=(1 << 16,), **hdf5plugin.Blosc())
+            file.create_dataset(f"events/{name}", data=values.astype(dtype), chunks=True, **hdf5plugin.Blosc())
         file["ms_to_idx"] = np.zeros(1, np.uint64)
         file["t_offset"] = _START
 
