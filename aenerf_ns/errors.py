@@ -15,4 +15,6 @@ class DataError(ValueError):
     """
 
     def __init__(self, source: str | Path, problem: str, remedy: str) -> None:
-        super().__init__(f"{source}: {problem}; {remedy}")
+        message = f"{source}: {problem}; {remedy}"
+        # A value from a file may hold line breaks.
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in message))
