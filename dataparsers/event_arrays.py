@@ -24,7 +24,7 @@ from aenerf_ns.dataparsers.event_table import (
 )
 from aenerf_ns.dataparsers.text import NANOSECONDS, TimeUnit, first_and_last_row, is_row
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 
 # Robust e-NeRF.
 POSITION_TIMESTAMP_POLARITY = EventLayout(
@@ -168,8 +168,7 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return CsvEventFile(path, width, height, time_unit)
-    if not path.is_file():
-        raise DataError(path, "there is no such event file", "check the path of the dataset")
+    require_event_file(path)
     if suffix == ".npy":
         layout = XYTP_MATRIX if load_npy(path).dtype.names is None else _XYTP_RECORDS
         return NpyEventFile(path, width, height, layout, time_unit)

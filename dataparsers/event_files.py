@@ -16,7 +16,7 @@ from aenerf_ns.dataparsers.rosbag import RosbagEventFile
 from aenerf_ns.dataparsers.sensor_size import sensor_size
 from aenerf_ns.dataparsers.text import TimeUnit
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 
 _FORMAT_OF_SUFFIX = {
     ".raw": "raw",
@@ -92,8 +92,7 @@ class _MissingEventFile(EventFile):
 
 
 def _format(path: Path) -> str:
-    if not path.is_file():
-        raise DataError(path, "there is no such event file", "check the path of the dataset")
+    require_event_file(path)
     suffix = path.suffix.lower()
     with path.open("rb") as file:
         beginning = file.read(16)

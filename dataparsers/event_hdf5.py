@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from aenerf_ns.dataparsers.event_table import EventLayout, EventTableFile
 from aenerf_ns.dataparsers.text import NANOSECONDS, TimeUnit
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 
 if TYPE_CHECKING:
     import h5py
@@ -169,8 +169,7 @@ def _open(path: Path) -> h5py.File:
     with suppress(ImportError):
         # Registers Blosc and other compression filters, where the extra is installed.
         import hdf5plugin  # noqa: F401
-    if not path.is_file():
-        raise DataError(path, "there is no such event file", "check the path of the dataset")
+    require_event_file(path)
     try:
         return h5py.File(path, "r")
     except OSError as error:

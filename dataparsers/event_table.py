@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.dataparsers.text import NANOSECONDS, TimeUnit
+from aenerf_ns.dataparsers.text import MAX_TIME, NANOSECONDS, TimeUnit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 
@@ -21,7 +21,6 @@ _COLUMNS = ("x", "y", "t", "p")
 _CHUNK = 1 << 20
 # Events looked at to find the unit of their times.
 SAMPLE = 4096
-_MAX_TIME = 9 * 10**18
 
 
 @dataclass(frozen=True)
@@ -204,7 +203,7 @@ def events_from_columns(
         pixels[name] = values.astype(np.uint16)
 
     times, polarities = columns["t"], columns["p"]
-    limit = _MAX_TIME // tick - abs(offset)
+    limit = MAX_TIME // tick - abs(offset)
     # NaN compares as false.
     good = (times >= -limit) & (times <= limit) if times.dtype.kind in "if" else times <= max(limit, 0)
     if not good.all():

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera, LensModel
+from aenerf_ns.image_encoding import ImageEncoding
 
 # The lens and the names of its distortion parameters, in OpenCV's order, for Nerfstudio's names of camera models.
 LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
@@ -119,3 +120,15 @@ def read_camera(meta: Metadata, width: str, height: str) -> EventCamera:
         raise
     except ValueError as error:
         raise meta.error("intrinsics:", str(error)) from None
+
+
+def read_image_encoding(meta: Metadata) -> ImageEncoding:
+    """What the values of the images are; sRGB unless it is stated.
+
+    Raises:
+        DataError: it is neither sRGB nor linear.
+    """
+    encoding: ImageEncoding = meta.get("image_encoding", str, "srgb")
+    if encoding not in ("srgb", "linear"):
+        raise DataError(meta.path, f'image_encoding is "{encoding}"', 'use "srgb" or "linear"')
+    return encoding

@@ -13,7 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile
-from aenerf_ns.dataparsers.metadata import Metadata, read_camera
+from aenerf_ns.dataparsers.metadata import Metadata, read_camera, read_image_encoding
 from aenerf_ns.dataparsers.recording import (
     EventDataParser,
     EventDataParserConfig,
@@ -24,7 +24,6 @@ from aenerf_ns.dataparsers.recording import (
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.image_encoding import ImageEncoding
 from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous, require_rigid
 
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
@@ -66,9 +65,6 @@ class NativeDataParser(EventDataParser):
         ground_truth = read_tum_trajectory(true_poses) if true_poses.exists() else None
         frames = meta.get("frames", list, [])
         sensor = self._sensor(block)
-        encoding: ImageEncoding = meta.get("image_encoding", str, "srgb")
-        if encoding not in ("srgb", "linear"):
-            raise DataError(meta.path, f'image_encoding is "{encoding}"', 'use "srgb" or "linear"')
         box = meta.get("scene_box", list, None)
         max_pose_gap = meta.get("max_pose_gap_ns", int, None)
         if max_pose_gap is not None and max_pose_gap <= 0:
@@ -86,7 +82,7 @@ class NativeDataParser(EventDataParser):
                 ground_truth is not None,
                 block.matrix("T_frame_event"),
             ),
-            image_encoding=encoding,
+            image_encoding=read_image_encoding(meta),
             scene_box=None if box is None else _scene_box(meta, box),
             ground_truth=ground_truth,
             max_pose_gap=max_pose_gap,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from aenerf_ns.dataparsers.event_files import SUFFIXES, open_event_file
 from aenerf_ns.dataparsers.kalibr import read_camchain
-from aenerf_ns.dataparsers.metadata import Metadata, read_camera
+from aenerf_ns.dataparsers.metadata import Metadata, read_camera, read_image_encoding
 from aenerf_ns.dataparsers.recording import EventDataParser, FrameSequence, PublishedDataParserConfig, Recording
 from aenerf_ns.dataparsers.text import TimeUnit
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
@@ -196,9 +196,6 @@ def _read_json(path: Path) -> _Calibration:
     if frame_from_event is None:
         frame_from_event = torch.eye(4, dtype=torch.float64)
     require_rigid(frame_from_event[None], f"{path}: event_camera.T_frame_event")
-    encoding = meta.get("image_encoding", str, "srgb")
-    if encoding not in ("srgb", "linear"):
-        raise meta.error("image_encoding", f'is "{encoding}", not "srgb" or "linear"')
     default = SensorModel()
     try:
         sensor = SensorModel(
@@ -212,7 +209,7 @@ def _read_json(path: Path) -> _Calibration:
     except ValueError as error:
         raise block.error("sensor:", str(error)) from None
     frame = read_camera(meta, "w", "h") if "w" in meta else event
-    return _Calibration(event, frame, frame_from_event, sensor, encoding)
+    return _Calibration(event, frame, frame_from_event, sensor, read_image_encoding(meta))
 
 
 def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import require_event_file
 
 # Far more than any header has.
 _MAX_BYTES = 1 << 16
@@ -53,8 +54,7 @@ def read_header(path: Path) -> PropheseeHeader:
     Raises:
         DataError: the file is missing or has no such header.
     """
-    if not path.is_file():
-        raise DataError(path, "there is no such event file", "check the path of the dataset")
+    require_event_file(path)
     with path.open("rb") as file:
         text = file.read(_MAX_BYTES)
     fields: dict[str, str] = {}

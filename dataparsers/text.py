@@ -16,7 +16,7 @@ NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 
 _UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
 # In nanoseconds: what an int64 holds, which is 285 years.
-_MAX_TIME = 9 * 10**18
+MAX_TIME = 9 * 10**18
 
 # Longer than any line of a file of events.
 _TAIL_BYTES = 4096
@@ -86,7 +86,7 @@ def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[
     for index, field in enumerate(fields):
         try:
             time = Decimal(field) * NANOSECONDS[unit]
-            good = abs(time) < _MAX_TIME
+            good = abs(time) < MAX_TIME
         except ArithmeticError:
             good = False
         if not good:

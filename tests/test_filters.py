@@ -187,3 +187,10 @@ def test_a_region_beyond_the_sensor_is_refused() -> None:
 def test_filters_that_leave_nothing_are_told() -> None:
     with pytest.raises(DataError, match="no event is left; widen"):
         list(FilteredEventFile(EventList([(0, 0, 0, 1)], []), EventFilters(start=1)).chunks())
+
+
+def test_events_are_counted_on_a_sensor_of_more_pixels_than_16_bits_hold() -> None:
+    x, y = np.array([1279, 3, 1279], np.uint16), np.array([719, 700, 719], np.uint16)
+    events = EventStream(x, y, np.arange(3), np.ones(3, np.int8), 1280, 720)
+    counts = count_events([events, events], 1280, 720)
+    assert (counts[719, 1279], counts[700, 3], counts.sum()) == (4, 2, 6)

@@ -66,7 +66,7 @@ def count_events(chunks: Iterable[EventStream], width: int, height: int) -> NDAr
     """Number of events of every pixel (height, width), in one pass over the stream."""
     counts = np.zeros(width * height, np.int64)
     for chunk in chunks:
-        _count(chunk.x, chunk.y, width, counts)
+        counts += np.bincount(chunk.y.astype(np.int64) * width + chunk.x, minlength=counts.size)
     return counts.reshape(height, width)
 
 
@@ -194,12 +194,6 @@ class FilteredEventFile(EventFile):
 
     def empty_error(self) -> DataError:
         return DataError(self.path, "no event is left", "widen the time window, the region of interest or the share")
-
-
-@numba.njit(cache=True)
-def _count(x, y, width, counts):
-    for i in range(x.shape[0]):
-        counts[np.int64(y[i]) * width + x[i]] += 1
 
 
 @numba.njit(cache=True)

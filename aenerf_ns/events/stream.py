@@ -100,6 +100,12 @@ def _unsorted(source: str | Path, index: int, time: int, previous: int) -> DataE
     )
 
 
+def require_event_file(path: Path) -> None:
+    """Raises a DataError when the file does not exist."""
+    if not path.is_file():
+        raise DataError(path, "there is no such event file", "check the path of the dataset")
+
+
 class EventFile(ABC):
     """A file of events, opened only when its events are asked for.
 
@@ -154,8 +160,7 @@ class EventFile(ABC):
 
     def require(self) -> None:
         """Raises a DataError when the file does not exist."""
-        if not self.path.is_file():
-            raise DataError(self.path, "there is no such event file", "check the path of the dataset")
+        require_event_file(self.path)
 
     def empty_error(self) -> DataError:
         """The error for a file without events."""
