@@ -204,8 +204,8 @@ def events_from_columns(
 
     times, polarities = columns["t"], columns["p"]
     limit = MAX_TIME // tick - abs(offset)
-    # NaN compares as false.
-    good = (times >= -limit) & (times <= limit) if times.dtype.kind in "if" else times <= max(limit, 0)
+    # NaN compares as false; no time is good where the offset alone is beyond the limit.
+    good = (times >= -limit) & (times <= limit) if times.dtype.kind in "if" else (limit >= 0) & (times <= max(limit, 0))
     if not good.all():
         raise error("t", ~good, "check the unit of the times and the order of the columns")
     if times.dtype.kind == "f":

@@ -373,3 +373,10 @@ def test_columns_of_any_type_give_events_or_a_clear_error(data: st.DataObject) -
     np.testing.assert_array_equal(events.p == 1, columns["p"] == 1)
     if columns["t"].dtype.kind != "f":
         assert events.t.tolist() == [(int(t) + offset) * tick for t in columns["t"]]
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint64, np.int64, np.float64, bool])
+def test_an_offset_beyond_the_limit_leaves_no_good_time(kind: type) -> None:
+    one = {name: np.zeros(1, kind if name == "t" else np.uint8) for name in "xytp"}
+    with pytest.raises(DataError, match="check the unit of the times"):
+        events_from_columns(one, width=4, height=3, tick=10**9, offset=9_223_372_037, source="made")
