@@ -46,10 +46,13 @@ aenerf = MethodSpecification(
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
             "camera_opt": {
-                "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
+                "optimizer": AdamOptimizerConfig(lr=2e-3, eps=1e-15),
                 "scheduler": RelativeCosineSchedulerConfig(),
             },
         },
+        # A batch has few rays for each knot of the spline. Poses that follow every one of them tremble by a pixel until
+        # their rate has fallen, and the field is blurred as by a shaking camera.
+        gradient_accumulation_steps={"camera_opt": 8},
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
         vis="viewer",
     ),

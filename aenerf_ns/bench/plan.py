@@ -24,7 +24,7 @@ _NOISE = {
     "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
 }
 _METHOD = {"full": "aenerf", "tiny": "aenerf-small"}
-_STEPS = {"full": 30000, "tiny": 2000}
+_STEPS = {"full": 30000, "tiny": 1500}
 
 OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
     "with pose correction",
