@@ -141,7 +141,7 @@ def plan(
         tables: "methods" are those of the paper's tables 1 and 3; "losses", its table 4, is of hard speed only.
         seeds: of the trainings.
         scale: "full" or, for a CPU, "tiny".
-        steps: of every training; 30,000 or 2000 by default.
+        steps: of every training; 30,000 or 1500 by default.
         simulate: more options of aenerf simulate.
         train: more options of the event method's trainings.
     """

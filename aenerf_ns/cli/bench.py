@@ -37,7 +37,7 @@ class Bench:
     seeds: tuple[int, ...] = (42,)
     """Seeds of the trainings."""
     steps: int | None = None
-    """Steps of every training; 30,000 or, for a CPU, 2000 by default."""
+    """Steps of every training; 30,000 or, for a CPU, 1500 by default."""
     simulate: str = ""
     """More options of aenerf simulate, as in --simulate="--bayer-pattern RGGB"."""
     train: str = ""
