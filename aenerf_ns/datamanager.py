@@ -26,6 +26,9 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Rays of a training batch; a pair of events takes two."""
     eval_num_rays_per_batch: int = 8192
     """Rays of a batch of pairs on which the loss is logged without training; a pair of events takes two."""
+    max_events_per_pair: int = 32
+    """The most events of its pixel that a pair spans; 1: consecutive events, as in the paper. They are also where the
+    sensor has a refractory period, or one is learned."""
 
 
 class EventDataManager(VanillaDataManager[EventDataset]):
@@ -73,12 +76,17 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     def setup_train(self) -> None:
         """Reads the events for training. A trained run is opened without them."""
         metadata = self.train_dataset.metadata
+        if self.config.max_events_per_pair < 1:
+            raise DataError(
+                "the datamanager", f"max-events-per-pair is {self.config.max_events_per_pair}", "give 1 or more"
+            )
         self.train_pixel_sampler = EventRaySampler(
             lambda: self.train_dataset.pairs,
             metadata["event_camera"],
             metadata["sensor"],
             deepcopy(metadata["trajectory"]).to(self.device),
             self.config.train_num_rays_per_batch,
+            self.config.max_events_per_pair,
         )
         if self.test_mode == "val":
             self.train_pixel_sampler.prepare()

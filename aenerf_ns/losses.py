@@ -12,8 +12,8 @@ def log_radiance_change(
     """Change of log-radiance that a pair of events tells of: Δ = n+ C+ − n− C− (paper, eq. 5).
 
     Args:
-        num_positive: (N,) positive events at the later time, one but for merged events.
-        num_negative: (N,) negative events at the later time.
+        num_positive: (N,) positive events after the earlier time up to the later one.
+        num_negative: (N,) negative events, likewise.
         positive_threshold: C+; a scalar in the graph when it is learned.
         negative_threshold: C−.
 

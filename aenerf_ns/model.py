@@ -376,7 +376,9 @@ class AENeRFModel(Model):
             if "log_radiance_rate" in outputs:
                 rate = outputs["log_radiance_rate"].gather(1, batch["channel"][:, None])[:, 0]
                 interval = batch["interval"] + outputs.get("interval_change", 0.0)
-                losses["temporal_loss"] = temporal_loss(rate, target, interval)
+                # Only between consecutive events is the mean rate near that of a moment.
+                change = torch.where(batch["consecutive"], target, torch.zeros_like(target))
+                losses["temporal_loss"] = temporal_loss(rate, change, interval)
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             losses["interlevel_loss"] = interlevel_loss(weights, samples) / mean_threshold**2
             losses["distortion_loss"] = distortion_loss(weights, samples)
@@ -386,7 +388,10 @@ class AENeRFModel(Model):
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         """How far the rendered changes of log-radiance agree with the events."""
         predicted, target = self._log_radiance_changes(outputs, batch)
-        metrics: dict[str, Any] = {"polarity_agreement": (predicted.detach() * target > 0).float().mean()}
+        # Polarities that cancel have no sign to agree with.
+        signed = target != 0
+        agreeing = (predicted.detach() * target > 0) & signed
+        metrics: dict[str, Any] = {"polarity_agreement": agreeing.sum() / signed.sum().clamp_min(1)}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics | self.sensor_parameters.learned()
 

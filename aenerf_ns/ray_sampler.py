@@ -29,10 +29,17 @@ _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
 
 
 class EventRaySampler:
-    """Samples pairs of events uniformly and gives each one's rays.
+    """Samples pairs of events and gives each one's rays.
 
-    A pair's interval is [previous time + refractory period, time]. Draws from torch's global generator, which
-    Nerfstudio seeds.
+    A pair's later event is drawn uniformly, and how many events of its pixel the pair spans from 1 to
+    ``max_events_per_pair`` with log-uniform probability: 1 is the paper's pair of consecutive events (eq. 4). Those say
+    where there is an edge, but little of how it compares with the rest of the scene: a change that is seen at a
+    slightly wrong time is as large an error as the change itself. Over many events it is a small part.
+
+    A pair's interval is [earlier time + refractory period, time]. What changes while a pixel is blind is in no event,
+    and would be missing within a longer pair: with a refractory period, pairs are consecutive.
+
+    Draws from torch's global generator, which Nerfstudio seeds.
 
     Args:
         pairs: gives the pairs to sample from, which stay in host memory; asked when the first batch is drawn.
@@ -40,8 +47,10 @@ class EventRaySampler:
         sensor: for the refractory period and the pixels' colour filters.
         trajectory: whose start times count from; on the device of the rays.
         num_rays_per_batch: rays of a batch; a pair takes two, or three with a time within its interval.
+        max_events_per_pair: the most events that a pair spans.
 
     Attributes:
+        max_events_per_pair: see above.
         with_time_within: whether batches for training have a third ray for each pair, at a random time t_sam within
             its interval, for the temporal loss.
     """
@@ -53,10 +62,12 @@ class EventRaySampler:
         sensor: SensorModel,
         trajectory: Trajectory,
         num_rays_per_batch: int,
+        max_events_per_pair: int,
     ) -> None:
         self.sensor = sensor
         self.trajectory = trajectory
         self.num_rays_per_batch = num_rays_per_batch
+        self.max_events_per_pair = max_events_per_pair
         directions, has_direction = camera.pixel_directions()
         if not has_direction.all():
             CONSOLE.print(
@@ -80,8 +91,9 @@ class EventRaySampler:
             The rays at the starts of the N intervals, then those at their ends, then those at t_sam if there are any.
             They are in the camera's frame: pose correction moves them to the world by their ``times``, in float64
             seconds since the trajectory's start, and the ``camera_directions`` among their metadata, in float64. And
-            for each pair ``num_positive`` and ``num_negative`` (N,) counts of events at its end, the ``interval``
-            (N,) in seconds, and the ``channel`` (N,) of its pixel's filter.
+            for each pair ``num_positive`` and ``num_negative`` (N,) counts of events after its earlier one up to its
+            later one, whether it is of ``consecutive`` (N,) events, the ``interval`` (N,) in seconds, and the
+            ``channel`` (N,) of its pixel's filter.
         """
         with_time_within = self.with_time_within and num_pairs is None
         rays_per_pair = 3 if with_time_within else 2
@@ -89,7 +101,8 @@ class EventRaySampler:
         pairs, device = self._pairs(), self._directions.device
         index = self._draw(pairs, num_pairs)
         x, y = pairs.x[index].astype(np.int64), pairs.y[index].astype(np.int64)
-        starts = pairs.previous_time[index] + self.sensor.refractory_period
+        first, num_positive, num_negative = self._extend(pairs, index)
+        starts = pairs.previous_time[first] + self.sensor.refractory_period
         start, end = (self.trajectory.seconds(torch.from_numpy(t).to(device)) for t in (starts, pairs.time[index]))
         interval = torch.from_numpy((pairs.time[index] - starts) * 1e-9).to(device)
         times = [start, end]
@@ -109,12 +122,45 @@ class EventRaySampler:
             metadata={CAMERA_DIRECTIONS: in_camera},
         )
         batch = {
-            "num_positive": torch.from_numpy(pairs.num_positive[index].astype(np.float32)).to(device),
-            "num_negative": torch.from_numpy(pairs.num_negative[index].astype(np.float32)).to(device),
+            "num_positive": torch.from_numpy(num_positive.astype(np.float32)).to(device),
+            "num_negative": torch.from_numpy(num_negative.astype(np.float32)).to(device),
+            "consecutive": torch.from_numpy(first == index).to(device),
             "interval": interval.float(),
             "channel": torch.from_numpy(self.sensor.channel(x, y)).to(device),
         }
         return rays, batch
+
+    def _extend(
+        self, pairs: EventPairs, last: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """For pairs that end with the given ones, the pairs they begin with and their counts of events."""
+        first = last
+        num_positive, num_negative = (
+            counts[last].astype(np.int64) for counts in (pairs.num_positive, pairs.num_negative)
+        )
+        if not self._spans_several:
+            return first, num_positive, num_negative
+        spans = (self.max_events_per_pair + 1) ** torch.rand(len(last), dtype=torch.float64).numpy()
+        # The shortest are done after one round, so that few are left for the last.
+        going = np.arange(len(last))
+        first = last.copy()
+        for length in range(2, self.max_events_per_pair + 1):
+            going = going[spans[going] >= length]
+            earlier = self._predecessors[first[going]]
+            going, earlier = going[earlier >= 0], earlier[earlier >= 0]
+            first[going] = earlier
+            num_positive[going] += pairs.num_positive[earlier]
+            num_negative[going] += pairs.num_negative[earlier]
+        return first, num_positive, num_negative
+
+    @property
+    def _spans_several(self) -> bool:
+        """Whether any pair may span several events."""
+        return self.max_events_per_pair > 1 and self.sensor.refractory_period == 0
+
+    @cached_property
+    def _predecessors(self) -> NDArray[np.int32] | NDArray[np.int64]:
+        return self._pairs().predecessors()
 
     @cached_property
     def _usable(self) -> NDArray[np.int64] | None:
@@ -134,6 +180,8 @@ class EventRaySampler:
             DataError: the events cannot be used.
         """
         _ = self._pairs(), self._usable
+        if self._spans_several:
+            _ = self._predecessors
 
     def _draw(self, pairs: EventPairs, num_pairs: int) -> NDArray[np.int64]:
         """Uniform indices of usable pairs."""

@@ -5,7 +5,8 @@ r"""How well a field trained on a real recording agrees with the recording's own
     python benchmarks/real_recording.py --load-config outputs/.../config.yml --output benchmarks/results/NAME.json
 
 Reports the correlation of rendered log-radiance with the log-intensity of each held-out frame at the frame's pose, and
-the reconstruction loss over many pairs (1 for a constant field), for the trained field and for an untrained one.
+the reconstruction loss over many pairs of consecutive events (1 for a constant field), for the trained field and for an
+untrained one.
 """
 
 from __future__ import annotations
@@ -66,6 +67,9 @@ class RealRecording:
                 name = views.image_filenames[index].name
                 # A rendering without any structure has no correlation.
                 correlations[name] = torch.corrcoef(stacked)[0, 1].nan_to_num().item()
+        sampler = pipeline.datamanager.train_pixel_sampler
+        assert sampler is not None
+        sampler.max_events_per_pair = 1
         torch.manual_seed(1)
         losses = []
         for _ in range(_NUM_BATCHES):

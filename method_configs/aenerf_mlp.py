@@ -22,7 +22,10 @@ aenerf_mlp = MethodSpecification(
             _base.pipeline,
             # 2048 rays with 32 samples of the field: the paper's 65,536 samples.
             datamanager=replace(
-                _base.pipeline.datamanager, train_num_rays_per_batch=2048, eval_num_rays_per_batch=2048
+                _base.pipeline.datamanager,
+                train_num_rays_per_batch=2048,
+                eval_num_rays_per_batch=2048,
+                max_events_per_pair=1,
             ),
             model=replace(
                 _base.pipeline.model,

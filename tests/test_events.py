@@ -67,6 +67,10 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     distinct = len({(x, y, t) for x, y, t, _ in rows})
     assert pairs.num_merged == len(rows) - distinct >= merged_in_pairs
     assert len(pairs) + pairs.num_first + pairs.num_within_refractory_period == distinct
+    # The predecessor is the pair of the same pixel that ends where this one begins.
+    ends = {(x, y, t): i for i, (x, y, t) in enumerate(zip(pairs.x, pairs.y, pairs.time, strict=True))}
+    begins = zip(pairs.x, pairs.y, pairs.previous_time, strict=True)
+    assert pairs.predecessors().tolist() == [ends.get(begin, -1) for begin in begins]
 
 
 def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:
@@ -77,6 +81,7 @@ def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:
             pairs = pair_events(cut(make_stream(rows), sizes), gaps=gaps)
             assert list(zip(pairs.previous_time.tolist(), pairs.time.tolist(), strict=True)) == expected
             assert (pairs.num_outside, pairs.num_first, pairs.num_merged) == (2, 2, 1)
+            assert pairs.predecessors().tolist() == [-1, -1, 1]
     # What a gap leaves of the time window.
     pairs = pair_events([make_stream(rows)], start=10, end=25, gaps=[(5, 11), (20, 30)])
     assert list(zip(pairs.previous_time.tolist(), pairs.time.tolist(), strict=True)) == [(11, 15), (15, 20)]

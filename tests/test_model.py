@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,14 @@ ALL_LOSSES = {"reconstruction_loss": 1.0, "temporal_loss": 1e-3, "interlevel_los
 EPOCH = 1_600_000_000_000_000_000
 
 
-def make_sampler(random_poses: torch.Tensor, sensor: SensorModel, camera: EventCamera = CAMERA) -> EventRaySampler:
+def make_sampler(
+    random_poses: torch.Tensor, sensor: SensorModel, camera: EventCamera = CAMERA, max_events_per_pair: int = 1
+) -> EventRaySampler:
     rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
     stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
     pairs = pair_events([stream], refractory_period=sensor.refractory_period)
     trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
-    return EventRaySampler(lambda: pairs, camera, sensor, trajectory, num_rays_per_batch=40)
+    return EventRaySampler(lambda: pairs, camera, sensor, trajectory, 40, max_events_per_pair)
 
 
 def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> None:
@@ -66,6 +69,38 @@ def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> N
             direction = pose[:, :3] @ torch.from_numpy(pixel_directions[y, x])
             torch.testing.assert_close(rays.directions[ray], direction.float(), rtol=0, atol=1e-6)
     assert seen == set(known)
+
+
+def test_a_pair_spans_several_events(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel(), max_events_per_pair=3)
+    sampler.num_rays_per_batch = 8000
+    rays, batch = sampler.sample()
+    assert rays.times is not None
+    starts, ends = torch.round(rays.times[:, 0] * 1e9).long().chunk(2)
+    counts = zip(
+        starts.tolist(),
+        ends.tolist(),
+        batch["num_positive"].tolist(),
+        batch["num_negative"].tolist(),
+        batch["consecutive"].tolist(),
+        strict=True,
+    )
+    # All that end with an event of their pixel, never beyond its first.
+    found = Counter(counts)
+    assert found.keys() == {
+        (100_000, 600_000_000, 0, 1, True),
+        (5_000, 250_000_000, 0, 1, True),
+        (250_000_000, 10**9, 1, 0, True),
+        (5_000, 10**9, 1, 1, False),
+    }
+    torch.testing.assert_close(batch["interval"], (ends - starts).float() * 1e-9)
+    # One event in half of the cases: log 2 / log 4.
+    assert found[250_000_000, 10**9, 1, 0, True] / found[5_000, 10**9, 1, 1, False] == pytest.approx(1, abs=0.2)
+
+
+def test_pairs_are_of_consecutive_events_where_pixels_are_blind(random_poses: torch.Tensor) -> None:
+    _, batch = make_sampler(random_poses, SensorModel(refractory_period=1_000), max_events_per_pair=3).sample()
+    assert batch["consecutive"].all()
 
 
 def test_a_third_ray_lies_within_each_interval(random_poses: torch.Tensor) -> None:
@@ -169,6 +204,7 @@ def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
     return {
         "num_positive": positive,
         "num_negative": 1 - positive,
+        "consecutive": torch.ones(num_pairs, dtype=torch.bool),
         "interval": torch.full((num_pairs,), 1e-3),
         "channel": torch.zeros(num_pairs, dtype=torch.long),
     }

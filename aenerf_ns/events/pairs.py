@@ -53,6 +53,14 @@ class EventPairs:
     def __len__(self) -> int:
         return len(self.time)
 
+    def predecessors(self) -> NDArray[np.int32] | NDArray[np.int64]:
+        """(N,) indices of the pairs that end where these begin, −1 where there is none: at a pixel's first pair, and
+        behind a gap or an event that gave no pair."""
+        indices = np.empty(len(self), np.int32 if len(self) <= np.iinfo(np.int32).max else np.int64)
+        width, height = (int(pixels.max(initial=0)) + 1 for pixels in (self.x, self.y))
+        _link(self.x, self.y, self.previous_time, self.time, width, height, indices)
+        return indices
+
     @property
     def shortest_interval(self) -> int:
         """Nanoseconds between the two events of the closest pair."""
@@ -105,6 +113,17 @@ def _pair_chunk(columns, width, refractory_period, last_time, last_record, recor
             last_record[pixel] = n
             n += 1
     return n, first, merged, refractory
+
+
+@numba.njit(cache=True)
+def _link(x, y, previous_time, time, width, height, indices):
+    """Fills in the index of each pair's predecessor."""
+    latest = np.full(width * height, -1, dtype=np.int64)
+    for i in range(time.shape[0]):
+        pixel = np.int64(y[i]) * width + x[i]
+        before = latest[pixel]
+        indices[i] = before if before >= 0 and time[before] == previous_time[i] else -1
+        latest[pixel] = i
 
 
 def pair_events(
