@@ -51,7 +51,13 @@ aenerf_mlp = MethodSpecification(
                 "optimizer": AdamOptimizerConfig(lr=5e-4, weight_decay=1e-6),
                 "scheduler": _base.optimizers["networks"]["scheduler"],
             },
+            "camera_opt": {
+                "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
+                "scheduler": _base.optimizers["camera_opt"]["scheduler"],
+            },
         },
+        # Every ray of a batch tells of all weights of the poses' network.
+        gradient_accumulation_steps={},
     ),
     description="AE-NeRF with the paper's MLPs: slow.",
 )

@@ -56,7 +56,7 @@ class EventPairs:
     def predecessors(self) -> NDArray[np.int32] | NDArray[np.int64]:
         """(N,) indices of the pairs that end where these begin, −1 where there is none: at a pixel's first pair, and
         behind a gap or an event that gave no pair."""
-        indices = np.empty(len(self), np.int32 if len(self) <= np.iinfo(np.int32).max else np.int64)
+        indices: NDArray = np.empty(len(self), np.int32 if len(self) <= np.iinfo(np.int32).max else np.int64)
         width, height = (int(pixels.max(initial=0)) + 1 for pixels in (self.x, self.y))
         _link(self.x, self.y, self.previous_time, self.time, width, height, indices)
         return indices
