@@ -134,7 +134,7 @@ class EventRaySampler:
         self, pairs: EventPairs, last: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """For pairs that end with the given ones, the pairs they begin with and their counts of events."""
-        first = last
+        first = last.copy()
         num_positive, num_negative = (
             counts[last].astype(np.int64) for counts in (pairs.num_positive, pairs.num_negative)
         )
@@ -143,7 +143,6 @@ class EventRaySampler:
         spans = (self.max_events_per_pair + 1) ** torch.rand(len(last), dtype=torch.float64).numpy()
         # The shortest are done after one round, so that few are left for the last.
         going = np.arange(len(last))
-        first = last.copy()
         for length in range(2, self.max_events_per_pair + 1):
             going = going[spans[going] >= length]
             earlier = self._predecessors[first[going]]
