@@ -34,6 +34,8 @@ aenerf_small = MethodSpecification(
                 proposal_num_levels=4,
                 proposal_log2_hashmap_size=14,
                 proposal_weights_anneal_iterations=200,
+                # On a CPU twice as fast as with 8192: what a piece needs stays small.
+                eval_num_rays_per_chunk=1 << 10,
             ),
         ),
     ),

@@ -121,6 +121,9 @@ class Runner:
             # Of the framework's implementations, the one that needs no CUDA extension.
             options = ("--pipeline.model.implementation", "torch", "--pipeline.model.camera-optimizer.mode", "off",
                        "--pipeline.model.use-appearance-embedding", "False")  # fmt: skip
+            if self._device == "cpu":
+                # The same pictures, sooner: what a piece needs stays small.
+                options += ("--pipeline.model.eval-num-rays-per-chunk", "1024")
             images = ("nerfstudio-data", "--data", str(_with_true_poses(data).resolve()))
             self._call(run.name, *_NERFACTO, "ns-train", *common, *options, *run.options, *images)
         else:
