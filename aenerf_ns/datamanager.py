@@ -26,7 +26,7 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Rays of a training batch; a pair of events takes two."""
     eval_num_rays_per_batch: int = 8192
     """Rays of a batch of pairs on which the loss is logged without training; a pair of events takes two."""
-    max_events_per_pair: int = 32
+    max_events_per_pair: int = 64
     """The most events of its pixel that a pair spans; 1: consecutive events, as in the paper. They are also where the
     sensor has a refractory period, or one is learned."""
 
