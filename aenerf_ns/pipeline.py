@@ -57,13 +57,13 @@ class AENeRFPipeline(VanillaPipeline):
     model: AENeRFModel
 
     def __init__(self, config: AENeRFPipelineConfig, device: str, **kwargs: Any) -> None:
+        if config.model.learn_refractory_period:
+            config.datamanager.max_events_per_pair = 1
         super().__init__(config, device, **kwargs)
         self._refined_test_poses = False
         if self.datamanager.train_pixel_sampler is not None:
             training = self.test_mode == "val"
             self.datamanager.train_pixel_sampler.with_time_within = training and self.model.uses_temporal_loss
-            if self.model.config.learn_refractory_period:
-                self.datamanager.train_pixel_sampler.max_events_per_pair = 1
         if self.test_mode == "val" and self.model.config.learn_refractory_period:
             self.model.sensor_parameters.bound_refractory_period(self.datamanager.train_dataset.pairs.shortest_interval)
         # Made once: a fit every so many steps would read the images again.

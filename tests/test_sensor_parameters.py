@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
+from conftest import make_stream
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from test_model import ALL_LOSSES, make_batch, make_model, make_rays
 
+from aenerf_ns.datamanager import EventDataManagerConfig
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.model import AENeRFModel
+from aenerf_ns.model import AENeRFModel, AENeRFModelConfig
+from aenerf_ns.pipeline import AENeRFPipelineConfig
 from aenerf_ns.sensor_parameters import SensorParameters
+from aenerf_ns.trajectory.trajectory import Trajectory
 
 
 @pytest.mark.parametrize("ratio", [1e-3, 0.5, 1.0, 1.458, 40.0])
@@ -98,3 +107,18 @@ def test_they_form_a_parameter_group_and_are_logged() -> None:
     metrics = model.get_metrics_dict(outputs, make_batch(5))
     assert metrics["contrast_threshold_ratio"] == pytest.approx(1.5, rel=1e-6)
     assert metrics["refractory_period_ns"] == pytest.approx(20e6, rel=1e-6)
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_pairs_are_of_consecutive_events_where_the_refractory_period_is_learned(learned: bool, tmp_path: Path) -> None:
+    with NativeDatasetWriter(tmp_path / "data", EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb") as writer:
+        writer.events.append(make_stream([(1, 1, t * 10**8, 1) for t in range(11)], 6, 4))
+        poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+        poses[1, 0, 3] = 0.1
+        writer.add_trajectories(Trajectory([0, 10**9], poses), None)
+    pipeline = AENeRFPipelineConfig(
+        datamanager=EventDataManagerConfig(dataparser=NativeDataParserConfig(data=tmp_path / "data")),
+        model=AENeRFModelConfig(log2_hashmap_size=8, learn_refractory_period=learned),
+    ).setup(device="cpu", test_mode="val")
+    _, batch = pipeline.datamanager.next_train(0)
+    assert batch["consecutive"].all() == learned
