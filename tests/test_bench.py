@@ -14,11 +14,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+import torchmetrics.functional as functional
+import torchmetrics.image.lpip as lpip
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.models.nerfacto import NerfactoModelConfig
 from PIL import Image
 
 from aenerf_ns.bench import tables
 from aenerf_ns.bench.figures import draw, error_map
+from aenerf_ns.bench.nerfacto import prepare
 from aenerf_ns.bench.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
+from aenerf_ns.errors import DataError
+from aenerf_ns.image_metrics import ImageMetrics
 
 
 def small_plan(**changes: Any) -> list[Run]:
@@ -60,11 +68,17 @@ def test_whatever_a_run_depends_on_is_in_its_name() -> None:
         assert not changed & names, change
 
 
-def test_a_scene_file_goes_by_its_folder() -> None:
+def test_a_scene_file_goes_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (run, *_) = small_plan(scenes=("scenes/piano/scene.json",))
     assert run.name.startswith("piano_easy_")
     (run, *_) = small_plan(scenes=("models/lamp.glb",))
     assert run.name.startswith("lamp_easy_")
+    (tmp_path / "hall").mkdir()
+    monkeypatch.chdir(tmp_path / "hall")
+    (run, *_) = small_plan(scenes=("scene.json",))
+    assert run.name.startswith("hall_easy_")
+    with pytest.raises(DataError, match="two scenes go by the name piano"):
+        small_plan(scenes=("old/piano/scene.json", "new/piano/scene.json"))
 
 
 def figures_of(run: Run, psnr: float, kind: str, errors: tuple[float, float]) -> dict[str, Any]:
@@ -78,9 +92,14 @@ def figures_of(run: Run, psnr: float, kind: str, errors: tuple[float, float]) ->
         "scene": run.dataset.scene,
         "kind": kind,
         "speed": run.dataset.speed,
+        "method": run.method,
+        "steps": run.steps,
         "seed": run.seed,
+        "device": "cpu",
+        "simulate": " ".join(("aenerf", "simulate", *run.dataset.command)),
+        "poses_report": None,
         "results": {"psnr": psnr, "ssim": psnr / 100, "lpips": None, "pose_errors": poses},
-        "machine": {"cpu": "a processor", "gpu": None, "cores": 2},
+        "machine": {"cpu": "a processor", "gpu": "of no use here", "cores": 2},
         "versions": {"aenerf-ns": "0.1.0"},
         "commit": "abc",
     }
@@ -99,14 +118,14 @@ def test_tables_are_means_over_scenes_and_seeds() -> None:
     methods = [one for one in figures if one["table"] == "methods"]
     header, _, *rows = cells(tables.methods_table(methods))
     assert [row[0] for row in rows] == [WITHOUT_CORRECTION, OURS, TRUE_POSES, CEILING]
-    column = header.index("large scenes, hard: PSNR")
+    column = header.index("1 large scenes, hard: PSNR")
     expected = [
         one["results"]["psnr"] for one in methods if (one["row"], one["scene"], one["speed"]) == (OURS, "room", "hard")
     ]
     assert len(expected) == 2
     assert rows[1][column] == f"{sum(expected) / 2:.2f}"
     # LPIPS is not known, and never a number then.
-    assert rows[1][header.index("large scenes, hard: LPIPS")] == "n/a"
+    assert rows[1][header.index("1 large scenes, hard: LPIPS")] == "n/a"
     poses = cells(tables.poses_table(methods))
     assert poses[0] == ["", "easy: with ψ", "easy: without ψ", "hard: with ψ", "hard: without ψ"]
     assert poses[2:] == [
@@ -115,11 +134,55 @@ def test_tables_are_means_over_scenes_and_seeds() -> None:
     ]
     losses = cells(tables.losses_table([one for one in figures if one["table"] == "losses"]))
     assert [row[0] for row in losses[2:]] == list(LOSSES)
-    text = tables.report(figures[:-1], ["the last"])
-    assert "1 runs are missing: the last" in text
-    assert "a processor, 2 cores; aenerf-ns 0.1.0; commit abc" in text
+    text = tables.report(figures[:-1], {"the last": "out of memory", "another": ""})
+    assert f"2 of {len(figures) + 1} runs are missing" in text
+    assert "- the last: out of memory\n- another\n" in text
+    assert "- a processor, 2 cores; aenerf-ns 0.1.0; commit abc" in text
+    assert "- aenerf-small, 1500 steps\n- nerfacto, 1500 steps\n" in text
+    assert text.count("- data: `aenerf simulate --scene SCENE --speed SPEED --width 96 --height 72 ") == 1
     # Over two seeds 24 runs apart.
     assert f"± {24 / 2**0.5:.2f}" in text
+
+
+def test_means_are_over_what_all_rows_have() -> None:
+    runs = [run for run in small_plan(speeds=("hard",), seeds=(1,)) if run.row != CEILING]
+    worth = {"room": 20.0, "object": 30.0}
+    figures = [figures_of(run, worth[run.dataset.scene], "large", (1.0, 0.5)) for run in runs]
+    for table, make in (("methods", tables.methods_table), ("losses", tables.losses_table)):
+        of_table = [one for one in figures if one["table"] == table]
+        _, _, *rows = cells(make(of_table))
+        assert {row[1] for row in rows} == {"25.00"}
+        # The first row lacks the easy scene, and would look worse than it is.
+        partial = [one for one in of_table if one["row"] not in (OURS, "all") or one["scene"] == "room"]
+        _, _, *rows = cells(make(partial))
+        assert {row[1] for row in rows} == {"20.00"}
+
+
+def test_what_colmap_made_of_a_sequence_is_reported() -> None:
+    run, other = small_plan(poses="colmap", tables=("losses",), seeds=(1,))[:2]
+    errors = {"rotation_error_degrees": 0.5, "translation_error": 0.04, "misplaced_frames": 2}
+    poses = {"frames": 33, "registered_frames": 30, "errors": errors}
+    poses["errors_between_frames"] = {"rotation_error_degrees": 3.0, "translation_error": 0.25}
+    figures = [{**figures_of(one, 20.0, "large", (1.0, 0.5)), "poses_report": poses} for one in (run, other)]
+    text = tables.report(figures, {})
+    assert text.count("| room | hard | 33 | 30 | 2 | 0.50° | 4.0 cm | 3.00° | 25.0 cm |") == 1
+
+
+def test_the_ceiling_has_the_same_metrics_as_all_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As the wrapper changes them; put back at the end.
+    monkeypatch.setattr(lpip, "LearnedPerceptualImagePatchSimilarity", lpip.LearnedPerceptualImagePatchSimilarity)
+    name = "structural_similarity_index_measure"
+    monkeypatch.setattr(functional, name, getattr(functional, name))
+    monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "0")
+    prepare()
+    # Of little contrast, where the range of a picture is far from 1.
+    predicted, reference = 0.4 + 0.2 * torch.rand(2, 24, 32, 3, generator=torch.Generator().manual_seed(0))
+    images = [image.moveaxis(-1, 0)[None] for image in (predicted, reference)]
+    model = NerfactoModelConfig(implementation="torch", log2_hashmap_size=8).setup(
+        scene_box=SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])), num_train_data=1
+    )
+    ssim = model.ssim(*images)
+    assert ssim.item() == pytest.approx(ImageMetrics(with_lpips=False)(predicted, reference)["ssim"])
 
 
 def test_the_error_map_is_dark_where_there_is_no_error() -> None:
@@ -132,7 +195,7 @@ def test_the_error_map_is_dark_where_there_is_no_error() -> None:
 
 
 def test_figures_are_drawn_of_whatever_seed_there_is(tmp_path: Path) -> None:
-    # As one shard finds them while the others are still at work.
+    # As one process finds them while the others are still at work.
     made = [
         run for run in small_plan(tables=("losses",)) if (run.dataset.scene, run.seed) in (("room", 1), ("object", 2))
     ]
@@ -153,16 +216,30 @@ def test_figures_are_drawn_of_whatever_seed_there_is(tmp_path: Path) -> None:
     assert len(draw(tmp_path, small_plan(tables=("losses",)), half)) == len(names)
 
 
+def small_bench(folder: Path, *tables: str) -> list[str]:
+    """The command of a small benchmark."""
+    (folder / "object").mkdir()  # A folder by the name of a built-in scene is no scene.
+    return [
+        str(Path(sys.executable).parent / "aenerf"), "bench", "--output", "bench", "--scale", "tiny", "--device", "cpu",
+        "--scenes", "object", "--speeds", "hard", "--steps", "8", "--tables", *tables,
+        "--simulate=--width 32 --height 24 --duration 0.5 --validation-views 3 --test-views 3 --train-images 6",
+    ]  # fmt: skip
+
+
+def test_a_benchmark_that_is_ended_leaves_no_command_at_work(tmp_path: Path) -> None:
+    process = subprocess.Popen(small_bench(tmp_path, "methods"), cwd=tmp_path, start_new_session=True)
+    while not list(tmp_path.glob("bench/logs/*")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    process.terminate()
+    assert process.wait() == 128 + signal.SIGTERM
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+
+
 @pytest.mark.slow
 def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path) -> None:
-    options = (
-        "--output", "bench", "--scale", "tiny", "--device", "cpu", "--scenes", "object", "--speeds", "easy",
-        "--steps", "8", "--tables", "methods",
-        "--simulate=--width 32 --height 24 --duration 0.5 --validation-views 3 --test-views 3 --train-images 6",
-    )  # fmt: skip
-    # A folder by the name of a built-in scene is no scene.
-    (tmp_path / "object").mkdir()
-    command = [str(Path(sys.executable).parent / "aenerf"), "bench", *options]
+    command = small_bench(tmp_path, "methods", "losses")
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     first = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
     while not list(tmp_path.glob("bench/runs/*.json")):
@@ -172,11 +249,11 @@ def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path)
     first.wait()
     (done,) = tmp_path.glob("bench/runs/*.json")
     before = done.stat().st_mtime_ns
-    both = [subprocess.Popen([*command, "--shard", shard], cwd=tmp_path, env=environment) for shard in ("1/2", "2/2")]
+    both = [subprocess.Popen(command, cwd=tmp_path, env=environment) for _ in range(2)]
     assert [process.wait() for process in both] == [0, 0]
     assert done.stat().st_mtime_ns == before
     figures = [json.loads(path.read_text()) for path in tmp_path.glob("bench/runs/*.json")]
-    assert {one["row"] for one in figures} == {OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING}
+    assert {one["row"] for one in figures} == {OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING, *LOSSES}
     assert {one["kind"] for one in figures} == {"object"}
     for one in figures:
         assert len(one["curve"]) >= 4
@@ -185,5 +262,11 @@ def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path)
     report = (tmp_path / "bench" / "report.md").read_text()
     assert "missing" not in report
     drawn = sorted(path.name for path in (tmp_path / "bench" / "figures").iterdir())
-    assert drawn == ["easy_methods.jpg", *(f"object_easy_methods_{kind}.png" for kind in ("paths", "psnr", "views"))]
-    assert Image.open(tmp_path / "bench" / "figures" / drawn[3]).size == (5 * 192 + 4 * 4, 14 + 2 * 144 + 4)
+    kinds = {"methods": ("paths", "psnr", "views"), "losses": ("psnr", "views")}
+    of_scene = {f"object_hard_{table}_{kind}.png" for table in kinds for kind in kinds[table]}
+    assert set(drawn) == {"hard_methods.jpg", "hard_losses.jpg", *of_scene}
+    views = Image.open(tmp_path / "bench" / "figures" / "object_hard_methods_views.png")
+    assert views.size == (
+        5 * 192 + 4 * 4,
+        14 + 2 * 144 + 4,
+    )

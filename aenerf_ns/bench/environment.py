@@ -10,6 +10,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+_PACKAGES = (
+    "aenerf-ns", "nerfstudio", "torch", "numpy", "numba", "scipy", "open3d", "opencv-contrib-python-headless", "pillow",
+    "h5py", "pycolmap",
+)  # fmt: skip
+"""Whatever decides the bytes of a simulated dataset, and what is trained with."""
+
 
 def environment() -> dict[str, Any]:
     """Machine, versions, commit (None outside a checkout) and command of this process."""
@@ -20,7 +26,7 @@ def environment() -> dict[str, Any]:
         "machine": {"cpu": _cpu(), "cores": os.cpu_count(), "gpu": gpu, "torch_threads": torch.get_num_threads()},
         "versions": {
             "python": platform.python_version(),
-            **{name: version(name) for name in ("aenerf-ns", "nerfstudio", "torch", "numpy", "numba")},
+            **{name: version(name) for name in _PACKAGES},
         },
         "commit": _commit(),
         "command": " ".join([_program(), *map(_portable, sys.argv[1:])]),

@@ -33,7 +33,8 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
     """
     output = folder / "figures"
     output.mkdir(exist_ok=True)
-    made = [run for run in runs if run.name in figures]
+    # Figures can come without the pictures, from results that are published.
+    made = [run for run in runs if run.name in figures and (folder / "runs" / run.name / "pictures").exists()]
     files = []
     for speed, table in dict.fromkeys((run.dataset.speed, run.table) for run in made):
         rows = [run for run in made if (run.dataset.speed, run.table) == (speed, table)]
@@ -55,7 +56,7 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
 
 
 def _views(folder: Path, runs: Sequence[Run], file: Path) -> Path:
-    """A test view: the truth, and what each run made of it with the error below."""
+    """A test view: the truth, and what each run made of it with the error below, white from a quarter of the range."""
     columns: dict[str, list[NDArray[np.uint8]]] = {}
     for run in runs:
         truth, rendered = _view(folder, run)
@@ -139,7 +140,7 @@ def _paths(data: Path, corrected: Path, file: Path) -> Path:
         above.plot(*aligned[:, :2, 3].T, color=color, linewidth=0.8)
         angles = torch.rad2deg(rotation_angle(aligned, reference))
         over_time.plot((times - truth.start).double() * 1e-9, angles, color=color, linewidth=0.8, label=poses)
-    above.set(aspect="equal", xlabel="x", ylabel="y", title="path from above")
+    above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="path from above, after Sim(3) alignment")
     over_time.set(xlabel="seconds", ylabel="degrees", title="rotation error")
     over_time.plot([], color="black", label="true")
     over_time.legend(frameon=False)
@@ -154,10 +155,9 @@ def _curves(runs: Sequence[Run], figures: Mapping[str, dict[str, Any]], file: Pa
     figure = Figure(figsize=(5, 3.5), layout="constrained")
     axes = figure.subplots()
     for run in runs:
-        one = figures[run.name]
-        points = [*one["curve"], (run.steps, one["results"]["psnr"])]
-        axes.plot(*zip(*points, strict=True), marker=".", label=run.row)
-    axes.set(xlabel="steps", ylabel="PSNR [dB] on the test views")
+        if figures[run.name]["curve"]:
+            axes.plot(*zip(*figures[run.name]["curve"], strict=True), marker=".", label=run.row)
+    axes.set(xlabel="steps", ylabel="PSNR [dB] on the validation views")
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(file, dpi=100)
     return file

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from aenerf_ns.errors import DataError
+
 Poses = Literal["noise", "colmap"]
 Scale = Literal["full", "tiny"]
 Table = Literal["methods", "losses"]
@@ -115,7 +117,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """File name: what it is, and a digest of all that it depends on."""
+        """File name: what it is, and a digest of the options that it depends on."""
         unique = digest((self.dataset.name, self.method, str(self.steps), *self.options))
         row = self.row.replace(",", "").replace(" + ", "+").replace(" ", "-")
         return f"{scene_name(self.dataset.scene)}_{self.dataset.speed}_{row}_seed{self.seed}_{unique}"
@@ -144,7 +146,13 @@ def plan(
         steps: of every training; 30,000 or 1500 by default.
         simulate: more options of aenerf simulate.
         train: more options of the event method's trainings.
+
+    Raises:
+        DataError: two scenes have one name.
     """
+    for scene in scenes:
+        if [scene_name(other) for other in scenes].count(scene_name(scene)) > 1:
+            raise DataError("aenerf bench", f"two scenes go by the name {scene_name(scene)}", "give one another folder")
 
     def dataset(scene: str, speed: str) -> Dataset:
         estimated = _NOISE[scale] if poses == "noise" else ("--poses", "colmap")
@@ -180,7 +188,7 @@ def plan(
 def scene_name(scene: str) -> str:
     """Short name of a scene, which may be given as a file."""
     path = Path(scene)
-    return path.parent.name if path.name == "scene.json" else path.stem
+    return path.resolve().parent.name if path.name == "scene.json" else path.stem
 
 
 def digest(words: Sequence[str]) -> str:

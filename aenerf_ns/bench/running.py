@@ -1,6 +1,7 @@
 """Making the runs of a benchmark: simulate, train, evaluate, and keep the figures.
 
-Everything lies in one folder, which can be worked on again and by several processes at once:
+Everything lies in one folder, which can be worked on again and by several processes at once, each of which leaves alone
+what another is making:
 
     datasets/DATASET/       what was simulated
     outputs/RUN/            what was trained, as ns-train leaves it
@@ -14,6 +15,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -22,7 +24,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from aenerf_ns.bench.environment import environment
 from aenerf_ns.bench.plan import CEILING, OURS, Dataset, Run, scene_name
@@ -46,31 +48,36 @@ class Runner:
     def __init__(self, folder: Path, device: str) -> None:
         self._folder = folder
         self._device = device
+        self._failed: dict[str, DataError] = {}
         for name in ("datasets", "outputs", "logs", "runs"):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
     def figures(self, run: Run) -> dict[str, Any] | None:
         """The figures of a run, None where it has not been made."""
         file = self._figures_file(run)
-        return json.loads(file.read_text("utf8")) if file.exists() else None
+        return _read(file)
 
-    def make(self, run: Run) -> dict[str, Any]:
+    def make(self, run: Run) -> dict[str, Any] | None:
         """Makes a run, unless that has been done.
 
         Returns:
-            Its figures.
+            Its figures; None where another process is making it.
 
         Raises:
             DataError: a command failed.
         """
-        done = self.figures(run)
-        if done is not None:
-            return done
+        try:
+            with FileLock(self._folder / "runs" / f".{run.name}.lock", timeout=0):
+                return self.figures(run) or self._make(run)
+        except Timeout:
+            return None
+
+    def _make(self, run: Run) -> dict[str, Any]:
         data = self._dataset(run.dataset)
         # What was left by a training that was killed.
         shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)
         begin = time.perf_counter()
-        self._train(run, data)
+        training = self._train(run, data)
         seconds = time.perf_counter() - begin
         (config,) = (self._folder / "outputs" / run.name).rglob("config.yml")
         results = self._evaluate(run, config)
@@ -82,10 +89,13 @@ class Runner:
             "speed": run.dataset.speed,
             "poses": "true" if run.true_poses else run.dataset.poses,
             "method": run.method,
+            "steps": run.steps,
             "seed": run.seed,
-            "simulate": " ".join(("aenerf", "simulate", *run.dataset.command)),
-            "options": " ".join(run.options),
+            "device": self._device,
+            "simulate": shlex.join(("aenerf", "simulate", *run.dataset.command)),
+            "train": shlex.join(training),
             "train_seconds": round(seconds),
+            "poses_report": _read(data / "poses_report.json"),
             "results": results,
             "curve": _curve(config.parent),
             **environment(),
@@ -100,6 +110,9 @@ class Runner:
         return self._folder / "runs" / f"{run.name}.json"
 
     def _dataset(self, dataset: Dataset) -> Path:
+        if dataset.name in self._failed:
+            # Every one of its runs would simulate anew, and fail at the same place.
+            raise self._failed[dataset.name]
         folder = self._folder / "datasets" / dataset.name
         # Where another process is making the same, its work is waited for.
         with FileLock(folder.with_name(f".{dataset.name}.lock")):
@@ -107,11 +120,16 @@ class Runner:
                 # A built-in scene's name has no suffix; a file's path is relative to where the benchmark was started.
                 scene = str(Path(dataset.scene).resolve()) if Path(dataset.scene).suffix else dataset.scene
                 options = ("--scene", scene, *dataset.command[2:])
-                self._call(dataset.name, _script("aenerf"), "simulate", "--output", str(folder.resolve()), *options)
+                output = str(folder.resolve())
+                try:
+                    self._call(dataset.name, _script("aenerf"), "simulate", "--output", output, *options)
+                except DataError as error:
+                    self._failed[dataset.name] = error
+                    raise
         return folder
 
-    def _train(self, run: Run, data: Path) -> None:
-        path = str(data.resolve())
+    def _train(self, run: Run, data: Path) -> tuple[str, ...]:
+        """Returns the command, in terms of the benchmark's folder."""
         common = (
             run.method, "--machine.device-type", self._device, "--machine.seed", str(run.seed), "--vis", "tensorboard",
             "--experiment-name", run.name, "--output-dir", "outputs", "--max-num-iterations", str(run.steps),
@@ -125,11 +143,16 @@ class Runner:
                 # The same pictures, sooner: what a piece needs stays small.
                 options += ("--pipeline.model.eval-num-rays-per-chunk", "1024")
             images = ("nerfstudio-data", "--data", str(_with_true_poses(data).resolve()))
-            self._call(run.name, *_NERFACTO, "ns-train", *common, *options, *run.options, *images)
+            program, command = _NERFACTO, ("ns-train", *common, *options, *run.options, *images)
         else:
             poses = "ground-truth" if run.true_poses else "estimated"
-            events = ("aenerf-data", "--data", path, "--poses", poses)
-            self._call(run.name, _script("ns-train"), *common, *run.options, *events)
+            events = ("aenerf-data", "--data", str(data.resolve()), "--poses", poses)
+            # Reported where its network can be had, as nerfacto's is.
+            lpips = ("--pipeline.model.lpips", "True")
+            program, command = (_script("ns-train"),), (*common, *lpips, *run.options, *events)
+        self._call(run.name, *program, *command)
+        said = ("python", *program[1:]) if run.row == CEILING else ("ns-train",)
+        return (*said, *(word.replace(f"{self._folder.resolve()}/", "") for word in command))
 
     def _evaluate(self, run: Run, config: Path) -> dict[str, Any]:
         relative = str(config.relative_to(self._folder))
@@ -158,11 +181,21 @@ class Runner:
         """
         file = self._folder / "logs" / f"{log}.log"
         with file.open("a", encoding="utf8") as output:
-            output.write(f"$ {' '.join(command)}\n")
+            output.write(f"$ {shlex.join(command)}\n")
             output.flush()
-            done = subprocess.run(command, cwd=self._folder, stdout=output, stderr=subprocess.STDOUT, check=False)
-        if done.returncode:
-            raise DataError(file, f"a command ended with status {done.returncode}", "see the end of this file")
+            with subprocess.Popen(command, cwd=self._folder, stdout=output, stderr=subprocess.STDOUT) as process:
+                try:
+                    status = process.wait()
+                except BaseException:
+                    # Left alone, it would go on beside what the next call starts in its place.
+                    process.terminate()
+                    raise
+        if status:
+            raise DataError(file, f"a command ended with status {status}", "see the end of this file")
+
+
+def _read(file: Path) -> dict[str, Any] | None:
+    return json.loads(file.read_text("utf8")) if file.exists() else None
 
 
 def _script(name: str) -> str:
@@ -186,7 +219,8 @@ def _with_true_poses(data: Path) -> Path:
 
 
 def _curve(run: Path) -> list[tuple[int, float]]:
-    """PSNR over the test views now and then during a training: steps and values, from its TensorBoard log."""
+    """PSNR over the validation views, which is what the framework looks at while it trains: steps and values, from a
+    training's TensorBoard log."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     log = EventAccumulator(str(run))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
@@ -13,15 +14,21 @@ _METRICS = ("psnr", "ssim", "lpips")
 _METHODS = (WITHOUT_CORRECTION, OURS, TRUE_POSES, CEILING)
 
 
-def report(figures: Sequence[Figures], missing: Sequence[str]) -> str:
-    """All tables of the figures of some runs, and the names of the runs that are missing."""
+def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
+    """All tables of the figures of some runs.
+
+    Args:
+        figures: of the runs.
+        missing: names of the runs that have none, and why not, or nothing where they have not been tried.
+    """
     methods, losses = ([one for one in figures if one["table"] == table] for table in ("methods", "losses"))
     parts = ["# Benchmark", _conditions(figures)]
     if missing:
-        parts.append(f"**Not complete:** {len(missing)} runs are missing: {', '.join(missing)}.")
+        parts.append(f"**Not complete:** {len(missing)} of {len(missing) + len(figures)} runs are missing.")
     if methods:
         parts += [
             "## Novel views (the paper's table 1)",
+            "Means over what all methods of a column have in common.",
             methods_table(methods),
             "## Pose correction (the paper's table 3)",
             "RE: rotation error in degrees, TE: translation error in percent of the length of the path; both after "
@@ -32,23 +39,26 @@ def report(figures: Sequence[Figures], missing: Sequence[str]) -> str:
         parts += ["## Losses (the paper's table 4), hard speed", losses_table(losses)]
     if figures:
         parts += ["## Every scene", scenes_table(figures)]
+    sequences = {(one["scene"], one["speed"]): one for one in figures if one["poses_report"]}
+    if sequences:
+        parts += ["## Poses from COLMAP", sequences_table(list(sequences.values()))]
+    if missing:
+        parts += ["## Missing", "\n".join(f"- {name}{why and f': {why}'}" for name, why in missing.items())]
     return "\n\n".join(parts) + "\n"
 
 
 def methods_table(figures: Sequence[Figures]) -> str:
-    """Means over scenes and seeds for each method, kind of scene and speed."""
+    """Means for each method, kind of scene and speed, over the scenes and seeds that all methods of the column have:
+    where runs are missing, a method would look good that lacks the hard scenes."""
     columns = [(kind, speed) for kind in ("object", "large") for speed in ("easy", "hard")]
     columns = [column for column in columns if _of(figures, kind=column[0], speed=column[1])]
-    header = ["method"] + [f"{kind} scenes, {speed}: {m.upper()}" for kind, speed in columns for m in _METRICS]
-    rows = []
-    for method in _METHODS:
-        if _of(figures, row=method):
-            cells = [
-                _mean(_of(figures, row=method, kind=kind, speed=speed), metric)
-                for kind, speed in columns
-                for metric in _METRICS
-            ]
-            rows.append([method, *cells])
+    header, rows = ["method"], [[method] for method in _METHODS if _of(figures, row=method)]
+    for kind, speed in columns:
+        common = _common(_of(figures, kind=kind, speed=speed))
+        count = len({one["scene"] for one in common})
+        header += [f"{count} {kind} scenes, {speed}: {metric.upper()}" for metric in _METRICS]
+        for row in rows:
+            row += [_mean(_of(common, row=row[0]), metric) for metric in _METRICS]
     return _markdown(header, rows)
 
 
@@ -69,7 +79,8 @@ def poses_table(figures: Sequence[Figures]) -> str:
 
 
 def losses_table(figures: Sequence[Figures]) -> str:
-    """Means over scenes and seeds for each set of losses."""
+    """Means for each set of losses over the scenes and seeds that all of them have."""
+    figures = _common(figures)
     rows = [[name, *(_mean(_of(figures, row=name), m) for m in _METRICS)] for name in LOSSES if _of(figures, row=name)]
     return _markdown(["losses", *map(str.upper, _METRICS)], rows)
 
@@ -94,16 +105,48 @@ def scenes_table(figures: Sequence[Figures]) -> str:
     return _markdown(header, rows)
 
 
+def sequences_table(figures: Sequence[Figures]) -> str:
+    """What COLMAP made of each sequence, given one run of each: mean errors at the frames, and between them."""
+    header = ["scene", "speed", "frames", "registered", "misplaced", "RE", "TE", "RE between", "TE between"]
+    rows = []
+    for one in figures:
+        poses = one["poses_report"]
+        cells = [str(poses["frames"]), str(poses["registered_frames"]), str(poses["errors"]["misplaced_frames"])]
+        for errors in (poses["errors"], poses["errors_between_frames"]):
+            cells += [f"{errors['rotation_error_degrees']:.2f}°", f"{100 * errors['translation_error']:.1f} cm"]
+        rows.append([one["scene"], one["speed"], *cells])
+    return _markdown(header, rows)
+
+
+def _common(figures: Sequence[Figures]) -> list[Figures]:
+    """Those of the scenes, speeds and seeds that every row among them has."""
+    made: dict[str, set[tuple]] = {}
+    for one in figures:
+        made.setdefault(one["row"], set()).add((one["scene"], one["speed"], one["seed"]))
+    shared = set.intersection(*made.values()) if made else set()
+    return [one for one in figures if (one["scene"], one["speed"], one["seed"]) in shared]
+
+
 def _conditions(figures: Sequence[Figures]) -> str:
     """Where and how the figures were made."""
-    lines = []
+    trained = dict.fromkeys((one["method"], one["steps"]) for one in figures)
+    lines = [f"- {method}, {steps} steps" for method, steps in trained]
+    lines += [f"- data: `{command}`" for command in dict.fromkeys(_simulation(one) for one in figures)]
     for one in {(str(one["machine"]), str(one["versions"]), one["commit"]): one for one in figures}.values():
         machine, versions = one["machine"], ", ".join(f"{name} {number}" for name, number in one["versions"].items())
-        device = f"{machine['gpu'] or machine['cpu']}, {machine['cores']} cores"
+        device = f"{machine['gpu'] if one['device'] == 'cuda' else machine['cpu']}, {machine['cores']} cores"
         lines.append(f"- {device}; {versions}; commit {one['commit']}")
     used = {one["results"].get("color_correction", "none (nerfacto)") for one in figures}
     lines.append(f"- colour correction: {'; '.join(sorted(used))}")
     return "\n".join(lines)
+
+
+def _simulation(figures: Figures) -> str:
+    """The command that made the data, whichever the scene and the speed."""
+    words = shlex.split(figures["simulate"])
+    for option in ("--scene", "--speed"):
+        words[words.index(option) + 1] = option[2:].upper()
+    return shlex.join(words)
 
 
 def _of(figures: Sequence[Figures], **wanted: str) -> list[Figures]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import re
+import shlex
+import signal
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from filelock import FileLock
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.bench.plan import Poses, Scale, Table, plan
@@ -19,7 +21,8 @@ from aenerf_ns.progress import progress_bar
 class Bench:
     """Simulate, train and evaluate scenes x speeds x methods x seeds, and write tables and figures.
 
-    Can be stopped and repeated: what has been made stays. Several processes can share the work, see --shard.
+    Can be stopped and repeated: what has been made stays. Several processes can work on one folder: the same command,
+    started several times, or as a scheduler's array.
     """
 
     output: Path
@@ -44,8 +47,6 @@ class Bench:
     """More options of the event method's trainings."""
     device: Literal["cuda", "cpu"] = "cuda"
     """Where to train."""
-    shard: str = "1/1"
-    """Which part of the runs to make, as in 2/8: for the jobs of a scheduler's array that work on one folder."""
 
     def main(self) -> None:
         """Makes the runs and writes ``report.md`` and the figures."""
@@ -53,36 +54,31 @@ class Bench:
         from aenerf_ns.bench.running import Runner
         from aenerf_ns.bench.tables import report
 
-        part, parts = self._shard()
         runs = plan(
             self.scenes, self.speeds, self.poses, self.tables, self.seeds, self.scale, self.steps,
-            self.simulate.split(), self.train.split(),
+            shlex.split(self.simulate), shlex.split(self.train),
         )  # fmt: skip
         runner = Runner(self.output, self.device)
-        failures = []
+        # A scheduler ends its jobs so: as an exception it reaches the command that runs, which is not left behind.
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+        failures = {}
         with progress_bar() as progress:
-            for run in progress.track(runs[part - 1 :: parts], description="Runs"):
+            for run in progress.track(runs, description="Runs"):
                 try:
-                    results = runner.make(run)["results"]
+                    made = runner.make(run)
                 except DataError as error:
-                    failures.append(str(error))
+                    failures[run.name] = str(error)
                     CONSOLE.print(f"[red]{run.name}: {error}")
                 else:
-                    CONSOLE.print(f"{run.name}: PSNR {results['psnr']:.2f} dB")
-        figures = {run.name: one for run in runs if (one := runner.figures(run)) is not None}
-        missing = [run.name for run in runs if run.name not in figures]
+                    done = "another process is at it" if made is None else f"PSNR {made['results']['psnr']:.2f} dB"
+                    CONSOLE.print(f"{run.name}: {done}")
         file = self.output / "report.md"
-        partial = self.output / f".report.{os.getpid()}"
-        partial.write_text(report(list(figures.values()), missing), "utf8")
-        partial.rename(file)
-        drawn = draw(self.output, runs, figures)
+        # One process after the other, so that what is written last is the whole.
+        with FileLock(self.output / ".report.lock"):
+            figures = {run.name: one for run in runs if (one := runner.figures(run)) is not None}
+            missing = {run.name: failures.get(run.name, "") for run in runs if run.name not in figures}
+            file.write_text(report(list(figures.values()), missing), "utf8")
+            drawn = draw(self.output, runs, figures)
         CONSOLE.print(f"{file}, {len(drawn)} figures beside it; {len(missing)} of {len(runs)} runs are missing.")
         if failures:
             raise DataError(self.output, f"{len(failures)} runs failed", "see above, and repeat the command")
-
-    def _shard(self) -> tuple[int, int]:
-        match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
-        part, parts = map(int, match.groups()) if match else (0, 0)
-        if not 1 <= part <= parts:
-            raise DataError("aenerf bench", f"--shard {self.shard}", "give it as 1/4, 2/4, 3/4 or 4/4")
-        return part, parts
