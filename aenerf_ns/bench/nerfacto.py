@@ -42,7 +42,7 @@ def prepare() -> None:
             return _Absent()
 
     lpip.LearnedPerceptualImagePatchSimilarity = build_or_leave_out  # type: ignore[misc,assignment]
-    functional.structural_similarity_index_measure = partial(  # type: ignore[assignment]
+    functional.structural_similarity_index_measure = partial(
         functional.structural_similarity_index_measure, data_range=1.0
     )
     os.environ["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"

@@ -129,7 +129,7 @@ class Runner:
         return folder
 
     def _train(self, run: Run, data: Path) -> tuple[str, ...]:
-        """Returns the command, in terms of the benchmark's folder."""
+        """Returns the command, without the folders of this machine."""
         common = (
             run.method, "--machine.device-type", self._device, "--machine.seed", str(run.seed), "--vis", "tensorboard",
             "--experiment-name", run.name, "--output-dir", "outputs", "--max-num-iterations", str(run.steps),
@@ -137,22 +137,22 @@ class Runner:
         )  # fmt: skip
         if run.row == CEILING:
             # Of the framework's implementations, the one that needs no CUDA extension.
-            options = ("--pipeline.model.implementation", "torch", "--pipeline.model.camera-optimizer.mode", "off",
-                       "--pipeline.model.use-appearance-embedding", "False")  # fmt: skip
+            command = [
+                *_NERFACTO, "ns-train", *common, "--pipeline.model.implementation", "torch",
+                "--pipeline.model.camera-optimizer.mode", "off", "--pipeline.model.use-appearance-embedding", "False",
+            ]  # fmt: skip
             if self._device == "cpu":
                 # The same pictures, sooner: what a piece needs stays small.
-                options += ("--pipeline.model.eval-num-rays-per-chunk", "1024")
-            images = ("nerfstudio-data", "--data", str(_with_true_poses(data).resolve()))
-            program, command = _NERFACTO, ("ns-train", *common, *options, *run.options, *images)
+                command += ["--pipeline.model.eval-num-rays-per-chunk", "1024"]
+            command += [*run.options, "nerfstudio-data", "--data", str(_with_true_poses(data).resolve())]
         else:
+            # LPIPS is reported where its network can be had, as nerfacto's is.
+            command = [_script("ns-train"), *common, "--pipeline.model.lpips", "True", *run.options]
             poses = "ground-truth" if run.true_poses else "estimated"
-            events = ("aenerf-data", "--data", str(data.resolve()), "--poses", poses)
-            # Reported where its network can be had, as nerfacto's is.
-            lpips = ("--pipeline.model.lpips", "True")
-            program, command = (_script("ns-train"),), (*common, *lpips, *run.options, *events)
-        self._call(run.name, *program, *command)
-        said = ("python", *program[1:]) if run.row == CEILING else ("ns-train",)
-        return (*said, *(word.replace(f"{self._folder.resolve()}/", "") for word in command))
+            command += ["aenerf-data", "--data", str(data.resolve()), "--poses", poses]
+        self._call(run.name, *command)
+        words = (word.replace(f"{self._folder.resolve()}/", "") for word in command[1:])
+        return (Path(command[0]).name, *words)
 
     def _evaluate(self, run: Run, config: Path) -> dict[str, Any]:
         relative = str(config.relative_to(self._folder))
