@@ -49,7 +49,7 @@ class Simulation:
         sensor: thresholds, refractory period and Bayer pattern.
         speed: "easy" for constant speed, "hard" for 8^sin(2πt) times that speed.
         easy_duration: seconds that the path takes at constant speed.
-        max_displacement: pixels that the image may move between two rendered frames.
+        max_displacement: pixels that 99 % of what is seen may move between two rendered frames.
         contrast_threshold_spread: standard deviation of the thresholds over the pixels.
         seed: of the sensor's thresholds and noise.
         leak_rate: see :class:`~aenerf_ns.events.esim.EventSimulator`.
@@ -86,7 +86,7 @@ class Simulation:
             shot_noise_rate=shot_noise_rate,
             seed=seed,
         )
-        self._frames = frame_parameters(scene.renderer, scene.path, self._intrinsics, width, height, max_displacement)
+        self._frames = frame_parameters(scene, self._intrinsics, width, height, max_displacement)
         self._times = _nanoseconds(self._profile.time(self._frames))
         if (np.diff(self._times) <= 0).any():
             raise ValueError(f"duration must be long enough to tell its frames apart, not {easy_duration} s")

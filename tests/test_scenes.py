@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterator
 
@@ -304,7 +305,11 @@ def test_frame_displacement_of_a_turn_and_of_a_shift() -> None:
     behind = np.eye(4)
     behind[2, 3] = 3.0
     assert frame_displacement(depth, np.eye(4), behind, intrinsics) == np.inf
-    assert frame_displacement(np.full((24, 32), np.inf), np.eye(4), shifted, intrinsics) == 0
+    nothing = np.full((24, 32), np.inf)
+    assert frame_displacement(nothing, np.eye(4), shifted, intrinsics) == 0
+    assert frame_displacement(nothing, np.eye(4), shifted @ rolled, intrinsics, sees_infinity=True) == pytest.approx(
+        expected, abs=1e-12
+    )
 
 
 def test_frame_parameters_bound_the_motion(toy: SimulationScene) -> None:
@@ -314,7 +319,8 @@ def test_frame_parameters_bound_the_motion(toy: SimulationScene) -> None:
     def path(s: float) -> np.ndarray:
         return paths.object_path(s, turns=3.0)
 
-    parameters = frame_parameters(toy.renderer, path, intrinsics, width, height, 1.0)
+    scene = dataclasses.replace(toy, path=path)
+    parameters = frame_parameters(scene, intrinsics, width, height, 1.0)
     assert parameters[0] == 0
     assert parameters[-1] == 1
     assert (np.diff(parameters) > 0).all()
@@ -326,7 +332,7 @@ def test_frame_parameters_bound_the_motion(toy: SimulationScene) -> None:
     assert max(moved) < 1.1
     assert np.mean(moved[1:-1]) > 0.9
     with pytest.raises(ValueError, match="must be positive, got 0"):
-        frame_parameters(toy.renderer, path, intrinsics, width, height, 0.0)
+        frame_parameters(scene, intrinsics, width, height, 0.0)
 
 
 # --- built-in scenes

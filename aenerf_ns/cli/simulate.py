@@ -69,7 +69,7 @@ class Simulate:
     bayer_pattern: BayerPattern = ""
     """RGGB for a colour sensor."""
     max_displacement: float = 0.5
-    """Pixels that the image may move between two rendered frames."""
+    """Pixels that 99 % of what is seen may move between two rendered frames."""
     train_images: int = 50
     """Reference images along the trajectory. They are never trained on."""
     validation_views: int = 20

@@ -25,7 +25,7 @@ class SimulationScene:
         path: s in [0, 1] to a pose (4, 4).
         focal_ratio: focal length over image width; the pixels are square and the principal point is the middle.
         aabb: (2, 3) corners of the box that holds the scene; None where it surrounds the camera.
-        background: (3,) linear RGB behind the scene; None where every ray hits something.
+        background: (3,) linear RGB behind the scene; None where every ray hits something, or an environment.
         validation_views: number of views to poses (n, 4, 4) around the path.
         test_views: number of views and seed to random poses (n, 4, 4).
         duration: seconds that the path takes at constant speed.

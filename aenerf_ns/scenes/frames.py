@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.scenes.renderer import Renderer
+from aenerf_ns.scenes import SimulationScene
 
 Array = NDArray[np.float64]
 
@@ -24,45 +24,50 @@ def frame_displacement(
     first_camera_to_world: ArrayLike,
     second_camera_to_world: ArrayLike,
     intrinsics: Sequence[float],
+    sees_infinity: bool = False,
 ) -> float:
     """99th percentile of how far the pixels of one view lie from where they were in another, in pixels.
 
     Args:
-        depth: (H, W) of the first view along its optical axis; inf where there is nothing.
+        depth: (H, W) of the first view along its optical axis; inf where no surface is.
         first_camera_to_world, second_camera_to_world: (4, 4), OpenCV axes.
         intrinsics: (fx, fy, cx, cy) of this depth map, pixel centres at +0.5.
+        sees_infinity: whether there is something to be seen where the depth is inf: then it moves as the camera turns.
 
     Returns:
         The percentile, 0 where nothing is seen, inf where the second view has some of it behind the camera.
     """
     depth = np.asarray(depth, np.float64)
     fx, fy, cx, cy = intrinsics
-    y, x = np.nonzero(np.isfinite(depth))
+    finite = np.isfinite(depth)
+    y, x = np.nonzero(finite | sees_infinity)
     if len(x) == 0:
         return 0.0
     u, v = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
     first, second = np.asarray(first_camera_to_world, np.float64), np.asarray(second_camera_to_world, np.float64)
     rotation = second[:3, :3].T @ first[:3, :3]
     shift = second[:3, :3].T @ (first[:3, 3] - second[:3, 3])
-    points = np.stack([u, v, np.ones_like(u)]) * depth[y, x]
-    px, py, pz = rotation @ points + shift[:, None]
+    # A point at infinity is a direction, which shifts leave as it is.
+    near = finite[y, x]
+    points = np.stack([u, v, np.ones_like(u)]) * np.where(near, depth[y, x], 1.0)
+    px, py, pz = rotation @ points + shift[:, None] * near
     if pz.min() <= 0:
         return np.inf
     return float(np.percentile(np.hypot(fx * (px / pz - u), fy * (py / pz - v)), _PERCENTILE))
 
 
 def frame_parameters(
-    renderer: Renderer,
-    path: Callable[[float], Array],
+    scene: SimulationScene,
     intrinsics: Sequence[float],
     width: int,
     height: int,
     maximum_displacement: float = 0.5,
 ) -> Array:
-    """Path parameters (N,) from 0 to 1 between which the image moves by at most ``maximum_displacement`` pixels.
+    """Path parameters (N,), 0 to 1, between which 99 % of what is seen moves at most ``maximum_displacement`` pixels.
 
-    That is the `frame_displacement` of a coarse depth map, in pixels of the full picture, as far apart as it allows.
-    They do not depend on the speed at which the path is travelled.
+    That is the `frame_displacement` of a coarse depth map, in pixels of the full picture, as far apart as it allows. A
+    uniform background does not count, for its motion is not seen; an environment does. The parameters do not depend on
+    the speed at which the path is travelled.
 
     Raises:
         ValueError: on a displacement that is not positive.
@@ -77,13 +82,13 @@ def frame_parameters(
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        parameters, pose, step = [0.0], path(0.0), 1e-4
+        parameters, pose, step = [0.0], scene.path(0.0), 1e-4
         while parameters[-1] < 1.0:
-            depth = renderer.render(pose, probe, _PROBE_WIDTH, rows, 1)[1]
+            depth = scene.renderer.render(pose, probe, _PROBE_WIDTH, rows, 1)[1]
             while True:
                 step = min(step, _LARGEST_STEP, 1.0 - parameters[-1])
-                next_pose = path(parameters[-1] + step)
-                displacement = frame_displacement(depth, pose, next_pose, probe) / shrink
+                next_pose = scene.path(parameters[-1] + step)
+                displacement = frame_displacement(depth, pose, next_pose, probe, scene.background is None) / shrink
                 if displacement <= maximum_displacement:
                     break
                 step *= max(target / displacement, 0.1)
