@@ -58,6 +58,7 @@ class AENeRFPipeline(VanillaPipeline):
 
     def __init__(self, config: AENeRFPipelineConfig, device: str, **kwargs: Any) -> None:
         if config.model.learn_refractory_period:
+            # Not once the sampler is there: it would have worked out what longer pairs need.
             config.datamanager.max_events_per_pair = 1
         super().__init__(config, device, **kwargs)
         self._refined_test_poses = False

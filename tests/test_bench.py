@@ -266,7 +266,4 @@ def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path)
     of_scene = {f"object_hard_{table}_{kind}.png" for table in kinds for kind in kinds[table]}
     assert set(drawn) == {"hard_methods.jpg", "hard_losses.jpg", *of_scene}
     views = Image.open(tmp_path / "bench" / "figures" / "object_hard_methods_views.png")
-    assert views.size == (
-        5 * 192 + 4 * 4,
-        14 + 2 * 144 + 4,
-    )
+    assert views.size == (5 * 192 + 4 * 4, 14 + 2 * 144 + 4)

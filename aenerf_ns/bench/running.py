@@ -54,8 +54,7 @@ class Runner:
 
     def figures(self, run: Run) -> dict[str, Any] | None:
         """The figures of a run, None where it has not been made."""
-        file = self._figures_file(run)
-        return _read(file)
+        return _read(self._figures_file(run))
 
     def make(self, run: Run) -> dict[str, Any] | None:
         """Makes a run, unless that has been done.
