@@ -23,12 +23,12 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
 
     _target: type = field(default_factory=lambda: EventDataManager)
     train_num_rays_per_batch: int = 8192
-    """Rays of a training batch; a pair of events takes two."""
+    """Rays of a training batch; a pair of events takes two, or three with the temporal loss."""
     eval_num_rays_per_batch: int = 8192
     """Rays of a batch of pairs on which the loss is logged without training; a pair of events takes two."""
     max_events_per_pair: int = 64
-    """The most events of its pixel that a pair spans; 1: consecutive events, as in the paper. They are also where the
-    sensor has a refractory period, or one is learned."""
+    """The most events of its pixel that a pair spans; 1: consecutive events, as in the paper. They also are where a
+    refractory period is learned, or is more than a hundredth of an event's distance from its neighbours."""
 
 
 class EventDataManager(VanillaDataManager[EventDataset]):

@@ -100,7 +100,7 @@ class AENeRFModelConfig(ModelConfig):
         {"reconstruction_loss": 1.0, "temporal_loss": 0.0, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
     )
     """Weights of the losses (paper, eq. 14: alpha, beta, gamma, eta). A weight of 0 turns a loss off. The paper's beta
-    is 0.001; on hash grids it has lowered quality so far."""
+    is 0.001; on hash grids it has not been seen to help."""
     learn_contrast_threshold_ratio: bool = False
     """Learn C+ / C-, from the dataset's values; C- stays."""
     learn_refractory_period: bool = False
@@ -306,11 +306,12 @@ class AENeRFModel(Model):
                 learned["positive_contrast_threshold"] = ratio * self.sensor.negative_contrast_threshold
             period = self.sensor_parameters.refractory_period
             if period is not None:
-                learned["interval_change"] = self.sensor.refractory_period * 1e-9 - period
-                num_pairs = len(ray_bundle) // (3 if self.training and self.uses_temporal_loss else 2)
-                # Intervals start at the end of the refractory period.
-                starts = torch.arange(len(ray_bundle), device=ray_bundle.times.device) < num_pairs
-                ray_bundle.times = ray_bundle.times - starts[:, None] * learned["interval_change"]
+                learned["interval_change"] = change = self.sensor.refractory_period * 1e-9 - period
+                rays_per_pair = 3 if self.training and self.uses_temporal_loss else 2
+                start, end, *within = ray_bundle.times.chunk(rays_per_pair)
+                # Intervals start at the end of the refractory period, and what is drawn from them keeps its place.
+                within = [end - (end - t) * (1 + change / (end - start)) for t in within]
+                ray_bundle.times = torch.cat([start - change, end, *within])
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         return super().forward(ray_bundle) | learned
 
@@ -375,9 +376,8 @@ class AENeRFModel(Model):
         if self.training:
             if "log_radiance_rate" in outputs:
                 rate = outputs["log_radiance_rate"].gather(1, batch["channel"][:, None])[:, 0]
-                interval = batch["interval"] + outputs.get("interval_change", 0.0)
-                # Only between consecutive events is the mean rate near that of a moment.
-                change = torch.where(batch["consecutive"], target, torch.zeros_like(target))
+                interval = batch["last_interval"] + outputs.get("interval_change", 0.0)
+                change = self._change(outputs, batch["last_num_positive"], batch["last_num_negative"])
                 losses["temporal_loss"] = temporal_loss(rate, change, interval)
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             losses["interlevel_loss"] = interlevel_loss(weights, samples) / mean_threshold**2
@@ -399,13 +399,12 @@ class AENeRFModel(Model):
         """Rendered and true changes (N,) over the intervals of a batch, each of its pixel's channel."""
         start, end = outputs["log_radiance"].split(len(batch["channel"]))[:2]
         predicted = (end - start).gather(1, batch["channel"][:, None])[:, 0]
-        target = log_radiance_change(
-            batch["num_positive"],
-            batch["num_negative"],
-            self._positive_contrast_threshold(outputs),
-            self.sensor.negative_contrast_threshold,
-        )
-        return predicted, target
+        return predicted, self._change(outputs, batch["num_positive"], batch["num_negative"])
+
+    def _change(self, outputs: dict[str, Any], num_positive: Tensor, num_negative: Tensor) -> Tensor:
+        """The change of log-radiance (N,) that counts of events tell of."""
+        positive, negative = self._positive_contrast_threshold(outputs), self.sensor.negative_contrast_threshold
+        return log_radiance_change(num_positive, num_negative, positive, negative)
 
     def _positive_contrast_threshold(self, outputs: dict[str, Any]) -> Tensor | float:
         """C+, learned or given."""

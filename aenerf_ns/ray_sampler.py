@@ -11,7 +11,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 # Among the metadata of rays of pairs, and of no others: (N, 3) float64 unit vectors in the camera's frame.
 CAMERA_DIRECTIONS = "camera_directions"
 
-# t_sam: a truncated normal distribution over the interval.
+# A pair spans an event only where the intervals on its two sides are so many refractory periods long: at a steady rate,
+# a hundredth of a contrast threshold goes unseen.
+_INTERVAL_TO_REFRACTORY_PERIOD = 100
+
+# t_sam: a truncated normal distribution over the interval of the pair's last event.
 _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
 
 
@@ -37,7 +41,7 @@ class EventRaySampler:
     slightly wrong time is as large an error as the change itself. Over many events it is a small part.
 
     A pair's interval is [earlier time + refractory period, time]. What changes while a pixel is blind is in no event,
-    and would be missing within a longer pair: with a refractory period, pairs are consecutive.
+    and is missing within a longer pair: pairs reach back only over events beside which the refractory period is short.
 
     Draws from torch's global generator, which Nerfstudio seeds.
 
@@ -51,8 +55,8 @@ class EventRaySampler:
 
     Attributes:
         max_events_per_pair: see above.
-        with_time_within: whether batches for training have a third ray for each pair, at a random time t_sam within
-            its interval, for the temporal loss.
+        with_time_within: whether batches for training have a third ray for each pair, for the temporal loss, at a
+            random time t_sam between the last two of its events: over more, the mean rate tells little of a moment's.
     """
 
     def __init__(
@@ -92,8 +96,8 @@ class EventRaySampler:
             They are in the camera's frame: pose correction moves them to the world by their ``times``, in float64
             seconds since the trajectory's start, and the ``camera_directions`` among their metadata, in float64. And
             for each pair ``num_positive`` and ``num_negative`` (N,) counts of events after its earlier one up to its
-            later one, whether it is of ``consecutive`` (N,) events, the ``interval`` (N,) in seconds, and the
-            ``channel`` (N,) of its pixel's filter.
+            later one, of these the ``last_num_positive`` and ``last_num_negative`` (N,) at the time of the later one,
+            the ``last_interval`` (N,) in seconds from the event before, and the ``channel`` (N,) of its pixel's filter.
         """
         with_time_within = self.with_time_within and num_pairs is None
         rays_per_pair = 3 if with_time_within else 2
@@ -102,15 +106,25 @@ class EventRaySampler:
         index = self._draw(pairs, num_pairs)
         x, y = pairs.x[index].astype(np.int64), pairs.y[index].astype(np.int64)
         first, num_positive, num_negative = self._extend(pairs, index)
-        starts = pairs.previous_time[first] + self.sensor.refractory_period
-        start, end = (self.trajectory.seconds(torch.from_numpy(t).to(device)) for t in (starts, pairs.time[index]))
-        interval = torch.from_numpy((pairs.time[index] - starts) * 1e-9).to(device)
+        end, start, last_start = (
+            self.trajectory.seconds(torch.from_numpy(t).to(device))
+            for t in (
+                pairs.time[index],
+                pairs.previous_time[first] + self.sensor.refractory_period,
+                pairs.previous_time[index] + self.sensor.refractory_period,
+            )
+        )
+        last_interval = end - last_start
         times = [start, end]
         if with_time_within:
             within = torch.empty(num_pairs, dtype=torch.float64)
             nn.init.trunc_normal_(within, mean=_WITHIN_MEAN, std=_WITHIN_DEVIATION, a=0.0, b=1.0)
-            times.append(start + within.to(device) * interval)
+            times.append(last_start + within.to(device) * last_interval)
         seconds = torch.cat(times)
+
+        def as_float(counts: NDArray) -> Tensor:
+            return torch.from_numpy(counts.astype(np.float32)).to(device)
+
         rows, columns = torch.from_numpy(y).to(device), torch.from_numpy(x).to(device)
         in_camera = self._directions[rows, columns].repeat(rays_per_pair, 1)
         rays = RayBundle(
@@ -122,10 +136,11 @@ class EventRaySampler:
             metadata={CAMERA_DIRECTIONS: in_camera},
         )
         batch = {
-            "num_positive": torch.from_numpy(num_positive.astype(np.float32)).to(device),
-            "num_negative": torch.from_numpy(num_negative.astype(np.float32)).to(device),
-            "consecutive": torch.from_numpy(first == index).to(device),
-            "interval": interval.float(),
+            "num_positive": as_float(num_positive),
+            "num_negative": as_float(num_negative),
+            "last_num_positive": as_float(pairs.num_positive[index]),
+            "last_num_negative": as_float(pairs.num_negative[index]),
+            "last_interval": last_interval.float(),
             "channel": torch.from_numpy(self.sensor.channel(x, y)).to(device),
         }
         return rays, batch
@@ -138,7 +153,7 @@ class EventRaySampler:
         num_positive, num_negative = (
             counts[last].astype(np.int64) for counts in (pairs.num_positive, pairs.num_negative)
         )
-        if not self._spans_several:
+        if self.max_events_per_pair == 1:
             return first, num_positive, num_negative
         spans = (self.max_events_per_pair + 1) ** torch.rand(len(last), dtype=torch.float64).numpy()
         # The shortest are done after one round, so that few are left for the last.
@@ -152,14 +167,9 @@ class EventRaySampler:
             num_negative[going] += pairs.num_negative[earlier]
         return first, num_positive, num_negative
 
-    @property
-    def _spans_several(self) -> bool:
-        """Whether any pair may span several events."""
-        return self.max_events_per_pair > 1 and self.sensor.refractory_period == 0
-
     @cached_property
     def _predecessors(self) -> NDArray[np.int32] | NDArray[np.int64]:
-        return self._pairs().predecessors()
+        return self._pairs().predecessors(_INTERVAL_TO_REFRACTORY_PERIOD * self.sensor.refractory_period)
 
     @cached_property
     def _usable(self) -> NDArray[np.int64] | None:
@@ -179,7 +189,7 @@ class EventRaySampler:
             DataError: the events cannot be used.
         """
         _ = self._pairs(), self._usable
-        if self._spans_several:
+        if self.max_events_per_pair > 1:
             _ = self._predecessors
 
     def _draw(self, pairs: EventPairs, num_pairs: int) -> NDArray[np.int64]:

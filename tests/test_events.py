@@ -54,9 +54,9 @@ def cut(stream: EventStream, sizes: list[int]) -> Iterator[EventStream]:
 
 
 @settings(max_examples=300, deadline=None)
-@given(EVENTS, st.lists(st.integers(0, 20), max_size=6), st.integers(0, 5))
+@given(EVENTS, st.lists(st.integers(0, 20), max_size=6), st.integers(0, 5), st.integers(0, 10))
 def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
-    rows: list[tuple[int, int, int, int]], sizes: list[int], refractory_period: int
+    rows: list[tuple[int, int, int, int]], sizes: list[int], refractory_period: int, shortest: int
 ) -> None:
     pairs = pair_events(cut(make_stream(rows), sizes), refractory_period=refractory_period)
     assert as_set(pairs) == brute_force_pairs(rows, refractory_period)
@@ -67,10 +67,12 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     distinct = len({(x, y, t) for x, y, t, _ in rows})
     assert pairs.num_merged == len(rows) - distinct >= merged_in_pairs
     assert len(pairs) + pairs.num_first + pairs.num_within_refractory_period == distinct
-    # The predecessor is the pair of the same pixel that ends where this one begins.
-    ends = {(x, y, t): i for i, (x, y, t) in enumerate(zip(pairs.x, pairs.y, pairs.time, strict=True))}
+    # The predecessor is the pair of the same pixel that ends where this one begins, if neither is too short.
+    long = pairs.time - pairs.previous_time >= shortest
+    ends = {(x, y, t): i for i, (x, y, t) in enumerate(zip(pairs.x, pairs.y, pairs.time, strict=True)) if long[i]}
     begins = zip(pairs.x, pairs.y, pairs.previous_time, strict=True)
-    assert pairs.predecessors().tolist() == [ends.get(begin, -1) for begin in begins]
+    expected = [ends.get(begin, -1) if long[i] else -1 for i, begin in enumerate(begins)]
+    assert pairs.predecessors(shortest).tolist() == expected
 
 
 def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:
@@ -145,7 +147,6 @@ def test_bayer_channels_follow_the_raw_pixel() -> None:
     assert sensor.channel(x, y).tolist() == [0, 1, 1, 2, 0, 2]
     assert sensor.num_channels == 3
     assert SensorModel().channel(x, y).tolist() == [0] * 6
-    assert SensorModel(0.2, 0.4).mean_contrast_threshold == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(

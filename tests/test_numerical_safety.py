@@ -63,7 +63,7 @@ def counts(positive: float, negative: float) -> Callable[[dict], dict]:
 
 
 def interval(seconds: float) -> Callable[[dict], dict]:
-    return lambda batch: {**batch, "interval": torch.full_like(batch["interval"], seconds)}
+    return lambda batch: {**batch, "last_interval": torch.full_like(batch["last_interval"], seconds)}
 
 
 CASES: dict[str, dict[str, Any]] = {

@@ -78,7 +78,7 @@ def test_their_gradients_are_those_of_finite_differences() -> None:
         assert abs(gradient.item()) > 1e-6, name
 
 
-def test_only_the_starts_of_the_intervals_move() -> None:
+def test_the_starts_of_the_intervals_move_and_what_lies_within_keeps_its_place() -> None:
     model = make_learning_model().train()
     rays = make_rays(15, with_times=True)
     before = rays.times.clone()
@@ -88,13 +88,15 @@ def test_only_the_starts_of_the_intervals_move() -> None:
     outputs = model(rays)
     moved = rays.times - before
     torch.testing.assert_close(moved[:5], torch.full_like(moved[:5], period - 0.02), rtol=0, atol=1e-12)
-    assert (moved[5:] == 0).all()
+    assert (moved[5:10] == 0).all()
+    places = [(within - start) / (end - start) for start, end, within in (before.chunk(3), rays.times.chunk(3))]
+    torch.testing.assert_close(places[0], places[1], rtol=1e-9, atol=1e-9)
     # Later starts make shorter intervals.
     assert outputs["interval_change"].item() == pytest.approx(0.02 - period, rel=1e-9)
-    losses = model.get_loss_dict(outputs, make_batch(5) | {"interval": torch.full((5,), 0.1)})
+    losses = model.get_loss_dict(outputs, make_batch(5) | {"last_interval": torch.full((5,), 0.1)})
     shorter = model.get_loss_dict(
         {k: v for k, v in outputs.items() if k != "interval_change"},
-        make_batch(5) | {"interval": torch.full((5,), 0.1 + 0.02 - period)},
+        make_batch(5) | {"last_interval": torch.full((5,), 0.1 + 0.02 - period)},
     )
     torch.testing.assert_close(losses["temporal_loss"], shorter["temporal_loss"])
 
@@ -121,4 +123,4 @@ def test_pairs_are_of_consecutive_events_where_the_refractory_period_is_learned(
         model=AENeRFModelConfig(log2_hashmap_size=8, learn_refractory_period=learned),
     ).setup(device="cpu", test_mode="val")
     _, batch = pipeline.datamanager.next_train(0)
-    assert batch["consecutive"].all() == learned
+    assert (batch["num_positive"] == 1).all() == learned

@@ -53,12 +53,16 @@ class EventPairs:
     def __len__(self) -> int:
         return len(self.time)
 
-    def predecessors(self) -> NDArray[np.int32] | NDArray[np.int64]:
+    def predecessors(self, shortest_interval: int = 0) -> NDArray[np.int32] | NDArray[np.int64]:
         """(N,) indices of the pairs that end where these begin, −1 where there is none: at a pixel's first pair, and
-        behind a gap or an event that gave no pair."""
+        behind a gap or an event that gave no pair.
+
+        Args:
+            shortest_interval: pairs whose events are fewer nanoseconds apart neither have nor are predecessors.
+        """
         indices: NDArray = np.empty(len(self), np.int32 if len(self) <= np.iinfo(np.int32).max else np.int64)
         width, height = (int(pixels.max(initial=0)) + 1 for pixels in (self.x, self.y))
-        _link(self.x, self.y, self.previous_time, self.time, width, height, indices)
+        _link(self.x, self.y, self.previous_time, self.time, width, height, shortest_interval, indices)
         return indices
 
     @property
@@ -116,14 +120,15 @@ def _pair_chunk(columns, width, refractory_period, last_time, last_record, recor
 
 
 @numba.njit(cache=True)
-def _link(x, y, previous_time, time, width, height, indices):
+def _link(x, y, previous_time, time, width, height, shortest_interval, indices):
     """Fills in the index of each pair's predecessor."""
     latest = np.full(width * height, -1, dtype=np.int64)
     for i in range(time.shape[0]):
         pixel = np.int64(y[i]) * width + x[i]
         before = latest[pixel]
-        indices[i] = before if before >= 0 and time[before] == previous_time[i] else -1
-        latest[pixel] = i
+        latest[pixel] = i if time[i] - previous_time[i] >= shortest_interval else -1
+        linked = before >= 0 and latest[pixel] >= 0 and time[before] == previous_time[i]
+        indices[i] = before if linked else -1
 
 
 def pair_events(

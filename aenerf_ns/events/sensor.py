@@ -46,11 +46,6 @@ class SensorModel:
             raise ValueError(f'bayer_pattern must be "" or "RGGB", not "{self.bayer_pattern}"')
 
     @property
-    def mean_contrast_threshold(self) -> float:
-        """C̄ = (C+ + C−) / 2, which the paper's losses are normalised by."""
-        return (self.positive_contrast_threshold + self.negative_contrast_threshold) / 2
-
-    @property
     def num_channels(self) -> int:
         """Number of radiance channels the sensor sees: 1 for a monochrome sensor, 3 for a colour one."""
         return 3 if self.bayer_pattern else 1
