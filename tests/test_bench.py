@@ -21,12 +21,14 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from PIL import Image
 
-from aenerf_ns.bench import tables
+from aenerf_ns.bench import environment, tables
 from aenerf_ns.bench.figures import draw, error_map
 from aenerf_ns.bench.nerfacto import prepare
 from aenerf_ns.bench.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
 from aenerf_ns.errors import DataError
 from aenerf_ns.image_metrics import ImageMetrics
+from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.method_configs.aenerf_small import aenerf_small
 
 
 def small_plan(**changes: Any) -> list[Run]:
@@ -55,6 +57,16 @@ def test_the_plan_has_every_run_once() -> None:
     assert all(run.dataset.options[-2:] == ("--poses", "colmap") for run in small_plan(poses="colmap"))
 
 
+def test_all_losses_are_compared_on_as_many_pairs() -> None:
+    option = "--pipeline.datamanager.train-num-rays-per-batch"
+    for scale, method in (("tiny", aenerf_small), ("full", aenerf)):
+        own = method.config.pipeline.datamanager.train_num_rays_per_batch
+        runs = small_plan(scale=scale, tables=("losses",), seeds=(1,), scenes=("room",))
+        rays = {run.row: int(run.options[run.options.index(option) + 1]) for run in runs}
+        assert rays["l_p + l_r"] == rays["l_p + l_r + l_d"] == own
+        assert rays["l_p + l_r + l_g"] == rays["all"] == own // 2 * 3
+
+
 def test_whatever_a_run_depends_on_is_in_its_name() -> None:
     names = {run.name for run in small_plan()}
     for change in (
@@ -79,6 +91,26 @@ def test_a_scene_file_goes_by_its_folder(tmp_path: Path, monkeypatch: pytest.Mon
     assert run.name.startswith("hall_easy_")
     with pytest.raises(DataError, match="two scenes go by the name piano"):
         small_plan(scenes=("old/piano/scene.json", "new/piano/scene.json"))
+
+
+def test_a_commit_is_that_of_this_package_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    git = ("git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b")
+    module = tmp_path / "package" / "environment.py"
+    module.parent.mkdir()
+    module.write_text("")
+    monkeypatch.setattr(environment, "__file__", str(module))
+    assert environment.environment()["commit"] is None
+    subprocess.run([*git, "init", "--quiet"], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "of something else"], check=True)
+    assert environment.environment()["commit"] is None
+    subprocess.run([*git, "add", "package"], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--message", "of this"], check=True)
+    commit = environment.environment()["commit"]
+    assert len(commit) == 7
+    module.write_text("changed")
+    assert environment.environment()["commit"] == f"{commit}+changes"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert environment.environment()["commit"] is None
 
 
 def figures_of(run: Run, psnr: float, kind: str, errors: tuple[float, float]) -> dict[str, Any]:

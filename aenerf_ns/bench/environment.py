@@ -18,7 +18,7 @@ _PACKAGES = (
 
 
 def environment() -> dict[str, Any]:
-    """Machine, versions, commit (None outside a checkout) and command of this process."""
+    """Machine, versions, commit (None where this is no checkout, or without git) and command of this process."""
     import torch
 
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
@@ -34,12 +34,16 @@ def environment() -> dict[str, Any]:
 
 
 def _commit() -> str | None:
-    git = ("git", "-C", str(Path(__file__).parent))
-    commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    if commit.returncode:
+    def git(*arguments: str) -> str:
+        command = ("git", "-C", str(Path(__file__).parent), *arguments)
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        # An installed package may lie within the checkout of something else.
+        git("ls-files", "--error-unmatch", Path(__file__).name)
+        return git("rev-parse", "--short", "HEAD") + ("+changes" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
         return None
-    changed = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=False)
-    return commit.stdout.strip() + ("+changes" if changed.stdout.strip() else "")
 
 
 def _program() -> str:

@@ -27,6 +27,8 @@ _NOISE = {
 }
 _METHOD = {"full": "aenerf", "tiny": "aenerf-small"}
 _STEPS = {"full": 30000, "tiny": 1500}
+# Of a batch, in the table of losses: the methods' own, whose rays are two a pair.
+_PAIRS = {"full": 4096, "tiny": 512}
 
 OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
     "with pose correction",
@@ -43,7 +45,8 @@ LOSSES = {
     "l_p + l_r + l_d": {"temporal-loss": 0.0, "distortion-loss": 1e-3},
     "all": {"temporal-loss": 1e-3, "distortion-loss": 1e-3},
 }
-"""The rows of the paper's table 4: weights of the terms."""
+"""The rows of the paper's table 4: weights of the terms. All have the same pairs in a batch, which with the
+temporal loss take three rays in place of two."""
 
 _OFF = ("--pipeline.model.camera-optimizer.mode", "off")
 # A full-size nerfacto in the proportions of aenerf-small.
@@ -158,7 +161,7 @@ def plan(
         estimated = _NOISE[scale] if poses == "noise" else ("--poses", "colmap")
         return Dataset(scene, speed, poses, (*_SIMULATE[scale], *estimated, *simulate))
 
-    event_method, length, runs = _METHOD[scale], steps or _STEPS[scale], []
+    event_method, length, runs = _METHOD[scale], _STEPS[scale] if steps is None else steps, []
     for seed in seeds:
         for scene in scenes:
             for speed in speeds if "methods" in tables else ():
@@ -176,11 +179,10 @@ def plan(
             if "losses" in tables:
                 data = dataset(scene, "hard")
                 for row, weights in LOSSES.items():
-                    options = [
-                        word
-                        for loss, weight in weights.items()
-                        for word in (f"--pipeline.model.loss-coefficients.{loss}", str(weight))
-                    ]
+                    rays = (3 if weights["temporal-loss"] else 2) * _PAIRS[scale]
+                    options = ["--pipeline.datamanager.train-num-rays-per-batch", str(rays)]
+                    for loss, weight in weights.items():
+                        options += [f"--pipeline.model.loss-coefficients.{loss}", str(weight)]
                     runs.append(Run("losses", row, data, event_method, length, seed, (*train, *options)))
     return runs
 

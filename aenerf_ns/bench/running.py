@@ -72,6 +72,8 @@ class Runner:
             return None
 
     def _make(self, run: Run) -> dict[str, Any]:
+        # What the run is made with, not what is there by its end.
+        origin = environment()
         data = self._dataset(run.dataset)
         # What was left by a training that was killed.
         shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)
@@ -97,7 +99,7 @@ class Runner:
             "poses_report": _read(data / "poses_report.json"),
             "results": results,
             "curve": _curve(config.parent),
-            **environment(),
+            **origin,
         }
         file = self._figures_file(run)
         partial = file.with_suffix(f".{os.getpid()}")
@@ -179,10 +181,14 @@ class Runner:
             DataError: it failed.
         """
         file = self._folder / "logs" / f"{log}.log"
+        # ns-eval has no option for this.
+        hidden = {"CUDA_VISIBLE_DEVICES": ""} if self._device == "cpu" else {}
         with file.open("a", encoding="utf8") as output:
             output.write(f"$ {shlex.join(command)}\n")
             output.flush()
-            with subprocess.Popen(command, cwd=self._folder, stdout=output, stderr=subprocess.STDOUT) as process:
+            with subprocess.Popen(
+                command, cwd=self._folder, env={**os.environ, **hidden}, stdout=output, stderr=subprocess.STDOUT
+            ) as process:
                 try:
                     status = process.wait()
                 except BaseException:
