@@ -11,16 +11,18 @@ _MISSED = 1e-5
 
 
 class BoxCollider(AABBBoxCollider):
-    """The framework's box collider, with rays that miss the box ending behind it.
+    """The framework's box collider, with rays that miss the box ending behind it, and one near plane for all rays.
 
-    The framework lets such rays end anywhere, often at the camera. Their depth, which is that end, would then hide
-    whatever the viewer draws behind: the training cameras around an object.
+    The framework lets rays that miss end anywhere, often at the camera. Their depth, which is that end, would then hide
+    whatever the viewer draws behind: the training cameras around an object. And outside training it has no near plane:
+    a camera within the box would see what no training ray has ever told of.
     """
 
     def set_nears_and_fars(self, ray_bundle: RayBundle) -> RayBundle:
         """Fills in ``nears`` and ``fars`` (N, 1), distances in scene units."""
         ray_bundle = super().set_nears_and_fars(ray_bundle)
-        nears, fars = ray_bundle.nears, ray_bundle.fars
+        nears = ray_bundle.nears.clamp_min(self.near_plane)
+        fars = torch.maximum(ray_bundle.fars, nears)
         aabb = self.scene_box.aabb.to(nears)
         to_center = (ray_bundle.origins - aabb.mean(0)).norm(dim=-1, keepdim=True)
         behind = to_center + (aabb[1] - aabb[0]).norm()

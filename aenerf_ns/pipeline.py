@@ -252,14 +252,20 @@ class AENeRFPipeline(VanillaPipeline):
         are known, the errors of the poses alone.
 
         Raises:
-            SystemExit: there are neither.
+            SystemExit: there are neither; or, outside training, a metric is not a number.
         """
         metrics: dict[str, Any] = {}
         if self.datamanager.has_reference_views or not self.model.camera_optimizer.has_ground_truth:
             self._require_reference_views()
             metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
             # A single view has no standard deviation, and NaN is no JSON.
-            metrics = {name: value for name, value in metrics.items() if not math.isnan(value)}
+            metrics = {k: value for k, value in metrics.items() if not (k.endswith("_std") and math.isnan(value))}
+            undefined = [name for name, value in metrics.items() if math.isnan(value)]
+            if undefined and self.test_mode == "test":
+                raise SystemExit(
+                    f"Error: {', '.join(undefined)} of the {self.datamanager.test_split} views is not a number: "
+                    "the run renders values that are not finite; train it again"
+                )
         if self.test_mode == "test":
             # The trainer's log, in the other mode, takes numbers only.
             metrics["color_correction"] = self.model.color_correction.description

@@ -262,3 +262,17 @@ def test_reference_views_are_placed_by_the_poses_of_the_moment(tmp_path: Path, m
     expected = correction.apply_to_camera(pipeline.datamanager.reference_views("val").cameras)[0, :, 3]
     torch.testing.assert_close(after, expected.expand_as(after))
     torch.testing.assert_close((after - before).norm(dim=-1), torch.full((64,), 0.5))
+
+
+@pytest.mark.parametrize("psnr", [20.0, float("nan")])
+def test_a_metric_that_is_not_a_number_is_named(psnr: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "test", num_views=0)
+    # One test view, whose metrics have no standard deviation.
+    monkeypatch.setattr(pipeline.model, "get_image_metrics_and_images", lambda *_: ({"psnr": psnr, "ssim": 0.5}, {}))
+    if psnr == 20:
+        metrics = pipeline.get_average_eval_image_metrics(get_std=True)
+        assert metrics["psnr"] == 20
+        assert "psnr_std" not in metrics
+    else:
+        with pytest.raises(SystemExit, match="psnr of the test views is not a number"):
+            pipeline.get_average_eval_image_metrics(get_std=True)

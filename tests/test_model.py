@@ -82,36 +82,53 @@ def test_a_pair_spans_several_events(random_poses: torch.Tensor) -> None:
         ends.tolist(),
         batch["num_positive"].tolist(),
         batch["num_negative"].tolist(),
-        batch["consecutive"].tolist(),
+        batch["last_num_negative"].tolist(),
+        [round(seconds, 6) for seconds in batch["last_interval"].tolist()],
         strict=True,
     )
     # All that end with an event of their pixel, never beyond its first.
     found = Counter(counts)
+    one, two = (250_000_000, 10**9, 1, 0, 0, 0.75), (5_000, 10**9, 1, 1, 0, 0.75)
     assert found.keys() == {
-        (100_000, 600_000_000, 0, 1, True),
-        (5_000, 250_000_000, 0, 1, True),
-        (250_000_000, 10**9, 1, 0, True),
-        (5_000, 10**9, 1, 1, False),
+        (100_000, 600_000_000, 0, 1, 1, 0.5999),
+        (5_000, 250_000_000, 0, 1, 1, 0.249995),
+        one,
+        two,
     }
-    torch.testing.assert_close(batch["interval"], (ends - starts).float() * 1e-9)
     # One event in half of the cases: log 2 / log 4.
-    assert found[250_000_000, 10**9, 1, 0, True] / found[5_000, 10**9, 1, 1, False] == pytest.approx(1, abs=0.2)
+    assert found[one] / found[two] == pytest.approx(1, abs=0.2)
 
 
-def test_pairs_are_of_consecutive_events_where_pixels_are_blind(random_poses: torch.Tensor) -> None:
-    _, batch = make_sampler(random_poses, SensorModel(refractory_period=1_000), max_events_per_pair=3).sample()
-    assert batch["consecutive"].all()
+@pytest.mark.parametrize("refractory_period", [2_400_000, 2_500_000])
+def test_pairs_span_events_beside_which_the_refractory_period_is_short(
+    random_poses: torch.Tensor, refractory_period: int
+) -> None:
+    # The middle one of a pixel's three events is 245 ms after the first, 750 ms before the last.
+    sensor = SensorModel(refractory_period=refractory_period)
+    sampler = make_sampler(random_poses, sensor, max_events_per_pair=3)
+    sampler.num_rays_per_batch = 400
+    rays, batch = sampler.sample()
+    assert rays.times is not None
+    longer = batch["num_positive"] + batch["num_negative"] > 1
+    assert longer.any() == (refractory_period == 2_400_000)
+    starts, ends = torch.round(rays.times[:, 0] * 1e9).long().chunk(2)
+    assert (starts[longer] == 5_000 + refractory_period).all()
+    assert (ends[longer] == 10**9).all()
 
 
-def test_a_third_ray_lies_within_each_interval(random_poses: torch.Tensor) -> None:
-    sampler = make_sampler(random_poses, SensorModel())
+@pytest.mark.parametrize("max_events_per_pair", [1, 3])
+def test_a_third_ray_lies_between_the_last_two_events(random_poses: torch.Tensor, max_events_per_pair: int) -> None:
+    sampler = make_sampler(random_poses, SensorModel(refractory_period=1_000), max_events_per_pair=max_events_per_pair)
     sampler.num_rays_per_batch = 6000
     sampler.with_time_within = True
     rays, batch = sampler.sample()
     assert rays.times is not None
     start, end, within = rays.times[:, 0].chunk(3)
-    torch.testing.assert_close(batch["interval"], (end - start).float())
-    part = (within - start) / (end - start)
+    assert ((batch["num_positive"] + batch["num_negative"]).max() > 1) == (max_events_per_pair > 1)
+    single = batch["num_positive"] + batch["num_negative"] == 1
+    torch.testing.assert_close(batch["last_interval"][single], (end - start)[single].float())
+    assert (batch["last_num_positive"] + batch["last_num_negative"] == 1).all()
+    part = 1 - (end - within) / batch["last_interval"]
     assert part.min() >= 0
     assert part.max() <= 1
     # A normal distribution of mean 0.5 and deviation 0.25, cut at two deviations, has the deviation 0.22.
@@ -204,8 +221,9 @@ def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
     return {
         "num_positive": positive,
         "num_negative": 1 - positive,
-        "consecutive": torch.ones(num_pairs, dtype=torch.bool),
-        "interval": torch.full((num_pairs,), 1e-3),
+        "last_num_positive": positive,
+        "last_num_negative": 1 - positive,
+        "last_interval": torch.full((num_pairs,), 1e-3),
         "channel": torch.zeros(num_pairs, dtype=torch.long),
     }
 
@@ -324,6 +342,19 @@ def test_rays_past_a_bounded_scene_see_the_background() -> None:
     # From z = 3, so behind the box: the viewer hides what lies behind a pixel's depth.
     torch.testing.assert_close(outputs["depth"], torch.full((10, 1), 3 + 12**0.5), atol=1e-3, rtol=0)
     assert make_model(bounded=False).raw_background is None
+
+
+def test_a_camera_within_the_box_sees_nothing_nearer_than_the_near_plane() -> None:
+    model = make_model(bounded=True, near_plane=0.3)
+    rays = make_rays(5)
+    rays.origins = torch.zeros(5, 3)
+    for training in (True, False):
+        nears = model.train(training).collider(rays).nears
+        torch.testing.assert_close(nears, torch.full((5, 1), 0.3))
+        assert (rays.fars >= 1).all()
+    # And from so near a wall nothing of it.
+    rays.origins = torch.tensor([0.0, 0.0, -0.9]).expand(5, 3)
+    assert model(rays)["accumulation"].max() < 1e-3
 
 
 def test_the_picture_is_the_colour_corrected_one() -> None:
