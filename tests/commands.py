@@ -11,9 +11,11 @@ from pathlib import Path
 CPU = ("--machine.device-type", "cpu")
 
 
-def run(*command: str | Path, cwd: Path, fails: bool = False) -> str:
+def run(*command: str | Path, cwd: Path, fails: bool = False, gpu: bool = False) -> str:
     """Runs a console script of this environment and returns its output, without terminal formatting."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200", "CUDA_VISIBLE_DEVICES": ""}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
+    if not gpu:
+        environment["CUDA_VISIBLE_DEVICES"] = ""
     script = Path(sys.executable).parent / str(command[0])
     done = subprocess.run(
         [script, *command[1:]], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False
