@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.simulation import Simulation
 from aenerf_ns.structure_from_motion import compare_with_truth, estimate_poses
@@ -40,7 +41,13 @@ def poses_from_frames(
     found = estimate_poses(frames, times, camera, "frames of aenerf simulate", seed)
     true_poses = torch.stack([simulation.pose(time)[:3] for time in found.trajectory.times.tolist()])
     estimated, errors = compare_with_truth(found.trajectory, true_poses)
-    knots = truth.knots_covered_by(estimated)
+    knots = truth.times[(truth.times >= estimated.start) & (truth.times <= estimated.end)]
+    if len(knots) < 2:
+        raise DataError(
+            "aenerf simulate",
+            f"COLMAP's poses span {len(estimated)} frames, and fewer than two of the true poses",
+            "give a higher --pose-rate",
+        )
     between = pose_errors(estimated.interpolate(knots), truth.interpolate(knots))
     settings = {"frame_rate": frame_rate, "exposure_seconds": exposure}
     report = {**settings, **found.report(), "errors": errors, "errors_between_frames": between}

@@ -236,8 +236,8 @@ class _Workspace:
         """Writes the frames as COLMAP reads them."""
         named = zip(self._names, frames, strict=True)
         for name, frame in self._progress.track(named, total=len(self._names), description="Collecting frames"):
-            with Image.open(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
-                origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
+            origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
+            with _read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
                 if image.size != (camera.width, camera.height):
                     raise DataError(
                         origin,
@@ -327,6 +327,15 @@ class _Workspace:
         finally:
             pycolmap.logging.minloglevel = level
             self._progress.update(task, total=len(self._names), completed=len(self._names))
+
+
+def _read_image(file: Path) -> Image.Image:
+    try:
+        with Image.open(file) as image:
+            image.load()
+            return image
+    except OSError as error:
+        raise DataError(file, f"not an image that can be read ({error})", "copy it again, or leave it out") from None
 
 
 def _pairs(num_frames: int) -> list[tuple[int, int]]:

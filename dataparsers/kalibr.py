@@ -41,7 +41,7 @@ def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
     from_first = torch.eye(4, dtype=torch.float64)
     for name in sorted(map(str, chain)):
         meta = Metadata(path, chain[name], f"{name}.")
-        step = meta.matrix("T_cn_cnm1")
+        step = meta.rigid_motion("T_cn_cnm1")
         if cameras and step is not None:
             from_first = step @ from_first
         cameras[name] = (_camera(meta), from_first)

@@ -13,6 +13,7 @@ from torch import Tensor
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera, LensModel
 from aenerf_ns.image_encoding import ImageEncoding
+from aenerf_ns.trajectory.trajectory import require_rigid
 
 # The lens and the names of its distortion parameters, in OpenCV's order, for Nerfstudio's names of camera models.
 LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
@@ -79,11 +80,13 @@ class Metadata:
             raise self.error(f"{name}[{index}]", f"is {value!r}, not an object")
         return Metadata(self.path, value, f"{self._prefix}{name}[{index}].")
 
-    def matrix(self, name: str) -> Tensor | None:
-        """The (4, 4) float64 matrix ``name``, or None when it is absent."""
+    def rigid_motion(self, name: str) -> Tensor | None:
+        """The (4, 4) float64 matrix ``name`` of a rotation and a translation, or None when it is absent."""
         if name not in self._values:
             return None
-        return self.numbers(name, self._values[name], (4, 4))
+        matrix = self.numbers(name, self._values[name], (4, 4))
+        require_rigid(matrix[None], f"{self.path}: {self._prefix}{name}")
+        return matrix
 
     def numbers(self, name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
         try:

@@ -24,7 +24,7 @@ from aenerf_ns.dataparsers.recording import (
 from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous, require_rigid
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
@@ -80,7 +80,7 @@ class NativeDataParser(EventDataParser):
                 frames,
                 trajectory if ground_truth is None else ground_truth,
                 ground_truth is not None,
-                block.matrix("T_frame_event"),
+                block.rigid_motion("T_frame_event"),
             ),
             image_encoding=read_image_encoding(meta),
             scene_box=None if box is None else _scene_box(meta, box),
@@ -134,12 +134,11 @@ def _reference_views(
             raise frame.error("file_path", f"names {name}, which does not exist")
         stamp = frame.get("timestamp", float, None)
         time = None if stamp is None else int((Decimal(values["timestamp"]) * 1_000_000_000).to_integral_value())
-        pose = frame.matrix("transform_matrix")
+        pose = frame.rigid_motion("transform_matrix")
         if pose is None and time is not None and has_ground_truth and not trajectory.start <= time <= trajectory.end:
             num_without_pose += 1
             continue
         if pose is not None:
-            require_rigid(pose[None], f"{meta.path}: frames[{index}].transform_matrix")
             pose = pose @ OPENCV_TO_OPENGL
         elif time is not None:
             pose = homogeneous(trajectory.interpolate(time)) @ torch.linalg.inv(frame_from_event)

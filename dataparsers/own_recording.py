@@ -24,7 +24,7 @@ from aenerf_ns.event_camera import EventCamera
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.image_encoding import ImageEncoding
-from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous, require_rigid
+from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml")
 
@@ -192,10 +192,9 @@ def _read_json(path: Path) -> _Calibration:
     meta = Metadata.read(path)
     block = meta.block("event_camera")
     event = read_camera(block, "width", "height")
-    frame_from_event = block.matrix("T_frame_event")
+    frame_from_event = block.rigid_motion("T_frame_event")
     if frame_from_event is None:
         frame_from_event = torch.eye(4, dtype=torch.float64)
-    require_rigid(frame_from_event[None], f"{path}: event_camera.T_frame_event")
     default = SensorModel()
     try:
         sensor = SensorModel(

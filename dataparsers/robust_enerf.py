@@ -25,7 +25,7 @@ from aenerf_ns.dataparsers.views import IMAGE_SUFFIXES
 from aenerf_ns.errors import DataError
 from aenerf_ns.event_camera import EventCamera, LensModel
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, require_rigid
+from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory
 
 # Of the synthetic scenes, in the authors' configuration.
 _HALF_EXTENT = 1.5
@@ -176,10 +176,9 @@ def _read_view(frame: Metadata, folder: Path) -> ReferenceView:
     file = next((file for file in files if file.is_file()), None)
     if file is None:
         raise frame.error("file_path", f"names {name}, of which there is no PNG or JPEG image")
-    pose = frame.matrix("transform_matrix")
+    pose = frame.rigid_motion("transform_matrix")
     if pose is None:
         raise frame.error("transform_matrix", "is missing")
-    require_rigid(pose[None], f"{frame.path}: {name}")
     return ReferenceView(file, pose @ OPENCV_TO_OPENGL, None)
 
 

@@ -464,6 +464,10 @@ NATIVE_FAULTS = {
         edit_json(lambda m: m["frames"][0].update(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist())),
         r"frames\[0\].transform_matrix: pose 0 is not a rigid motion",
     ),
+    "event camera that is scaled": (
+        edit_json(lambda m: m["event_camera"].update(T_frame_event=np.diag([1e3, 1e3, 1e3, 1]).tolist())),
+        r"event_camera.T_frame_event: pose 0 is not a rigid motion",
+    ),
     "frame twice": (edit_json(lambda m: m["frames"].append(m["frames"][0])), r"names images/train/00000.png again"),
     "unknown encoding": (edit_json(lambda m: m.update(image_encoding="log")), 'image_encoding is "log"'),
     "box inside out": (edit_json(lambda m: m.update(scene_box=[[1, 1, 1], [0, 0, 0]])), "scene_box has corners"),

@@ -131,7 +131,7 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
         ("corrected", (), given.times),
         ("ground-truth", ("--rate", "100"), torch.arange(0, given.end + 1, 10_000_000)),
     ):
-        output = workspace / "poses.txt"
+        output = workspace / "exported" / "poses.txt"
         options = ("--poses", poses, *rate)
         run("aenerf", "export-trajectory", "--load-config", trained, "--output", output, *options, cwd=workspace)
         exported = read_tum_trajectory(output)

@@ -229,6 +229,16 @@ def test_lost_frames_and_fragments_are_told(truth: torch.Tensor) -> None:
     assert "\n" not in whole.summary()
 
 
+def test_a_frame_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    whole = tmp_path / "whole.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (12, 16), np.uint8)).save(whole)
+    cut = tmp_path / "cut.png"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    camera = EventCamera(16, 12, 10.0, 10.0, 8.0, 6.0)
+    with pytest.raises(DataError, match=r"cut.png: not an image that can be read"):
+        estimate_poses([whole, cut], FRAME * np.arange(2), camera, "frames", 0)
+
+
 def test_pose_noise_and_colmap_exclude_each_other(room: SimulationScene, tmp_path: Path) -> None:
     options = Simulate(tmp_path / "scene", poses="colmap", pose_noise_degrees=1.0, width=16, height=12, duration=0.5)
     with pytest.MonkeyPatch.context() as patch:

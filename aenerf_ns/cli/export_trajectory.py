@@ -32,12 +32,14 @@ class ExportTrajectory:
 
     def main(self) -> None:
         """Loads the run and writes its poses."""
-        if self.rate is not None and not 0 < self.rate < float("inf"):
-            raise DataError("aenerf export-trajectory", f"a rate of {self.rate}", "it must be positive")
+        if self.rate is not None and not 0 < self.rate <= 1e9:
+            raise DataError("aenerf export-trajectory", f"a rate of {self.rate}", "give one above 0 and up to 1e9")
         if not self.load_config.is_file():
             raise DataError(self.load_config, "there is no such file", "give the config.yml of a trained run")
-        _, pipeline, _, _ = eval_setup(self.load_config, test_mode="inference")
-        assert isinstance(pipeline, AENeRFPipeline)
+        config, pipeline, _, _ = eval_setup(self.load_config, test_mode="inference")
+        if not isinstance(pipeline, AENeRFPipeline):
+            remedy = "give one of this package's"
+            raise DataError(self.load_config, f"the run is of method {config.method_name}", remedy)
         correction = pipeline.model.camera_optimizer
         estimated = correction.trajectory
         trajectory = estimated
@@ -55,5 +57,6 @@ class ExportTrajectory:
         with torch.no_grad():
             poses = source.pose(trajectory.seconds(times))
         written = Trajectory(times.cpu(), pipeline.in_recording(poses))
+        self.output.parent.mkdir(parents=True, exist_ok=True)
         write_tum_trajectory(self.output, written)
         CONSOLE.print(f"{self.output}: {len(written)} {self.poses} poses.")
