@@ -57,7 +57,7 @@ aenerf_mlp = MethodSpecification(
             },
         },
         # Every ray of a batch tells of all weights of the poses' network.
-        gradient_accumulation_steps={},
+        gradient_accumulation_steps={"camera_opt": 1},
     ),
     description="AE-NeRF with the paper's MLPs: slow.",
 )
