@@ -32,7 +32,8 @@ from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, homogeneous
 
-_CURVE_POINTS = 5
+# Parts of a training. The framework looks at the views after each but the last, whose final step it counts as one less.
+_CURVE_PARTS = 5
 _CURVE = "Eval Images Metrics Dict (all images)/psnr"
 _NERFACTO = (sys.executable, "-m", "aenerf_ns.bench.nerfacto")
 
@@ -134,7 +135,7 @@ class Runner:
         common = (
             run.method, "--machine.device-type", self._device, "--machine.seed", str(run.seed), "--vis", "tensorboard",
             "--experiment-name", run.name, "--output-dir", "outputs", "--max-num-iterations", str(run.steps),
-            "--steps-per-eval-all-images", str(max(run.steps // _CURVE_POINTS, 1)),
+            "--steps-per-eval-all-images", str(max(run.steps // _CURVE_PARTS, 1)),
         )  # fmt: skip
         if run.row == CEILING:
             # Of the framework's implementations, the one that needs no CUDA extension.
