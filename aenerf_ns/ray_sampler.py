@@ -19,14 +19,14 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from aenerf_ns.events.pairs import EventPairs
+    from aenerf_ns.events.pairs import EventPairs, PairsInTime
 
 # Among the metadata of rays of pairs, and of no others: (N, 3) float64 unit vectors in the camera's frame.
 CAMERA_DIRECTIONS = "camera_directions"
 
 # A pair spans an event only where the intervals on its two sides are so many refractory periods long: at a steady rate,
-# a hundredth of a contrast threshold goes unseen.
-_INTERVAL_TO_REFRACTORY_PERIOD = 100
+# a twentieth of a contrast threshold goes unseen at most, which is less than thresholds are known to.
+_INTERVAL_TO_REFRACTORY_PERIOD = 20
 
 # t_sam: a truncated normal distribution over the interval of the pair's last event.
 _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
@@ -35,10 +35,13 @@ _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
 class EventRaySampler:
     """Samples pairs of events and gives each one's rays.
 
-    A pair's later event is drawn uniformly, and how many events of its pixel the pair spans from 1 to
-    ``max_events_per_pair`` with log-uniform probability: 1 is the paper's pair of consecutive events (eq. 4). Those say
-    where there is an edge, but little of how it compares with the rest of the scene: a change that is seen at a
-    slightly wrong time is as large an error as the change itself. Over many events it is a small part.
+    A pair's later event is drawn uniformly, as in the paper, or it is the next one after a uniform moment at a uniform
+    pixel. Events are where the edges are: only the moments come to the surfaces between.
+
+    How many events of its pixel a pair spans is drawn from 1 to ``max_events_per_pair`` with log-uniform probability:
+    1 is the paper's pair of consecutive events (eq. 4). Those say where there is an edge, but little of how it compares
+    with the rest of the scene: a change that is seen at a slightly wrong time is as large an error as the change
+    itself. Over many events it is a small part.
 
     A pair's interval is [earlier time + refractory period, time]. What changes while a pixel is blind is in no event,
     and is missing within a longer pair: pairs reach back only over events beside which the refractory period is short.
@@ -52,9 +55,11 @@ class EventRaySampler:
         trajectory: whose start times count from; on the device of the rays.
         num_rays_per_batch: rays of a batch; a pair takes two, or three with a time within its interval.
         max_events_per_pair: the most events that a pair spans.
+        share_by_moment: part of the pairs of a batch that are drawn by a moment.
 
     Attributes:
         max_events_per_pair: see above.
+        share_by_moment: see above.
         with_time_within: whether batches for training have a third ray for each pair, for the temporal loss, at a
             random time t_sam between the last two of its events: over more, the mean rate tells little of a moment's.
     """
@@ -67,18 +72,20 @@ class EventRaySampler:
         trajectory: Trajectory,
         num_rays_per_batch: int,
         max_events_per_pair: int,
+        share_by_moment: float,
     ) -> None:
         self.sensor = sensor
         self.trajectory = trajectory
         self.num_rays_per_batch = num_rays_per_batch
         self.max_events_per_pair = max_events_per_pair
+        self.share_by_moment = share_by_moment
         directions, has_direction = camera.pixel_directions()
         if not has_direction.all():
             CONSOLE.print(
                 f"[yellow]The lens model gives {(~has_direction).sum()} pixels no direction; their events are left out"
             )
         self.with_time_within = False
-        self._has_direction = None if has_direction.all() else has_direction
+        self._has_direction = has_direction
         self._directions = torch.from_numpy(directions).to(trajectory.times.device)
         # Area of a pixel at distance one from the camera.
         self._pixel_area = 1 / (camera.fx * camera.fy)
@@ -174,7 +181,7 @@ class EventRaySampler:
     @cached_property
     def _usable(self) -> NDArray[np.int64] | None:
         """Indices of the pairs whose pixel has a direction, or None when all have."""
-        if self._has_direction is None:
+        if self._has_direction.all():
             return None
         pairs = self._pairs()
         usable = np.flatnonzero(self._has_direction[pairs.y, pairs.x])
@@ -191,9 +198,24 @@ class EventRaySampler:
         _ = self._pairs(), self._usable
         if self.max_events_per_pair > 1:
             _ = self._predecessors
+        if self.share_by_moment > 0:
+            _ = self._in_time
+
+    @cached_property
+    def _in_time(self) -> PairsInTime:
+        from aenerf_ns.events.pairs import PairsInTime
+
+        _ = self._usable
+        return PairsInTime(self._pairs(), self._has_direction)
 
     def _draw(self, pairs: EventPairs, num_pairs: int) -> NDArray[np.int64]:
-        """Uniform indices of usable pairs."""
-        if self._usable is None:
-            return torch.randint(len(pairs), (num_pairs,)).numpy()
-        return self._usable[torch.randint(len(self._usable), (num_pairs,)).numpy()]
+        """Indices of usable pairs, those that are drawn by a moment first."""
+        num_by_moment = round(self.share_by_moment * num_pairs)
+        count = len(pairs) if self._usable is None else len(self._usable)
+        by_event = torch.randint(count, (num_pairs - num_by_moment,)).numpy()
+        if self._usable is not None:
+            by_event = self._usable[by_event]
+        if num_by_moment == 0:
+            return by_event
+        places = torch.rand(num_by_moment, dtype=torch.float64).numpy()
+        return np.concatenate([self._in_time.at(places), by_event])

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pairs import EventPairs, pair_events
+from aenerf_ns.events.pairs import EventPairs, PairsInTime, pair_events
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
@@ -73,6 +73,25 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     begins = zip(pairs.x, pairs.y, pairs.previous_time, strict=True)
     expected = [ends.get(begin, -1) if long[i] else -1 for i, begin in enumerate(begins)]
     assert pairs.predecessors(shortest).tolist() == expected
+
+
+@settings(max_examples=200, deadline=None)
+@given(EVENTS, st.integers(1, 3), st.integers(0, 2**32))
+def test_moments_fall_into_the_intervals_laid_end_to_end(
+    rows: list[tuple[int, int, int, int]], times: int, seed: int
+) -> None:
+    # Several blocks of pairs.
+    last = max((t for _, _, t, _ in rows), default=0) + 1
+    pairs = pair_events([make_stream([(x, y, t + i * last, p) for i in range(20 * times) for x, y, t, p in rows])])
+    generator = np.random.default_rng(seed)
+    usable = generator.random((3, 4)) < 0.7
+    durations = np.where(usable[pairs.y, pairs.x], pairs.time - pairs.previous_time, 0)
+    if durations.sum() == 0:
+        return
+    places = np.concatenate([generator.random(50), [0.0, 1 - 2.0**-53, 1.0]])
+    ends = np.cumsum(durations)
+    expected = np.searchsorted(ends, np.minimum(places * ends[-1], np.nextafter(float(ends[-1]), 0)), side="right")
+    assert PairsInTime(pairs, usable).at(places).tolist() == expected.tolist()
 
 
 def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:

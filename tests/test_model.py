@@ -32,13 +32,17 @@ EPOCH = 1_600_000_000_000_000_000
 
 
 def make_sampler(
-    random_poses: torch.Tensor, sensor: SensorModel, camera: EventCamera = CAMERA, max_events_per_pair: int = 1
+    random_poses: torch.Tensor,
+    sensor: SensorModel,
+    camera: EventCamera = CAMERA,
+    max_events_per_pair: int = 1,
+    share: float = 0.0,
 ) -> EventRaySampler:
     rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
     stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
     pairs = pair_events([stream], refractory_period=sensor.refractory_period)
     trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
-    return EventRaySampler(lambda: pairs, camera, sensor, trajectory, 40, max_events_per_pair)
+    return EventRaySampler(lambda: pairs, camera, sensor, trajectory, 40, max_events_per_pair, share)
 
 
 def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> None:
@@ -99,7 +103,7 @@ def test_a_pair_spans_several_events(random_poses: torch.Tensor) -> None:
     assert found[one] / found[two] == pytest.approx(1, abs=0.2)
 
 
-@pytest.mark.parametrize("refractory_period", [2_400_000, 2_500_000])
+@pytest.mark.parametrize("refractory_period", [12_000_000, 12_500_000])
 def test_pairs_span_events_beside_which_the_refractory_period_is_short(
     random_poses: torch.Tensor, refractory_period: int
 ) -> None:
@@ -110,7 +114,7 @@ def test_pairs_span_events_beside_which_the_refractory_period_is_short(
     rays, batch = sampler.sample()
     assert rays.times is not None
     longer = batch["num_positive"] + batch["num_negative"] > 1
-    assert longer.any() == (refractory_period == 2_400_000)
+    assert longer.any() == (refractory_period == 12_000_000)
     starts, ends = torch.round(rays.times[:, 0] * 1e9).long().chunk(2)
     assert (starts[longer] == 5_000 + refractory_period).all()
     assert (ends[longer] == 10**9).all()
@@ -138,8 +142,22 @@ def test_a_third_ray_lies_between_the_last_two_events(random_poses: torch.Tensor
     assert len(sampler.sample(5)[0]) == 10
 
 
-def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
-    sampler = make_sampler(random_poses, SensorModel())
+def test_a_share_of_the_pairs_is_drawn_by_moments(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel(), share=0.75)
+    sampler.num_rays_per_batch = 20_000
+    rays, _ = sampler.sample()
+    assert rays.times is not None
+    counts = Counter(torch.round(rays.times[:, 0] * 1e9).long().chunk(2)[1].tolist())
+    # By their later event: a third each of a quarter, and of the rest as much as their intervals take up.
+    durations = {600_000_000: 0.5999, 250_000_000: 0.249995, 10**9: 0.75}
+    for end, duration in durations.items():
+        expected = 0.25 / 3 + 0.75 * duration / sum(durations.values())
+        assert counts[end] / 10_000 == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_sampling_is_seeded(share: float, random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel(), share=share)
     batches = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
@@ -157,13 +175,15 @@ def test_the_colour_filter_is_that_of_the_raw_pixel(random_poses: torch.Tensor) 
 def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) -> None:
     # This lens model folds over towards the corners, pixel (0, 2) among them.
     nowhere = EventCamera(4, 3, 0.1, 0.1, 30.0, 1.5, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
-    with pytest.raises(DataError, match="no event lies on a pixel with a direction"):
-        make_sampler(random_poses, SensorModel(), nowhere).prepare()
+    for share in (0.0, 1.0):
+        with pytest.raises(DataError, match="no event lies on a pixel with a direction"):
+            make_sampler(random_poses, SensorModel(), nowhere, share=share).prepare()
     folded = EventCamera(4, 3, 1.2, 1.2, 3.0, 1.5, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
     assert not folded.pixel_directions()[1][2, 0]
     assert folded.pixel_directions()[1][1, 3]
-    _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB"), folded).sample()
-    assert set(batch["channel"].tolist()) == {2}
+    for share in (0.0, 1.0):
+        _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB"), folded, share=share).sample()
+        assert set(batch["channel"].tolist()) == {2}
 
 
 def make_model(

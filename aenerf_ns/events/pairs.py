@@ -15,6 +15,8 @@ from aenerf_ns.events.stream import EventStream
 _NEVER = np.iinfo(np.int64).min
 _MAX_TIME = np.iinfo(np.int64).max - 1
 _MAX_MERGED = 255
+# Pairs for each number that a PairsInTime keeps, and that are looked through for each draw.
+_BLOCK = 64
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,54 @@ class EventPairs:
             f"window or the poses, {self.num_first:,} first of their pixel, {self.num_within_refractory_period:,} "
             f"within the refractory period; {self.num_merged:,} merged with one of the same pixel and time"
         )
+
+
+class PairsInTime:
+    """Finds the pair whose interval surrounds a moment at a pixel, with one number in memory for 64 pairs.
+
+    Args:
+        pairs: to choose from.
+        usable: (height, width) pixels to choose from, of which one at least has a pair.
+    """
+
+    def __init__(self, pairs: EventPairs, usable: NDArray[np.bool_]) -> None:
+        self._columns = (pairs.x, pairs.y, pairs.previous_time, pairs.time, usable)
+        self._ends = np.zeros(-(-len(pairs) // _BLOCK))
+        _add_up(*self._columns, self._ends)
+
+    def at(self, places: NDArray[np.float64]) -> NDArray[np.int64]:
+        """(N,) indices of the pairs at (N,) places from 0 to 1 along the intervals of all pairs, laid end to end.
+
+        Uniform places are uniform moments at uniform pixels, as far as these have events before and after.
+        """
+        found = np.empty(len(places), np.int64)
+        _find(*self._columns, self._ends, np.minimum(places * self._ends[-1], np.nextafter(self._ends[-1], 0)), found)
+        return found
+
+
+@numba.njit(cache=True)
+def _add_up(x, y, previous_time, time, usable, ends):
+    """Fills in where along the line of usable intervals each block of pairs ends, in nanoseconds."""
+    end = 0.0
+    for i in range(time.shape[0]):
+        if usable[y[i], x[i]]:
+            end += time[i] - previous_time[i]
+        ends[i // _BLOCK] = end
+
+
+@numba.njit(cache=True)
+def _find(x, y, previous_time, time, usable, ends, places, found):
+    """Fills in the pairs at places along that line."""
+    for k in range(places.shape[0]):
+        # The first block that ends behind the place, so one that has a usable pair.
+        block = np.searchsorted(ends, places[k], side="right")
+        left = places[k] - (ends[block - 1] if block > 0 else 0.0)
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, time.shape[0])):
+            if usable[y[i], x[i]]:
+                found[k] = i
+                left -= time[i] - previous_time[i]
+                if left < 0:
+                    break
 
 
 @numba.njit(cache=True)
