@@ -205,6 +205,7 @@ class EventRaySampler:
     def _in_time(self) -> PairsInTime:
         from aenerf_ns.events.pairs import PairsInTime
 
+        # Raises where there is none.
         _ = self._usable
         return PairsInTime(self._pairs(), self._has_direction)
 
