@@ -205,8 +205,6 @@ class EventRaySampler:
     def _in_time(self) -> PairsInTime:
         from aenerf_ns.events.pairs import PairsInTime
 
-        # Raises where there is none.
-        _ = self._usable
         return PairsInTime(self._pairs(), self._has_direction)
 
     def _draw(self, pairs: EventPairs, num_pairs: int) -> NDArray[np.int64]:

@@ -41,7 +41,7 @@ def poses_from_frames(
     found = estimate_poses(frames, times, camera, "frames of aenerf simulate", seed)
     true_poses = torch.stack([simulation.pose(time)[:3] for time in found.trajectory.times.tolist()])
     estimated, errors = compare_with_truth(found.trajectory, true_poses)
-    knots = truth.times[(truth.times >= estimated.start) & (truth.times <= estimated.end)]
+    knots = truth.knots_between(estimated.start, estimated.end)
     if len(knots) < 2:
         raise DataError(
             "aenerf simulate",

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
+
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from aenerf_ns.errors import DataError
 
 NOTHING = np.uint32(0xFFFFFFFF)
 """The triangle a ray hits that hits none."""
@@ -15,11 +20,13 @@ class RayCaster:
 
     Rays are float32 (N, 6): origin and direction. Their answers do not depend on the number of threads, which is
     numba's: the tree is built by one.
+
+    Raises:
+        DataError: Open3D cannot be loaded.
     """
 
     def __init__(self, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> None:
-        import open3d  # takes seconds to import
-
+        open3d = _open3d()
         self._tensor = open3d.core.Tensor.from_numpy
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
@@ -48,3 +55,25 @@ class RayCaster:
         """Distance (N,) of points (N, 3) from the nearest triangle."""
         query = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
         return self._scene.compute_distance(self._tensor(query), nthreads=numba.get_num_threads()).numpy()
+
+
+def _open3d():
+    """The module, whose import takes seconds.
+
+    Raises:
+        DataError: a library of the system that it needs is missing.
+    """
+    if sys.platform == "linux":
+        # Open3D's wheels link libusb, for depth cameras, without bringing it along.
+        try:
+            ctypes.CDLL("libusb-1.0.so.0")
+        except OSError:
+            import libusb_package
+
+            ctypes.CDLL(str(libusb_package.get_library_path()))
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        remedy = "install what it misses, on Debian and Ubuntu: apt-get install libgl1 libx11-6 libgomp1 libusb-1.0-0"
+        raise DataError("Open3D", f"cannot be loaded ({error})", remedy) from error
+    return open3d

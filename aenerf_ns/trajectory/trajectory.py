@@ -190,13 +190,17 @@ class Trajectory(nn.Module):
         wide = (self.times[1:] - self.times[:-1] > longest).nonzero()[:, 0]
         return [(int(self.times[i]), int(self.times[i + 1])) for i in wide]
 
+    def knots_between(self, start: int, end: int) -> Tensor:
+        """Times in nanoseconds of the knots from one time to another, both included."""
+        return self.times[(self.times >= start) & (self.times <= end)]
+
     def knots_covered_by(self, reference: Trajectory) -> Tensor:
         """Times in nanoseconds of the knots within the span of a reference trajectory.
 
         Raises:
             DataError: there are fewer than two.
         """
-        times = self.times[(self.times >= reference.start) & (self.times <= reference.end)]
+        times = self.knots_between(reference.start, reference.end)
         if len(times) < 2:
             raise DataError(
                 reference.source,

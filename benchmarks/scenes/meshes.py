@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.scenes.embree import RayCaster
 from aenerf_ns.scenes.textures import ALBEDO_RANGE, Texture, linear
 
 Array = NDArray[np.float64]
@@ -474,13 +475,7 @@ def _overlapped(triangles: Array, asked: NDArray[np.bool_], tolerance: float) ->
 
     Only pairs with one of the ``asked`` triangles (F,) are looked at.
     """
-    import open3d
-
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        open3d.core.Tensor(triangles.reshape(-1, 3).astype(np.float32)),
-        open3d.core.Tensor(np.arange(3 * len(triangles), dtype=np.uint32).reshape(-1, 3)),
-    )
+    caster = RayCaster(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
     normals = _face_normals(triangles)
     longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
     piece = _pieces(triangles)
@@ -494,9 +489,9 @@ def _overlapped(triangles: Array, asked: NDArray[np.bool_], tolerance: float) ->
             continue
         origin = np.einsum("k,fkd->fd", weight, triangles[source]) + tolerance * normals[source]
         rays = np.concatenate([origin, -normals[source]], axis=1).astype(np.float32)
-        hits = scene.list_intersections(open3d.core.Tensor(rays), nthreads=1)
-        one, other = source[hits["ray_ids"].numpy().astype(np.int64)], hits["primitive_ids"].numpy().astype(np.int64)
-        near = (hits["t_hit"].numpy() < 2 * tolerance) & (piece[one] != piece[other])
+        hits = caster.all_hits(rays)
+        one, other = source[hits["ray_ids"].astype(np.int64)], hits["primitive_ids"].astype(np.int64)
+        near = (hits["t_hit"] < 2 * tolerance) & (piece[one] != piece[other])
         near &= (normals[one] * normals[other]).sum(axis=1) > 0.99
         one, other = one[near], other[near]
         size = piece_area[piece[one]] - piece_area[piece[other]]
