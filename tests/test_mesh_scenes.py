@@ -550,6 +550,12 @@ def test_an_environment_file_is_turned(tmp_path: Path) -> None:
         load_environment(tmp_path / "b.hdr")
 
 
+def test_open3d_that_cannot_be_loaded_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(DataError, match=r"Open3D: cannot be loaded \(.*\); install what it misses"):
+        RayCaster(np.eye(3), np.array([[0, 1, 2]]))
+
+
 # --- paths
 
 
@@ -677,9 +683,3 @@ def test_simulated_events_are_thresholds_apart(box_file: Path) -> None:
             pixels += 1
     assert pixels > 50
     assert json.loads((output / "transforms.json").read_text())["scene_box"][1][0] == pytest.approx(0.63, abs=1e-3)
-
-
-def test_open3d_that_cannot_be_loaded_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(DataError, match=r"Open3D: cannot be loaded \(.*\); install what it misses"):
-        RayCaster(np.eye(3), np.array([[0, 1, 2]]))
