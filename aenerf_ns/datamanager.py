@@ -29,9 +29,9 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     max_events_per_pair: int = 64
     """The most events of its pixel that a pair spans; 1: consecutive events, as in the paper. They also are where a
     refractory period is learned, or is more than a twentieth of an event's distance from its neighbours."""
-    share_of_pairs_by_moment: float = 0.5
-    """Part of the pairs of a batch that are those around a random moment at a random pixel; the others are those of a
-    random event. 0: all of them, as in the paper."""
+    share_of_pairs_to_moments: float = 0.5
+    """Part of the pairs of a batch that end at a random moment at a random pixel, between two events; the others end at
+    a random event. 0: all of them, as in the paper, and where a refractory period is learned."""
 
 
 class EventDataManager(VanillaDataManager[EventDataset]):
@@ -83,9 +83,9 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             raise DataError(
                 "the datamanager", f"max-events-per-pair is {self.config.max_events_per_pair}", "give 1 or more"
             )
-        if not 0 <= self.config.share_of_pairs_by_moment <= 1:
-            share = self.config.share_of_pairs_by_moment
-            raise DataError("the datamanager", f"share-of-pairs-by-moment is {share}", "give a number from 0 to 1")
+        if not 0 <= self.config.share_of_pairs_to_moments <= 1:
+            share = self.config.share_of_pairs_to_moments
+            raise DataError("the datamanager", f"share-of-pairs-to-moments is {share}", "give a number from 0 to 1")
         self.train_pixel_sampler = EventRaySampler(
             lambda: self.train_dataset.pairs,
             metadata["event_camera"],
@@ -93,7 +93,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             deepcopy(metadata["trajectory"]).to(self.device),
             self.config.train_num_rays_per_batch,
             self.config.max_events_per_pair,
-            self.config.share_of_pairs_by_moment,
+            self.config.share_of_pairs_to_moments,
         )
         if self.test_mode == "val":
             self.train_pixel_sampler.prepare()

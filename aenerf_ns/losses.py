@@ -23,6 +23,23 @@ def log_radiance_change(
     return num_positive * positive_threshold - num_negative * negative_threshold
 
 
+def silent_change(
+    predicted: Tensor, change: Tensor, positive_threshold: Tensor | float, negative_threshold: float
+) -> Tensor:
+    """The change nearest to the predicted one after which a pixel is still silent: within a threshold of its events'.
+
+    Args:
+        predicted: (N,) rendered changes of log-radiance up to a moment between two events.
+        change: (N,) changes that the events tell of up to the last one before it.
+        positive_threshold: C+.
+        negative_threshold: C−.
+
+    Returns:
+        (N,) changes between change − C− and change + C+, constants.
+    """
+    return torch.minimum(torch.maximum(predicted, change - negative_threshold), change + positive_threshold).detach()
+
+
 def temporal_loss(rate: Tensor, change: Tensor, interval: Tensor) -> Tensor:
     """ℓ_g (paper, eq. 12): the mean relative error |(G_gt − G_pred) / G_gt|, with G_gt = change / interval.
 

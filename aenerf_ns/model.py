@@ -34,7 +34,7 @@ from aenerf_ns.field import DensityField, EventRadianceField, ProposalNetwork
 from aenerf_ns.hash_encoding import HashEncoding
 from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
-from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
+from aenerf_ns.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
 from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
 from aenerf_ns.ray_sampler import CAMERA_DIRECTIONS
 from aenerf_ns.sensor_parameters import SensorParameters
@@ -371,7 +371,10 @@ class AENeRFModel(Model):
     ) -> dict[str, Tensor]:
         """The weighted terms of the paper's total loss (eq. 14) on a batch of the event ray sampler."""
         mean_threshold = (self._positive_contrast_threshold(outputs) + self.sensor.negative_contrast_threshold) / 2
-        predicted, target = self._log_radiance_changes(outputs, batch)
+        predicted, change = self._log_radiance_changes(outputs, batch)
+        positive, negative = self._positive_contrast_threshold(outputs), self.sensor.negative_contrast_threshold
+        silent = silent_change(predicted, change, positive, negative)
+        target = torch.where(batch["ends_between_events"], silent, change)
         losses = {"reconstruction_loss": reconstruction_loss(predicted, target, mean_threshold)}
         if self.training:
             if "log_radiance_rate" in outputs:
@@ -388,15 +391,15 @@ class AENeRFModel(Model):
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         """How far the rendered changes of log-radiance agree with the events."""
         predicted, target = self._log_radiance_changes(outputs, batch)
-        # Polarities that cancel have no sign to agree with.
-        signed = target != 0
+        # Polarities that cancel have no sign to agree with, and what is known to a threshold may have either.
+        signed = (target != 0) & ~batch["ends_between_events"]
         agreeing = (predicted.detach() * target > 0) & signed
         metrics: dict[str, Any] = {"polarity_agreement": agreeing.sum() / signed.sum().clamp_min(1)}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics | self.sensor_parameters.learned()
 
     def _log_radiance_changes(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        """Rendered and true changes (N,) over the intervals of a batch, each of its pixel's channel."""
+        """Changes (N,) over a batch's intervals, as rendered, each of its pixel's channel, and as the events tell."""
         start, end = outputs["log_radiance"].split(len(batch["channel"]))[:2]
         predicted = (end - start).gather(1, batch["channel"][:, None])[:, 0]
         return predicted, self._change(outputs, batch["num_positive"], batch["num_negative"])

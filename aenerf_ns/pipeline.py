@@ -58,8 +58,10 @@ class AENeRFPipeline(VanillaPipeline):
 
     def __init__(self, config: AENeRFPipelineConfig, device: str, **kwargs: Any) -> None:
         if config.model.learn_refractory_period:
-            # Not once the sampler is there: it would have worked out what longer pairs need.
+            # Longer pairs leave out what a pixel did not see while it was blind, and at a moment it may be blind. Not
+            # once the sampler is there: it would have worked out what these need.
             config.datamanager.max_events_per_pair = 1
+            config.datamanager.share_of_pairs_to_moments = 0.0
         super().__init__(config, device, **kwargs)
         self._refined_test_poses = False
         if self.datamanager.train_pixel_sampler is not None:

@@ -35,16 +35,18 @@ _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
 class EventRaySampler:
     """Samples pairs of events and gives each one's rays.
 
-    A pair's later event is drawn uniformly, as in the paper, or it is the next one after a uniform moment at a uniform
-    pixel. Events are where the edges are: only the moments come to the surfaces between.
+    A pair's later event is drawn uniformly, as in the paper. Events are where the edges are, so a pair may instead end
+    at a uniform moment at a uniform pixel, between two events: since the first of them, log-radiance has changed by
+    less than a contrast threshold.
 
     How many events of its pixel a pair spans is drawn from 1 to ``max_events_per_pair`` with log-uniform probability:
     1 is the paper's pair of consecutive events (eq. 4). Those say where there is an edge, but little of how it compares
     with the rest of the scene: a change that is seen at a slightly wrong time is as large an error as the change
     itself. Over many events it is a small part.
 
-    A pair's interval is [earlier time + refractory period, time]. What changes while a pixel is blind is in no event,
-    and is missing within a longer pair: pairs reach back only over events beside which the refractory period is short.
+    A pair's interval is [earlier time + refractory period, time of the later event or of the moment]. What changes
+    while a pixel is blind is in no event, and is missing within a longer pair: pairs reach back only over events beside
+    which the refractory period is short.
 
     Draws from torch's global generator, which Nerfstudio seeds.
 
@@ -55,11 +57,11 @@ class EventRaySampler:
         trajectory: whose start times count from; on the device of the rays.
         num_rays_per_batch: rays of a batch; a pair takes two, or three with a time within its interval.
         max_events_per_pair: the most events that a pair spans.
-        share_by_moment: part of the pairs of a batch that are drawn by a moment.
+        share_to_moments: part of the pairs of a batch that end at a moment.
 
     Attributes:
         max_events_per_pair: see above.
-        share_by_moment: see above.
+        share_to_moments: see above.
         with_time_within: whether batches for training have a third ray for each pair, for the temporal loss, at a
             random time t_sam between the last two of its events: over more, the mean rate tells little of a moment's.
     """
@@ -72,13 +74,13 @@ class EventRaySampler:
         trajectory: Trajectory,
         num_rays_per_batch: int,
         max_events_per_pair: int,
-        share_by_moment: float,
+        share_to_moments: float,
     ) -> None:
         self.sensor = sensor
         self.trajectory = trajectory
         self.num_rays_per_batch = num_rays_per_batch
         self.max_events_per_pair = max_events_per_pair
-        self.share_by_moment = share_by_moment
+        self.share_to_moments = share_to_moments
         directions, has_direction = camera.pixel_directions()
         if not has_direction.all():
             CONSOLE.print(
@@ -103,14 +105,16 @@ class EventRaySampler:
             They are in the camera's frame: pose correction moves them to the world by their ``times``, in float64
             seconds since the trajectory's start, and the ``camera_directions`` among their metadata, in float64. And
             for each pair ``num_positive`` and ``num_negative`` (N,) counts of events after its earlier one up to its
-            later one, of these the ``last_num_positive`` and ``last_num_negative`` (N,) at the time of the later one,
-            the ``last_interval`` (N,) in seconds from the event before, and the ``channel`` (N,) of its pixel's filter.
+            end, whether it ``ends_between_events`` (N,), and the ``channel`` (N,) of its pixel's filter. And of the
+            event that it ends at, or that follows its end: ``last_num_positive`` and ``last_num_negative`` (N,) at its
+            time and the ``last_interval`` (N,) in seconds from the event before.
         """
         with_time_within = self.with_time_within and num_pairs is None
         rays_per_pair = 3 if with_time_within else 2
         num_pairs = num_pairs or max(self.num_rays_per_batch // rays_per_pair, 1)
         pairs, device = self._pairs(), self._directions.device
-        index = self._draw(pairs, num_pairs)
+        num_to_moments = round(self.share_to_moments * num_pairs)
+        index = self._draw(pairs, num_to_moments, num_pairs - num_to_moments)
         x, y = pairs.x[index].astype(np.int64), pairs.y[index].astype(np.int64)
         first, num_positive, num_negative = self._extend(pairs, index)
         end, start, last_start = (
@@ -122,6 +126,12 @@ class EventRaySampler:
             )
         )
         last_interval = end - last_start
+        to_moments = slice(num_to_moments)
+        # Given the interval that it lies in, a uniform moment is uniform there.
+        part = torch.rand(num_to_moments, dtype=torch.float64).to(device)
+        end[to_moments] = last_start[to_moments] + part * last_interval[to_moments]
+        num_positive[to_moments] -= pairs.num_positive[index[to_moments]]
+        num_negative[to_moments] -= pairs.num_negative[index[to_moments]]
         times = [start, end]
         if with_time_within:
             within = torch.empty(num_pairs, dtype=torch.float64)
@@ -145,6 +155,7 @@ class EventRaySampler:
         batch = {
             "num_positive": as_float(num_positive),
             "num_negative": as_float(num_negative),
+            "ends_between_events": torch.arange(num_pairs, device=device) < num_to_moments,
             "last_num_positive": as_float(pairs.num_positive[index]),
             "last_num_negative": as_float(pairs.num_negative[index]),
             "last_interval": last_interval.float(),
@@ -198,7 +209,7 @@ class EventRaySampler:
         _ = self._pairs(), self._usable
         if self.max_events_per_pair > 1:
             _ = self._predecessors
-        if self.share_by_moment > 0:
+        if self.share_to_moments > 0:
             _ = self._in_time
 
     @cached_property
@@ -207,14 +218,13 @@ class EventRaySampler:
 
         return PairsInTime(self._pairs(), self._has_direction)
 
-    def _draw(self, pairs: EventPairs, num_pairs: int) -> NDArray[np.int64]:
-        """Indices of usable pairs, those that are drawn by a moment first."""
-        num_by_moment = round(self.share_by_moment * num_pairs)
+    def _draw(self, pairs: EventPairs, num_moments: int, num_events: int) -> NDArray[np.int64]:
+        """Indices of usable pairs: first those around uniform moments at uniform pixels, then uniform ones."""
         count = len(pairs) if self._usable is None else len(self._usable)
-        by_event = torch.randint(count, (num_pairs - num_by_moment,)).numpy()
+        by_event = torch.randint(count, (num_events,)).numpy()
         if self._usable is not None:
             by_event = self._usable[by_event]
-        if num_by_moment == 0:
+        if num_moments == 0:
             return by_event
-        places = torch.rand(num_by_moment, dtype=torch.float64).numpy()
+        places = torch.rand(num_moments, dtype=torch.float64).numpy()
         return np.concatenate([self._in_time.at(places), by_event])

@@ -69,7 +69,7 @@ class RealRecording:
                 correlations[name] = torch.corrcoef(stacked)[0, 1].nan_to_num().item()
         sampler = pipeline.datamanager.train_pixel_sampler
         assert sampler is not None
-        sampler.max_events_per_pair, sampler.share_by_moment = 1, 0.0
+        sampler.max_events_per_pair, sampler.share_to_moments = 1, 0.0
         torch.manual_seed(1)
         losses = []
         for _ in range(_NUM_BATCHES):

@@ -26,7 +26,7 @@ aenerf_mlp = MethodSpecification(
                 train_num_rays_per_batch=2048,
                 eval_num_rays_per_batch=2048,
                 max_events_per_pair=1,
-                share_of_pairs_by_moment=0.0,
+                share_of_pairs_to_moments=0.0,
             ),
             model=replace(
                 _base.pipeline.model,

@@ -9,7 +9,7 @@ import torch
 
 from aenerf_ns.image_encoding import decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
-from aenerf_ns.losses import log_radiance_change, reconstruction_loss, temporal_loss
+from aenerf_ns.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
 
 
 def test_changes_count_positive_and_negative_events() -> None:
@@ -23,6 +23,13 @@ def test_reconstruction_loss_by_hand() -> None:
     assert reconstruction_loss(predicted, target, 0.35).item() == pytest.approx(expected)
     # A field that does not change misses each event by one threshold.
     assert reconstruction_loss(torch.zeros(2), torch.tensor([0.3, -0.3]), 0.3).item() == pytest.approx(1.0)
+
+
+def test_a_silent_pixel_is_within_a_threshold_of_its_events() -> None:
+    predicted = torch.tensor([0.9, 0.5, 0.2, -0.4], requires_grad=True)
+    nearest = silent_change(predicted, torch.tensor([0.4, 0.4, 0.4, 0.4]), torch.tensor(0.2, requires_grad=True), 0.3)
+    torch.testing.assert_close(nearest, torch.tensor([0.6, 0.5, 0.2, 0.1]))
+    assert not nearest.requires_grad
 
 
 def test_temporal_loss_by_hand() -> None:

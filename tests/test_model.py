@@ -142,17 +142,32 @@ def test_a_third_ray_lies_between_the_last_two_events(random_poses: torch.Tensor
     assert len(sampler.sample(5)[0]) == 10
 
 
-def test_a_share_of_the_pairs_is_drawn_by_moments(random_poses: torch.Tensor) -> None:
-    sampler = make_sampler(random_poses, SensorModel(), share=0.75)
-    sampler.num_rays_per_batch = 20_000
-    rays, _ = sampler.sample()
+def test_a_share_of_the_pairs_ends_at_uniform_moments(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel(refractory_period=1_000), max_events_per_pair=3, share=0.75)
+    sampler.num_rays_per_batch = 40_000
+    rays, batch = sampler.sample()
     assert rays.times is not None
-    counts = Counter(torch.round(rays.times[:, 0] * 1e9).long().chunk(2)[1].tolist())
-    # By their later event: a third each of a quarter, and of the rest as much as their intervals take up.
-    durations = {600_000_000: 0.5999, 250_000_000: 0.249995, 10**9: 0.75}
-    for end, duration in durations.items():
-        expected = 0.25 / 3 + 0.75 * duration / sum(durations.values())
-        assert counts[end] / 10_000 == pytest.approx(expected, abs=0.02)
+    starts, ends = rays.times[:, 0].chunk(2)
+    between = batch["ends_between_events"]
+    assert between.sum() == 15_000
+    count = batch["num_positive"] + batch["num_negative"]
+    # Nothing has happened since the pair's start, or since an event that is counted: the pixel's middle one.
+    assert set(count[between].tolist()) == {0, 1}
+    assert set(count[~between].tolist()) == {1, 2}
+    # As many as the intervals take up, and at any time within.
+    intervals = [(0.000_101, 0.6), (0.000_006, 0.25), (0.250_001, 1.0)]
+    total = sum(end - start for start, end in intervals)
+    for index, (start, end) in enumerate(intervals):
+        # Events before the last interval of a pixel: two events of (3, 1) tell its two intervals apart, by their end.
+        inside = between & (batch["last_interval"] - (end - start)).abs().lt(1e-6)
+        assert inside.sum() / 15_000 == pytest.approx((end - start) / total, abs=0.02)
+        assert ends[inside].min() == pytest.approx(start, abs=0.005)
+        assert ends[inside].max() == pytest.approx(end, abs=0.005)
+        assert ends[inside].mean() == pytest.approx((start + end) / 2, abs=0.02)
+        longer = inside & (count == 1)
+        assert longer.any() == (index == 2)
+        assert torch.allclose(starts[longer], torch.tensor(0.000_006, dtype=torch.float64))
+        assert torch.allclose(starts[inside & ~longer], torch.tensor(start, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
@@ -245,6 +260,7 @@ def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
         "last_num_negative": 1 - positive,
         "last_interval": torch.full((num_pairs,), 1e-3),
         "channel": torch.zeros(num_pairs, dtype=torch.long),
+        "ends_between_events": torch.zeros(num_pairs, dtype=torch.bool),
     }
 
 
@@ -272,6 +288,22 @@ def test_proposal_loss_is_normalised_by_the_mean_threshold() -> None:
     expected = 3.0 * interlevel_loss(outputs["weights_list"], outputs["ray_samples_list"]) / 0.25**2
     assert expected > 0
     torch.testing.assert_close(losses["interlevel_loss"], expected)
+
+
+def test_between_events_changes_within_the_thresholds_are_right() -> None:
+    model = make_model(loss_coefficients={"reconstruction_loss": 1.0, "interlevel_loss": 0.0, "distortion_loss": 0.0})
+    # Events tell of -0.3, 0.2, -0.3, 0.2, -0.3; the thresholds are 0.2 and 0.3.
+    log_radiance = torch.zeros(10, 1)
+    log_radiance[5:, 0] = torch.tensor([-0.61, 0.38, -0.05, -0.08, -0.3])
+    outputs = model(make_rays()) | {"log_radiance": log_radiance.requires_grad_()}
+    batch = make_batch(5) | {"ends_between_events": torch.tensor([True, True, True, True, False])}
+    loss = model.get_loss_dict(outputs, batch)["reconstruction_loss"]
+    errors = torch.tensor([-0.01, 0.0, 0.05, 0.0, 0.0])
+    torch.testing.assert_close(loss, (errors**2).mean() / 0.25**2)
+    (gradient,) = torch.autograd.grad(loss, log_radiance)
+    torch.testing.assert_close(gradient[5:, 0], 2 * errors / 5 / 0.25**2)
+    # Of changes that are known to a threshold the sign says nothing.
+    assert model.get_metrics_dict(outputs, batch)["polarity_agreement"] == 1
 
 
 def test_losses_are_those_of_the_rendered_changes() -> None:
