@@ -29,7 +29,7 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     max_events_per_pair: int = 64
     """The most events of its pixel that a pair spans; 1: consecutive events, as in the paper. They also are where a
     refractory period is learned, or is more than a twentieth of an event's distance from its neighbours."""
-    share_of_pairs_to_moments: float = 0.5
+    share_of_pairs_to_moments: float = 0.25
     """Part of the pairs of a batch that end at a random moment at a random pixel, between two events; the others end at
     a random event. 0: all of them, as in the paper, and where a refractory period is learned."""
 
