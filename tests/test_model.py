@@ -158,7 +158,6 @@ def test_a_share_of_the_pairs_ends_at_uniform_moments(random_poses: torch.Tensor
     intervals = [(0.000_101, 0.6), (0.000_006, 0.25), (0.250_001, 1.0)]
     total = sum(end - start for start, end in intervals)
     for index, (start, end) in enumerate(intervals):
-        # Events before the last interval of a pixel: two events of (3, 1) tell its two intervals apart, by their end.
         inside = between & (batch["last_interval"] - (end - start)).abs().lt(1e-6)
         assert inside.sum() / 15_000 == pytest.approx((end - start) / total, abs=0.02)
         assert ends[inside].min() == pytest.approx(start, abs=0.005)
