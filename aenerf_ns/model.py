@@ -370,9 +370,9 @@ class AENeRFModel(Model):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
         """The weighted terms of the paper's total loss (eq. 14) on a batch of the event ray sampler."""
-        mean_threshold = (self._positive_contrast_threshold(outputs) + self.sensor.negative_contrast_threshold) / 2
-        predicted, change = self._log_radiance_changes(outputs, batch)
         positive, negative = self._positive_contrast_threshold(outputs), self.sensor.negative_contrast_threshold
+        mean_threshold = (positive + negative) / 2
+        predicted, change = self._log_radiance_changes(outputs, batch)
         silent = silent_change(predicted, change, positive, negative)
         target = torch.where(batch["ends_between_events"], silent, change)
         losses = {"reconstruction_loss": reconstruction_loss(predicted, target, mean_threshold)}
