@@ -102,6 +102,50 @@ def test_the_methods_for_gpus_train_too(room: Path, workspace: Path, method: str
     assert len(list((workspace / "outputs" / "room" / method).rglob("*.ckpt"))) == 1
 
 
+def test_two_processes_learn_the_same_from_different_pairs(room: Path, workspace: Path) -> None:
+    run(
+        "python",
+        Path(__file__).with_name("train_on_cpu_processes.py"),
+        "aenerf-small",
+        *CPU,
+        "--machine.num-devices",
+        "2",
+        "--vis",
+        "tensorboard",
+        "--max-num-iterations",
+        "3",
+        "--pipeline.datamanager.train-num-rays-per-batch",
+        "255",
+        "--optimizers.camera-opt.scheduler.delay",
+        "0",
+        "--gradient-accumulation-steps.camera-opt",
+        "1",
+        # All that is learned besides the scene.
+        "--pipeline.model.learn-contrast-threshold-ratio",
+        "True",
+        "--pipeline.model.learn-refractory-period",
+        "True",
+        "--pipeline.model.loss-coefficients.temporal-loss",
+        "0.001",
+        "--output-dir",
+        "two-processes",
+        "--data",
+        room,
+        cwd=workspace,
+    )
+    first, second = (torch.load(workspace / f"process_{rank}.pt", weights_only=True) for rank in range(2))
+    assert not torch.equal(first["times"], second["times"])
+    for name, value in first["weights"].items():
+        assert torch.equal(value, second["weights"][name]), name
+    assert first["weights"]["_model.module.camera_optimizer.twists.control_twists"].any()
+    results = workspace / "two-processes.json"
+    config = newest_config(workspace / "two-processes")
+    run("ns-eval", "--load-config", config, "--output-path", results, cwd=workspace)
+    learned = json.loads(results.read_text())["results"]
+    assert learned["contrast_threshold_ratio"] != 1
+    assert learned["num_views"] == 3
+
+
 def test_the_framework_lists_the_methods_and_its_own_still_work(workspace: Path) -> None:
     output = run("ns-train", "--help", cwd=workspace)
     assert "aenerf " in output
