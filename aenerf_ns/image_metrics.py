@@ -50,7 +50,10 @@ class ImageMetrics:
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         try:
-            self._lpips = LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
+            # It draws weights ahead of those that it loads, more of them where these can be had: what training draws
+            # afterwards must depend on neither.
+            with torch.random.fork_rng(devices=[]):
+                self._lpips = LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
         except Exception as error:
             # torch.hub raises whatever its connection raises.
             self.lpips_absent = f"the weights of AlexNet could not be had ({error})"

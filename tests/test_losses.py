@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
+from torchvision.models import alexnet
 
 from aenerf_ns.image_encoding import decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
@@ -67,15 +69,31 @@ def test_psnr_by_hand_and_lpips_is_absent_unless_asked_for() -> None:
     assert metrics.lpips_absent is not None
 
 
+def replace_downloads(monkeypatch: pytest.MonkeyPatch, download: Callable[..., object]) -> None:
+    monkeypatch.setattr("torch.hub.load_state_dict_from_url", download)
+    monkeypatch.setattr("torchvision._internally_replaced_utils.load_state_dict_from_url", download, raising=False)
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", download, raising=False)
+
+
 def test_lpips_without_weights_is_absent_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_connection(*_: object, **__: object) -> None:
         raise OSError("no connection")
 
-    monkeypatch.setattr("torch.hub.load_state_dict_from_url", no_connection)
-    monkeypatch.setattr("torchvision._internally_replaced_utils.load_state_dict_from_url", no_connection, raising=False)
-    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", no_connection, raising=False)
+    replace_downloads(monkeypatch, no_connection)
     image = torch.rand(64, 64, 3)
     metrics = ImageMetrics(with_lpips=True)
+    before = torch.get_rng_state()
     values = metrics(image, image)
+    # Else what a training draws after its first evaluation would depend on the connection.
+    assert torch.equal(torch.get_rng_state(), before)
     assert "lpips" not in values
     assert "no connection" in str(metrics.lpips_absent)
+
+
+def test_lpips_with_weights_leaves_the_random_numbers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    replace_downloads(monkeypatch, lambda *_, **__: alexnet().state_dict())
+    image = torch.rand(64, 64, 3)
+    before = torch.get_rng_state()
+    values = ImageMetrics(with_lpips=True)(image, image)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert values["lpips"] == pytest.approx(0)
