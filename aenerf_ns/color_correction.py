@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from aenerf_ns.image_encoding import ImageEncoding, encode
+from aenerf_ns.camera.image_encoding import ImageEncoding, encode
 
 ColorCorrectionProtocol = Literal["affine", "affine-test", "network", "none"]
 

@@ -32,7 +32,7 @@ from aenerf_ns.color_correction import COLOR_CORRECTIONS, ColorCorrection, Color
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.field import DensityField, EventRadianceField, ProposalNetwork
 from aenerf_ns.hash_encoding import HashEncoding
-from aenerf_ns.image_encoding import ImageEncoding, decode, encode, to_channels
+from aenerf_ns.camera.image_encoding import ImageEncoding, decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
 from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig

@@ -21,8 +21,8 @@ from aenerf_ns.datamanager import EventDataManager
 from aenerf_ns.model import AENeRFModel
 from aenerf_ns.pose_refinement import NUM_STEPS, refine_camera
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.trajectory.alignment import pose_errors
-from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, homogeneous
+from aenerf_ns.camera.alignment import pose_errors
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
@@ -210,7 +210,7 @@ class AENeRFPipeline(VanillaPipeline):
 
     def pose_errors(self) -> dict[str, dict[str, float]] | None:
         """Errors of the ``estimated`` and the ``corrected`` poses against the true ones, in the units of the recording
-        (see :func:`~aenerf_ns.trajectory.alignment.pose_errors`); None where these are not known."""
+        (see :func:`~aenerf_ns.camera.alignment.pose_errors`); None where these are not known."""
         correction = self.model.camera_optimizer
         if not correction.has_ground_truth:
             return None

@@ -15,11 +15,11 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.encodings import NeRFEncoding
 from torch import Tensor, nn
 
-from aenerf_ns.event_camera import REFERENCE_SECONDS, TRAJECTORY_SECONDS
+from aenerf_ns.camera.lens import REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.ray_sampler import CAMERA_DIRECTIONS
-from aenerf_ns.trajectory.alignment import Similarity, align
-from aenerf_ns.trajectory.rotation import motion_from_twist
-from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
+from aenerf_ns.camera.alignment import Similarity, align
+from aenerf_ns.camera.rotation import motion_from_twist
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 
 # Poses at which trajectories are compared: enough for any metric, and quick enough to be logged.
 _MAX_COMPARED = 2000

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.trajectory.trajectory import Trajectory
+from aenerf_ns.camera.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from aenerf_ns.events.pairs import EventPairs, PairsInTime

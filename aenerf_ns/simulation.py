@@ -10,16 +10,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.esim import EventSimulator
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.image_encoding import encode, to_channels
+from aenerf_ns.camera.image_encoding import encode, to_channels
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.scenes import SimulationScene
 from aenerf_ns.scenes.frames import frame_parameters
 from aenerf_ns.scenes.paths import SpeedProfile
-from aenerf_ns.trajectory.trajectory import Trajectory
+from aenerf_ns.camera.trajectory import Trajectory
 
 # Rays through a pixel: enough that the frames' own aliasing triggers few events, and references without visible noise.
 _EVENT_SAMPLES = 4

@@ -26,7 +26,7 @@ import tyro
 from numpy.typing import NDArray
 
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventWriter
+from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.events.stream import EventStream
 
 _WIDTH, _HEIGHT = 1280, 720
@@ -206,7 +206,7 @@ WRITERS: dict[str, Callable[[Path, int], None]] = {
 def count_events(reader: str, path: Path) -> int:
     """Reads a file from end to end, in pieces."""
     if reader == "aenerf":
-        from aenerf_ns.dataparsers.event_files import open_event_file
+        from aenerf_ns.files.open import open_event_file
 
         return sum(map(len, open_event_file(path, _WIDTH, _HEIGHT).chunks()))
     import faery
@@ -228,7 +228,7 @@ def measure(reader: str, small: Path, path: Path) -> dict:
         "peak_mib_of_the_process_before": before,
     }
     if reader == "aenerf":
-        from aenerf_ns.dataparsers.event_files import open_event_file
+        from aenerf_ns.files.open import open_event_file
 
         begin = time.process_time()
         open_event_file(path, _WIDTH, _HEIGHT).time_span()

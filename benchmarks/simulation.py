@@ -22,7 +22,7 @@ import tyro
 
 from aenerf_ns.bench.environment import environment
 from aenerf_ns.bench.plan import scene_name
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.esim import EventSimulator
 from aenerf_ns.events.sensor import LUMINANCE, SensorModel
 from aenerf_ns.scenes import open_scene

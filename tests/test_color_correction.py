@@ -21,14 +21,14 @@ from aenerf_ns.color_correction import (
 )
 from aenerf_ns.datamanager import EventDataManagerConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.image_encoding import encode
+from aenerf_ns.camera.image_encoding import encode
 from aenerf_ns.model import AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipeline, AENeRFPipelineConfig
 from aenerf_ns.pose_correction import PoseCorrectionConfig
-from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 
 FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
 

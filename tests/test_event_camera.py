@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from aenerf_ns.event_camera import EventCamera
-from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL
 
 DAVIS = EventCamera(
     240, 180, 335.42, 335.35, 130.42, 99.69, "radial_tangential", (-0.1386, 0.0934, -0.0034, 0.0017, 0.02)

@@ -14,10 +14,10 @@ from conftest import FUZZ_EXAMPLES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aenerf_ns.dataparsers.event_arrays import NpzEventFile, open_array_events
-from aenerf_ns.dataparsers.event_files import open_event_file
-from aenerf_ns.dataparsers.event_hdf5 import Hdf5EventFile, Hdf5EventWriter, open_hdf5_events
-from aenerf_ns.dataparsers.event_table import events_from_columns
+from aenerf_ns.files.event_arrays import NpzEventFile, open_array_events
+from aenerf_ns.files.open import open_event_file
+from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter, open_hdf5_events
+from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 
@@ -124,8 +124,8 @@ def test_every_layout_gives_the_events_it_was_written_with(
     layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Several pieces.
-    monkeypatch.setattr("aenerf_ns.dataparsers.event_table._CHUNK", 128)
-    monkeypatch.setattr("aenerf_ns.dataparsers.event_arrays._CHUNK_LINES", 128)
+    monkeypatch.setattr("aenerf_ns.files.event_table._CHUNK", 128)
+    monkeypatch.setattr("aenerf_ns.files.event_arrays._CHUNK_LINES", 128)
     name, write = LAYOUTS[layout]
     expected = made_columns()
     write(tmp_path / name, expected)
@@ -329,7 +329,7 @@ def test_blosc_without_its_filter_names_the_extra(tmp_path: Path) -> None:
     # In a process of its own, for a filter that is loaded stays.
     code = (
         "import sys; from pathlib import Path; sys.modules['hdf5plugin'] = None\n"
-        "from aenerf_ns.dataparsers.event_hdf5 import open_hdf5_events\n"
+        "from aenerf_ns.files.event_hdf5 import open_hdf5_events\n"
         f"open_hdf5_events(Path({str(tmp_path / 'events.h5')!r}), {WIDTH}, {HEIGHT}).time_span()"
     )
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile, count_events, find_hot_pixels
 from aenerf_ns.events.pairs import pair_events
 from aenerf_ns.events.stream import EventFile, EventStream

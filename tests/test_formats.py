@@ -25,16 +25,17 @@ from scipy.spatial.transform import Rotation
 
 from aenerf_ns.datamanager import EventDataManagerConfig
 from aenerf_ns.dataparsers.formats import FORMATS, AutomaticDataParserConfig, recognise
-from aenerf_ns.dataparsers.kalibr import read_camchain
+from aenerf_ns.files.kalibr import read_camchain
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
+from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.dataparsers.paev3d import PAEv3DDataParserConfig
-from aenerf_ns.dataparsers.recording import EventDataParserConfig, Recording
-from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.recording.dataparser import EventDataParserConfig
+from aenerf_ns.recording.recording import Recording
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.dataset import EventDataset
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.sensor import SensorModel
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -18,7 +18,7 @@ import torch
 import websockets.sync.client
 from commands import CPU, newest_config, run, simulate
 
-from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 
 # Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.
 STEPS = 300

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torchvision.models import alexnet
 
-from aenerf_ns.image_encoding import decode, encode, to_channels
+from aenerf_ns.camera.image_encoding import decode, encode, to_channels
 from aenerf_ns.image_metrics import ImageMetrics
 from aenerf_ns.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
 

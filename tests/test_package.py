@@ -68,7 +68,7 @@ def test_importing_the_package_costs_nothing() -> None:
 def test_the_registered_modules_leave_the_heaviest_imports_for_later() -> None:
     # What the framework itself imports at every command is no cost of ours.
     code = (
-        "import sys, nerfstudio.configs.method_configs as framework, aenerf_ns.dataparsers.event_files;"
+        "import sys, nerfstudio.configs.method_configs as framework, aenerf_ns.files.open;"
         "assert {'aenerf', 'aenerf-mlp', 'aenerf-small'} <= set(framework.all_methods);"
         "print({'numba', 'torchmetrics', 'h5py', 'pycolmap', 'rosbags'} & set(sys.modules))"
     )

@@ -12,13 +12,13 @@ from test_model import ALL_LOSSES, make_batch, make_model, make_rays
 
 from aenerf_ns.datamanager import EventDataManagerConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.dataparsers.native_writer import NativeDatasetWriter
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.model import AENeRFModel, AENeRFModelConfig
 from aenerf_ns.pipeline import AENeRFPipelineConfig
 from aenerf_ns.sensor_parameters import SensorParameters
-from aenerf_ns.trajectory.trajectory import Trajectory
+from aenerf_ns.camera.trajectory import Trajectory
 
 
 @pytest.mark.parametrize("ratio", [1e-3, 0.5, 1.0, 1.458, 40.0])

@@ -15,8 +15,8 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.losses import temporal_loss
 from aenerf_ns.model import AENeRFModel
 from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig, world_rays
-from aenerf_ns.trajectory.rotation import cross_matrix, motion_from_twist, rotation_from_vector
-from aenerf_ns.trajectory.trajectory import Trajectory, homogeneous
+from aenerf_ns.camera.rotation import cross_matrix, motion_from_twist, rotation_from_vector
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 
 
 def exact_model(mode: str, **options: Any) -> AENeRFModel:

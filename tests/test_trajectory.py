@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.trajectory.noise import perturb
-from aenerf_ns.trajectory.rotation import (
+from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.rotation import (
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
     vector_from_quaternion,
 )
-from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 
 # Unix time in nanoseconds, which float64 seconds cannot hold.
 EPOCH = 1_600_000_000_123_456_789

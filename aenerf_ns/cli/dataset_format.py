@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast, get_type_hints
 import tyro
 
 from aenerf_ns.dataparsers.formats import FORMATS, recognise
-from aenerf_ns.dataparsers.recording import EventDataParser, EventDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfig
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""What every dataset format gives, and how Nerfstudio is given it: the base of all dataparsers."""
+"""How Nerfstudio is given a recording: the base of all dataparsers, and their options."""
 
 from __future__ import annotations
 
@@ -13,107 +13,21 @@ from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
-from PIL import Image
 from torch import Tensor
 
-from aenerf_ns.dataparsers.tum_trajectory import read_tum_trajectory
+from aenerf_ns.camera.lens import REFERENCE_SECONDS, TRAJECTORY_SECONDS
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import REFERENCE_SECONDS, TRAJECTORY_SECONDS, EventCamera
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile
-from aenerf_ns.image_encoding import ImageEncoding
-from aenerf_ns.trajectory.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
-
-Split = Literal["train", "val", "test"]
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.recording.images import check_image
+from aenerf_ns.recording.recording import FrameSequence, Recording, ReferenceView, Split
 
 # In extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
 _MAX_REFERENCE_DISTANCE = 1e4
 
 # Training cameras are only there to be seen: the framework's viewer and its start-up slow down with their number.
 _MAX_SHOWN = 24
-
-
-@dataclass(frozen=True)
-class ReferenceView:
-    """An image with its pose. Reference images serve evaluation, colour correction and the viewer, never training.
-
-    Attributes:
-        file: the image.
-        camera_to_world: (4, 4) float64 pose, OpenCV camera axes, in the world of the recording's
-            :attr:`~Recording.reference_trajectory`.
-        time: in nanoseconds on the clock of the events, or None for an image that was not taken on the trajectory.
-    """
-
-    file: Path
-    camera_to_world: Tensor
-    time: int | None
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A recording of an event camera, in the world frame and the units of its poses.
-
-    Attributes:
-        event_file: the events, not yet read.
-        event_camera: the event camera's lens.
-        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
-        trajectory: the estimated trajectory of the event camera, camera-to-world, OpenCV camera axes.
-        frame_camera: the lens of the camera that took the reference views.
-        reference_views: the images of each split.
-        image_encoding: whether the images' values are sRGB or linear in radiance.
-        scene_box: (2, 3) smallest and largest corner of a box that holds the whole scene, or None for a scene
-            without bounds.
-        ground_truth: the true trajectory, camera-to-world, OpenCV camera axes, in a world of any position, orientation
-            and scale, or None where it is not known. It serves evaluation only.
-        max_pose_gap: nanoseconds; where poses are further apart, the camera's way between them is not known. None:
-            poses are interpolated however far apart they are.
-        max_views: how many of the views of a split that were taken on the trajectory are used at most, evenly spread
-            over the time window; None: all.
-        image_background: RGB in [0, 1] behind images that have an alpha channel, or None where that is ignored.
-    """
-
-    event_file: EventFile
-    event_camera: EventCamera
-    sensor: SensorModel
-    trajectory: Trajectory
-    frame_camera: EventCamera
-    reference_views: dict[Split, list[ReferenceView]]
-    image_encoding: ImageEncoding
-    scene_box: Tensor | None = None
-    ground_truth: Trajectory | None = None
-    max_pose_gap: int | None = None
-    max_views: int | None = None
-    image_background: tuple[float, float, float] | None = None
-
-    @property
-    def reference_trajectory(self) -> Trajectory:
-        """The best there is to compare with: the true trajectory, or where it is not known the estimated one."""
-        return self.trajectory if self.ground_truth is None else self.ground_truth
-
-
-@dataclass(frozen=True)
-class FrameSequence:
-    """A recording as it is before it has poses, with the frames that they can be estimated from.
-
-    Attributes:
-        event_file: the events, not yet read.
-        event_camera: the event camera's lens.
-        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
-        frame_camera: the lens of the camera that took the frames.
-        files: the frames, in the order of time.
-        times: when they were taken, in nanoseconds on the clock of the events.
-        image_encoding: whether the frames' values are sRGB or linear in radiance.
-        recording: the recording with its given poses, or None where it has none.
-    """
-
-    event_file: EventFile
-    event_camera: EventCamera
-    sensor: SensorModel
-    frame_camera: EventCamera
-    files: list[Path]
-    times: list[int]
-    image_encoding: ImageEncoding
-    recording: Recording | None
 
 
 @dataclass
@@ -375,32 +289,6 @@ def _as_split(split: str) -> Split:
     if split not in ("train", "val", "test"):
         raise ValueError(f"there is no split {split!r}")
     return split  # type: ignore[return-value]
-
-
-def check_image(file: Path, camera: EventCamera) -> None:
-    """Raises a DataError for an image that the framework cannot read, or would read wrongly."""
-    size, mode = image_size_and_mode(file)
-    if size != (camera.width, camera.height):
-        raise DataError(
-            file,
-            f"the image has {size[0]} x {size[1]} pixels, its camera {camera.width} x {camera.height}",
-            "give the intrinsics of the images as they are",
-        )
-    if mode not in ("L", "RGB", "RGBA"):
-        raise DataError(file, f"the image is of PIL's mode {mode}", "store 8 bits of grey or RGB")
-
-
-def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:
-    """Width and height in pixels, and PIL's name of what the pixels hold.
-
-    Raises:
-        DataError: the file is missing or no image.
-    """
-    try:
-        with Image.open(file) as image:
-            return image.size, image.mode
-    except OSError as error:
-        raise DataError(file, f"not an image that can be read ({error})", "copy it again") from None
 
 
 def _check_distance(poses: Tensor, reference: Trajectory) -> None:

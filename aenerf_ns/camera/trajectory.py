@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.trajectory.rotation import (
+from aenerf_ns.camera.rotation import (
     cross_matrix,
     quaternion_from_rotation,
     rotation_from_vector,

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.dataparsers.prophesee_header import read_header
-from aenerf_ns.dataparsers.sensor_size import sensor_size
+from aenerf_ns.files.prophesee_header import read_header
+from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 

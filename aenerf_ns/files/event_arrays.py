@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.dataparsers.event_table import (
+from aenerf_ns.files.event_table import (
     SAMPLE,
     EventLayout,
     EventTableFile,
     events_from_columns,
     guess_time_unit,
 )
-from aenerf_ns.dataparsers.text import NANOSECONDS, TimeUnit, first_and_last_row, is_row
+from aenerf_ns.files.text import NANOSECONDS, TimeUnit, first_and_last_row, is_row
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 

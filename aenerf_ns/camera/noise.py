@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from aenerf_ns.trajectory.rotation import rotation_from_vector
-from aenerf_ns.trajectory.trajectory import Trajectory
+from aenerf_ns.camera.rotation import rotation_from_vector
+from aenerf_ns.camera.trajectory import Trajectory
 
 _NUM_WAVES = 64
 

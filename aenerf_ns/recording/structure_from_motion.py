@@ -20,10 +20,10 @@ from rich.progress import Progress
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.event_camera import EventCamera
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.trajectory.alignment import Similarity, align, pose_errors, rotation_angle
-from aenerf_ns.trajectory.trajectory import Trajectory
+from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
+from aenerf_ns.camera.trajectory import Trajectory
 
 # Each frame is matched with so many after it, and with those 16, 32, ... 1024 after it,
 _NEIGHBOURS = 10
@@ -177,7 +177,7 @@ def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory
     """Maps estimated poses to the true world by one Sim(3), and tells their errors.
 
     Only position, orientation and scale of the whole world are taken from the truth. The similarity is that of
-    positions and orientations (:func:`~aenerf_ns.trajectory.alignment.align`) of the frames that agree with most
+    positions and orientations (:func:`~aenerf_ns.camera.alignment.align`) of the frames that agree with most
     others, so that a few misplaced ones do not turn the world away from the rest. All are mapped and none is removed.
 
     Args:
@@ -186,7 +186,7 @@ def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory
 
     Returns:
         The mapped trajectory, and its errors in the units of the truth: those of
-        :func:`~aenerf_ns.trajectory.alignment.pose_errors`, which aligns all frames; and without another alignment the
+        :func:`~aenerf_ns.camera.alignment.pose_errors`, which aligns all frames; and without another alignment the
         medians and maxima of rotation and translation error, the ``extent`` (root mean square distance of the true
         positions from their mean), the number of ``misplaced_frames``, off by more than 5 degrees or a tenth of the
         extent, and of ``flipped_frames`` among them, by more than 90 degrees.

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from aenerf_ns.dataparsers.aedat4 import Aedat4File
-from aenerf_ns.dataparsers.ecd import EcdEventFile
-from aenerf_ns.dataparsers.event_arrays import open_array_events
-from aenerf_ns.dataparsers.event_hdf5 import open_hdf5_events
-from aenerf_ns.dataparsers.prophesee_dat import PropheseeDatFile
-from aenerf_ns.dataparsers.prophesee_header import read_header
-from aenerf_ns.dataparsers.prophesee_raw import PropheseeRawFile
-from aenerf_ns.dataparsers.rosbag import RosbagEventFile
-from aenerf_ns.dataparsers.sensor_size import sensor_size
-from aenerf_ns.dataparsers.text import TimeUnit
+from aenerf_ns.files.aedat4 import Aedat4File
+from aenerf_ns.files.event_text import TextEventFile
+from aenerf_ns.files.event_arrays import open_array_events
+from aenerf_ns.files.event_hdf5 import open_hdf5_events
+from aenerf_ns.files.prophesee_dat import PropheseeDatFile
+from aenerf_ns.files.prophesee_header import read_header
+from aenerf_ns.files.prophesee_raw import PropheseeRawFile
+from aenerf_ns.files.rosbag import RosbagEventFile
+from aenerf_ns.files.sensor_size import sensor_size
+from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 
@@ -78,7 +78,7 @@ def open_event_file(
     size = sensor_size(path, None, width, height)
     if name == "hdf5":
         return open_hdf5_events(path, *size, time_unit)
-    return open_array_events(path, *size, time_unit) if name == "arrays" else EcdEventFile(path, *size)
+    return open_array_events(path, *size, time_unit) if name == "arrays" else TextEventFile(path, *size)
 
 
 class _MissingEventFile(EventFile):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.dataparsers.text import MAX_TIME, NANOSECONDS, TimeUnit
+from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 

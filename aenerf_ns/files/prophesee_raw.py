@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.dataparsers.prophesee_header import PropheseeHeader, read_header
-from aenerf_ns.dataparsers.sensor_size import sensor_size
+from aenerf_ns.files.prophesee_header import PropheseeHeader, read_header
+from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 
 if TYPE_CHECKING:
-    from aenerf_ns.dataparsers.evt_words import Columns
+    from aenerf_ns.files.evt_words import Columns
 
 # Words read at once.
 _BLOCK = 1 << 20
@@ -47,7 +47,7 @@ class PropheseeRawFile(EventFile):
 
     def _decoded(self) -> Iterator[Columns]:
         # Late, for every command of every method would wait for numba.
-        from aenerf_ns.dataparsers.evt_words import EVT2, EVT3, decode_words, initial_state
+        from aenerf_ns.files.evt_words import EVT2, EVT3, decode_words, initial_state
 
         header = read_header(self.path)
         sensor_size(self.path, header.size, self.width, self.height)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.dataparsers.sensor_size import sensor_size
+from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.rosbag1 import Reader
 
-    from aenerf_ns.dataparsers.evt_words import Columns
+    from aenerf_ns.files.evt_words import Columns
 
 _CHUNK = 1 << 20
 _PACKET_TYPE = "event_camera_msgs/msg/EventPacket"
@@ -155,7 +155,7 @@ class RosbagEventFile(EventFile):
 
     def _columns_of_packets(self, start: int | None) -> Iterator[Columns]:
         # Late, for every command of every method would wait for numba.
-        from aenerf_ns.dataparsers.evt_words import EVT3, decode_words, initial_state
+        from aenerf_ns.files.evt_words import EVT3, decode_words, initial_state
 
         state = initial_state()
 

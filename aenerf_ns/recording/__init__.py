@@ -1,0 +1,1 @@
+"""What a dataset holds, and how Nerfstudio is given it."""

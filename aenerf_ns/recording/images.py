@@ -1,0 +1,36 @@
+"""Reference images, looked at before the framework reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PIL import Image
+
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
+
+
+def check_image(file: Path, camera: EventCamera) -> None:
+    """Raises a DataError for an image that the framework cannot read, or would read wrongly."""
+    size, mode = image_size_and_mode(file)
+    if size != (camera.width, camera.height):
+        raise DataError(
+            file,
+            f"the image has {size[0]} x {size[1]} pixels, its camera {camera.width} x {camera.height}",
+            "give the intrinsics of the images as they are",
+        )
+    if mode not in ("L", "RGB", "RGBA"):
+        raise DataError(file, f"the image is of PIL's mode {mode}", "store 8 bits of grey or RGB")
+
+
+def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:
+    """Width and height in pixels, and PIL's name of what the pixels hold.
+
+    Raises:
+        DataError: the file is missing or no image.
+    """
+    try:
+        with Image.open(file) as image:
+            return image.size, image.mode
+    except OSError as error:
+        raise DataError(file, f"not an image that can be read ({error})", "copy it again") from None

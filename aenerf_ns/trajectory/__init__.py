@@ -1,1 +1,0 @@
-"""Camera poses in continuous time."""
