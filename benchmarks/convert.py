@@ -24,13 +24,13 @@ import torch
 import tyro
 
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.cli.convert import Convert
-from aenerf_ns.files.event_hdf5 import Hdf5EventFile
-from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.cli.convert import Convert
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.files.event_hdf5 import Hdf5EventFile
+from aenerf_ns.recording.writer import NativeDatasetWriter
 
 _WIDTH, _HEIGHT = 1280, 720
 _CHUNK = 1 << 22

@@ -20,12 +20,13 @@ import tyro
 
 from aenerf_ns.bench.environment import environment
 from aenerf_ns.bench.plan import scene_name
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.scenes import SimulationScene, open_scene
-from aenerf_ns.simulated_poses import poses_from_frames
-from aenerf_ns.simulation import Simulation
+from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.scene import SimulationScene
+from aenerf_ns.simulator.simulated_poses import poses_from_frames
+from aenerf_ns.simulator.simulation import Simulation
 
 
 @dataclass

@@ -26,8 +26,8 @@ import tyro
 from numpy.typing import NDArray
 
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 
 _WIDTH, _HEIGHT = 1280, 720
 _START = 1_600_000_000_000_000

@@ -20,8 +20,8 @@ import torch
 import tyro
 
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.camera.noise import perturb
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 
 
 @dataclass

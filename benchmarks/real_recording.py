@@ -20,7 +20,7 @@ import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.pipeline import AENeRFPipeline
+from aenerf_ns.training.pipeline import AENeRFPipeline
 
 _NUM_BATCHES = 20
 

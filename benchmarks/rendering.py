@@ -21,12 +21,12 @@ import trimesh
 import tyro
 
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.scenes import built_in_scene
-from aenerf_ns.scenes.embree import RayCaster
-from aenerf_ns.scenes.environment import sky
-from aenerf_ns.scenes.light_baking import AreaLight
-from aenerf_ns.scenes.mesh_lighting import baked_mesh, light_mesh, light_points
-from aenerf_ns.scenes.mesh_loading import Mesh, scaled
+from aenerf_ns.simulator.open_scene import built_in_scene
+from aenerf_ns.simulator.rendering.embree import RayCaster
+from aenerf_ns.simulator.rendering.environment import sky
+from aenerf_ns.simulator.rendering.light_baking import AreaLight
+from aenerf_ns.simulator.rendering.mesh_lighting import baked_mesh, light_mesh, light_points
+from aenerf_ns.simulator.rendering.mesh_loading import Mesh, scaled
 
 
 @dataclass

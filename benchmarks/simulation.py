@@ -23,10 +23,10 @@ import tyro
 from aenerf_ns.bench.environment import environment
 from aenerf_ns.bench.plan import scene_name
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.esim import EventSimulator
 from aenerf_ns.events.sensor import LUMINANCE, SensorModel
-from aenerf_ns.scenes import open_scene
-from aenerf_ns.scenes.frames import frame_parameters
+from aenerf_ns.simulator.esim import EventSimulator
+from aenerf_ns.simulator.frames import frame_parameters
+from aenerf_ns.simulator.open_scene import open_scene
 
 _TESTED_PIXELS = 2000
 

@@ -32,10 +32,10 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.field_components.encodings import HashEncoding as FrameworkHashEncoding
 
-import aenerf_ns.model
+import aenerf_ns.method.model
 from aenerf_ns.bench.environment import environment
-from aenerf_ns.hash_encoding import HashEncoding
-from aenerf_ns.temporal import log_radiance_rate
+from aenerf_ns.method.encoding.hash_grid import HashEncoding
+from aenerf_ns.method.temporal import log_radiance_rate
 
 _WARM_UP = 100
 # Seconds to either side; only what it costs counts here.
@@ -48,7 +48,7 @@ class Variant:
 
     Attributes:
         temporal: whether the temporal loss is on.
-        rate: in place of :func:`aenerf_ns.temporal.log_radiance_rate`.
+        rate: in place of :func:`aenerf_ns.method.temporal.log_radiance_rate`.
         composite: in place of the model's rendering of samples.
         encoding: in place of the hash encoding.
         compiled: whether torch.compile is used.
@@ -217,7 +217,7 @@ class StepCost:
         model.config.loss_coefficients = {**coefficients, "temporal_loss": 1e-3 if variant.temporal else 0.0}
         sampler.with_time_within = variant.temporal
         HashEncoding.pytorch_fwd = variant.encoding
-        aenerf_ns.model.log_radiance_rate = variant.rate
+        aenerf_ns.method.model.log_radiance_rate = variant.rate
         model.__dict__.pop("_composite", None)
         if variant.composite is not None:
             model._composite = variant.composite

@@ -11,16 +11,17 @@ from pathlib import Path
 
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
-from aenerf_ns.recording.images import image_size_and_mode
-from aenerf_ns.recording.recording import FrameSequence, Recording
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.text import parse_numbers, read_rows
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
+from aenerf_ns.recording.images import image_size_and_mode
+from aenerf_ns.recording.recording import FrameSequence, Recording
 from aenerf_ns.recording.views import read_image_list, views_on_trajectory
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import SensorModel
+
 
 @dataclass
 class EcdDataParserConfig(PublishedDataParserConfig):

@@ -10,15 +10,15 @@ import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_AT_TOP, Hdf5TableFile
 from aenerf_ns.files.kalibr import read_camchain
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import SensorModel
 
 # The authors' calibration of the recordings ("03_calib" in uzh-rpg/bundles-eds), which the sequences do not contain:
 # k1, k2, p1, p2, and what takes points from the frame camera's to the event camera's coordinates.

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from aenerf_ns.files.event_arrays import XYTP_MATRIX, NpyEventFile, load_npy
-from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
-from aenerf_ns.recording.recording import Recording
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.event_arrays import XYTP_MATRIX, NpyEventFile, load_npy
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
+from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
 
 
 class EsimEventFolder(EventFile):

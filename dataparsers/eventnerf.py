@@ -11,16 +11,16 @@ import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
-from aenerf_ns.recording.dataparser import EventDataParser, ObjectDataParserConfig
-from aenerf_ns.recording.recording import Recording, ReferenceView, Split
-from aenerf_ns.files.text import TimeUnit
-from aenerf_ns.recording.views import MAX_VIEWS, image_files, views_on_trajectory
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import Trajectory, require_rigid
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.camera.trajectory import Trajectory, require_rigid
+from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
+from aenerf_ns.files.text import TimeUnit
+from aenerf_ns.recording.dataparser import EventDataParser, ObjectDataParserConfig
+from aenerf_ns.recording.recording import Recording, ReferenceView, Split
+from aenerf_ns.recording.views import MAX_VIEWS, image_files, views_on_trajectory
 
 # A DAVIS 346C.
 _WIDTH, _HEIGHT = 346, 260

@@ -18,10 +18,10 @@ from aenerf_ns.dataparsers.eventnerf import eventnerf_dataparser
 from aenerf_ns.dataparsers.native import native_dataparser
 from aenerf_ns.dataparsers.own_recording import own_recording_dataparser
 from aenerf_ns.dataparsers.paev3d import paev3d_dataparser
-from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfig
 from aenerf_ns.dataparsers.robust_enerf import robust_enerf_dataparser
 from aenerf_ns.dataparsers.tum_vie import tum_vie_dataparser
 from aenerf_ns.errors import DataError
+from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfig
 
 # Under the names they are registered with, those first that are taken where a folder has several.
 FORMATS: dict[str, EventDataParserConfig] = {

@@ -12,14 +12,14 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.files.event_hdf5 import Hdf5EventFile
-from aenerf_ns.files.json_object import Metadata, read_camera, read_image_encoding
-from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfig
-from aenerf_ns.recording.recording import Recording, ReferenceView, Split
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.files.event_hdf5 import Hdf5EventFile
+from aenerf_ns.files.json_object import Metadata, read_camera, read_image_encoding
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfig
+from aenerf_ns.recording.recording import Recording, ReferenceView, Split
 
 _SPLITS: tuple[Split, ...] = ("train", "val", "test")
 

@@ -12,20 +12,20 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.files.open import SUFFIXES, open_event_file
-from aenerf_ns.files.kalibr import read_camchain
-from aenerf_ns.files.json_object import Metadata, read_camera, read_image_encoding
-from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
-from aenerf_ns.recording.recording import FrameSequence, Recording
-from aenerf_ns.files.text import TimeUnit
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.recording.views import MAX_VIEWS, read_image_list, views_on_trajectory
-from aenerf_ns.errors import DataError
+from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.files.json_object import Metadata, read_camera, read_image_encoding
+from aenerf_ns.files.kalibr import read_camchain
+from aenerf_ns.files.open import SUFFIXES, open_event_file
+from aenerf_ns.files.text import TimeUnit
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
+from aenerf_ns.recording.recording import FrameSequence, Recording
+from aenerf_ns.recording.views import MAX_VIEWS, read_image_list, views_on_trajectory
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml")
 

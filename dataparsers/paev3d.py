@@ -13,15 +13,15 @@ import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, require_rigid
+from aenerf_ns.dataparsers.eventnerf import UNIT_SPHERE, EvenPosesDataParserConfig, read_intrinsics
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import NPZ_ERRORS, read_npy_header
 from aenerf_ns.files.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
-from aenerf_ns.dataparsers.eventnerf import UNIT_SPHERE, EvenPosesDataParserConfig, read_intrinsics
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, image_files, views_on_trajectory
-from aenerf_ns.errors import DataError
-from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, require_rigid
 
 _WIDTH, _HEIGHT = 640, 480
 # All that NumPy's arrays and numbers need. A pickle may otherwise run what it likes.

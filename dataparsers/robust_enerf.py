@@ -10,17 +10,17 @@ import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from numpy.typing import NDArray
 
+from aenerf_ns.camera.lens import EventCamera, LensModel
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import POSITION_TIMESTAMP_POLARITY, NpzEventFile, read_npz_member
 from aenerf_ns.files.json_object import Metadata
+from aenerf_ns.files.tum_trajectory import poses_from_quaternions
 from aenerf_ns.recording.dataparser import EventDataParser, ObjectDataParserConfig
 from aenerf_ns.recording.images import image_size_and_mode
 from aenerf_ns.recording.recording import Recording, ReferenceView, Split
-from aenerf_ns.files.tum_trajectory import poses_from_quaternions
 from aenerf_ns.recording.views import IMAGE_SUFFIXES
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera, LensModel
-from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 
 # Of the synthetic scenes, in the authors' configuration.
 _HALF_EXTENT = 1.5

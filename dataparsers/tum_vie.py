@@ -11,15 +11,15 @@ import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
 from aenerf_ns.files.json_object import Metadata
+from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import SensorModel
 
 _EVENTS = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
 _PARTS = ("-events_left.h5", "-vi_gt_data")

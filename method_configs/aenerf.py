@@ -6,13 +6,13 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from aenerf_ns.datamanager import EventDataManagerConfig
 from aenerf_ns.dataparsers.formats import AutomaticDataParserConfig
-from aenerf_ns.ffmpeg import provide_ffmpeg
-from aenerf_ns.model import AENeRFModelConfig
-from aenerf_ns.pipeline import AENeRFPipelineConfig
-from aenerf_ns.pose_correction import PoseCorrectionConfig
-from aenerf_ns.training import (
+from aenerf_ns.method.model import AENeRFModelConfig
+from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+from aenerf_ns.training.datamanager import EventDataManagerConfig
+from aenerf_ns.training.ffmpeg import provide_ffmpeg
+from aenerf_ns.training.pipeline import AENeRFPipelineConfig
+from aenerf_ns.training.schedules import (
     AENeRFTrainerConfig,
     RelativeCosineSchedulerConfig,
     RelativeMultiStepSchedulerConfig,

@@ -8,8 +8,8 @@ from dataclasses import replace
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.pose_correction import PoseCorrectionConfig
 
 _base = deepcopy(aenerf.config)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.camera.rotation import rotation_from_vector
+from aenerf_ns.events.stream import EventStream
 
 # Examples of each test that feeds readers with damaged and random input; many more when they are set to.
 FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))

@@ -26,7 +26,7 @@ from aenerf_ns.bench.figures import draw, error_map
 from aenerf_ns.bench.nerfacto import prepare
 from aenerf_ns.bench.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
 from aenerf_ns.errors import DataError
-from aenerf_ns.image_metrics import ImageMetrics
+from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_small import aenerf_small
 

@@ -13,19 +13,19 @@ import torch
 from conftest import make_stream
 from PIL import Image
 
+from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.checking.contrast import WarpedEvents, clock_hypothesis
 from aenerf_ns.cli import check as command
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
-from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.recording.recording import Recording
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.events.statistics import event_statistics
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
-from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.warped_events import WarpedEvents, clock_hypothesis
+from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.recording.recording import Recording
 
 # Part of the simulated recording that is looked at, in nanoseconds.
 PART = 2_600_000_000

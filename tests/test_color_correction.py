@@ -12,23 +12,23 @@ import torch
 from conftest import make_stream
 from nerfstudio.cameras.rays import RayBundle
 
-from aenerf_ns.color_correction import (
+from aenerf_ns.camera.image_encoding import encode
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.method.color_correction import (
     COLOR_CORRECTIONS,
     AffineColorCorrection,
     ColorCorrectionProtocol,
     NetworkColorCorrection,
     NoColorCorrection,
 )
-from aenerf_ns.datamanager import EventDataManagerConfig
-from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.method.model import AENeRFModelConfig
+from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.camera.image_encoding import encode
-from aenerf_ns.model import AENeRFModelConfig
-from aenerf_ns.pipeline import AENeRFPipeline, AENeRFPipelineConfig
-from aenerf_ns.pose_correction import PoseCorrectionConfig
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.training.datamanager import EventDataManagerConfig
+from aenerf_ns.training.pipeline import AENeRFPipeline, AENeRFPipelineConfig
 
 FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
 

@@ -26,20 +26,20 @@ from test_dataparsers import (
     write_native,
 )
 
+from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import convert as command
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
-from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.recording.dataparser import EventDataParserConfig
-from aenerf_ns.recording.recording import Recording
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.recording.dataparser import EventDataParserConfig
+from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.structure_from_motion import EstimatedPoses
-from aenerf_ns.camera.noise import perturb
-from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.recording.writer import NativeDatasetWriter
 
 
 def columns(recording: Recording) -> dict[str, np.ndarray]:

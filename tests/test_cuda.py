@@ -15,7 +15,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.pose_correction import PoseCorrectionConfig
+from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 
 GPU = torch.device("cuda:0")
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

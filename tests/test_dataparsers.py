@@ -15,19 +15,20 @@ from conftest import make_stream
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from PIL import Image
 
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
-from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.files.text import format_seconds, parse_times
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
-from aenerf_ns.dataset import EventDataset
 from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import REFERENCE_SECONDS, EventCamera
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.camera.noise import perturb
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
+from aenerf_ns.files.text import format_seconds, parse_times
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.training.dataset import EventDataset
 
 CAMERA = EventCamera(6, 4, 5.0, 5.5, 3.0, 2.0, "radial_tangential", (0.01, 0.0, 0.001, 0.0, 0.0))
 SENSOR = SensorModel(0.3, 0.2, 1000, "RGGB")

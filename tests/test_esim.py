@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from aenerf_ns.events.esim import EventSimulator
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.simulator.esim import EventSimulator
 
 WIDTH, HEIGHT = 7, 6
 LOG_EPSILON = 1e-3

@@ -15,10 +15,10 @@ from conftest import FUZZ_EXAMPLES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from aenerf_ns.files import aedat4, evt_words, prophesee_dat, prophesee_raw, rosbag
-from aenerf_ns.files.open import open_event_file
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files import aedat4, evt_words, prophesee_dat, prophesee_raw, rosbag
+from aenerf_ns.files.open import open_event_file
 
 _VENDOR_FILES = Path(__file__).parents[2] / "shared" / "data" / "vendor_formats"
 _WIDTH, _HEIGHT = 64, 48

@@ -14,12 +14,12 @@ from conftest import FUZZ_EXAMPLES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aenerf_ns.files.event_arrays import NpzEventFile, open_array_events
-from aenerf_ns.files.open import open_event_file
-from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter, open_hdf5_events
-from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.event_arrays import NpzEventFile, open_array_events
+from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter, open_hdf5_events
+from aenerf_ns.files.event_table import events_from_columns
+from aenerf_ns.files.open import open_event_file
 
 WIDTH, HEIGHT, N = 60, 40, 300
 

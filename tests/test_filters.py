@@ -11,8 +11,8 @@ from conftest import make_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile, count_events, find_hot_pixels
 from aenerf_ns.events.pairs import pair_events
 from aenerf_ns.events.stream import EventFile, EventStream

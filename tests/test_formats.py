@@ -23,20 +23,20 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from aenerf_ns.datamanager import EventDataManagerConfig
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.dataparsers.formats import FORMATS, AutomaticDataParserConfig, recognise
-from aenerf_ns.files.kalibr import read_camchain
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.dataparsers.paev3d import PAEv3DDataParserConfig
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.kalibr import read_camchain
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParserConfig
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.dataset import EventDataset
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.training.datamanager import EventDataManagerConfig
+from aenerf_ns.training.dataset import EventDataset
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 N_POSES, N_EVENTS = 21, 200

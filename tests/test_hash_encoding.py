@@ -6,7 +6,7 @@ import pytest
 import torch
 from nerfstudio.field_components.encodings import HashEncoding as FrameworkHashEncoding
 
-from aenerf_ns.hash_encoding import HashEncoding
+from aenerf_ns.method.encoding.hash_grid import HashEncoding
 
 OPTIONS = {"num_levels": 5, "min_res": 4, "max_res": 200, "log2_hashmap_size": 9}
 

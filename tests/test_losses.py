@@ -10,8 +10,8 @@ import torch
 from torchvision.models import alexnet
 
 from aenerf_ns.camera.image_encoding import decode, encode, to_channels
-from aenerf_ns.image_metrics import ImageMetrics
-from aenerf_ns.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
+from aenerf_ns.method.image_metrics import ImageMetrics
+from aenerf_ns.supervision.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
 
 
 def test_changes_count_positive_and_negative_events() -> None:

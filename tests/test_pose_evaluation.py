@@ -13,15 +13,16 @@ from nerfstudio.cameras.rays import RayBundle
 from test_color_correction import make_pipeline
 from test_model import make_model
 
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import REFERENCE_SECONDS, EventCamera
-from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
-from aenerf_ns.pose_refinement import refine_camera
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS
 from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotation, rotation_from_vector
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.training.pose_refinement import refine_camera
 
 SECOND = 10**9
 

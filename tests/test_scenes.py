@@ -12,12 +12,14 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from aenerf_ns.scenes import SimulationScene, built_in_scene, paths
-from aenerf_ns.scenes import textures as tx
-from aenerf_ns.scenes.frames import frame_displacement, frame_parameters
-from aenerf_ns.scenes.light_baking import AreaLight, bake
-from aenerf_ns.scenes.raycast import BOX, CYLINDER, RECTANGLE, SPHERE, Primitive, PrimitiveScene
-from aenerf_ns.scenes.renderer import sample_offsets
+from aenerf_ns.simulator import paths
+from aenerf_ns.simulator import textures as tx
+from aenerf_ns.simulator.frames import frame_displacement, frame_parameters
+from aenerf_ns.simulator.open_scene import built_in_scene
+from aenerf_ns.simulator.rendering.light_baking import AreaLight, bake
+from aenerf_ns.simulator.rendering.raycast import BOX, CYLINDER, RECTANGLE, SPHERE, Primitive, PrimitiveScene
+from aenerf_ns.simulator.rendering.renderer import sample_offsets
+from aenerf_ns.simulator.scene import SimulationScene
 
 WHITE = {"white": np.full((8, 8, 3), 0.5, np.float32)}
 OVERHEAD = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])

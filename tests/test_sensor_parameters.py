@@ -10,15 +10,15 @@ from conftest import make_stream
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from test_model import ALL_LOSSES, make_batch, make_model, make_rays
 
-from aenerf_ns.datamanager import EventDataManagerConfig
-from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.model import AENeRFModel, AENeRFModelConfig
-from aenerf_ns.pipeline import AENeRFPipelineConfig
-from aenerf_ns.sensor_parameters import SensorParameters
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
+from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.supervision.sensor_parameters import SensorParameters
+from aenerf_ns.training.datamanager import EventDataManagerConfig
+from aenerf_ns.training.pipeline import AENeRFPipelineConfig
 
 
 @pytest.mark.parametrize("ratio", [1e-3, 0.5, 1.0, 1.458, 40.0])

@@ -11,20 +11,21 @@ import pytest
 import torch
 from PIL import Image
 
+from aenerf_ns.camera.alignment import Similarity, align
+from aenerf_ns.camera.image_encoding import decode
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.rotation import rotation_from_vector
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import simulate as command
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.camera.image_encoding import decode
-from aenerf_ns.scenes import SimulationScene, built_in_scene
-from aenerf_ns.simulation import Simulation
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.structure_from_motion import EstimatedPoses, colmap_camera, compare_with_truth, estimate_poses
-from aenerf_ns.camera.alignment import Similarity, align
-from aenerf_ns.camera.rotation import rotation_from_vector
-from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.simulator.open_scene import built_in_scene
+from aenerf_ns.simulator.scene import SimulationScene
+from aenerf_ns.simulator.simulation import Simulation
 
 FRAME = 40_000_000
 

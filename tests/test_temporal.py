@@ -11,12 +11,12 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from test_model import ALL_LOSSES, make_batch, make_model, make_rays
 
-from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.losses import temporal_loss
-from aenerf_ns.model import AENeRFModel
-from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig, world_rays
 from aenerf_ns.camera.rotation import cross_matrix, motion_from_twist, rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.method.model import AENeRFModel
+from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig, world_rays
+from aenerf_ns.supervision.losses import temporal_loss
 
 
 def exact_model(mode: str, **options: Any) -> AENeRFModel:

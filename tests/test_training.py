@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.optim.lr_scheduler import LRScheduler
 
-from aenerf_ns.training import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
+from aenerf_ns.training.schedules import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
 
 
 def make_scheduler(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import (
     quaternion_from_rotation,
@@ -17,6 +16,7 @@ from aenerf_ns.camera.rotation import (
     vector_from_quaternion,
 )
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.errors import DataError
 
 # Unix time in nanoseconds, which float64 seconds cannot hold.
 EPOCH = 1_600_000_000_123_456_789

@@ -124,8 +124,8 @@ def _paths(data: Path, corrected: Path, file: Path) -> Path:
     import torch
     from matplotlib.figure import Figure
 
-    from aenerf_ns.files.tum_trajectory import read_tum_trajectory
     from aenerf_ns.camera.alignment import align, rotation_angle
+    from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 
     truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
     figure = Figure(figsize=(9, 4), layout="constrained")

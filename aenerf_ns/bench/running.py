@@ -28,9 +28,9 @@ from filelock import FileLock, Timeout
 
 from aenerf_ns.bench.environment import environment
 from aenerf_ns.bench.plan import CEILING, OURS, Dataset, Run, scene_name
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 
 # Parts of a training. The framework looks at the views after each but the last, whose final step it counts as one less.
 _CURVE_PARTS = 5

@@ -14,12 +14,6 @@ from torch import Tensor
 
 LensModel = Literal["radial_tangential", "fisheye"]
 
-# Among the metadata of cameras that reference images were taken from, which marks them as such: (N, 1) float64 seconds
-# since the start of the estimated trajectory, NaN for those not taken on it.
-REFERENCE_SECONDS = "reference_seconds"
-# Likewise of cameras that are on the estimated trajectory.
-TRAJECTORY_SECONDS = "trajectory_seconds"
-
 # A pixel whose undistorted direction projects back this far off, in pixels, lies where the lens model folds over.
 _MAX_ROUND_TRIP_ERROR = 1e-3
 

@@ -9,13 +9,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.rotation import (
     cross_matrix,
     quaternion_from_rotation,
     rotation_from_vector,
     vector_from_quaternion,
 )
+from aenerf_ns.errors import DataError
 
 # Multiplying by it from the right turns OpenCV camera axes (x right, y down, z forward) into OpenGL ones, which
 # Nerfstudio uses (x right, y up, z backward), and back.

@@ -12,18 +12,18 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
+from aenerf_ns.camera.alignment import rotation_angle
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.checking.contrast import Comparison, WarpedEvents, num_slices, slice_size
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
-from aenerf_ns.recording.dataparser import EventDataParser
-from aenerf_ns.recording.recording import Recording
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.camera.alignment import rotation_angle
-from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.warped_events import Comparison, WarpedEvents, num_slices, slice_size
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.recording import Recording
 
 Gaps = list[tuple[int, int]]
 

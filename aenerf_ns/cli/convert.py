@@ -12,17 +12,17 @@ from typing import Any, Literal
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
-from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.recording.dataparser import thinned
-from aenerf_ns.recording.images import check_image
-from aenerf_ns.recording.recording import FrameSequence, Recording, ReferenceView, Split
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile, hot_pixel_summary
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.progress import progress_bar
+from aenerf_ns.recording.dataparser import thinned
+from aenerf_ns.recording.images import check_image
+from aenerf_ns.recording.recording import FrameSequence, Recording, ReferenceView, Split
 from aenerf_ns.recording.structure_from_motion import compare_with_truth, estimate_poses
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.recording.writer import NativeDatasetWriter
 
 
 @dataclass

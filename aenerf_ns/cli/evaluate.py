@@ -10,9 +10,9 @@ from typing import Literal
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.color_correction import ColorCorrectionProtocol
 from aenerf_ns.errors import DataError
-from aenerf_ns.pipeline import AENeRFPipeline
+from aenerf_ns.method.color_correction import ColorCorrectionProtocol
+from aenerf_ns.training.pipeline import AENeRFPipeline
 
 
 @dataclass

@@ -10,10 +10,10 @@ import torch
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.files.tum_trajectory import write_tum_trajectory
-from aenerf_ns.errors import DataError
-from aenerf_ns.pipeline import AENeRFPipeline
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.tum_trajectory import write_tum_trajectory
+from aenerf_ns.training.pipeline import AENeRFPipeline
 
 
 @dataclass

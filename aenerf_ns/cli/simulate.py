@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.recording.recording import Split
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import BayerPattern, SensorModel
-from aenerf_ns.scenes import open_scene
-from aenerf_ns.simulated_poses import poses_from_frames
-from aenerf_ns.simulation import Simulation
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.recording.recording import Split
+from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.simulated_poses import poses_from_frames
+from aenerf_ns.simulator.simulation import Simulation
 
 
 @dataclass

@@ -18,9 +18,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.sensor_size import sensor_size
 
 _CHUNK = 1 << 20
 _MAGIC = b"#!AER-DAT4.0\r\n"

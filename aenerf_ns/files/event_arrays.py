@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 from aenerf_ns.files.event_table import (
     SAMPLE,
     EventLayout,
@@ -23,8 +25,6 @@ from aenerf_ns.files.event_table import (
     guess_time_unit,
 )
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit, first_and_last_row, is_row
-from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 
 # Robust e-NeRF.
 POSITION_TIMESTAMP_POLARITY = EventLayout(

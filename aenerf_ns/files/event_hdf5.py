@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.files.event_table import EventLayout, EventTableFile
-from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
+from aenerf_ns.files.event_table import EventLayout, EventTableFile
+from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
 if TYPE_CHECKING:
     import h5py

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
 
 _COLUMNS = ("x", "y", "t", "p")
 # Events read at once: 32 MB of a matrix of float64.

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera, LensModel
 from aenerf_ns.camera.image_encoding import ImageEncoding
+from aenerf_ns.camera.lens import EventCamera, LensModel
 from aenerf_ns.camera.trajectory import require_rigid
+from aenerf_ns.errors import DataError
 
 # The lens and the names of its distortion parameters, in OpenCV's order, for Nerfstudio's names of camera models.
 LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {

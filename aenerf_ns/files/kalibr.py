@@ -9,9 +9,9 @@ import torch
 import yaml
 from torch import Tensor
 
-from aenerf_ns.files.json_object import Metadata
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.lens import EventCamera, LensModel
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.json_object import Metadata
 
 _LENS_MODELS: dict[str, LensModel] = {
     "radtan": "radial_tangential",

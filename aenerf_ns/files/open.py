@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 from aenerf_ns.files.aedat4 import Aedat4File
-from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.event_arrays import open_array_events
 from aenerf_ns.files.event_hdf5 import open_hdf5_events
+from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.prophesee_dat import PropheseeDatFile
 from aenerf_ns.files.prophesee_header import read_header
 from aenerf_ns.files.prophesee_raw import PropheseeRawFile
 from aenerf_ns.files.rosbag import RosbagEventFile
 from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.files.text import TimeUnit
-from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 
 _FORMAT_OF_SUFFIX = {
     ".raw": "raw",

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.files.prophesee_header import read_header
-from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.prophesee_header import read_header
+from aenerf_ns.files.sensor_size import sensor_size
 
 _CHUNK = 1 << 20
 # Microseconds, then 14 bits of x, 14 of y and 4 of polarity.

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.files.prophesee_header import PropheseeHeader, read_header
-from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.prophesee_header import PropheseeHeader, read_header
+from aenerf_ns.files.sensor_size import sensor_size
 
 if TYPE_CHECKING:
     from aenerf_ns.files.evt_words import Columns

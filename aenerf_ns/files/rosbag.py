@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.sensor_size import sensor_size
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.files.text import TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.text import TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
 
 # Trajectories are commonly printed with six or more digits.
 _MAX_NORM_ERROR = 1e-3

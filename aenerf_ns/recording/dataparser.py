@@ -15,7 +15,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.camera.lens import REFERENCE_SECONDS, TRAJECTORY_SECONDS
+from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel

@@ -19,11 +19,11 @@ from PIL import Image
 from rich.progress import Progress
 from torch import Tensor
 
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.progress import progress_bar
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.progress import progress_bar
 
 # Each frame is matched with so many after it, and with those 16, 32, ... 1024 after it,
 _NEIGHBOURS = 10

@@ -9,10 +9,10 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.recording.recording import ReferenceView, Split
-from aenerf_ns.files.text import TimeUnit, parse_times, read_rows
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.text import TimeUnit, parse_times, read_rows
+from aenerf_ns.recording.recording import ReferenceView, Split
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 

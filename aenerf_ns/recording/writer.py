@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from aenerf_ns.camera.image_encoding import ImageEncoding
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.json_object import LENS_MODELS
-from aenerf_ns.recording.recording import Split
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
+from aenerf_ns.recording.recording import Split
 
 
 class NativeDatasetWriter:

@@ -21,7 +21,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.scenes import textures
+from aenerf_ns.simulator import textures
 
 # OpenCV reads OpenEXR files only where this is set before it is imported.
 os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from meshes import Material, Model, box, coloured_copy, disc, join, paint, rectangle, revolved
 
-from aenerf_ns.scenes import textures as tx
+from aenerf_ns.simulator import textures as tx
 
 _BOOK_COLOURS = ("8c3b32", "35608c", "4a7a4f", "b98a3a", "6f4a7a", "a8a090", "396b73", "a35f3a")
 

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.scenes.embree import RayCaster
-from aenerf_ns.scenes.textures import ALBEDO_RANGE, Texture, linear
+from aenerf_ns.simulator.rendering.embree import RayCaster
+from aenerf_ns.simulator.textures import ALBEDO_RANGE, Texture, linear
 
 Array = NDArray[np.float64]
 
@@ -128,7 +128,7 @@ class Model:
 def paint(
     name: str, generator: Callable[..., Texture], *arguments: object, size: int = 256, **options: object
 ) -> Material:
-    """A material of a generated texture (see aenerf_ns.scenes.textures). Its name is the seed of its pattern."""
+    """A material of a generated texture (see aenerf_ns.simulator.textures). Its name is the seed of its pattern."""
     texture = generator(size, np.random.default_rng(zlib.crc32(name.encode())), *arguments, **options)
     return Material(name, srgb_picture(texture)[::-1])
 

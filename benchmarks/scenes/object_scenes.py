@@ -6,7 +6,7 @@ from assets import Library
 from furnishings import bookcase, framed_picture, oak, podium, steel, walnut
 from meshes import Model, box, disc, paint, revolved, top
 
-from aenerf_ns.scenes import textures as tx
+from aenerf_ns.simulator import textures as tx
 
 
 def piano(library: Library) -> Model:

@@ -19,7 +19,7 @@ from furnishings import (
 )
 from meshes import Material, Model, box, disc, paint, rectangle, revolved, top
 
-from aenerf_ns.scenes import textures as tx
+from aenerf_ns.simulator import textures as tx
 
 Placing = tuple[str, float, float, float]
 """Model, x, y and turn in degrees of something that is put down."""

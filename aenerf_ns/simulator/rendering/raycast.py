@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.scenes.renderer import POINT_SPREAD, sample_offsets
+from aenerf_ns.simulator.rendering.renderer import POINT_SPREAD, sample_offsets
 
 Array = NDArray[np.float64]
 
@@ -302,7 +302,7 @@ class PrimitiveScene:
         height: int,
         samples: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Picture through a pinhole camera: see :class:`~aenerf_ns.scenes.renderer.Renderer`."""
+        """Picture through a pinhole camera: see :class:`~aenerf_ns.simulator.rendering.renderer.Renderer`."""
         pose = np.asarray(camera_to_world, np.float64)
         arrays = self.arrays
         to_camera = arrays.centre - pose[:3, 3]

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.scenes import SimulationScene
+from aenerf_ns.simulator.scene import SimulationScene
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.scenes.embree import RayCaster
+from aenerf_ns.simulator.rendering.embree import RayCaster
 
 _STEPS = 2000
 

@@ -27,18 +27,18 @@ from nerfstudio.utils.misc import scale_dict
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from aenerf_ns.box_collider import BoxCollider
-from aenerf_ns.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
-from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.field import DensityField, EventRadianceField, ProposalNetwork
-from aenerf_ns.hash_encoding import HashEncoding
 from aenerf_ns.camera.image_encoding import ImageEncoding, decode, encode, to_channels
-from aenerf_ns.image_metrics import ImageMetrics
-from aenerf_ns.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
-from aenerf_ns.pose_correction import PoseCorrection, PoseCorrectionConfig
-from aenerf_ns.ray_sampler import CAMERA_DIRECTIONS
-from aenerf_ns.sensor_parameters import SensorParameters
-from aenerf_ns.temporal import log_radiance_rate
+from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.method.box_collider import BoxCollider
+from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
+from aenerf_ns.method.encoding.hash_grid import HashEncoding
+from aenerf_ns.method.field import DensityField, EventRadianceField, ProposalNetwork
+from aenerf_ns.method.image_metrics import ImageMetrics
+from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.method.temporal import log_radiance_rate
+from aenerf_ns.supervision.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
+from aenerf_ns.supervision.sensor_parameters import SensorParameters
 
 # ε of the paper's appendix "Model Architecture": the least radiance that can be rendered.
 _RADIANCE_EPSILON = 1e-3

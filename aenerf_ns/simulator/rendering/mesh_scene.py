@@ -15,11 +15,11 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.scenes.embree import NOTHING, RayCaster
-from aenerf_ns.scenes.environment import Environment
-from aenerf_ns.scenes.mesh_loading import Array, Mesh
-from aenerf_ns.scenes.mip_maps import MipMaps, lookup, mip_maps, panorama
-from aenerf_ns.scenes.renderer import sample_offsets
+from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
+from aenerf_ns.simulator.rendering.environment import Environment
+from aenerf_ns.simulator.rendering.mesh_loading import Array, Mesh
+from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps, panorama
+from aenerf_ns.simulator.rendering.renderer import sample_offsets
 
 _FOOTPRINT = 0.5
 """Side of the texture region a sample averages, in pixels: about the distance between the samples of a pixel."""
@@ -198,7 +198,7 @@ class MeshScene:
         height: int,
         samples: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Picture through a pinhole camera: see :class:`~aenerf_ns.scenes.renderer.Renderer`."""
+        """Picture through a pinhole camera: see :class:`~aenerf_ns.simulator.rendering.renderer.Renderer`."""
         pose = np.asarray(camera_to_world, np.float64)
         rotation, centre = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
         lens, offsets = np.asarray(intrinsics, np.float64), sample_offsets(samples)

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.scenes.polygons import triangulated_obj
-from aenerf_ns.scenes.textures import linear
+from aenerf_ns.simulator.rendering.polygons import triangulated_obj
+from aenerf_ns.simulator.textures import linear
 
 Array = NDArray[np.float64]
 

@@ -13,16 +13,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
 
 if TYPE_CHECKING:
     from aenerf_ns.events.pairs import EventPairs, PairsInTime
-
-# Among the metadata of rays of pairs, and of no others: (N, 3) float64 unit vectors in the camera's frame.
-CAMERA_DIRECTIONS = "camera_directions"
 
 # A pair spans an event only where the intervals on its two sides are so many refractory periods long: at a steady rate,
 # a twentieth of a contrast threshold goes unseen at most, which is less than thresholds are known to.

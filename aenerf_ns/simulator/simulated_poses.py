@@ -6,12 +6,12 @@ from typing import Any
 
 import torch
 
-from aenerf_ns.errors import DataError
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.simulation import Simulation
-from aenerf_ns.recording.structure_from_motion import compare_with_truth, estimate_poses
 from aenerf_ns.camera.alignment import pose_errors
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.recording.structure_from_motion import compare_with_truth, estimate_poses
+from aenerf_ns.simulator.simulation import Simulation
 
 
 def poses_from_frames(

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.scenes.embree import NOTHING, RayCaster
-from aenerf_ns.scenes.environment import Environment
-from aenerf_ns.scenes.light_baking import AreaLight, plane_sequence
-from aenerf_ns.scenes.mesh import MeshArrays, MeshScene, mesh_arrays, surroundings
-from aenerf_ns.scenes.mesh_loading import Array, Mesh
-from aenerf_ns.scenes.mesh_repair import normals_and_areas, position_ids
-from aenerf_ns.scenes.mip_maps import MipMaps, lookup, mip_maps, panorama
+from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
+from aenerf_ns.simulator.rendering.environment import Environment
+from aenerf_ns.simulator.rendering.light_baking import AreaLight, plane_sequence
+from aenerf_ns.simulator.rendering.mesh_loading import Array, Mesh
+from aenerf_ns.simulator.rendering.mesh_repair import normals_and_areas, position_ids
+from aenerf_ns.simulator.rendering.mesh_scene import MeshArrays, MeshScene, mesh_arrays, surroundings
+from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps, panorama
 
 _CREASE = math.cos(math.radians(40.0))
 """Faces that meet at less than this angle are parts of one smooth surface."""

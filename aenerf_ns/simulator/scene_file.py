@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.scenes import SimulationScene, paths
-from aenerf_ns.scenes.embree import RayCaster
-from aenerf_ns.scenes.environment import Environment, load_environment, sky
-from aenerf_ns.scenes.free_space import FreeSpace
-from aenerf_ns.scenes.light_baking import AreaLight
-from aenerf_ns.scenes.mesh import MeshScene
-from aenerf_ns.scenes.mesh_lighting import baked_mesh, light_mesh
-from aenerf_ns.scenes.mesh_loading import SUFFIXES, Mesh, load_mesh, scaled
-from aenerf_ns.scenes.mesh_repair import prepared
+from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.free_space import FreeSpace
+from aenerf_ns.simulator.rendering.embree import RayCaster
+from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
+from aenerf_ns.simulator.rendering.light_baking import AreaLight
+from aenerf_ns.simulator.rendering.mesh_lighting import baked_mesh, light_mesh
+from aenerf_ns.simulator.rendering.mesh_loading import SUFFIXES, Mesh, load_mesh, scaled
+from aenerf_ns.simulator.rendering.mesh_repair import prepared
+from aenerf_ns.simulator.rendering.mesh_scene import MeshScene
+from aenerf_ns.simulator.scene import SimulationScene
 
 Array = NDArray[np.float64]
 

@@ -16,13 +16,13 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.color_correction import ColorCorrectionProtocol, NoColorCorrection
-from aenerf_ns.datamanager import EventDataManager
-from aenerf_ns.model import AENeRFModel
-from aenerf_ns.pose_refinement import NUM_STEPS, refine_camera
-from aenerf_ns.progress import progress_bar
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
+from aenerf_ns.method.color_correction import ColorCorrectionProtocol, NoColorCorrection
+from aenerf_ns.method.model import AENeRFModel
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.training.datamanager import EventDataManager
+from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.scenes.raycast import (
+from aenerf_ns.simulator.rendering.raycast import (
     BOX,
     CYLINDER,
     RECTANGLE,
@@ -27,7 +27,7 @@ from aenerf_ns.scenes.raycast import (
     irradiance,
     surface,
 )
-from aenerf_ns.scenes.textures import Texture, mip_pyramid
+from aenerf_ns.simulator.textures import Texture, mip_pyramid
 
 BOUNCES = 3
 _SURFACE_OFFSET = 1e-4

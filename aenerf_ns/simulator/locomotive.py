@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from aenerf_ns.scenes import textures as tx
-from aenerf_ns.scenes.light_baking import AreaLight, bake
-from aenerf_ns.scenes.raycast import Primitive, PrimitiveScene
-from aenerf_ns.scenes.shapes import ALONG_X, ALONG_Y, box, pillar, rod, sphere, turned_box
+from aenerf_ns.simulator import textures as tx
+from aenerf_ns.simulator.rendering.light_baking import AreaLight, bake
+from aenerf_ns.simulator.rendering.raycast import Primitive, PrimitiveScene
+from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, box, pillar, rod, sphere, turned_box
 
 TEXTURE_SIZE = 256
 BACKGROUND = (0.5, 0.5, 0.5)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.events.stream import EventStream
 
 # The images of warped events are at most this wide: larger sensors are binned.
 _MAX_WIDTH = 240

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.scenes.embree import RayCaster
-from aenerf_ns.scenes.mesh_loading import Array, Mesh
+from aenerf_ns.simulator.rendering.embree import RayCaster
+from aenerf_ns.simulator.rendering.mesh_loading import Array, Mesh
 
 _RESOLUTION = 4e-6
 """Distance, in parts of the largest coordinate, below which the ray caster's float32 cannot order two surfaces."""

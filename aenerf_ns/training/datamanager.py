@@ -12,9 +12,9 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from torch import Tensor
 
-from aenerf_ns.dataset import EventDataset
 from aenerf_ns.errors import DataError
-from aenerf_ns.ray_sampler import EventRaySampler
+from aenerf_ns.supervision.pairs import EventRaySampler
+from aenerf_ns.training.dataset import EventDataset
 
 
 @dataclass

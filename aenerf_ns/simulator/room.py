@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from aenerf_ns.scenes import textures as tx
-from aenerf_ns.scenes.light_baking import AreaLight, bake
-from aenerf_ns.scenes.raycast import Primitive, PrimitiveScene
-from aenerf_ns.scenes.shapes import ALONG_X, axes, box, panel, pillar, rod, sphere, turned_box
+from aenerf_ns.simulator import textures as tx
+from aenerf_ns.simulator.rendering.light_baking import AreaLight, bake
+from aenerf_ns.simulator.rendering.raycast import Primitive, PrimitiveScene
+from aenerf_ns.simulator.shapes import ALONG_X, axes, box, panel, pillar, rod, sphere, turned_box
 
 TEXTURE_SIZE = 256
 HALF_SIZE = 2.0

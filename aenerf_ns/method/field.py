@@ -17,7 +17,7 @@ from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
 
-from aenerf_ns.hash_encoding import HashEncoding
+from aenerf_ns.method.encoding.hash_grid import HashEncoding
 
 # The framework's trunc_exp cuts gradients at the same value, but is a custom function without forward-mode derivatives,
 # and overflows.

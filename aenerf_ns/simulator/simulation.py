@@ -10,16 +10,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from aenerf_ns.camera.image_encoding import encode, to_channels
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.esim import EventSimulator
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.camera.image_encoding import encode, to_channels
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.scenes import SimulationScene
-from aenerf_ns.scenes.frames import frame_parameters
-from aenerf_ns.scenes.paths import SpeedProfile
-from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.simulator.esim import EventSimulator
+from aenerf_ns.simulator.frames import frame_parameters
+from aenerf_ns.simulator.paths import SpeedProfile
+from aenerf_ns.simulator.scene import SimulationScene
 
 # Rays through a pixel: enough that the frames' own aliasing triggers few events, and references without visible noise.
 _EVENT_SAMPLES = 4
@@ -52,7 +52,7 @@ class Simulation:
         max_displacement: pixels that 99 % of what is seen may move between two rendered frames.
         contrast_threshold_spread: standard deviation of the thresholds over the pixels.
         seed: of the sensor's thresholds and noise.
-        leak_rate: see :class:`~aenerf_ns.events.esim.EventSimulator`.
+        leak_rate: see :class:`~aenerf_ns.simulator.esim.EventSimulator`.
         shot_noise_rate: likewise.
 
     Raises:

@@ -8,8 +8,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from aenerf_ns.model import AENeRFModel
 from aenerf_ns.camera.rotation import motion_from_twist
+from aenerf_ns.method.model import AENeRFModel
 
 NUM_STEPS = 100
 _NUM_RAYS = 1024

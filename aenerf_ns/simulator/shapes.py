@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.scenes.raycast import BOX, CYLINDER, RECTANGLE, SPHERE, Primitive
+from aenerf_ns.simulator.rendering.raycast import BOX, CYLINDER, RECTANGLE, SPHERE, Primitive
 
 Array = NDArray[np.float64]
 

@@ -15,9 +15,8 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.encodings import NeRFEncoding
 from torch import Tensor, nn
 
-from aenerf_ns.camera.lens import REFERENCE_SECONDS, TRAJECTORY_SECONDS
-from aenerf_ns.ray_sampler import CAMERA_DIRECTIONS
 from aenerf_ns.camera.alignment import Similarity, align
+from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS, REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.rotation import motion_from_twist
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 

@@ -1,0 +1,1 @@
+"""Whether poses and intrinsics fit the events."""

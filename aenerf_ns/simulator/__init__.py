@@ -1,0 +1,1 @@
+"""An event camera in a scene that is made up."""

@@ -1,0 +1,1 @@
+"""How a batch is drawn, and what its renderings are compared with."""

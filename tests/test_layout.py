@@ -1,0 +1,94 @@
+"""How the project is laid out: which folder may use which, and what stands where."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# The floors, bottom up, and what each stands on. A folder may also use itself.
+MAY_USE = {
+    "errors": set(),
+    "progress": set(),
+    "events": {"errors", "progress"},
+    "camera": {"errors", "events"},
+    "files": {"errors", "events", "camera"},
+    "recording": {"errors", "progress", "events", "camera", "files"},
+    "supervision": {"errors", "events", "camera"},
+    "method": {"events", "camera", "supervision"},
+    "training": {"errors", "progress", "events", "camera", "supervision", "method"},
+    "checking": {"errors", "progress", "events", "camera", "recording"},
+    "simulator": {"errors", "progress", "events", "camera", "files", "recording"},
+    "dataparsers": {"errors", "events", "camera", "files", "recording"},
+    "method_configs": {"supervision", "method", "training", "dataparsers"},
+    "cli": {
+        *("errors", "progress", "events", "camera", "files", "recording", "method", "training", "checking"),
+        *("simulator", "dataparsers"),
+    },
+}
+
+
+def _modules() -> Iterator[tuple[str, Path]]:
+    """Each source file with the folder, or the file at the top, that it belongs to."""
+    for folder in ("dataparsers", "method_configs"):
+        yield from ((folder, path) for path in (ROOT / folder).rglob("*.py"))
+    for path in (ROOT / "aenerf_ns").rglob("*.py"):
+        place = path.relative_to(ROOT / "aenerf_ns").with_suffix("").parts[0]
+        if place != "__init__":
+            yield place, path
+
+
+def _imported(path: Path) -> set[str]:
+    """The folders and top-level files of the package that a source file imports."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module == "aenerf_ns":
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("aenerf_ns."):
+            names.add(node.module.split(".")[1])
+        elif isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("aenerf_ns.")}
+    return names
+
+
+@pytest.mark.parametrize("place", MAY_USE)
+def test_a_folder_uses_only_the_floors_it_stands_on(place: str) -> None:
+    for own, path in _modules():
+        if own == place:
+            assert _imported(path) - {place} <= MAY_USE[place], path
+
+
+def test_the_floors_are_in_order_and_none_is_forgotten() -> None:
+    order = list(MAY_USE)
+    for place, used in MAY_USE.items():
+        assert all(order.index(name) < order.index(place) for name in used)
+    assert {place for place, _ in _modules()} == set(MAY_USE)
+    # What is allowed is also needed, or it would let in what nobody meant.
+    for place, used in MAY_USE.items():
+        needed = set().union(*(_imported(path) for own, path in _modules() if own == place))
+        assert used <= needed, f"{place} no longer uses {used - needed}"
+
+
+def test_the_hallway_is_empty() -> None:
+    assert {path.name for path in (ROOT / "aenerf_ns").iterdir() if path.is_file()} == {
+        "__init__.py",
+        "errors.py",
+        "progress.py",
+        "py.typed",
+    }
+
+
+def test_dataparsers_holds_formats_only() -> None:
+    for path in (ROOT / "dataparsers").glob("*.py"):
+        if path.stem != "__init__":
+            assert "DataParserSpecification(" in path.read_text(encoding="utf-8"), path
+
+
+def test_every_method_config_registers_one_method() -> None:
+    for path in (ROOT / "method_configs").glob("*.py"):
+        if path.stem != "__init__":
+            assert path.read_text(encoding="utf-8").count("MethodSpecification(") == 1, path
