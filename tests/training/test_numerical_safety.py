@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle, RaySamples
-from test_model import ALL_LOSSES, make_batch, make_model, make_rays, make_sampler
+from small_models import ALL_LOSSES, make_batch, make_model, make_rays, make_sampler
 from torch import Tensor, nn
 
 from aenerf_ns.events.sensor import SensorModel

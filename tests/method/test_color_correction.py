@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
 import pytest
 import torch
-from conftest import make_stream
 from nerfstudio.cameras.rays import RayBundle
+from small_pipelines import make_pipeline
 
 from aenerf_ns.camera.image_encoding import encode
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
-from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.color_correction import (
     COLOR_CORRECTIONS,
     AffineColorCorrection,
@@ -24,11 +18,6 @@ from aenerf_ns.method.color_correction import (
     NetworkColorCorrection,
     NoColorCorrection,
 )
-from aenerf_ns.method.model import AENeRFModelConfig
-from aenerf_ns.method.pose_correction import PoseCorrectionConfig
-from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.training.datamanager import EventDataManagerConfig
-from aenerf_ns.training.pipeline import AENeRFPipeline, AENeRFPipelineConfig
 
 FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
 
@@ -154,46 +143,6 @@ def test_fits_are_the_same_every_time_and_are_restored_from_checkpoints(protocol
 def test_checkpoints_of_the_affine_protocol_hold_these_buffers() -> None:
     # Checkpoints of the first version do.
     assert set(AffineColorCorrection(3, "srgb").state_dict()) == {"scale", "offset", "num_views"}
-
-
-def make_pipeline(
-    folder: Path,
-    test_mode: Literal["test", "val"],
-    num_views: int = 2,
-    pose_correction: str = "off",
-    true_world: Callable[[torch.Tensor], torch.Tensor] | None = None,
-) -> AENeRFPipeline:
-    """A small untrained model of a colour sensor: grey validation views, and one test view more, orange. With
-    ``true_world`` there are true poses, in the world that it maps to, and the views' are in that as well."""
-    if not folder.exists():
-        camera = EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
-        poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-        poses[:, 0, 3] = torch.tensor([-0.1, 0.0, 0.1])
-        with NativeDatasetWriter(folder, camera, SensorModel(bayer_pattern="RGGB"), "srgb") as writer:
-            writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 10**9, -1)], 6, 4))
-            trajectory = Trajectory([0, 5 * 10**8, 10**9], poses)
-            writer.add_trajectories(trajectory, None if true_world is None else trajectory.mapped(true_world))
-            if true_world is not None:
-                poses = homogeneous(true_world(poses))
-            for _ in range(num_views):
-                writer.add_image("val", np.full((4, 6, 3), 102, np.uint8), poses[0])
-            for _ in range(num_views + 1):
-                writer.add_image("test", np.full((4, 6, 3), (204, 102, 51), np.uint8), poses[2])
-    model = AENeRFModelConfig(
-        num_levels=4,
-        max_resolution=32,
-        log2_hashmap_size=10,
-        num_proposal_samples_per_ray=(16,),
-        num_nerf_samples_per_ray=12,
-        proposal_max_resolutions=(16,),
-        proposal_num_levels=2,
-        proposal_log2_hashmap_size=8,
-        color_correction_num_rays=64,
-        camera_optimizer=PoseCorrectionConfig(mode=pose_correction),
-    )
-    torch.manual_seed(0)
-    datamanager = EventDataManagerConfig(dataparser=NativeDataParserConfig(data=folder))
-    return AENeRFPipelineConfig(datamanager=datamanager, model=model).setup(device="cpu", test_mode=test_mode)
 
 
 @pytest.mark.parametrize("test_mode", ["val", "test"])

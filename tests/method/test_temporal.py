@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
-from test_model import ALL_LOSSES, make_batch, make_model, make_rays
+from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 
 from aenerf_ns.camera.rotation import cross_matrix, motion_from_twist, rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous

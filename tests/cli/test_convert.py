@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_dataparsers import (
+from small_datasets import (
     ECD_FAULTS,
     END,
     NATIVE_FAULTS,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from test_color_correction import make_pipeline
-from test_model import make_model
+from small_models import make_model
+from small_pipelines import make_pipeline
 
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
 from aenerf_ns.camera.lens import EventCamera

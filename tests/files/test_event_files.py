@@ -20,7 +20,7 @@ from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files import aedat4, evt_words, prophesee_dat, prophesee_raw, rosbag
 from aenerf_ns.files.open import open_event_file
 
-_VENDOR_FILES = Path(__file__).parents[2] / "shared" / "data" / "vendor_formats"
+_VENDOR_FILES = Path(__file__).parents[3] / "shared" / "data" / "vendor_formats"
 _WIDTH, _HEIGHT = 64, 48
 
 # Rows x, y, t in microseconds, p.

@@ -8,7 +8,7 @@ import pytest
 import torch
 from conftest import make_stream
 from nerfstudio.model_components.ray_samplers import UniformSampler
-from test_model import ALL_LOSSES, make_batch, make_model, make_rays
+from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import Trajectory

@@ -10,7 +10,7 @@ import pytest
 import torch
 from commands import run, simulate
 from nerfstudio.cameras.rays import RayBundle
-from test_model import make_batch, make_model, make_rays
+from small_models import make_batch, make_model, make_rays
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 

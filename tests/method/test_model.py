@@ -5,44 +5,18 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from conftest import make_stream
 from nerfstudio.cameras.cameras import CameraType
-from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.viewer.utils import CameraState, get_camera
+from small_models import ALL_LOSSES, CAMERA, EPOCH, make_batch, make_model, make_rays, make_sampler
 
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.camera.rotation import rotation_from_vector
-from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pairs import pair_events
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
-from aenerf_ns.supervision.pairs import EventRaySampler
-
-CAMERA = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
-ALL_LOSSES = {"reconstruction_loss": 1.0, "temporal_loss": 1e-3, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
-EPOCH = 1_600_000_000_000_000_000
-
-
-def make_sampler(
-    random_poses: torch.Tensor,
-    sensor: SensorModel,
-    camera: EventCamera = CAMERA,
-    max_events_per_pair: int = 1,
-    share: float = 0.0,
-) -> EventRaySampler:
-    rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
-    stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
-    pairs = pair_events([stream], refractory_period=sensor.refractory_period)
-    trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
-    return EventRaySampler(lambda: pairs, camera, sensor, trajectory, 40, max_events_per_pair, share)
 
 
 def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> None:
@@ -198,69 +172,6 @@ def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) 
     for share in (0.0, 1.0):
         _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB"), folded, share=share).sample()
         assert set(batch["channel"].tolist()) == {2}
-
-
-def make_model(
-    sensor: SensorModel | None = None,
-    bounded: bool = False,
-    trajectory: Trajectory | None = None,
-    **options: Any,
-) -> AENeRFModel:
-    torch.manual_seed(0)
-    small: dict[str, Any] = {
-        "num_levels": 4,
-        "max_resolution": 32,
-        "log2_hashmap_size": 10,
-        "hidden_dim": 16,
-        "num_proposal_samples_per_ray": (16,),
-        "num_nerf_samples_per_ray": 12,
-        "proposal_max_resolutions": (16,),
-        "proposal_num_levels": 2,
-        "proposal_log2_hashmap_size": 8,
-    }
-    config = AENeRFModelConfig(**{**small, **options})
-    ends = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    ends[:, 2, 3] = 3
-    ends[:, 0, 3] = torch.tensor([-0.3, 0.3])
-    ends[1, :3, :3] = rotation_from_vector(torch.tensor([0.03, -0.06, 0.1], dtype=torch.float64))
-    metadata = {
-        "sensor": sensor or SensorModel(0.2, 0.3),
-        "image_encoding": "srgb",
-        "bounded": bounded,
-        "trajectory": trajectory or Trajectory([0, 10**9], ends),
-        "ground_truth": None,
-        "camera_times": torch.tensor([0]),
-    }
-    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
-    return config.setup(scene_box=box, num_train_data=1, metadata=metadata)
-
-
-def make_rays(count: int = 10, away: bool = False, with_times: bool = False) -> RayBundle:
-    """Rays from z = 3 towards the scene box, or past it."""
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.tensor([0.0, 0.0, 1.0 if away else -1.0]) + 0.1 * torch.randn(count, 3, generator=generator)
-    directions = F.normalize(directions, dim=-1)
-    return RayBundle(
-        origins=torch.tensor([0.0, 0.0, 3.0]).expand(count, 3),
-        directions=directions,
-        pixel_area=torch.ones(count, 1),
-        camera_indices=torch.zeros(count, 1, dtype=torch.long),
-        times=torch.rand(count, 1, generator=generator, dtype=torch.float64) if with_times else None,
-        metadata={"camera_directions": directions.double()} if with_times else {},
-    )
-
-
-def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
-    positive = (torch.arange(num_pairs) % 2).float()
-    return {
-        "num_positive": positive,
-        "num_negative": 1 - positive,
-        "last_num_positive": positive,
-        "last_num_negative": 1 - positive,
-        "last_interval": torch.full((num_pairs,), 1e-3),
-        "channel": torch.zeros(num_pairs, dtype=torch.long),
-        "ends_between_events": torch.zeros(num_pairs, dtype=torch.bool),
-    }
 
 
 @pytest.mark.parametrize("backbone", ["hash", "mlp"])

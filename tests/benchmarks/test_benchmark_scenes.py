@@ -8,7 +8,7 @@ import pytest
 
 from aenerf_ns.errors import DataError
 
-FOLDER = Path(__file__).parent.parent / "benchmarks" / "scenes"
+FOLDER = Path(__file__).parents[2] / "benchmarks" / "scenes"
 sys.path.insert(0, str(FOLDER))
 import assets  # noqa: E402
 import catalogue  # noqa: E402
