@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sized
+from typing import TypeVar
+
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Chunk = TypeVar("Chunk", bound=Sized)
 
 
 def progress_bar() -> Progress:
-    """A rich progress bar with counts, elapsed and remaining time, cleared when it is done."""
+    """Return a progress bar with counts, elapsed and remaining time, which is cleared when it is done."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -15,3 +20,18 @@ def progress_bar() -> Progress:
         TimeRemainingColumn(),
         transient=True,
     )
+
+
+def tracked(chunks: Iterable[Chunk], description: str, total: int | None) -> Iterator[Chunk]:
+    """Yield the chunks and show how much of them has been yielded.
+
+    Args:
+        chunks: pieces of a long whole, such as those of an event file.
+        description: shown in front of the bar.
+        total: length of all chunks together, or None where it is not known.
+    """
+    with progress_bar() as progress:
+        task = progress.add_task(description, total=total)
+        for chunk in chunks:
+            yield chunk
+            progress.advance(task, len(chunk))

@@ -10,16 +10,12 @@ from aenerf_ns.dataparsers.formats import AutomaticDataParserConfig
 from aenerf_ns.method.model import AENeRFModelConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.training.datamanager import EventDataManagerConfig
-from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pipeline import AENeRFPipelineConfig
 from aenerf_ns.training.schedules import (
     AENeRFTrainerConfig,
     RelativeCosineSchedulerConfig,
     RelativeMultiStepSchedulerConfig,
 )
-
-# Every ns-* command imports this module, ns-render among them.
-provide_ffmpeg()
 
 aenerf = MethodSpecification(
     config=AENeRFTrainerConfig(

@@ -8,8 +8,10 @@ from dataclasses import replace
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.supervision.pairs import PairSamplerConfig
 
 _base = deepcopy(aenerf.config)
 
@@ -25,21 +27,17 @@ aenerf_mlp = MethodSpecification(
                 _base.pipeline.datamanager,
                 train_num_rays_per_batch=2048,
                 eval_num_rays_per_batch=2048,
-                max_events_per_pair=1,
-                share_of_pairs_to_moments=0.0,
+                sampler=PairSamplerConfig(max_events_per_pair=1, share_to_moments=0.0),
             ),
             model=replace(
                 _base.pipeline.model,
                 backbone="mlp",
                 # Mip-NeRF 360's density bias: softplus(-1) = 0.31.
                 average_init_density=0.3,
-                num_hidden_layers=8,
-                hidden_dim=1024,
-                geometry_feature_dim=256,
-                num_proposal_samples_per_ray=(64, 64),
-                num_nerf_samples_per_ray=32,
-                proposal_num_hidden_layers=4,
-                proposal_hidden_dim=256,
+                field=FieldConfig(
+                    num_samples_per_ray=32, num_hidden_layers=8, hidden_dim=1024, geometry_feature_dim=256
+                ),
+                proposal=ProposalConfig(num_samples_per_ray=(64, 64), num_hidden_layers=4, hidden_dim=256),
                 camera_optimizer=PoseCorrectionConfig(mode="network"),
                 loss_coefficients={**_base.pipeline.model.loss_coefficients, "temporal_loss": 1e-3},
             ),

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from nerfstudio.plugins.types import MethodSpecification
 
+from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method_configs.aenerf import aenerf
 
 _base = deepcopy(aenerf.config)
@@ -24,16 +25,16 @@ aenerf_small = MethodSpecification(
             ),
             model=replace(
                 _base.pipeline.model,
-                num_levels=8,
-                max_resolution=256,
-                log2_hashmap_size=15,
-                hidden_dim=32,
-                num_proposal_samples_per_ray=(48,),
-                num_nerf_samples_per_ray=24,
-                proposal_max_resolutions=(64,),
-                proposal_num_levels=4,
-                proposal_log2_hashmap_size=14,
-                proposal_weights_anneal_iterations=200,
+                field=FieldConfig(
+                    num_samples_per_ray=24, num_levels=8, max_resolution=256, log2_hashmap_size=15, hidden_dim=32
+                ),
+                proposal=ProposalConfig(
+                    num_samples_per_ray=(48,),
+                    max_resolutions=(64,),
+                    num_levels=4,
+                    log2_hashmap_size=14,
+                    weights_anneal_iterations=200,
+                ),
                 # On a CPU twice as fast as with 8192: what a piece needs stays small.
                 eval_num_rays_per_chunk=1 << 10,
             ),

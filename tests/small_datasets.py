@@ -19,8 +19,8 @@ from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.training.dataset import EventDataset
 
 CAMERA = EventCamera(6, 4, 5.0, 5.5, 3.0, 2.0, "radial_tangential", (0.01, 0.0, 0.001, 0.0, 0.0))
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +17,14 @@ from nerfstudio.data.scene_box import SceneBox
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.events.pairs import EventPairs, pair_events
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
-from aenerf_ns.supervision.pairs import EventRaySampler
+from aenerf_ns.method.networks import FieldConfig, ProposalConfig
+from aenerf_ns.recording.scene import SCENE, Scene
+from aenerf_ns.supervision.pairs import PairSampler, PairSamplerConfig, PairSupervisionConfig
 
 CAMERA = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
 
@@ -28,53 +35,90 @@ ALL_LOSSES = {"reconstruction_loss": 1.0, "temporal_loss": 1e-3, "interlevel_los
 EPOCH = 1_600_000_000_000_000_000
 
 
+def make_scene(
+    sensor: SensorModel, trajectory: Trajectory, camera: EventCamera = CAMERA, bounded: bool = False
+) -> Scene:
+    return Scene(
+        trajectory=trajectory,
+        ground_truth=None,
+        event_camera=camera,
+        event_file=NoEvents(Path("none"), camera.width, camera.height),
+        sensor=sensor,
+        window=TimeWindow(),
+        camera_times=torch.tensor([0]),
+        has_image=[False],
+        image_encoding="srgb",
+        bounded=bounded,
+    )
+
+
+class NoEvents(EventFile):
+    """Stands where a scene has an event file, in tests that do not read it."""
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        raise AssertionError("no test reads it")
+
+    def time_span(self) -> tuple[int, int]:
+        raise AssertionError("no test reads it")
+
+
+@dataclass
+class FivePairs:
+    """A training dataset of five events at two pixels."""
+
+    scene: Scene
+    pairs: EventPairs
+
+
 def make_sampler(
     random_poses: torch.Tensor,
     sensor: SensorModel,
     camera: EventCamera = CAMERA,
     max_events_per_pair: int = 1,
     share: float = 0.0,
-) -> EventRaySampler:
+    temporal: bool = False,
+    learn_refractory_period: bool = False,
+) -> PairSampler:
     rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
     stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
     pairs = pair_events([stream], refractory_period=sensor.refractory_period)
     trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
-    return EventRaySampler(lambda: pairs, camera, sensor, trajectory, 40, max_events_per_pair, share)
+    return PairSamplerConfig(max_events_per_pair=max_events_per_pair, share_to_moments=share).setup(
+        dataset=FivePairs(make_scene(sensor, trajectory, camera), pairs),
+        supervision=PairSupervisionConfig(learn_refractory_period=learn_refractory_period).setup(
+            sensor=sensor, loss_coefficients={"temporal_loss": float(temporal)}
+        ),
+        device="cpu",
+    )
+
+
+SMALL_FIELD = {
+    "num_samples_per_ray": 12, "num_levels": 4, "max_resolution": 32, "log2_hashmap_size": 10, "hidden_dim": 16
+}  # fmt: skip
+SMALL_PROPOSAL = {"num_samples_per_ray": (16,), "max_resolutions": (16,), "num_levels": 2, "log2_hashmap_size": 8}
 
 
 def make_model(
     sensor: SensorModel | None = None,
     bounded: bool = False,
     trajectory: Trajectory | None = None,
+    field: dict[str, Any] | None = None,
+    proposal: dict[str, Any] | None = None,
     **options: Any,
 ) -> AENeRFModel:
     torch.manual_seed(0)
-    small: dict[str, Any] = {
-        "num_levels": 4,
-        "max_resolution": 32,
-        "log2_hashmap_size": 10,
-        "hidden_dim": 16,
-        "num_proposal_samples_per_ray": (16,),
-        "num_nerf_samples_per_ray": 12,
-        "proposal_max_resolutions": (16,),
-        "proposal_num_levels": 2,
-        "proposal_log2_hashmap_size": 8,
-    }
-    config = AENeRFModelConfig(**{**small, **options})
+    config = AENeRFModelConfig(
+        field=FieldConfig(**{**SMALL_FIELD, **(field or {})}),
+        proposal=ProposalConfig(**{**SMALL_PROPOSAL, **(proposal or {})}),
+        **options,
+    )
     ends = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     ends[:, 2, 3] = 3
     ends[:, 0, 3] = torch.tensor([-0.3, 0.3])
     ends[1, :3, :3] = rotation_from_vector(torch.tensor([0.03, -0.06, 0.1], dtype=torch.float64))
-    metadata = {
-        "sensor": sensor or SensorModel(0.2, 0.3),
-        "image_encoding": "srgb",
-        "bounded": bounded,
-        "trajectory": trajectory or Trajectory([0, 10**9], ends),
-        "ground_truth": None,
-        "camera_times": torch.tensor([0]),
-    }
+    scene = make_scene(sensor or SensorModel(0.2, 0.3), trajectory or Trajectory([0, 10**9], ends), bounded=bounded)
     box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
-    return config.setup(scene_box=box, num_train_data=1, metadata=metadata)
+    return config.setup(scene_box=box, num_train_data=1, metadata={SCENE: scene})
 
 
 def make_rays(count: int = 10, away: bool = False, with_times: bool = False) -> RayBundle:

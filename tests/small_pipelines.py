@@ -15,6 +15,7 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.model import AENeRFModelConfig
+from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.training.datamanager import EventDataManagerConfig
@@ -45,14 +46,8 @@ def make_pipeline(
             for _ in range(num_views + 1):
                 writer.add_image("test", np.full((4, 6, 3), (204, 102, 51), np.uint8), poses[2])
     model = AENeRFModelConfig(
-        num_levels=4,
-        max_resolution=32,
-        log2_hashmap_size=10,
-        num_proposal_samples_per_ray=(16,),
-        num_nerf_samples_per_ray=12,
-        proposal_max_resolutions=(16,),
-        proposal_num_levels=2,
-        proposal_log2_hashmap_size=8,
+        field=FieldConfig(num_samples_per_ray=12, num_levels=4, max_resolution=32, log2_hashmap_size=10),
+        proposal=ProposalConfig(num_samples_per_ray=(16,), max_resolutions=(16,), num_levels=2, log2_hashmap_size=8),
         color_correction_num_rays=64,
         camera_optimizer=PoseCorrectionConfig(mode=pose_correction),
     )

@@ -16,6 +16,7 @@ from aenerf_ns.camera.rotation import (
     vector_from_quaternion,
 )
 from aenerf_ns.errors import DataError
+from aenerf_ns.events.time_window import TimeWindow
 
 # Multiplying by it from the right turns OpenCV camera axes (x right, y down, z forward) into OpenGL ones, which
 # Nerfstudio uses (x right, y up, z backward), and back.
@@ -184,11 +185,18 @@ class Trajectory(nn.Module):
             )
         return Trajectory(self.times[first : last + 1], self.camera_to_worlds[first : last + 1], self.source)
 
-    def gaps(self, longest: int) -> list[tuple[int, int]]:
-        """The pairs of consecutive knots that are more than ``longest`` nanoseconds apart: between them the poses are
-        not known."""
-        wide = (self.times[1:] - self.times[:-1] > longest).nonzero()[:, 0]
-        return [(int(self.times[i]), int(self.times[i + 1])) for i in wide]
+    def window(self, longest_gap: int | None = None) -> TimeWindow:
+        """Return the time in which poses are known: the span of the knots, without the gaps.
+
+        Args:
+            longest_gap: nanoseconds. Between two knots that are further apart the poses are not known. None: they are
+                known everywhere.
+        """
+        gaps = []
+        if longest_gap is not None:
+            wide = (self.times[1:] - self.times[:-1] > longest_gap).nonzero()[:, 0]
+            gaps = [(int(self.times[i]), int(self.times[i + 1])) for i in wide]
+        return TimeWindow(self.start, self.end, tuple(gaps))
 
     def knots_between(self, start: int, end: int) -> Tensor:
         """Times in nanoseconds of the knots from one time to another, both included."""

@@ -21,11 +21,11 @@ from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.recording import Recording
-
-Gaps = list[tuple[int, int]]
+from aenerf_ns.recording.scene import SCENE
 
 _RATE_PARTS = 60
 _BLOCKS = " ▁▂▃▄▅▆▇█"
@@ -78,14 +78,14 @@ class Check:
         """Prints the figures and returns the problems."""
         # What training and evaluation will ask for.
         outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
-        recording, left_out = parser.recording, outputs[0].metadata["pose_gaps"]
-        statistics, num_covered = _read(recording, left_out)
-        problems = _check_events(recording, statistics) + _check_poses(recording, statistics, num_covered, left_out)
+        recording, window = parser.recording, outputs[0].metadata[SCENE].window
+        statistics, num_covered = _read(recording, window)
+        problems = _check_events(recording, statistics) + _check_poses(recording, statistics, num_covered, window)
         if num_covered < _MIN_EVENTS:
             unseen = "" if self.picture is None else " No picture is written."
             _print(f"Contrast of warped events: not computed, for only {num_covered} events have a pose.{unseen}")
             return problems
-        runs = _read_runs(recording, num_covered, left_out)
+        runs = _read_runs(recording, num_covered, window)
         with progress_bar() as progress:
             progress.add_task("Warping events", total=None)
             warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
@@ -114,15 +114,7 @@ def _tracked(event_file: EventFile, description: str) -> Iterator[EventStream]:
             progress.advance(task, len(chunk))
 
 
-def _covered(events: EventStream, trajectory: Trajectory, gaps: Gaps) -> EventStream:
-    """The events within the span of the poses and in none of the gaps."""
-    kept = (events.t >= trajectory.start) & (events.t <= trajectory.end)
-    for first, last in gaps:
-        kept &= (events.t <= first) | (events.t >= last)
-    return events[kept]
-
-
-def _read(recording: Recording, gaps: Gaps) -> tuple[EventStatistics, int]:
+def _read(recording: Recording, window: TimeWindow) -> tuple[EventStatistics, int]:
     """Statistics of the events, and how many of them have a pose."""
     event_file = recording.event_file
     num_covered = 0
@@ -130,7 +122,7 @@ def _read(recording: Recording, gaps: Gaps) -> tuple[EventStatistics, int]:
     def chunks() -> Iterator[EventStream]:
         nonlocal num_covered
         for chunk in _tracked(event_file, "Reading events"):
-            num_covered += len(_covered(chunk, recording.trajectory, gaps))
+            num_covered += int(window.contains(chunk.t).sum())
             yield chunk
 
     span = event_file.time_span()
@@ -138,7 +130,7 @@ def _read(recording: Recording, gaps: Gaps) -> tuple[EventStatistics, int]:
     return statistics, num_covered
 
 
-def _read_runs(recording: Recording, num_covered: int, gaps: Gaps) -> list[EventStream]:
+def _read_runs(recording: Recording, num_covered: int, window: TimeWindow) -> list[EventStream]:
     """Runs of events that have a pose, evenly spread over these."""
     camera = recording.event_camera
     count = num_slices(num_covered, camera)
@@ -147,7 +139,7 @@ def _read_runs(recording: Recording, num_covered: int, gaps: Gaps) -> list[Event
     parts: list[list[dict[str, np.ndarray]]] = [[] for _ in begins]
     position = 0
     for chunk in _tracked(recording.event_file, "Choosing events"):
-        covered = _covered(chunk, recording.trajectory, gaps)
+        covered = chunk[window.contains(chunk.t)]
         for part, begin in zip(parts, begins - position, strict=True):
             taken = covered[max(begin, 0) : max(begin + length, 0)]
             # Copies: views would keep whole chunks in memory.
@@ -204,7 +196,7 @@ def _histogram(values: np.ndarray) -> str:
     return "".join(_BLOCKS[level] for level in levels)
 
 
-def _check_poses(recording: Recording, statistics: EventStatistics, num_covered: int, left_out: Gaps) -> list[str]:
+def _check_poses(recording: Recording, statistics: EventStatistics, num_covered: int, window: TimeWindow) -> list[str]:
     problems = []
     trajectory = recording.trajectory
     times = trajectory.times.numpy()
@@ -227,7 +219,7 @@ def _check_poses(recording: Recording, statistics: EventStatistics, num_covered:
             "poses, or cut the recording"
         )
     # Those that training leaves out were told when the dataset was opened.
-    known = np.isin(times[:-1], [first for first, _ in left_out])
+    known = np.isin(times[:-1], [first for first, _ in window.gaps])
     gaps = np.flatnonzero((intervals > _GAP_FACTOR * median) & ~known)
     if len(gaps):
         # Of the sampled pairs, by their later event.

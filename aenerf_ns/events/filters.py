@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.time_window import FIRST_TIME, LAST_TIME
 
 _NEVER = np.iinfo(np.int64).min
 
@@ -173,7 +174,7 @@ class FilteredEventFile(EventFile):
     def _within(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
         start, end = self._filters.start, self._filters.end
         for chunk in chunks:
-            yield chunk.between(_NEVER if start is None else start, np.iinfo(np.int64).max - 1 if end is None else end)
+            yield chunk.between(FIRST_TIME if start is None else start, LAST_TIME if end is None else end)
 
     def _kept_pixels(self) -> NDArray[np.bool_]:
         """(height, width) pixels of the source whose events are kept."""

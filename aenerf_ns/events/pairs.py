@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numba
@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.events.time_window import TimeWindow
 
 _NEVER = np.iinfo(np.int64).min
-_MAX_TIME = np.iinfo(np.int64).max - 1
 _MAX_MERGED = 255
 # Pairs for each number that a PairsInTime keeps, and that are looked through for each draw.
 _BLOCK = 64
+
+_EVERYTHING = TimeWindow()
 
 
 @dataclass(frozen=True)
@@ -185,9 +187,7 @@ def pair_events(
     chunks: Iterable[EventStream],
     *,
     refractory_period: int = 0,
-    start: int | None = None,
-    end: int | None = None,
-    gaps: Sequence[tuple[int, int]] = (),
+    window: TimeWindow = _EVERYTHING,
     expected_events: int | None = None,
 ) -> EventPairs:
     """Pairs each event with the previous event of its pixel, in one pass over the stream.
@@ -197,10 +197,7 @@ def pair_events(
     Args:
         chunks: the stream in pieces, in the order of time, all of one sensor.
         refractory_period: τ in nanoseconds; an event that follows its pixel's previous one by no more gives no pair.
-        start: events before this time in nanoseconds are left out.
-        end: events after this time in nanoseconds are left out.
-        gaps: events between these times in nanoseconds, the times themselves excluded, are left out, in the order of
-            time; no pair spans one.
+        window: the events outside it are left out, and no pair spans a gap.
         expected_events: the number of events, when known, which saves growing the arrays.
 
     Returns:
@@ -212,8 +209,8 @@ def pair_events(
     dtypes = (np.uint16, np.uint16, np.int64, np.int64, np.uint8, np.uint8)
     # numpy.empty only reserves addresses: memory is used as the pairs are written.
     records: list[NDArray] = [np.empty(expected_events or 0, dtype) for dtype in dtypes]
-    windows = _windows(_NEVER + 1 if start is None else start, _MAX_TIME if end is None else end, gaps)
-    window = size = total = outside = first = merged = refractory = 0
+    pieces = window.pieces()
+    piece = size = total = outside = first = merged = refractory = 0
     last_time = last_record = None
     source: object = "events"
     for full_chunk in chunks:
@@ -223,13 +220,13 @@ def pair_events(
         if last_time is None or last_record is None:
             last_time = np.full(full_chunk.width * full_chunk.height, _NEVER, dtype=np.int64)
             last_record = np.full(full_chunk.width * full_chunk.height, -1, dtype=np.int64)
-        for index, chunk in enumerate(full_chunk.between(*times) for times in windows):
+        for index, chunk in enumerate(full_chunk.between(*times) for times in pieces):
             if len(chunk) == 0:
                 continue
             outside -= len(chunk)
-            if index != window:
+            if index != piece:
                 # Behind a gap every pixel begins anew.
-                window = index
+                piece = index
                 last_time.fill(_NEVER)
             if size + len(chunk) > len(records[0]):
                 capacity = max(size + len(chunk), 3 * len(records[0]) // 2)
@@ -257,7 +254,8 @@ def pair_events(
     if total == outside:
         raise DataError(
             str(source),
-            f"none of its {total} events lies between {start} and {end} ns, the span of the poses and the time window",
+            f"none of its {total} events lies between {window.start} and {window.end} ns, the span of the poses "
+            "and the time window",
             "check that events and poses share one clock and one unit of time",
         )
     x, y, previous_time, time, num_positive, num_negative = (record[:size] for record in records)
@@ -274,10 +272,3 @@ def pair_events(
         num_merged=merged,
         num_within_refractory_period=refractory,
     )
-
-
-def _windows(start: int, end: int, gaps: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """What is left of [start, end] between the gaps, both ends included."""
-    edges = [start, *(time for gap in gaps for time in gap), end]
-    windows = ((max(first, start), min(last, end)) for first, last in zip(edges[::2], edges[1::2], strict=True))
-    return [(first, last) for first, last in windows if first <= last]

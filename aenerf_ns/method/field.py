@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -27,55 +28,77 @@ _MAX_LOG_DENSITY = 15.0
 _SKIP_LAYER = 5
 
 
+@dataclass(frozen=True)
+class DensityShape:
+    """The network from an encoded position to density and feature.
+
+    Attributes:
+        num_hidden_layers: number of hidden layers. Where there are more than five, the encoding is joined to the output
+            of the fifth, as in NeRF.
+        hidden_dim: width of the hidden layers.
+        feature_dim: length of the feature that is handed on with the density, 0 for none.
+        activation: from the network's output to the density; "exp" is cut off at large exponents.
+        average_init_density: density where the network's output is 0, as it nearly is before training.
+    """
+
+    num_hidden_layers: int
+    hidden_dim: int
+    feature_dim: int
+    activation: Literal["exp", "softplus"]
+    average_init_density: float
+
+
+@dataclass(frozen=True)
+class RadianceShape:
+    """The network from feature and view direction to radiance.
+
+    Attributes:
+        num_channels: radiance channels of the sensor, 1 or 3.
+        num_hidden_layers: number of hidden layers.
+        hidden_dim: width of the hidden layers.
+    """
+
+    num_channels: int
+    num_hidden_layers: int
+    hidden_dim: int
+
+
 class DensityField(Field):
     """Density of space: an encoding of the position (γ_x of the paper, eq. 1) and a network.
 
-    Differentiable as often as the encoding is: hidden units are softplus with β = 100, which is smooth but as sharp
-    as a rectifier. Weights start as PyTorch's own linear layers do.
+    It can be differentiated as often as the encoding can: hidden units are softplus with β = 100, which is smooth but
+    as sharp as a rectifier. Weights start as PyTorch's own linear layers do.
 
     Args:
         aabb: (2, 3) scene box, which bounds the scene where there is no spatial distortion.
         spatial_distortion: contraction of space to a ball or cube of radius 2, or None for a bounded scene.
         encoding: of positions in the contracted space or box, which is scaled to [0, 1] along each axis.
-        num_hidden_layers: hidden layers of the network. Where there are more than five, the encoding is joined to
-            the output of the fifth, as in NeRF.
-        hidden_dim: width of the hidden layers.
-        feature_dim: length of the feature handed on with the density, 0 for none.
-        density_activation: of the network's output; "exp" is cut off at large exponents.
-        average_init_density: density where the network's output is 0, as it nearly is before training.
+        shape: of the network.
     """
 
     aabb: Tensor
 
     def __init__(
-        self,
-        aabb: Tensor,
-        spatial_distortion: SpatialDistortion | None,
-        encoding: Encoding,
-        num_hidden_layers: int,
-        hidden_dim: int,
-        feature_dim: int,
-        density_activation: Literal["exp", "softplus"],
-        average_init_density: float,
+        self, aabb: Tensor, spatial_distortion: SpatialDistortion | None, encoding: Encoding, shape: DensityShape
     ) -> None:
         super().__init__()
         self.register_buffer("aabb", aabb)
         self.spatial_distortion = spatial_distortion
-        self.density_activation = density_activation
-        self.average_init_density = average_init_density
+        self.density_activation = shape.activation
+        self.average_init_density = shape.average_init_density
         self.encoding = encoding
         self.density_network = MLP(
             in_dim=encoding.get_out_dim(),
-            num_layers=num_hidden_layers + 1,
-            layer_width=hidden_dim,
-            out_dim=1 + feature_dim,
-            skip_connections=(_SKIP_LAYER,) if num_hidden_layers > _SKIP_LAYER else None,
+            num_layers=shape.num_hidden_layers + 1,
+            layer_width=shape.hidden_dim,
+            out_dim=1 + shape.feature_dim,
+            skip_connections=(_SKIP_LAYER,) if shape.num_hidden_layers > _SKIP_LAYER else None,
             activation=nn.Softplus(beta=100),
             implementation="torch",
         )
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
-        """Density (..., 1), zero outside the box of a bounded scene, and the feature (..., feature_dim)."""
+        """Return density (..., 1), zero outside the box of a bounded scene, and the feature (..., feature_dim)."""
         positions, inside = _unit_positions(self, ray_samples)
         raw = self.density_network(self.encoding(positions.flatten(0, -2))).unflatten(0, positions.shape[:-1])
         raw_density, feature = raw[..., :1].to(positions.dtype), raw[..., 1:]
@@ -88,61 +111,40 @@ class DensityField(Field):
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Tensor | None = None
     ) -> dict[FieldHeadNames, Tensor]:
-        """Nothing besides the density."""
+        """Return nothing besides the density."""
         return {}
 
 
 class EventRadianceField(DensityField):
     """F_θ of the paper (eq. 1).
 
-    The view direction's encoding is sinusoidal: the framework's spherical harmonics run without gradients.
+    The encoding of the view direction is sinusoidal, because the framework's spherical harmonics run without gradients.
 
     Args:
         aabb: see :class:`DensityField`.
-        num_channels: radiance channels of the sensor, 1 or 3.
         spatial_distortion: see :class:`DensityField`.
         encoding: see :class:`DensityField`.
-        num_hidden_layers: see :class:`DensityField`.
-        hidden_dim: see :class:`DensityField`.
-        geometry_feature_dim: length of the feature handed from density to radiance.
-        radiance_num_hidden_layers: hidden layers from feature and view direction to radiance.
-        radiance_hidden_dim: their width.
-        density_activation: see :class:`DensityField`.
-        average_init_density: see :class:`DensityField`.
+        density: the network to density and feature.
+        radiance: the network to radiance.
     """
 
     def __init__(
         self,
         aabb: Tensor,
-        num_channels: int,
         spatial_distortion: SpatialDistortion | None,
         encoding: Encoding,
-        num_hidden_layers: int,
-        hidden_dim: int,
-        geometry_feature_dim: int,
-        radiance_num_hidden_layers: int,
-        radiance_hidden_dim: int,
-        density_activation: Literal["exp", "softplus"],
-        average_init_density: float,
+        density: DensityShape,
+        radiance: RadianceShape,
     ) -> None:
-        super().__init__(
-            aabb,
-            spatial_distortion,
-            encoding,
-            num_hidden_layers,
-            hidden_dim,
-            geometry_feature_dim,
-            density_activation,
-            average_init_density,
-        )
+        super().__init__(aabb, spatial_distortion, encoding, density)
         self.direction_encoding = NeRFEncoding(
             in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True, implementation="torch"
         )
         self.radiance_network = MLP(
-            in_dim=self.direction_encoding.get_out_dim() + geometry_feature_dim,
-            num_layers=radiance_num_hidden_layers + 1,
-            layer_width=radiance_hidden_dim,
-            out_dim=num_channels,
+            in_dim=self.direction_encoding.get_out_dim() + density.feature_dim,
+            num_layers=radiance.num_hidden_layers + 1,
+            layer_width=radiance.hidden_dim,
+            out_dim=radiance.num_channels,
             activation=nn.Softplus(beta=100),
             implementation="torch",
         )
@@ -150,7 +152,7 @@ class EventRadianceField(DensityField):
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Tensor | None = None
     ) -> dict[FieldHeadNames, Tensor]:
-        """Radiance (rays, samples, num_channels), positive and unbounded, under the framework's name for colour."""
+        """Return radiance (rays, samples, num_channels), positive and unbounded, by the framework's name for colour."""
         assert density_embedding is not None
         # All samples of a ray have its direction.
         directions = self.direction_encoding(ray_samples.frustums.directions[..., :1, :])
@@ -179,14 +181,14 @@ class ProposalNetwork(HashMLPDensityField):
         self.encoding = self.mlp_base[0] = HashEncoding(**grid)
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, None]:
-        """Density (..., 1), and no feature."""
+        """Return density (..., 1), and no feature."""
         positions, inside = _unit_positions(self, ray_samples)
         raw = self.mlp_base(positions.flatten(0, -2)).unflatten(0, positions.shape[:-1])
         return _exponential_density(raw.to(positions.dtype), self.average_init_density) * inside, None
 
 
 def _unit_positions(field: DensityField | ProposalNetwork, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
-    """Positions (..., 3) of samples in the unit cube, 0 for those outside the scene, and which (..., 1) are inside."""
+    """Return positions (..., 3) of samples in the unit cube, 0 outside the scene, and which (..., 1) are inside."""
     positions = ray_samples.frustums.get_positions()
     if field.spatial_distortion is not None:
         positions = (field.spatial_distortion(positions) + 2) / 4
@@ -197,5 +199,5 @@ def _unit_positions(field: DensityField | ProposalNetwork, ray_samples: RaySampl
 
 
 def _exponential_density(raw: Tensor, average_init_density: float) -> Tensor:
-    """Density of a network's output, which must not be in half precision: its exponential would overflow."""
+    """Return the density for a network's output, not in half precision, whose exponential would overflow."""
     return average_init_density * torch.exp(raw.clamp(max=_MAX_LOG_DENSITY))

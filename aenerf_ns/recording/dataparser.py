@@ -19,9 +19,11 @@ from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.recording import FrameSequence, Recording, ReferenceView, Split
+from aenerf_ns.recording.scene import SCENE, Scene
 
 # In extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
 _MAX_REFERENCE_DISTANCE = 1e4
@@ -168,9 +170,10 @@ class EventDataParser(DataParser):
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: object) -> DataparserOutputs:
         recording = self.recording
-        start, end = self._time_window(recording)
-        trajectory = recording.trajectory.between(start, end).mapped(lambda poses: poses @ OPENCV_TO_OPENGL)
-        gaps = self._pose_gaps(recording, start, end, say=split == "train")
+        window = self._time_window(recording, say=split == "train")
+        trajectory = recording.trajectory.between(window.start, window.end).mapped(
+            lambda poses: poses @ OPENCV_TO_OPENGL
+        )
         transform, scale, scene_box = self._world_transform(trajectory, recording.scene_box)
 
         def to_scene(poses: Tensor) -> Tensor:
@@ -187,7 +190,7 @@ class EventDataParser(DataParser):
             cameras = recording.event_camera.cameras(trajectory.interpolate(times))
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
         else:
-            views = _views_within(recording.reference_views[_as_split(split)], start, end, gaps)
+            views = _views_within(recording.reference_views[_as_split(split)], window)
             views = thinned(views, recording.max_views)
             for view in views:
                 check_image(view.file, recording.frame_camera)
@@ -207,23 +210,23 @@ class EventDataParser(DataParser):
             dataparser_scale=scale,
             alpha_color=None if recording.image_background is None else torch.tensor(recording.image_background),
             metadata={
-                "trajectory": trajectory,
-                "ground_truth": ground_truth,
-                "event_camera": recording.event_camera,
-                "event_file": recording.event_file,
-                "sensor": recording.sensor,
-                "time_window": (start, end),
-                "pose_gaps": gaps,
-                "camera_times": times,
-                "has_image": [index in images for index in range(len(cameras))],
-                "image_encoding": recording.image_encoding,
-                "bounded": recording.scene_box is not None,
+                SCENE: Scene(
+                    trajectory=trajectory,
+                    ground_truth=ground_truth,
+                    event_camera=recording.event_camera,
+                    event_file=recording.event_file,
+                    sensor=recording.sensor,
+                    window=window,
+                    camera_times=times,
+                    has_image=[index in images for index in range(len(cameras))],
+                    image_encoding=recording.image_encoding,
+                    bounded=recording.scene_box is not None,
+                )
             },
         )
 
-    def _time_window(self, recording: Recording) -> tuple[int, int]:
-        """Resolves the time window and stores it in the configuration, so that opening a trained run needs no
-        events."""
+    def _time_window(self, recording: Recording, say: bool) -> TimeWindow:
+        """Resolve the time window and store it in the configuration, so that opening a trained run needs no events."""
         config = self.config
         start, end = config.start_time_ns, config.end_time_ns
         if start is None or end is None:
@@ -237,25 +240,27 @@ class EventDataParser(DataParser):
             )
         covered = recording.trajectory.between(start, end)
         config.start_time_ns, config.end_time_ns = max(start, covered.start), min(end, covered.end)
-        return config.start_time_ns, config.end_time_ns
+        return TimeWindow(
+            config.start_time_ns,
+            config.end_time_ns,
+            self._pose_gaps(recording, config.start_time_ns, config.end_time_ns, say),
+        )
 
-    def _pose_gaps(self, recording: Recording, start: int, end: int, say: bool) -> list[tuple[int, int]]:
-        """Where within the time window the poses are too far apart for interpolation."""
+    def _pose_gaps(self, recording: Recording, start: int, end: int, say: bool) -> tuple[tuple[int, int], ...]:
+        """Return where within the time window the poses are too far apart for interpolation."""
         longest = self.config.max_pose_gap_ns
         if longest is not None and longest <= 0:
             raise DataError(str(self.config.data), f"max_pose_gap_ns is {longest}", "give a positive number")
         longest = recording.max_pose_gap if longest is None else longest
-        if longest is None:
-            return []
-        gaps = [gap for gap in recording.trajectory.gaps(longest) if gap[0] < end and gap[1] > start]
-        if gaps and say:
+        gaps = [gap for gap in recording.trajectory.window(longest).gaps if gap[0] < end and gap[1] > start]
+        if longest is not None and gaps and say:
             seconds = sum(last - first for first, last in gaps) * 1e-9
             first, last = max(gaps, key=lambda gap: gap[1] - gap[0])
             CONSOLE.print(
                 f"The poses have {len(gaps)} gap(s) of more than {longest * 1e-9:g} s, {seconds:.1f} s in all, the "
                 f"longest from {first * 1e-9:.3f} to {last * 1e-9:.3f} s: what happened there is left out."
             )
-        return gaps
+        return tuple(gaps)
 
     def _world_transform(self, trajectory: Trajectory, box: Tensor | None) -> tuple[Tensor, float, Tensor]:
         """The (3, 4) motion and then the scale that bring the world to the scene's frame, and the scene box there.
@@ -304,17 +309,12 @@ def _check_distance(poses: Tensor, reference: Trajectory) -> None:
         )
 
 
-def _views_within(views: list[ReferenceView], start: int, end: int, gaps: list[tuple[int, int]]) -> list[ReferenceView]:
-    kept = [
-        view
-        for view in views
-        if view.time is None
-        or (start <= view.time <= end and not any(first < view.time < last for first, last in gaps))
-    ]
+def _views_within(views: list[ReferenceView], window: TimeWindow) -> list[ReferenceView]:
+    kept = [view for view in views if view.time is None or window.contains(view.time)]
     if len(kept) < len(views):
         CONSOLE.print(
             f"{len(views) - len(kept)} of {len(views)} reference images are left out: they were taken outside the "
-            f"events' {start} to {end} ns or in a gap of the poses."
+            f"events' {window.start} to {window.end} ns or in a gap of the poses."
         )
     return kept
 

@@ -75,12 +75,8 @@ def views_on_trajectory(
             None where one sensor takes both.
         max_pose_gap: nanoseconds between poses beyond which no image there is kept, or None.
     """
-    gaps = [] if max_pose_gap is None else trajectory.gaps(max_pose_gap)
-    kept = [
-        (time, file)
-        for time, file in images
-        if trajectory.start <= time <= trajectory.end and not any(first < time < last for first, last in gaps)
-    ]
+    known = trajectory.window(max_pose_gap)
+    kept = [(time, file) for time, file in images if known.contains(time)]
     if len(kept) < len(images):
         CONSOLE.print(
             f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -13,8 +12,9 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.supervision.pairs import EventRaySampler
-from aenerf_ns.training.dataset import EventDataset
+from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision
+from aenerf_ns.supervision.pairs import PairSamplerConfig
 
 
 @dataclass
@@ -23,15 +23,11 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
 
     _target: type = field(default_factory=lambda: EventDataManager)
     train_num_rays_per_batch: int = 8192
-    """Rays of a training batch; a pair of events takes two, or three with the temporal loss."""
+    """The most rays of a training batch. A pair of events takes two, or three with the temporal loss."""
     eval_num_rays_per_batch: int = 8192
-    """Rays of a batch of pairs on which the loss is logged without training; a pair of events takes two."""
-    max_events_per_pair: int = 64
-    """The most events of its pixel that a pair spans; 1: consecutive events, as in the paper. They also are where a
-    refractory period is learned, or is more than a twentieth of an event's distance from its neighbours."""
-    share_of_pairs_to_moments: float = 0.25
-    """Part of the pairs of a batch that end at a random moment at a random pixel, between two events; the others end at
-    a random event. 0: all of them, as in the paper, and where a refractory period is learned."""
+    """The most rays of a batch on which the loss is logged without training. A pair of events takes two."""
+    sampler: SamplerConfig = field(default_factory=PairSamplerConfig)
+    """How batches are drawn. The model's supervision says what their renderings are compared with."""
 
 
 class EventDataManager(VanillaDataManager[EventDataset]):
@@ -42,7 +38,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     """
 
     config: EventDataManagerConfig
-    train_pixel_sampler: EventRaySampler | None
+    train_pixel_sampler: Sampler | None
     has_reference_views: bool
 
     def __init__(
@@ -77,26 +73,23 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return self.dataset_type(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
 
     def setup_train(self) -> None:
-        """Reads the events for training. A trained run is opened without them."""
-        metadata = self.train_dataset.metadata
-        if self.config.max_events_per_pair < 1:
-            raise DataError(
-                "the datamanager", f"max-events-per-pair is {self.config.max_events_per_pair}", "give 1 or more"
+        """Do nothing: :meth:`supervise` makes the sampler, once there is a supervision to make it for."""
+
+    def supervise(self, supervision: Supervision) -> None:
+        """Make the sampler for a supervision. While training, read the events for both; a trained run opens without.
+
+        Raises:
+            SystemExit: with one clear line, when events, sampler and supervision do not fit each other.
+        """
+        try:
+            self.train_pixel_sampler = self.config.sampler.setup(
+                dataset=self.train_dataset, supervision=supervision, device=self.device
             )
-        if not 0 <= self.config.share_of_pairs_to_moments <= 1:
-            share = self.config.share_of_pairs_to_moments
-            raise DataError("the datamanager", f"share-of-pairs-to-moments is {share}", "give a number from 0 to 1")
-        self.train_pixel_sampler = EventRaySampler(
-            lambda: self.train_dataset.pairs,
-            metadata["event_camera"],
-            metadata["sensor"],
-            deepcopy(metadata["trajectory"]).to(self.device),
-            self.config.train_num_rays_per_batch,
-            self.config.max_events_per_pair,
-            self.config.share_of_pairs_to_moments,
-        )
-        if self.test_mode == "val":
-            self.train_pixel_sampler.prepare()
+            if self.test_mode == "val":
+                self.train_pixel_sampler.prepare()
+                supervision.prepare(self.train_dataset)
+        except DataError as error:
+            raise SystemExit(f"Error: {error}") from None
 
     def setup_eval(self) -> None:
         """Only what gives whole reference views: no pixels are sampled from them."""
@@ -116,16 +109,16 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         _place(self.train_dataset, poses)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """A batch of pairs; see :meth:`EventRaySampler.sample`."""
+        """Draw a batch to train on; see :meth:`Sampler.sample`."""
         self.train_count += 1
         assert self.train_pixel_sampler is not None
-        return self.train_pixel_sampler.sample()
+        return self.train_pixel_sampler.sample(self.config.train_num_rays_per_batch)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """A batch of pairs to log the loss on."""
+        """Draw a batch to log the loss on."""
         self.eval_count += 1
         assert self.train_pixel_sampler is not None
-        return self.train_pixel_sampler.sample(max(self.config.eval_num_rays_per_batch // 2, 1))
+        return self.train_pixel_sampler.sample(self.config.eval_num_rays_per_batch, training=False)
 
 
 def _place(dataset: EventDataset, poses: Tensor) -> None:

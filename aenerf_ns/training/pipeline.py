@@ -22,6 +22,7 @@ from aenerf_ns.method.color_correction import ColorCorrectionProtocol, NoColorCo
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.training.datamanager import EventDataManager
+from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
@@ -56,19 +57,20 @@ class AENeRFPipeline(VanillaPipeline):
     datamanager: EventDataManager
     model: AENeRFModel
 
-    def __init__(self, config: AENeRFPipelineConfig, device: str, **kwargs: Any) -> None:
-        if config.model.learn_refractory_period:
-            # Longer pairs leave out what a pixel did not see while it was blind, and at a moment it may be blind. Not
-            # once the sampler is there: it would have worked out what these need.
-            config.datamanager.max_events_per_pair = 1
-            config.datamanager.share_of_pairs_to_moments = 0.0
-        super().__init__(config, device, **kwargs)
+    def __init__(
+        self,
+        config: AENeRFPipelineConfig,
+        device: str,
+        test_mode: Literal["test", "val", "inference"] = "val",
+        **kwargs: Any,
+    ) -> None:
+        if test_mode != "val":
+            # ns-render asks for a program that pip cannot install, once the pipeline is made.
+            provide_ffmpeg()
+        super().__init__(config, device, test_mode=test_mode, **kwargs)
         self._refined_test_poses = False
-        if self.datamanager.train_pixel_sampler is not None:
-            training = self.test_mode == "val"
-            self.datamanager.train_pixel_sampler.with_time_within = training and self.model.uses_temporal_loss
-        if self.test_mode == "val" and self.model.config.learn_refractory_period:
-            self.model.sensor_parameters.bound_refractory_period(self.datamanager.train_dataset.pairs.shortest_interval)
+        if test_mode != "inference":
+            self.datamanager.supervise(self.model.supervision)
         # Made once: a fit every so many steps would read the images again.
         self._pixels_of_split: dict[str, _Pixels] = {}
         self._warn_of_test_views()
@@ -275,7 +277,7 @@ class AENeRFPipeline(VanillaPipeline):
             metrics["pose_correction"] = self.model.config.camera_optimizer.mode
             metrics["pose_errors"] = self.pose_errors()
             metrics["test_poses"] = self._test_poses
-            metrics |= self.model.sensor_parameters.learned()
+            metrics |= self.model.supervision.learned()
             if self.model.image_metrics.lpips_absent is not None:
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent

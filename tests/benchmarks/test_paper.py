@@ -73,7 +73,7 @@ def test_whatever_a_run_depends_on_is_in_its_name() -> None:
         {"steps": 7},
         {"seeds": (3,)},
         {"scale": "full"},
-        {"train": ("--pipeline.model.num-levels", "4")},
+        {"train": ("--pipeline.model.field.num-levels", "4")},
         {"simulate": ("--refractory-period-ns", "1000")},
     ):
         changed = {run.name for run in small_plan(**change) if run.row != CEILING}

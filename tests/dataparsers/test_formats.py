@@ -33,10 +33,11 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.kalibr import read_camchain
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParserConfig
+from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.scene import SCENE
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.training.datamanager import EventDataManagerConfig
-from aenerf_ns.training.dataset import EventDataset
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 N_POSES, N_EVENTS = 21, 200
@@ -406,9 +407,9 @@ def test_converted_to_the_native_format_nothing_changes(written: tuple[str, Trut
     # Equal lenses have equal rays.
     for key in ("event_camera", "sensor", "time_window", "pose_gaps", "image_encoding", "bounded"):
         assert before[key] == after[key], key
-    assert torch.equal(before["trajectory"].times, after["trajectory"].times)
-    assert_same_poses(after["trajectory"].camera_to_worlds, before["trajectory"].camera_to_worlds.numpy())
-    before_events, after_events = (list(metadata["event_file"].chunks()) for metadata in (before, after))
+    assert torch.equal(before[SCENE].trajectory.times, after[SCENE].trajectory.times)
+    assert_same_poses(after[SCENE].trajectory.camera_to_worlds, before[SCENE].trajectory.camera_to_worlds.numpy())
+    before_events, after_events = (list(metadata[SCENE].event_file.chunks()) for metadata in (before, after))
     for column in "xytp":
         np.testing.assert_array_equal(
             *(np.concatenate([getattr(chunk, column) for chunk in events]) for events in (before_events, after_events))
@@ -441,7 +442,7 @@ def test_a_run_opens_without_events_and_in_another_folder(
     monkeypatch.chdir(tmp_path / "elsewhere")
     again = yaml.load(saved, Loader=yaml.Loader).setup(device="cpu", test_mode="inference", world_size=1, local_rank=0)
     assert torch.equal(manager.train_dataset.cameras.camera_to_worlds, again.train_dataset.cameras.camera_to_worlds)
-    assert manager.train_dataset.metadata["time_window"] == again.train_dataset.metadata["time_window"]
+    assert manager.train_dataset.metadata[SCENE].window == again.train_dataset.metadata[SCENE].window
     assert again.train_dataset.get_numpy_image(0).std() == 0
     for before, after in zip(manager.eval_dataset.image_filenames, again.eval_dataset.image_filenames, strict=True):
         assert before == after
@@ -586,7 +587,7 @@ def test_events_in_a_gap_of_the_poses_are_left_out_also_after_conversion(
             " ".join(capsys.readouterr().out.split()).count("The poses have 1 gap(s) of more than 0.05 s, 1.0 s in")
             == 1
         )
-        assert outputs.metadata["pose_gaps"] == [gap]
+        assert outputs.metadata[SCENE].window.gaps == (gap,)
         pairs = EventDataset(outputs).pairs
         times = truth.events["t"] * 1_000
         assert pairs.num_outside == int(((times > gap[0]) & (times < gap[1])).sum()) > 50
@@ -599,7 +600,7 @@ def test_events_in_a_gap_of_the_poses_are_left_out_also_after_conversion(
     views = recording_of(config).reference_views["train"]
     assert [view.file.name for view in views] == ["00000.jpg", "00002.jpg"]
     # Another limit may be given.
-    assert outputs_of(replace(config, max_pose_gap_ns=2 * 10**9)).metadata["pose_gaps"] == []
+    assert outputs_of(replace(config, max_pose_gap_ns=2 * 10**9)).metadata[SCENE].window.gaps == ()
 
 
 def test_several_sequences_in_a_folder_are_told_apart(tmp_path: Path, tum_vie_calibration: Path) -> None:

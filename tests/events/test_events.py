@@ -16,6 +16,7 @@ from aenerf_ns.events.pairs import EventPairs, PairsInTime, pair_events
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.events.time_window import TimeWindow
 
 WIDTH, HEIGHT = 4, 3
 # Small ranges, so that pixels repeat and times coincide.
@@ -97,14 +98,14 @@ def test_moments_fall_into_the_intervals_laid_end_to_end(
 def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:
     rows = [(1, 2, t, 1) for t in (0, 10, 11, 15, 20, 20, 25, 40)]
     expected = [(0, 10), (20, 25), (25, 40)]
-    for gaps in ([(10, 20)], [(-9, -3), (10, 20), (50, 60)]):
+    for gaps in (((10, 20),), ((-9, -3), (10, 20), (50, 60))):
         for sizes in ([8], [1] * 8, [3, 5]):
-            pairs = pair_events(cut(make_stream(rows), sizes), gaps=gaps)
+            pairs = pair_events(cut(make_stream(rows), sizes), window=TimeWindow(gaps=gaps))
             assert list(zip(pairs.previous_time.tolist(), pairs.time.tolist(), strict=True)) == expected
             assert (pairs.num_outside, pairs.num_first, pairs.num_merged) == (2, 2, 1)
             assert pairs.predecessors().tolist() == [-1, -1, 1]
     # What a gap leaves of the time window.
-    pairs = pair_events([make_stream(rows)], start=10, end=25, gaps=[(5, 11), (20, 30)])
+    pairs = pair_events([make_stream(rows)], window=TimeWindow(10, 25, ((5, 11), (20, 30))))
     assert list(zip(pairs.previous_time.tolist(), pairs.time.tolist(), strict=True)) == [(11, 15), (15, 20)]
 
 
@@ -116,9 +117,9 @@ def test_events_outside_the_time_window_are_left_out_and_counted(
     inside = [row for row in rows if start <= row[2] <= end]
     if not inside:
         with pytest.raises(DataError, match=f"none of its {len(rows)} events lies between {start} and {end} ns"):
-            pair_events([make_stream(rows)], start=start, end=end)
+            pair_events([make_stream(rows)], window=TimeWindow(start, end))
         return
-    pairs = pair_events([make_stream(rows)], start=start, end=end, expected_events=len(rows))
+    pairs = pair_events([make_stream(rows)], window=TimeWindow(start, end), expected_events=len(rows))
     assert as_set(pairs) == brute_force_pairs(inside, 0)
     assert pairs.num_outside == len(rows) - len(inside)
 

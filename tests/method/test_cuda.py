@@ -16,6 +16,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+from aenerf_ns.supervision.pairs import PairSupervisionConfig
 
 GPU = torch.device("cuda:0")
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -54,14 +55,13 @@ def test_whatever_the_model_computes_with_is_on_its_device(
     backbone: str, bounded: bool, correction: str, learned: bool
 ) -> None:
     mode = FakeTensorMode(allow_non_fake_inputs=True)
-    options: dict[str, Any] = {"num_proposal_samples_per_ray": (16, 8)} if backbone == "mlp" else {}
+    options: dict[str, Any] = {"proposal": {"num_samples_per_ray": (16, 8)}} if backbone == "mlp" else {}
     model = make_model(
         SensorModel(bayer_pattern="RGGB"),
         bounded=bounded,
         backbone=backbone,
         camera_optimizer=PoseCorrectionConfig(mode=correction),
-        learn_contrast_threshold_ratio=learned,
-        learn_refractory_period=learned,
+        supervision=PairSupervisionConfig(learn_contrast_threshold_ratio=learned, learn_refractory_period=learned),
         **options,
     )
     move_to_gpu(model, mode)

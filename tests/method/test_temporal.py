@@ -60,8 +60,7 @@ def test_the_rate_is_exact_along_the_whole_chain(mode: str, contraction: str, ba
         scene_contraction=contraction,
         bounded=contraction == "none",
         backbone=backbone,
-        num_hidden_layers=1 if backbone == "hash" else 6,
-        num_frequencies=4,
+        field={"num_hidden_layers": 1 if backbone == "hash" else 6, "num_frequencies": 4},
     )
     captured: list[tuple] = []
     composite = model._composite
@@ -116,7 +115,7 @@ def test_the_third_ray_takes_part_in_the_framework_s_losses() -> None:
 
 def test_without_the_temporal_loss_there_is_no_third_ray() -> None:
     model = make_model()
-    assert not model.uses_temporal_loss
+    assert model.supervision.num_rate_rays(15) == 0
     outputs = model(make_rays(10, with_times=True))
     assert "temporal_loss" not in model.get_loss_dict(outputs, make_batch(5))
 

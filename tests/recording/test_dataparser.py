@@ -33,25 +33,27 @@ from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.files.text import format_seconds, parse_times
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.recording.scene import SCENE
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.training.dataset import EventDataset
 
 
 def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     outputs = parse(NativeDataParserConfig(data=folder, **AS_RECORDED))
     metadata = outputs.metadata
-    assert metadata["event_camera"] == CAMERA
-    assert metadata["sensor"] == SENSOR
-    assert metadata["image_encoding"] == "srgb"
-    assert not metadata["bounded"]
+    assert metadata[SCENE].event_camera == CAMERA
+    assert metadata[SCENE].sensor == SENSOR
+    assert metadata[SCENE].image_encoding == "srgb"
+    assert not metadata[SCENE].bounded
     expected = make_trajectory()
-    assert torch.equal(metadata["trajectory"].times, expected.times)
+    assert torch.equal(metadata[SCENE].trajectory.times, expected.times)
     torch.testing.assert_close(
-        metadata["trajectory"].camera_to_worlds,
+        metadata[SCENE].trajectory.camera_to_worlds,
         (homogeneous(expected.camera_to_worlds) @ OPENCV_TO_OPENGL)[:, :3],
         rtol=0,
         atol=1e-11,
@@ -59,9 +61,9 @@ def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
     for split, values in (("val", [77]), ("test", [78, 79])):
         dataset = EventDataset(parse(NativeDataParserConfig(data=folder), split))
         assert [int(dataset.get_numpy_image(i)[0, 0, 0]) for i in range(len(dataset))] == values
-    events = list(metadata["event_file"].chunks())
-    assert sum(map(len, events)) == metadata["event_file"].count() == 200
-    assert metadata["event_file"].time_span() == (events[0].t[0], events[-1].t[-1])
+    events = list(metadata[SCENE].event_file.chunks())
+    assert sum(map(len, events)) == metadata[SCENE].event_file.count() == 200
+    assert metadata[SCENE].event_file.time_span() == (events[0].t[0], events[-1].t[-1])
 
 
 def test_all_splits_share_one_world_and_the_transform_is_the_one_reported(tmp_path: Path) -> None:
@@ -73,21 +75,21 @@ def test_all_splits_share_one_world_and_the_transform_is_the_one_reported(tmp_pa
     original = train.transform_poses_to_original_space(test.cameras.camera_to_worlds, "opencv")
     torch.testing.assert_close(original, make_trajectory().camera_to_worlds[[4, 5]].float(), rtol=0, atol=1e-5)
     # The framework's convention: cameras fit in a box of +/- 1 about the origin.
-    assert train.metadata["trajectory"].camera_to_worlds[:, :, 3].abs().max().item() == pytest.approx(1.0, rel=1e-2)
+    assert train.metadata[SCENE].trajectory.camera_to_worlds[:, :, 3].abs().max().item() == pytest.approx(1.0, rel=1e-2)
 
 
 def test_a_scene_box_sets_the_scale_and_bounds_the_scene(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made", np.array([[-1.0, -2.0, 0.0], [3.0, 4.0, 1.0]]))
     outputs = parse(NativeDataParserConfig(data=folder))
-    assert outputs.metadata["bounded"]
+    assert outputs.metadata[SCENE].bounded
     torch.testing.assert_close(outputs.scene_box.aabb, torch.tensor([[-2 / 3, -1, -1 / 6], [2 / 3, 1, 1 / 6]]))
-    first = outputs.metadata["trajectory"].camera_to_worlds[0, :, 3]
+    first = outputs.metadata[SCENE].trajectory.camera_to_worlds[0, :, 3]
     torch.testing.assert_close(first, torch.tensor([-1.0, -1.0, 1.5], dtype=torch.float64) / 3)
 
 
 def test_training_cameras_show_images_where_they_were_taken_and_events_elsewhere(tmp_path: Path) -> None:
     dataset = EventDataset(parse(NativeDataParserConfig(data=write_native(tmp_path / "made"))))
-    has_image = dataset.metadata["has_image"]
+    has_image = dataset.metadata[SCENE].has_image
     # Knots, of which two are also image times, and one image between two knots.
     assert len(dataset) == 22
     assert [i for i, image in enumerate(has_image) if image] == [0, 2, 21]
@@ -101,15 +103,15 @@ def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> N
     folder = write_native(tmp_path / "made")
     start, end = START + 500_000_000, START + 1_050_000_000
     dataset = EventDataset(parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end)))
-    trajectory = dataset.metadata["trajectory"]
+    trajectory = dataset.metadata[SCENE].trajectory
     assert (trajectory.start, trajectory.end) == (start, START + 1_100_000_000)
-    assert not any(dataset.metadata["has_image"])
+    assert not any(dataset.metadata[SCENE].has_image)
     assert dataset.pairs.previous_time.min() >= start
     assert dataset.pairs.time.max() <= end
     assert dataset.pairs.num_outside > 0
     # What lies outside the poses is no part of the window either.
     config = NativeDataParserConfig(data=folder, start_time_ns=0, end_time_ns=END + 10**12)
-    assert parse(config).metadata["time_window"] == (START, END)
+    assert parse(config).metadata[SCENE].window == TimeWindow(START, END)
     with pytest.raises(DataError, match="nothing is left from 9 to 9 ns"):
         parse(NativeDataParserConfig(data=folder, start_time_ns=9, end_time_ns=9))
 
@@ -165,7 +167,9 @@ def test_nothing_is_left_of_a_dataset_that_could_not_be_completed(tmp_path: Path
 def test_options_take_the_place_of_the_sensors_values(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     options = {"positive_contrast_threshold": 0.7, "refractory_period_ns": 0}
-    assert parse(NativeDataParserConfig(data=folder, **options)).metadata["sensor"] == SensorModel(0.7, 0.2, 0, "RGGB")
+    assert parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE].sensor == SensorModel(
+        0.7, 0.2, 0, "RGGB"
+    )
     with pytest.raises(DataError, match=r"positive_contrast_threshold must be a positive number, not 0\.0; .*options"):
         parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
 
@@ -221,13 +225,13 @@ def test_seconds_are_parsed_and_printed_exactly() -> None:
 def test_ecd_text_reads(tmp_path: Path) -> None:
     config = EcdDataParserConfig(data=write_ecd(tmp_path / "made"))
     dataset = EventDataset(parse(config))
-    camera = dataset.metadata["event_camera"]
+    camera = dataset.metadata[SCENE].event_camera
     # The format counts the principal point from the centre of the first pixel.
     assert (camera.width, camera.height, camera.cx, camera.cy) == (6, 4, 3.0, 2.0)
-    (chunk,) = dataset.metadata["event_file"].chunks()
+    (chunk,) = dataset.metadata[SCENE].event_file.chunks()
     assert chunk.t.tolist() == [10_000_000, 20_000_000, 30_000_000, 310_000_000]
     assert chunk.p.tolist() == [1, -1, 1, 1]
-    assert dataset.metadata["time_window"] == (10_000_000, 310_000_000)
+    assert dataset.metadata[SCENE].window == TimeWindow(10_000_000, 310_000_000)
     assert dataset.pairs.time.tolist() == [20_000_000, 310_000_000]
     # Images at 0.05 and 0.25 s validate, 0.15 s tests, 0.35 s is after the last event.
     assert len(parse(config, "val").image_filenames) == 2
@@ -241,19 +245,21 @@ def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     write_tum_trajectory(tmp_path / "other.txt", other)
     config = EcdDataParserConfig(data=folder, trajectory=tmp_path / "other.txt")
     outputs, as_given = parse(config), parse(EcdDataParserConfig(data=folder))
-    assert as_given.metadata["ground_truth"] is None
+    assert as_given.metadata[SCENE].ground_truth is None
     # In the scene's frame, which follows from the estimated poses; images have true ones.
     to_scene = homogeneous(outputs.dataparser_transform.double())
     for name, poses in (("ground_truth", truth), ("trajectory", other)):
-        times = outputs.metadata[name].times
+        times = getattr(outputs.metadata[SCENE], name).times
         expected = to_scene @ homogeneous(poses.interpolate(times)) @ OPENCV_TO_OPENGL
-        torch.testing.assert_close(outputs.metadata[name].camera_to_worlds, expected[:, :3], rtol=0, atol=1e-6)
+        torch.testing.assert_close(
+            getattr(outputs.metadata[SCENE], name).camera_to_worlds, expected[:, :3], rtol=0, atol=1e-6
+        )
     views = parse(config, "test").cameras
     expected = to_scene @ homogeneous(truth.interpolate([150_000_000])) @ OPENCV_TO_OPENGL
     torch.testing.assert_close(views.camera_to_worlds, expected[:, :3].float(), rtol=0, atol=1e-6)
     assert views.metadata is not None
     taken = views.metadata[REFERENCE_SECONDS][0, 0].item()
-    assert taken == pytest.approx(0.15 - 1e-9 * outputs.metadata["trajectory"].start)
+    assert taken == pytest.approx(0.15 - 1e-9 * outputs.metadata[SCENE].trajectory.start)
 
 
 def test_ecd_text_may_hold_comments_and_empty_lines(tmp_path: Path) -> None:
@@ -261,11 +267,11 @@ def test_ecd_text_may_hold_comments_and_empty_lines(tmp_path: Path) -> None:
     events = folder / "events.txt"
     events.write_text("# t x y p\n\n" + events.read_text() + "\n\n")
     dataset = EventDataset(parse(EcdDataParserConfig(data=folder)))
-    assert dataset.metadata["time_window"] == (10_000_000, 310_000_000)
+    assert dataset.metadata[SCENE].window == TimeWindow(10_000_000, 310_000_000)
     assert dataset.pairs.num_events == 4
     replace_line("events.txt", 4, "0.03 9 3 1")(folder)
     with pytest.raises(DataError, match="line 5 has x 9"):
-        list(dataset.metadata["event_file"].chunks())
+        list(dataset.metadata[SCENE].event_file.chunks())
 
 
 def test_the_real_recording_reads(slider_depth: Path) -> None:
@@ -274,12 +280,12 @@ def test_the_real_recording_reads(slider_depth: Path) -> None:
     pairs = dataset.pairs
     assert pairs.num_events == 50_000
     # The first pose is at 0.0223 s, the events begin at 0.0038 s.
-    assert dataset.metadata["time_window"] == (22_291_582, 174_156_000)
+    assert dataset.metadata[SCENE].window == TimeWindow(22_291_582, 174_156_000)
     assert pairs.num_outside == 3_251
     assert len(pairs) + pairs.num_first + pairs.num_outside + pairs.num_merged == 50_000
     assert len(parse(config, "test").image_filenames) == 2
     # A linear slider: straight on, no turn.
-    poses = dataset.metadata["trajectory"].camera_to_worlds
+    poses = dataset.metadata[SCENE].trajectory.camera_to_worlds
     assert (poses[:, :, :3] - poses[:1, :, :3]).abs().max() < 1e-6
     assert torch.linalg.matrix_rank(poses[1:, :, 3] - poses[0, :, 3], atol=1e-4) == 1
 

@@ -22,6 +22,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.recording.scene import SCENE
 from aenerf_ns.recording.structure_from_motion import EstimatedPoses, colmap_camera, compare_with_truth, estimate_poses
 from aenerf_ns.simulator.open_scene import built_in_scene
 from aenerf_ns.simulator.scene import SimulationScene
@@ -80,8 +81,8 @@ def test_the_estimated_poses_are_in_the_dataset_in_metres(dataset: tuple[Path, s
     assert 1e-5 < error.mean() < 0.05 * estimated.extent
     # What comes ahead of the first estimated pose and after the last is not trained on.
     outputs = NativeDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
-    start, end = outputs.metadata["time_window"]
-    assert estimated.start <= start < end == estimated.end < truth.end
+    window = outputs.metadata[SCENE].window
+    assert estimated.start <= window.start < window.end == estimated.end < truth.end
 
 
 def test_frames_without_texture_are_told() -> None:

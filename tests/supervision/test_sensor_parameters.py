@@ -15,7 +15,9 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
+from aenerf_ns.method.networks import FieldConfig
 from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.supervision.pairs import PairSupervisionConfig
 from aenerf_ns.supervision.sensor_parameters import SensorParameters
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipelineConfig
@@ -42,14 +44,13 @@ def test_the_refractory_period_starts_at_the_given_one_and_stays_below_the_bound
 def make_learning_model() -> AENeRFModel:
     model = make_model(
         SensorModel(0.3, 0.2, refractory_period=20_000_000),
-        learn_contrast_threshold_ratio=True,
-        learn_refractory_period=True,
+        supervision=PairSupervisionConfig(learn_contrast_threshold_ratio=True, learn_refractory_period=True),
         loss_coefficients=ALL_LOSSES,
         far_plane=6.0,
     ).double()
     torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
     model.field.average_init_density = 2.0
-    model.sensor_parameters.bound_refractory_period(50_000_000)
+    model.supervision.sensor_parameters.bound_refractory_period(50_000_000)
     return model
 
 
@@ -67,7 +68,7 @@ def test_their_gradients_are_those_of_finite_differences() -> None:
         outputs = model(rays)
         return model.get_loss_dict(outputs, batch)["reconstruction_loss"]
 
-    for name, parameter in model.sensor_parameters.named_parameters():
+    for name, parameter in model.supervision.sensor_parameters.named_parameters():
         (gradient,) = torch.autograd.grad(loss(), parameter)
         values = []
         for step in (1e-5, -1e-5):
@@ -83,8 +84,8 @@ def test_the_starts_of_the_intervals_move_and_what_lies_within_keeps_its_place()
     rays = make_rays(15, with_times=True)
     before = rays.times.clone()
     with torch.no_grad():
-        model.sensor_parameters.raw_refractory_period.add_(0.7)
-    period = model.sensor_parameters.refractory_period.item()
+        model.supervision.sensor_parameters.raw_refractory_period.add_(0.7)
+    period = model.supervision.sensor_parameters.refractory_period.item()
     outputs = model(rays)
     moved = rays.times - before
     torch.testing.assert_close(moved[:5], torch.full_like(moved[:5], period - 0.02), rtol=0, atol=1e-12)
@@ -120,7 +121,9 @@ def test_pairs_are_of_consecutive_events_where_the_refractory_period_is_learned(
         writer.add_trajectories(Trajectory([0, 10**9], poses), None)
     pipeline = AENeRFPipelineConfig(
         datamanager=EventDataManagerConfig(dataparser=NativeDataParserConfig(data=tmp_path / "data")),
-        model=AENeRFModelConfig(log2_hashmap_size=8, learn_refractory_period=learned),
+        model=AENeRFModelConfig(
+            field=FieldConfig(log2_hashmap_size=8), supervision=PairSupervisionConfig(learn_refractory_period=learned)
+        ),
     ).setup(device="cpu", test_mode="val")
     _, batch = pipeline.datamanager.next_train(0)
     assert (batch["num_positive"] == 1).all() == learned

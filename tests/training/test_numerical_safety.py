@@ -210,8 +210,7 @@ def test_training_in_mixed_precision_reaches_the_loss_of_full_precision(
 ) -> None:
     def train(precision: torch.dtype | None) -> float:
         sensor = SensorModel(0.2, 0.3)
-        sampler = make_sampler(random_poses, sensor)
-        sampler.with_time_within, sampler.num_rays_per_batch = True, 120
+        sampler = make_sampler(random_poses, sensor, temporal=True)
         model = make_model(sensor, loss_coefficients=ALL_LOSSES)
         optimizer = torch.optim.Adam(model.parameters(), lr=1e-2, eps=1e-15)
         scaler = torch.amp.GradScaler("cpu", enabled=precision == torch.float16)
@@ -219,7 +218,7 @@ def test_training_in_mixed_precision_reaches_the_loss_of_full_precision(
         for _ in range(60):
             optimizer.zero_grad()
             with torch.autocast("cpu", precision or torch.bfloat16, enabled=precision is not None):
-                rays, batch = sampler.sample()
+                rays, batch = sampler.sample(120)
                 losses = model.get_loss_dict(model(rays), batch)
             scaler.scale(torch.stack(list(losses.values())).sum()).backward()
             scaler.step(optimizer)

@@ -267,7 +267,7 @@ def test_in_a_known_scene_the_correction_finds_the_true_poses(mode: str) -> None
     truth = Trajectory(times, path)
     estimated = perturb(truth, rotation_degrees=2.0, translation=0.05, correlation_time=0.3, seed=0)
     config = PoseCorrectionConfig(mode=mode)
-    model = make_model(bounded=True, camera_optimizer=config, max_resolution=16, trajectory=estimated)
+    model = make_model(bounded=True, camera_optimizer=config, field={"max_resolution": 16}, trajectory=estimated)
     torch.nn.init.uniform_(model.field.encoding.hash_table, -0.5, 0.5)
     model.field.average_init_density = 3.0
     reference = PoseCorrectionConfig(mode="off").setup(

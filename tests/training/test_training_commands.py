@@ -79,8 +79,8 @@ def test_neither_images_nor_ground_truth_are_trained_on(room: Path, workspace: P
 @pytest.mark.parametrize(
     ("method", "small"),
     [
-        ("aenerf", ("--pipeline.model.log2-hashmap-size", "12")),
-        ("aenerf-mlp", ("--pipeline.model.hidden-dim", "32", "--pipeline.model.proposal-hidden-dim", "16")),
+        ("aenerf", ("--pipeline.model.field.log2-hashmap-size", "12")),
+        ("aenerf-mlp", ("--pipeline.model.field.hidden-dim", "32", "--pipeline.model.proposal.hidden-dim", "16")),
     ],
 )
 def test_the_methods_for_gpus_train_too(room: Path, workspace: Path, method: str, small: tuple[str, ...]) -> None:
@@ -121,9 +121,9 @@ def test_two_processes_learn_the_same_from_different_pairs(room: Path, workspace
         "--gradient-accumulation-steps.camera-opt",
         "1",
         # All that is learned besides the scene.
-        "--pipeline.model.learn-contrast-threshold-ratio",
+        "--pipeline.model.supervision.learn-contrast-threshold-ratio",
         "True",
-        "--pipeline.model.learn-refractory-period",
+        "--pipeline.model.supervision.learn-refractory-period",
         "True",
         "--pipeline.model.loss-coefficients.temporal-loss",
         "0.001",

@@ -1,0 +1,42 @@
+"""A stretch of a recording's time, and the gaps in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FIRST_TIME = int(np.iinfo(np.int64).min) + 1
+LAST_TIME = int(np.iinfo(np.int64).max) - 1
+
+
+@dataclass(frozen=True)
+class TimeWindow:
+    """The times from a start to an end, both included, without those strictly inside a gap.
+
+    Attributes:
+        start: nanoseconds.
+        end: nanoseconds.
+        gaps: (first, last) nanoseconds of each gap, in the order of time. The two times themselves are not in the gap.
+    """
+
+    start: int = FIRST_TIME
+    end: int = LAST_TIME
+    gaps: tuple[tuple[int, int], ...] = ()
+
+    def contains(self, times: ArrayLike) -> NDArray[np.bool_]:
+        """Return for (...) times in nanoseconds whether each lies in the window and in no gap."""
+        times = np.asarray(times)
+        inside = (times >= self.start) & (times <= self.end)
+        for first, last in self.gaps:
+            inside = inside & ((times <= first) | (times >= last))
+        return inside
+
+    def pieces(self) -> list[tuple[int, int]]:
+        """Return the first and the last time of each stretch between the gaps, both included."""
+        edges = [self.start, *(time for gap in self.gaps for time in gap), self.end]
+        pieces = (
+            (max(first, self.start), min(last, self.end)) for first, last in zip(edges[::2], edges[1::2], strict=True)
+        )
+        return [(first, last) for first, last in pieces if first <= last]

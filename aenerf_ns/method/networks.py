@@ -1,0 +1,154 @@
+"""The field and the proposal networks of each backbone, and their options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from nerfstudio.field_components.encodings import NeRFEncoding
+from nerfstudio.field_components.spatial_distortions import SpatialDistortion
+from nerfstudio.fields.base_field import Field
+from torch import Tensor
+
+from aenerf_ns.method.encoding.hash_grid import HashEncoding
+from aenerf_ns.method.field import DensityField, DensityShape, EventRadianceField, ProposalNetwork, RadianceShape
+
+Backbone = Literal["hash", "mlp"]
+
+
+@dataclass
+class FieldConfig:
+    """The event radiance field. Options that begin with "hash:" or "mlp:" have no effect on the other backbone."""
+
+    num_samples_per_ray: int = 48
+    """Samples along a ray."""
+    num_levels: int = 16
+    """hash: levels of the grid."""
+    base_resolution: int = 16
+    """hash: cells along an axis on the coarsest level."""
+    max_resolution: int = 2048
+    """hash: cells along an axis on the finest level."""
+    log2_hashmap_size: int = 19
+    """hash: binary logarithm of the entries of a level."""
+    num_frequencies: int = 10
+    """mlp: frequencies of the position's encoding, in octaves from one period across the box or contracted space."""
+    num_hidden_layers: int = 1
+    """Hidden layers from the encoded position to density and feature."""
+    hidden_dim: int = 64
+    """Width of the hidden layers."""
+    geometry_feature_dim: int = 15
+    """Length of the feature that the radiance is computed from, with the view direction."""
+
+
+@dataclass
+class ProposalConfig:
+    """The proposal networks. Options that begin with "hash:" have no effect on the other backbone."""
+
+    num_samples_per_ray: tuple[int, ...] = (256, 96)
+    """Samples of each round of proposals: of each hash network, or of each evaluation of the one mlp."""
+    max_resolutions: tuple[int, ...] = (128, 256)
+    """hash: cells along an axis on the finest level of each network's grid; there are as many networks."""
+    num_levels: int = 5
+    """hash: levels of the grids."""
+    log2_hashmap_size: int = 17
+    """hash: binary logarithm of the entries of a level."""
+    num_hidden_layers: int = 1
+    """Hidden layers of each network."""
+    hidden_dim: int = 16
+    """Width of the hidden layers."""
+    weights_anneal_iterations: int = 1000
+    """Steps over which sampling turns from broad to following the proposal weights."""
+
+
+def make_networks(
+    backbone: Backbone,
+    field: FieldConfig,
+    proposal: ProposalConfig,
+    aabb: Tensor,
+    spatial_distortion: SpatialDistortion | None,
+    num_channels: int,
+    average_init_density: float,
+) -> tuple[EventRadianceField, list[Field]]:
+    """Make the field, and the proposal networks in the order in which they are evaluated.
+
+    Args:
+        backbone: "hash", small networks on hash grids with exponential density; or "mlp", the paper's vanilla e-NeRF
+            and its one proposal e-NeRF (appendix "Model Architecture"), with softplus density.
+        field: options of the field.
+        proposal: options of the proposal networks.
+        aabb: (2, 3) scene box.
+        spatial_distortion: contraction of space, or None for a bounded scene.
+        num_channels: radiance channels of the sensor, 1 or 3.
+        average_init_density: density before training.
+    """
+    make = {"hash": _hash_networks, "mlp": _mlp_networks}[backbone]
+    return make(field, proposal, aabb, spatial_distortion, num_channels, average_init_density)
+
+
+def _hash_networks(
+    field: FieldConfig,
+    proposal: ProposalConfig,
+    aabb: Tensor,
+    spatial_distortion: SpatialDistortion | None,
+    num_channels: int,
+    average_init_density: float,
+) -> tuple[EventRadianceField, list[Field]]:
+    radiance_field = EventRadianceField(
+        aabb,
+        spatial_distortion,
+        HashEncoding(
+            num_levels=field.num_levels,
+            min_res=field.base_resolution,
+            max_res=field.max_resolution,
+            log2_hashmap_size=field.log2_hashmap_size,
+        ),
+        DensityShape(
+            field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "exp", average_init_density
+        ),
+        RadianceShape(num_channels, num_hidden_layers=2, hidden_dim=field.hidden_dim),
+    )
+    return radiance_field, [
+        ProposalNetwork(
+            aabb,
+            spatial_distortion=spatial_distortion,
+            num_levels=proposal.num_levels,
+            max_res=resolution,
+            log2_hashmap_size=proposal.log2_hashmap_size,
+            num_layers=proposal.num_hidden_layers + 1,
+            hidden_dim=proposal.hidden_dim,
+            average_init_density=average_init_density,
+        )
+        for resolution in proposal.max_resolutions
+    ]
+
+
+def _mlp_networks(
+    field: FieldConfig,
+    proposal: ProposalConfig,
+    aabb: Tensor,
+    spatial_distortion: SpatialDistortion | None,
+    num_channels: int,
+    average_init_density: float,
+) -> tuple[EventRadianceField, list[Field]]:
+    # On a position in [0, 1], which the framework's encoding multiplies by 2π: NeRF's frequencies on [-1, 1].
+    encoding = NeRFEncoding(
+        in_dim=3,
+        num_frequencies=field.num_frequencies,
+        min_freq_exp=0.0,
+        max_freq_exp=field.num_frequencies - 1.0,
+        include_input=True,
+        implementation="torch",
+    )
+    radiance_field = EventRadianceField(
+        aabb,
+        spatial_distortion,
+        encoding,
+        DensityShape(
+            field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "softplus", average_init_density
+        ),
+        # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
+        RadianceShape(num_channels, num_hidden_layers=1, hidden_dim=128),
+    )
+    shape = DensityShape(proposal.num_hidden_layers, proposal.hidden_dim, 0, "softplus", average_init_density)
+    # One network, which every round of proposals evaluates again.
+    return radiance_field, [DensityField(aabb, spatial_distortion, encoding, shape)]

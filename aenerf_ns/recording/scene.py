@@ -1,0 +1,47 @@
+"""A recording as the model is given it: in the frame and the units of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from aenerf_ns.camera.image_encoding import ImageEncoding
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventFile
+from aenerf_ns.events.time_window import TimeWindow
+
+SCENE = "scene"
+"""The key of the :class:`Scene` in the metadata of Nerfstudio's dataparser outputs and datasets."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The part of a recording that the dataparser hands to dataset, sampler and model.
+
+    Attributes:
+        trajectory: the estimated trajectory of the event camera, camera-to-world, OpenGL camera axes, scene units.
+        ground_truth: the true trajectory, with the same conventions, or None where it is not known. It serves
+            evaluation only.
+        event_camera: the event camera's lens.
+        event_file: the events, not yet read.
+        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
+        window: the time that is used: where there are both events and poses, without the gaps of the poses.
+        camera_times: (N,) times of the training cameras in nanoseconds; none for the other splits.
+        has_image: whether each camera of the split has an image.
+        image_encoding: whether the images' values are sRGB or linear in radiance.
+        bounded: whether the dataset states a box that holds the whole scene.
+    """
+
+    trajectory: Trajectory
+    ground_truth: Trajectory | None
+    event_camera: EventCamera
+    event_file: EventFile
+    sensor: SensorModel
+    window: TimeWindow
+    camera_times: Tensor
+    has_image: list[bool]
+    image_encoding: ImageEncoding
+    bounded: bool
