@@ -114,6 +114,10 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         assert self.train_pixel_sampler is not None
         return self.train_pixel_sampler.sample(self.config.train_num_rays_per_batch)
 
+    def get_train_rays_per_batch(self) -> int:
+        """Return the most rays of a training batch."""
+        return self.config.train_num_rays_per_batch
+
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """Draw a batch to log the loss on."""
         self.eval_count += 1
