@@ -6,12 +6,12 @@ from pathlib import Path
 
 
 class DataError(ValueError):
-    """Input that cannot be used, told in one line that names the file, the value and the remedy.
+    """Input that cannot be used. The message is one line that names the file, the value and the remedy.
 
     Args:
         source: the file, folder or option the value came from.
         problem: what is wrong, with the offending value.
-        remedy: what the user can do about it.
+        remedy: how the user can mend it.
     """
 
     def __init__(self, source: str | Path, problem: str, remedy: str) -> None:

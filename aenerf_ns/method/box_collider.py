@@ -6,20 +6,20 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider
 
-# The framework leaves rays that miss the box with an interval of this length, up to rounding.
+# The length of the interval that the framework gives to rays that miss the box, up to rounding.
 _MISSED = 1e-5
 
 
 class BoxCollider(AABBBoxCollider):
-    """The framework's box collider, with rays that miss the box ending behind it, and one near plane for all rays.
+    """The framework's box collider, but rays that miss the box end behind it, and the near plane always holds.
 
-    The framework lets rays that miss end anywhere, often at the camera. Their depth, which is that end, would then hide
-    whatever the viewer draws behind: the training cameras around an object. And outside training it has no near plane:
-    a camera within the box would see what no training ray has ever told of.
+    The framework lets rays that miss the box end anywhere, often at the camera. The depth of such a ray is its end, so
+    it would hide whatever the viewer draws behind: the training cameras around an object. And the framework drops the
+    near plane outside training, so a camera inside the box would see matter that no training ray has passed.
     """
 
     def set_nears_and_fars(self, ray_bundle: RayBundle) -> RayBundle:
-        """Fills in ``nears`` and ``fars`` (N, 1), distances in scene units."""
+        """Fill in ``nears`` and ``fars`` (N, 1), distances in scene units."""
         ray_bundle = super().set_nears_and_fars(ray_bundle)
         nears = ray_bundle.nears.clamp_min(self.near_plane)
         fars = torch.maximum(ray_bundle.fars, nears)

@@ -1,4 +1,7 @@
-"""From log-radiance, which events determine up to an affine map at best, to a picture: four named protocols."""
+"""Colour correction: from rendered log-radiance to a picture, by four named protocols.
+
+Events determine log-radiance only up to an affine map per channel, so that map has to come from elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from aenerf_ns.camera.image_encoding import ImageEncoding, encode
 
 ColorCorrectionProtocol = Literal["affine", "affine-test", "network", "none"]
 
-# Added to radiance in [0, 1] before the logarithm, so that black reference pixels are finite.
+# Added to radiance in [0, 1] before the logarithm, so that black reference pixels stay finite.
 _EPSILON = 1e-3
 # Without reference images: the share of pixels that may clip at either end, and the radiance the ends are mapped to.
 _CLIPPED = 0.01
@@ -39,7 +42,7 @@ class NoColorCorrection(nn.Module):
         self.encoding = encoding
 
     def forward(self, log_radiance: Tensor) -> Tensor:
-        """Display values in [0, 1], (..., channels), of rendered log-radiance (..., channels)."""
+        """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
         return encode(torch.exp(log_radiance), self.encoding)
 
     @property
@@ -49,8 +52,9 @@ class NoColorCorrection(nn.Module):
 
 
 class AffineColorCorrection(nn.Module):
-    """Protocol ``affine``: per-channel affine map of log-radiance (paper, "Color Correction of Synthesized Views"),
-    kept in checkpoints.
+    """Protocol ``affine``: an affine map of log-radiance per channel (paper, "Color Correction of Synthesized Views").
+
+    The map is fitted on the validation views and kept in checkpoints.
 
     Args:
         num_channels: radiance channels, 1 or 3.
@@ -73,7 +77,7 @@ class AffineColorCorrection(nn.Module):
         self.register_buffer("num_views", torch.zeros((), dtype=torch.int64))
 
     def forward(self, log_radiance: Tensor) -> Tensor:
-        """Display values in [0, 1], (..., channels), of rendered log-radiance (..., channels)."""
+        """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
         return encode(torch.exp(self.scale * log_radiance + self.offset) - _EPSILON, self.encoding)
 
     @property
@@ -90,17 +94,17 @@ class AffineColorCorrection(nn.Module):
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
-        """Least squares of log(reference + ε) against log-radiance, per channel, in float64.
+        """Fit log(reference + ε) to log-radiance by least squares, per channel, in float64.
 
         Args:
             log_radiance: (N, channels) rendered.
             reference: (N, channels) linear radiance in [0, 1] of the same pixels.
             num_views: number of reference views these pixels are from.
-            rough: do only what takes next to no time. This fit never takes longer.
+            rough: leave out whatever takes time. The affine fit takes next to none, so it is the same either way.
         """
         x, y = log_radiance.double(), torch.log(reference.double() + _EPSILON)
         x_mean, y_mean = x.mean(0), y.mean(0)
-        # A constant rendering, as before training, has no slope: the offset alone is fitted.
+        # A constant rendering, such as before training, has no slope. Then only the offset is fitted.
         scale = ((x - x_mean) * (y - y_mean)).sum(0) / (x - x_mean).square().sum(0).clamp_min(1e-12)
         self.scale.copy_(scale)
         self.offset.copy_(y_mean - scale * x_mean)
@@ -108,7 +112,7 @@ class AffineColorCorrection(nn.Module):
 
     @torch.no_grad()
     def stretch(self, log_radiance: Tensor) -> None:
-        """Without reference images: maps the 1st and 99th percentile over all channels to dark and bright.
+        """Map the 1st and the 99th percentile over all channels to dark and bright, without reference images.
 
         Args:
             log_radiance: (N, channels) rendered.
@@ -124,8 +128,10 @@ class AffineColorCorrection(nn.Module):
 
 
 class AffineTestColorCorrection(AffineColorCorrection):
-    """Protocol ``affine-test``: the affine map fitted on the very views that are evaluated, as Robust e-NeRF does. Only
-    to compare with figures that were made so."""
+    """Protocol ``affine-test``: the affine map, fitted on the views that are evaluated, as Robust e-NeRF does.
+
+    Use it only to compare with figures that were made that way.
+    """
 
     protocol = "affine-test"
     split = "test"
@@ -136,10 +142,11 @@ class AffineTestColorCorrection(AffineColorCorrection):
 
 
 class NetworkColorCorrection(AffineColorCorrection):
-    """Protocol ``network``: the paper's learned F (eq. 15), from the log-radiance of all channels of a pixel to its
-    display values. F is the affine map and a small network that is added to what it displays.
+    """Protocol ``network``: the paper's learned F (eq. 15), from a pixel's log-radiance to its display values.
 
-    The network is learned in :meth:`fit` and not by training, so its weights are buffers and not parameters.
+    F is the affine map plus a small network, whose output is added to the display values of the affine map.
+
+    The weights of the network are buffers, not parameters, because :meth:`fit` learns them and training does not.
     """
 
     protocol = "network"
@@ -156,7 +163,7 @@ class NetworkColorCorrection(AffineColorCorrection):
             self.register_buffer(f"bias_{layer}", torch.zeros(num_outputs))
 
     def forward(self, log_radiance: Tensor) -> Tensor:
-        """Display values in [0, 1], (..., channels), of rendered log-radiance (..., channels)."""
+        """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
         return (super().forward(log_radiance) + self._residual(log_radiance, self._layers)).clamp(0, 1)
 
     @property
@@ -171,13 +178,13 @@ class NetworkColorCorrection(AffineColorCorrection):
     def _residual(self, log_radiance: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         hidden = (log_radiance - self.input_mean) / self.input_deviation
         for weight, bias in layers[:-1]:
-            # Bounded, so that radiance that no reference view showed is not sent astray.
+            # Bounded, so that radiance outside the range of the reference views is not sent astray.
             hidden = torch.tanh(F.linear(hidden, weight, bias))
         return F.linear(hidden, *layers[-1])
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
-        """Fits the affine map, and then the network to what is left: least squares of display values, with Adam.
+        """Fit the affine map, then the network to the error that is left, by least squares of display values, with Adam.
 
         Args:
             log_radiance: (N, channels) rendered.
@@ -208,7 +215,7 @@ class NetworkColorCorrection(AffineColorCorrection):
 
     @torch.no_grad()
     def stretch(self, log_radiance: Tensor) -> None:
-        """Without reference images: the percentile stretch alone.
+        """Apply the percentile stretch alone, without reference images.
 
         Args:
             log_radiance: (N, channels) rendered.
@@ -217,8 +224,8 @@ class NetworkColorCorrection(AffineColorCorrection):
         self._reset_network()
 
     def _reset_network(self) -> None:
-        """Random hidden layers, the same every time, and an output of zero: the affine map alone."""
-        # Its own generator: which protocol is chosen must not change what training draws.
+        """Set the output to zero, which leaves the affine map, and the hidden layers to always the same weights."""
+        # With a generator of its own: the choice of the protocol must not change the numbers that training draws.
         generator = torch.Generator().manual_seed(0)
         for weight, bias in self._layers:
             weight.copy_(torch.randn(weight.shape, generator=generator) / weight.shape[1] ** 0.5)

@@ -1,4 +1,4 @@
-"""The event radiance field, density and unbounded positive radiance, and a field of density alone."""
+"""The event radiance field, with density and unbounded positive radiance, and a field of density alone."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from aenerf_ns.method.encoding.hash_grid import HashEncoding
 
-# The framework's trunc_exp cuts gradients at the same value, but is a custom function without forward-mode derivatives,
-# and overflows.
+# The framework's trunc_exp cuts gradients at the same value, but it overflows, and it is a custom function without
+# forward-mode derivatives.
 _MAX_LOG_DENSITY = 15.0
 
 # The hidden layer whose output the encoding is joined to (NeRF, https://arxiv.org/abs/2003.08934, fig. 7).
@@ -165,14 +165,14 @@ class EventRadianceField(DensityField):
 class ProposalNetwork(HashMLPDensityField):
     """Nerfstudio's proposal network on this package's hash encoding, with the density of the field.
 
-    The framework's density is an exponential that overflows, with gradients that are then not finite.
+    The framework's density is an exponential that overflows, and then its gradients are not finite.
 
     Args:
         aabb: (2, 3) scene box.
         num_levels: levels of the hash grid.
         max_res: cells along an axis on the finest level.
         log2_hashmap_size: binary logarithm of the entries of a level.
-        options: the framework's others.
+        options: the other options of the framework's network.
     """
 
     def __init__(self, aabb: Tensor, num_levels: int, max_res: int, log2_hashmap_size: int, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""Image metrics that neither need a download nor report a number they do not have."""
+"""PSNR, SSIM and LPIPS, which is reported as absent where its weights cannot be had."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class ImageMetrics:
     """PSNR, SSIM and, when asked for, LPIPS of an image.
 
     Args:
-        with_lpips: whether to report LPIPS. Its network is built on first use; where the weights cannot be had, the
+        with_lpips: whether to report LPIPS. Its network is built on first use. Where the weights cannot be had, the
             metric is left out and ``lpips_absent`` tells why.
 
     Attributes:
@@ -24,13 +24,13 @@ class ImageMetrics:
         self.lpips_absent: str | None = None if with_lpips else "not asked for (--pipeline.model.lpips True)"
 
     def __call__(self, predicted: Tensor, reference: Tensor) -> dict[str, float]:
-        """Metrics of display values in [0, 1].
+        """Return the metrics of display values in [0, 1] by their names.
 
         Args:
             predicted: (H, W, 3).
             reference: (H, W, 3).
         """
-        # Late, for every command of every method would wait for it.
+        # Imported lazily: every ns-* command imports this module, and torchmetrics is slow to import.
         from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
         predicted, reference = (image.moveaxis(-1, 0)[None].float() for image in (predicted, reference))
@@ -50,11 +50,11 @@ class ImageMetrics:
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         try:
-            # It draws weights ahead of those that it loads, more of them where these can be had: what training draws
-            # afterwards must depend on neither.
+            # Building LPIPS draws random weights before it loads the trained ones, and draws more of them where the
+            # trained ones can be had. The numbers that training draws must not depend on that.
             with torch.random.fork_rng(devices=[]):
                 self._lpips = LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
         except Exception as error:
-            # torch.hub raises whatever its connection raises.
+            # torch.hub passes on every error of its connection.
             self.lpips_absent = f"the weights of AlexNet could not be had ({error})"
             CONSOLE.print(f"[yellow]LPIPS is not reported: {self.lpips_absent}.")

@@ -1,4 +1,4 @@
-"""The AE-NeRF model: two-stage event radiance field, its losses and its pictures."""
+"""The AE-NeRF model: a two-stage event radiance field, its losses and its pictures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from aenerf_ns.recording.scene import SCENE, Scene
 from aenerf_ns.supervision.base import Supervision, SupervisionConfig
 from aenerf_ns.supervision.pairs import PairSupervisionConfig
 
-# ε of the paper's appendix "Model Architecture": the least radiance that can be rendered.
+# ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
 
 
@@ -48,18 +48,18 @@ class AENeRFModelConfig(ModelConfig):
 
     _target: type = dataclasses.field(default_factory=lambda: AENeRFModel)
     scene_contraction: Literal["auto", "l2", "linf", "none"] = "auto"
-    """How unbounded space is contracted (paper, eq. 7: l2). "auto" is "none" for a dataset that states a scene box
-    and "l2" for others."""
+    """How unbounded space is contracted (paper, eq. 7: l2). "auto": "none" for a dataset that states a scene box, "l2"
+    for others."""
     near_plane: float = 0.05
     """Distance at which rays start, in scene units."""
     far_plane: float = 1000.0
     """Distance at which rays end in an unbounded scene, in scene units."""
     background: Literal["auto", "learned", "none"] = "auto"
-    """Whether rays that pass the scene see a uniform background of learned radiance. "auto" is "learned" for a dataset
-    that states a scene box and "none" for others."""
+    """Whether rays that pass the scene see a uniform background of learned radiance. "auto": "learned" for a dataset
+    that states a scene box, "none" for others."""
     backbone: Backbone = "hash"
-    """What field and proposal networks are: small networks on hash grids, with exponential density, or the paper's
-    large networks on sinusoidal encodings, with softplus density."""
+    """Kind of field and proposal networks. "hash": small networks on hash grids, with exponential density. "mlp": the
+    paper's large networks on sinusoidal encodings, with softplus density."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     """The event radiance field."""
     proposal: ProposalConfig = dataclasses.field(default_factory=ProposalConfig)
@@ -70,21 +70,21 @@ class AENeRFModelConfig(ModelConfig):
         {"reconstruction_loss": 1.0, "temporal_loss": 0.0, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
     )
     """Weights of the losses (paper, eq. 14: alpha, beta, gamma, eta). A weight of 0 turns a loss off. The paper's beta
-    is 0.001; on hash grids it has not been seen to help."""
+    is 0.001. On hash grids the temporal loss has not been seen to help."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=PairSupervisionConfig)
     """What renderings are compared with. The datamanager's sampler draws the batches for it."""
     camera_optimizer: PoseCorrectionConfig = dataclasses.field(default_factory=PoseCorrectionConfig)
-    """Pose correction."""
+    """Correction of the estimated poses."""
     color_correction: ColorCorrectionProtocol = "affine"
-    """How log-radiance becomes a picture: by an affine map per channel fitted on the validation views, or on the test
-    views themselves (only to compare with figures that were made so), by a network fitted on the validation views
-    (paper, eq. 15), or as it is."""
+    """How log-radiance becomes a picture. "affine": by an affine map per channel, fitted on the validation views.
+    "affine-test": by one fitted on the test views themselves, only to compare with figures that were made that way.
+    "network": by a network fitted on the validation views (paper, eq. 15). "none": unchanged."""
     color_correction_num_rays: int = 16384
-    """Pixels, spread over all reference views it is fitted on, on which the colour correction is fitted."""
+    """Pixels that the colour correction is fitted on, spread over the reference views."""
     lpips: bool = False
-    """Also report LPIPS. It needs the AlexNet weights of torchvision, which are downloaded on first use."""
+    """Report LPIPS too. It needs torchvision's weights of AlexNet, which are downloaded on first use."""
     eval_num_rays_per_chunk: int = 1 << 13
-    """Rays rendered at once outside training."""
+    """Rays that are rendered at once outside training."""
 
 
 class AENeRFModel(Model):
@@ -153,7 +153,7 @@ class AENeRFModel(Model):
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Hash tables (and the background), if there are any, apart from the networks, which alone get weight decay."""
+        """Return the parameters by optimizer: only networks get weight decay, hash tables and background do not."""
         groups: dict[str, list[Parameter]] = {"encodings": [], "networks": []}
         for module in (self.field, self.proposal_networks):
             for name, parameter in module.named_parameters():
@@ -172,7 +172,7 @@ class AENeRFModel(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Schedules the proposal sampler as the framework's own methods do."""
+        """Return the callbacks that schedule the proposal sampler as the framework's own methods do."""
 
         def set_anneal(step: int) -> None:
             # https://arxiv.org/pdf/2111.12077.pdf, eq. 18
@@ -198,12 +198,12 @@ class AENeRFModel(Model):
         return super().forward(ray_bundle) | learned
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Renders a camera; one of a reference image from where it is in the frame of the corrected poses."""
+        """Render a camera. The camera of a reference image is carried over to the frame of the corrected poses."""
         moved = replace(camera, camera_to_worlds=self.camera_optimizer.apply_to_camera(camera))
         return super().get_outputs_for_camera(moved, obb_box)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Renders rays.
+        """Render rays.
 
         Returns:
             ``rgb`` (N, 3) colour-corrected display values, ``log_radiance`` (N, channels) the raw log L̂,
@@ -242,10 +242,10 @@ class AENeRFModel(Model):
         return outputs
 
     def _composite(self, samples: RaySamples) -> tuple[Tensor, Tensor]:
-        """Log-radiance (N, channels) and weights (N, samples, 1); in plain operations, for every differentiation."""
+        """Return log-radiance (N, channels) and weights (N, samples, 1), differentiable in every mode."""
         field_outputs = self.field(samples)
         weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
-        # Not the framework's RGBRenderer, which clips to [0, 1] outside training: radiance has no upper bound.
+        # Not by the framework's RGBRenderer, which clips to [0, 1] outside training: radiance has no upper bound.
         radiance = (weights * field_outputs[FieldHeadNames.RGB]).sum(-2)
         if self.raw_background is not None:
             radiance = radiance + (1 - weights.sum(-2)) * F.softplus(self.raw_background)
@@ -270,29 +270,32 @@ class AENeRFModel(Model):
         return metrics | self.supervision.learned()
 
     def new_color_correction(self, protocol: ColorCorrectionProtocol) -> ColorCorrection:
-        """A colour correction for this model's pictures, not yet fitted."""
+        """Return a colour correction for this model's pictures, not yet fitted."""
         return COLOR_CORRECTIONS[protocol](self.sensor.num_channels, self.image_encoding)
 
     def reference_radiance(self, image: Tensor) -> Tensor:
-        """Linear radiance (..., channels), as the sensor sees it, of reference image values (..., 3)."""
+        """Return linear radiance (..., channels), as the sensor sees it, for reference image values (..., 3)."""
         return to_channels(decode(image[..., :3], self.image_encoding), self.sensor.num_channels)
 
     def reference_display(self, image: Tensor) -> Tensor:
-        """Display values (..., 3), as the sensor sees it, of reference image values (..., 3)."""
+        """Return display values (..., 3), as the sensor sees them, for reference image values (..., 3)."""
         return _grey_to_rgb(encode(self.reference_radiance(image), self.image_encoding))
 
     def display(self, log_radiance: Tensor) -> Tensor:
-        """Colour-corrected display values (..., 3) of rendered log-radiance (..., channels)."""
+        """Return colour-corrected display values (..., 3) for rendered log-radiance (..., channels)."""
         return _grey_to_rgb(self.color_correction(log_radiance))
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Display values and opacity (..., 4): exporters leave out what is transparent."""
+        """Return display values and opacity (..., 4): exporters leave out what is transparent."""
         return torch.cat([outputs[output_name], outputs["accumulation"].clamp(0, 1)], dim=-1)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR, SSIM (and LPIPS) of the display values against the reference, as the sensor sees it, side by side."""
+        """Return the metrics of the display values, and pictures with the reference beside the rendering.
+
+        The reference is shown as the sensor sees it: grey for a monochrome sensor.
+        """
         predicted = outputs["rgb"]
         reference = self.reference_display(batch["image"].to(predicted.device))
         images = {
@@ -304,7 +307,7 @@ class AENeRFModel(Model):
 
     @torch.no_grad()
     def render_log_radiance(self, rays: RayBundle) -> Tensor:
-        """Log-radiance (N, channels) of rays, in evaluation mode and whatever the number of rays."""
+        """Return log-radiance (N, channels) of any number of rays, rendered in evaluation mode."""
         was_training = self.training
         self.eval()
         chunk = self.config.eval_num_rays_per_chunk
@@ -319,5 +322,5 @@ def _is_of_batch(ray_bundle: RayBundle) -> bool:
 
 
 def _grey_to_rgb(values: Tensor) -> Tensor:
-    """(..., 3) of (..., channels), 1 or 3."""
+    """Return (..., 3) values for (..., channels) values of 1 or 3 channels."""
     return values.expand(*values.shape[:-1], 3)

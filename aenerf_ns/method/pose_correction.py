@@ -20,49 +20,49 @@ from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS, REFERENCE_SECONDS, TRAJ
 from aenerf_ns.camera.rotation import motion_from_twist
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 
-# Poses at which trajectories are compared: enough for any metric, and quick enough to be logged.
+# Poses at which trajectories are compared: enough for any metric, few enough to be logged quickly.
 _MAX_COMPARED = 2000
-# A step of the optimizer changes hundreds of weights behind each number of a network's twist, and few behind a
-# spline's. With this factor on the network's output both move about as far at one learning rate.
+# A step of the optimizer changes hundreds of weights behind each number of a network's twist, but few behind a number
+# of a spline's. With this factor on the network's output, both move about as far at one learning rate.
 _NETWORK_OUTPUT_SCALE = 2e-3
 _SMALLEST_EXTENT = 1e-6
 
 
 @dataclass
 class PoseCorrectionConfig(CameraOptimizerConfig):
-    """Pose correction along the trajectory."""
+    """Correction of the estimated poses along the trajectory."""
 
     _target: type = field(default_factory=lambda: PoseCorrection)
     mode: Literal["off", "network", "spline"] = "off"
-    """The paper's network, a cubic B-spline of twists, or none."""
+    """How corrections vary in time: by the paper's network, by a cubic B-spline of twists, or not at all."""
     trans_l2_penalty: float = 1e-2
     """Weight of the mean squared translation of the corrections, in units of the trajectory's extent."""
     rot_l2_penalty: float = 1e-2
     """Weight of the mean squared rotation of the corrections, in radians."""
     knot_interval: float = 0.1
-    """Seconds between the knots of the spline: it can correct errors that change more slowly."""
+    """Seconds between the knots of the spline. It corrects errors that change more slowly than that."""
     num_frequencies: int = 3
     """Frequencies of the network's sinusoidal encoding."""
 
 
 class PoseCorrection(CameraOptimizer):
-    """A twist ξ(t) for every time, so that the corrected pose is base pose(t) · exp(ξ(t)) (paper, eq. 6).
+    """Corrects the pose at every time t to base pose(t) · exp(ξ(t)), with a twist ξ (paper, eq. 6).
 
-    ξ is zero at first, with gradients that are not. What the network or the spline gives counts in radians and, for the
-    translation, in units of the trajectory's extent (root mean square distance from its middle), so that a learning
-    rate means the same for a camera that moves by centimetres and one that walks through a hall.
+    ξ is zero before training, but its gradients are not. Network and spline count rotation in radians and translation
+    in units of the trajectory's extent (root mean square distance from its middle). So a learning rate means the same
+    for a camera that moves by centimetres and for a camera that is carried through a hall.
 
-    The scene is reconstructed in the frame of the corrected poses, while reference images have poses in the frame of
-    the true trajectory or, where that is not known, of the estimated one. :meth:`apply_to_camera` carries their cameras
-    over.
+    The scene is reconstructed in the frame of the corrected poses. Reference images have poses in the frame of the true
+    trajectory or, where the true trajectory is not known, of the estimated one. :meth:`apply_to_camera` carries the
+    cameras of reference images over.
 
     Args:
-        config: the kind of correction and its regularisation.
+        config: the kind of correction and its penalties.
         num_cameras: training cameras.
         device: of the parameters.
         trajectory: the estimated trajectory, camera-to-world, OpenGL camera axes, in scene units.
         camera_times: (num_cameras,) times of the training cameras in nanoseconds, for :meth:`forward`.
-        ground_truth: the true trajectory, if it is known; likewise. It never enters a loss.
+        ground_truth: the true trajectory with the same conventions, or None. It never enters a loss.
     """
 
     config: PoseCorrectionConfig
@@ -92,7 +92,7 @@ class PoseCorrection(CameraOptimizer):
         self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
         self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
         self._duration = (trajectory.end - trajectory.start) * 1e-9
-        # A camera that only turns gives translations no unit: that of the scene will do.
+        # A camera that only turns gives translations no unit. The unit of the scene serves instead.
         extent = trajectory.extent if trajectory.extent > _SMALLEST_EXTENT else 1.0
         units = torch.tensor([extent] * 3 + [1.0] * 3)
         self.register_buffer("_twist_units", units, persistent=False)
@@ -104,18 +104,20 @@ class PoseCorrection(CameraOptimizer):
             self.twists = TwistSpline(self._duration, config.knot_interval)
 
     def pose(self, seconds: Tensor) -> Tensor:
-        """Corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
+        """Return corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
         return self._corrected(seconds, self.trajectory.pose(seconds))
 
     def _corrected(self, seconds: Tensor, base: Tensor) -> Tensor:
-        """Corrected poses where the estimated ones are ``base`` (N, 3, 4)."""
+        """Return corrected poses (N, 3, 4) for the estimated poses ``base`` (N, 3, 4)."""
         if self.twists is None:
             return base
         return base @ motion_from_twist((self._twist_units * self.twists(seconds, base)).double())
 
     def forward(self, indices: Tensor) -> Tensor:
-        """The framework's contract: (N, 3, 4) motions that the training cameras' poses are multiplied with, none once
-        these are corrected (``training_cameras_are_corrected``)."""
+        """Return (N, 3, 4) motions that the framework multiplies the training cameras' poses with.
+
+        The motions are identities once ``training_cameras_are_corrected``.
+        """
         if self.training_cameras_are_corrected:
             return torch.eye(4, device=indices.device)[:3].expand(len(indices), 3, 4)
         seconds = self._camera_seconds[indices]
@@ -123,19 +125,19 @@ class PoseCorrection(CameraOptimizer):
         return (torch.linalg.inv(base) @ homogeneous(self.pose(seconds)))[:, :3].float()
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
-        """Moves the rays of a training batch, which have times, from the camera's frame to the corrected poses."""
+        """Move the rays of a batch, which have times, from the camera's frame to the corrected poses."""
         assert raybundle.times is not None
         origins, directions = world_rays(self.pose(raybundle.times[:, 0]), raybundle.metadata[CAMERA_DIRECTIONS])
         raybundle.origins, raybundle.directions = origins.to(raybundle.origins), directions.to(raybundle.directions)
 
     def apply_to_camera(self, camera: Cameras) -> Tensor:
-        """Poses (N, 3, 4) in the scene of cameras.
+        """Return the poses (N, 3, 4) of cameras in the frame of the corrected poses.
 
-        Those on the estimated trajectory get the corrected poses of their times. Those of reference images are moved
-        from the reference frame to that of the corrected poses: with ground truth by the Sim(3) that best maps the
-        corrected trajectory to the true one; without it as the corrected pose at the time the image was taken, and
-        images not taken on the trajectory by the Sim(3) to the estimated one. All other cameras are in the scene's
-        frame and stay.
+        - Cameras on the estimated trajectory get the corrected poses of their times.
+        - Cameras of reference images are moved, with ground truth, by the Sim(3) that best maps the corrected
+          trajectory to the true one. Without ground truth they move with the corrected pose of the time when the image
+          was taken, or, for images that were not taken on the trajectory, by the Sim(3) to the estimated trajectory.
+        - All other cameras are in the scene's frame already and stay.
         """
         poses = camera.camera_to_worlds
         metadata = camera.metadata or {}
@@ -156,19 +158,21 @@ class PoseCorrection(CameraOptimizer):
             return carried.to(poses)
 
     def alignment(self) -> Similarity:
-        """The Sim(3) that best maps the corrected trajectory to the true one, or where that is not known to the
-        estimated one."""
+        """Return the Sim(3) that best maps the corrected trajectory to the true one.
+
+        Where the true trajectory is not known, the estimated one takes its place.
+        """
         with torch.no_grad():
             return align(self.pose(self._compared_seconds), self._reference_poses)
 
     def compared_poses(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Estimated, corrected and reference poses (N, 3, 4) at the same times, in scene units."""
+        """Return estimated, corrected and reference poses (N, 3, 4) at the same times, in scene units."""
         with torch.no_grad():
             estimated, corrected = (source.pose(self._compared_seconds) for source in (self.trajectory, self))
         return estimated, corrected, self._reference_poses
 
     def ray_rates(self, raybundle: RayBundle) -> tuple[Tensor, Tensor]:
-        """Derivatives of the corrected rays' origins and directions (N, 3) with respect to time, per second."""
+        """Return the derivatives of the corrected rays' origins and directions (N, 3) by time, per second."""
         assert raybundle.times is not None
         seconds = raybundle.times[:, 0]
         pose, rate = self.trajectory.pose_and_rate(seconds)
@@ -183,7 +187,7 @@ class PoseCorrection(CameraOptimizer):
         return origin_rates.to(raybundle.origins), direction_rates.to(raybundle.origins)
 
     def get_loss_dict(self, loss_dict: dict[str, Tensor]) -> None:
-        """Adds the mean squared size of the corrections over the run, so that good poses stay as they are."""
+        """Add the mean squared size of the corrections over the recording, so that good poses stay as they are."""
         if self.twists is None:
             return
         twist = self._sampled_twists()
@@ -193,7 +197,7 @@ class PoseCorrection(CameraOptimizer):
         )
 
     def get_metrics_dict(self, metrics_dict: dict[str, Any]) -> None:
-        """Adds the root mean square size of the corrections."""
+        """Add the root mean square size of the corrections: scene units and degrees."""
         if self.twists is None:
             return
         with torch.no_grad():
@@ -202,20 +206,20 @@ class PoseCorrection(CameraOptimizer):
         metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
 
     def _sampled_twists(self) -> Tensor:
-        """Twists at times spread over the trajectory, in every interval of the spline, in units of its extent."""
+        """Return twists, in units of the trajectory's extent, at times in every interval of the spline."""
         assert self.twists is not None
         count = max(64, math.ceil(self._duration / self.config.knot_interval))
         seconds = torch.linspace(0, self._duration, count, dtype=torch.float64, device=self._camera_seconds.device)
         return self.twists(seconds, self.trajectory.pose(seconds))
 
     def get_param_groups(self, param_groups: dict[str, list[nn.Parameter]]) -> None:
-        """Adds the parameters as the group ``camera_opt``, where there are any."""
+        """Add the parameters as the group ``camera_opt``, where there are any."""
         if self.twists is not None:
             param_groups["camera_opt"] = list(self.parameters())
 
 
 def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Origins and unit directions (N, 3) in the world of rays in the camera's frame.
+    """Return origins and unit directions (N, 3) in the world for rays in the camera's frame.
 
     Args:
         poses: (N, 3, 4) camera-to-world.
@@ -225,7 +229,7 @@ def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _compared_times(trajectory: Trajectory, ground_truth: Trajectory | None) -> Tensor:
-    """Times in nanoseconds of at most _MAX_COMPARED knots, evenly thinned out, that the ground truth covers."""
+    """Return times in nanoseconds of at most _MAX_COMPARED knots that the ground truth covers, evenly spread."""
     times = trajectory.times if ground_truth is None else trajectory.knots_covered_by(ground_truth)
     count = min(len(times), _MAX_COMPARED)
     return times[torch.linspace(0, len(times) - 1, count, dtype=torch.float64).round().long()]
@@ -235,8 +239,8 @@ class TwistNetwork(nn.Module):
     """The paper's pose correction network (appendix, algorithm 1; softplus as in its text).
 
     Args:
-        trajectory: estimated trajectory, for the span of its times.
-        num_frequencies: of the sinusoidal encoding.
+        trajectory: estimated trajectory, whose span the times lie in.
+        num_frequencies: frequencies of the sinusoidal encoding.
     """
 
     def __init__(self, trajectory: Trajectory, num_frequencies: int) -> None:
@@ -257,20 +261,20 @@ class TwistNetwork(nn.Module):
         size = self.encoding.get_out_dim()
         for _ in range(4):
             linear = nn.Linear(size, width)
-            # With PyTorch's initialisation and a blunt softplus hardly any of the input's variation reaches the output:
-            # all that such a network learns for long is one correction for all times.
+            # With PyTorch's initialisation and a blunt softplus, hardly any of the input's variation reaches the output.
+            # For long, such a network learns only one correction for all times.
             nn.init.kaiming_normal_(linear.weight)
             nn.init.zeros_(linear.bias)
             layers += [linear, nn.Softplus(beta=100)]
             size = width
         self.hidden = nn.Sequential(*layers)
         self.output = nn.Linear(width, 6)
-        # No correction at first; the gradient of these weights is not zero.
+        # No correction before training. The gradient of these weights is not zero.
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
     def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
-        """Twists (N, 6) at (N,) seconds, where the estimated poses are (N, 3, 4)."""
+        """Return twists (N, 6) at (N,) seconds, for estimated poses (N, 3, 4)."""
         dtype = self.output.weight.dtype
         time = (2 * seconds / self._duration - 1).to(dtype)[:, None]
         # Half precision cannot tell the two ends of an interval apart.
@@ -295,7 +299,7 @@ class TwistSpline(nn.Module):
         self.control_twists = nn.Parameter(torch.zeros(self._segments + 3, 6))
 
     def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
-        """Twists (N, 6) at (N,) seconds; the poses play no part."""
+        """Return twists (N, 6) at (N,) seconds. The poses play no part."""
         position = seconds / self._interval
         segment = position.detach().floor().long().clamp(0, self._segments - 1)
         u = (position - segment)[:, None]

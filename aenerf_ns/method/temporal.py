@@ -17,15 +17,15 @@ def log_radiance_rate(
     rays: tuple[Tensor, Tensor],
     ray_rates: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """G_pred of the paper (before eq. 12): the total derivative d log L̂ / dt while the rays move.
+    """Return G_pred of the paper (before eq. 12): the total derivative d log L̂ / dt while the rays move.
 
-    Exact, by forward-mode automatic differentiation through the field and the compositing; gradients flow on to the
-    parameters of both the field and the rays' motion with one ordinary backward pass. The samples' distances along
-    the ray are held constant. In full precision even under autocast: on a fine grid, rates per second exceed the range
-    of half precision.
+    The derivative is exact: forward-mode automatic differentiation goes through the field and the compositing. One
+    ordinary backward pass then reaches the parameters of the field and of the rays' motion. The samples' distances
+    along the ray are held constant. Everything is in full precision even under autocast, because on a fine grid rates
+    per second exceed the range of half precision.
 
     Args:
-        render: gives log-radiance (N, channels) and weights (N, samples, 1) of ray samples.
+        render: returns log-radiance (N, channels) and weights (N, samples, 1) for ray samples.
         samples: samples along the N rays.
         rays: origins and directions (N, 3).
         ray_rates: their derivatives with respect to time (N, 3), per second.

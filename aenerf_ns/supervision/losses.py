@@ -1,4 +1,4 @@
-"""The losses on rendered log-radiance. Those on the ray weights are the framework's."""
+"""The losses on rendered log-radiance. The losses on ray weights are the framework's."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch import Tensor
 def log_radiance_change(
     num_positive: Tensor, num_negative: Tensor, positive_threshold: Tensor | float, negative_threshold: float
 ) -> Tensor:
-    """Change of log-radiance that a pair of events tells of: Δ = n+ C+ − n− C− (paper, eq. 5).
+    """Return the change of log-radiance that a pair of events tells of: Δ = n+ C+ − n− C− (paper, eq. 5).
 
     Args:
         num_positive: (N,) positive events after the earlier time up to the later one.
-        num_negative: (N,) negative events, likewise.
+        num_negative: (N,) negative events in the same time.
         positive_threshold: C+; a scalar in the graph when it is learned.
         negative_threshold: C−.
 
@@ -26,11 +26,13 @@ def log_radiance_change(
 def silent_change(
     predicted: Tensor, change: Tensor, positive_threshold: Tensor | float, negative_threshold: float
 ) -> Tensor:
-    """The change nearest to the predicted one after which a pixel is still silent: within a threshold of its events'.
+    """Return the change nearest to the predicted one that leaves a pixel silent.
+
+    A pixel is silent as long as its log-radiance is within a threshold of the value at its last event.
 
     Args:
         predicted: (N,) rendered changes of log-radiance up to a moment between two events.
-        change: (N,) changes that the events tell of up to the last one before it.
+        change: (N,) changes that the events tell of, up to the last event before that moment.
         positive_threshold: C+.
         negative_threshold: C−.
 
@@ -41,10 +43,10 @@ def silent_change(
 
 
 def temporal_loss(rate: Tensor, change: Tensor, interval: Tensor) -> Tensor:
-    """ℓ_g (paper, eq. 12): the mean relative error |(G_gt − G_pred) / G_gt|, with G_gt = change / interval.
+    """Return ℓ_g (paper, eq. 12): the mean relative error |(G_gt − G_pred) / G_gt|, with G_gt = change / interval.
 
-    Written so that no interval, however short, overflows. Pairs whose merged events cancel have no G_gt to be
-    relative to, and are left out.
+    The change is divided by last, so that no interval overflows, however short. Pairs whose events cancel are left out,
+    because their G_gt is zero.
 
     Args:
         rate: (N,) G_pred, rendered rates of log-radiance per second.
@@ -60,7 +62,7 @@ def temporal_loss(rate: Tensor, change: Tensor, interval: Tensor) -> Tensor:
 
 
 def reconstruction_loss(predicted: Tensor, target: Tensor, mean_contrast_threshold: Tensor | float) -> Tensor:
-    """ℓ_r (paper, eq. 11): the mean squared error of log-radiance changes, in units of the mean contrast threshold.
+    """Return ℓ_r (paper, eq. 11): the mean squared error of changes, in units of the mean contrast threshold.
 
     Args:
         predicted: (N,) rendered changes of log-radiance.

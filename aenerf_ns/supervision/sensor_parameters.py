@@ -1,4 +1,4 @@
-"""What is learned of the sensor with the scene: the ratio of its contrast thresholds, and its refractory period."""
+"""The sensor's parameters that are learned with the scene: ratio of contrast thresholds, and refractory period."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from aenerf_ns.events.sensor import SensorModel
 class SensorParameters(nn.Module):
     """Contrast threshold C+ and refractory period τ, each a parameter or a constant.
 
-    Events leave the scale of log-radiance open, so of the thresholds only the ratio C+ / C− can be learned: C− stays as
-    it is given. The ratio is a softplus, hence positive. τ is a sigmoid times the shortest interval between two events
-    of a pixel, which no refractory period can exceed.
+    Events leave the scale of log-radiance open, so only the ratio C+ / C− can be learned. C− keeps the given value.
+    The ratio is a softplus, so it is positive. τ is a sigmoid times the shortest interval between two events of a
+    pixel, because no refractory period can exceed that interval.
 
     Args:
         sensor: initial values.
@@ -35,27 +35,27 @@ class SensorParameters(nn.Module):
         self.raw_refractory_period: nn.Parameter | None = None
         if learn_contrast_threshold_ratio:
             ratio = sensor.positive_contrast_threshold / sensor.negative_contrast_threshold
-            # The inverse of softplus, for large ratios too.
+            # The inverse of softplus, exact for large ratios too.
             self.raw_ratio = nn.Parameter(torch.tensor(ratio + math.log(-math.expm1(-ratio))))
         if learn_refractory_period:
             self.raw_refractory_period = nn.Parameter(torch.tensor(0.0))
-            # Of the events, which are read for training only: kept in checkpoints.
+            # Kept in checkpoints, because events are read for training only.
             self.register_buffer("_longest_refractory_period", torch.tensor(torch.nan, dtype=torch.float64))
 
     @property
     def contrast_threshold_ratio(self) -> Tensor | None:
-        """C+ / C−, a scalar in the graph; None where it is not learned."""
+        """C+ / C−, a scalar with a gradient, or None where it is not learned."""
         return None if self.raw_ratio is None else F.softplus(self.raw_ratio)
 
     @property
     def refractory_period(self) -> Tensor | None:
-        """τ in seconds, a float64 scalar in the graph; None where it is not learned."""
+        """τ in seconds, a float64 scalar with a gradient, or None where it is not learned."""
         if self.raw_refractory_period is None:
             return None
         return self._longest_refractory_period * torch.sigmoid(self.raw_refractory_period.double())
 
     def learned(self) -> dict[str, float]:
-        """The values of those that are learned, for logs and evaluations."""
+        """Return the values that are learned, by their names, for logs and evaluations."""
         values = {}
         if self.contrast_threshold_ratio is not None:
             values["contrast_threshold_ratio"] = self.contrast_threshold_ratio.item()
@@ -64,10 +64,10 @@ class SensorParameters(nn.Module):
         return values
 
     def bound_refractory_period(self, shortest_interval: int) -> None:
-        """Sets the bound of τ, and τ to the sensor's value where that is positive, else to half of the bound.
+        """Set the bound of τ. Set τ to the sensor's value where that is positive, else to half of the bound.
 
         Args:
-            shortest_interval: between two consecutive events of a pixel, in nanoseconds; longer than the sensor's
+            shortest_interval: nanoseconds between two consecutive events of a pixel. It is longer than the sensor's
                 refractory period.
         """
         if self.raw_refractory_period is None:

@@ -1,4 +1,4 @@
-"""The event datamanager: batches of event pairs for training, reference views for evaluation."""
+"""The event datamanager: batches of the supervision's sampler for training, reference views for evaluation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aenerf_ns.supervision.pairs import PairSamplerConfig
 
 @dataclass
 class EventDataManagerConfig(VanillaDataManagerConfig):
-    """Of the inherited options, those on sampling pixels of images have no effect: no image is trained on."""
+    """Events to train on. Inherited options about sampling pixels of images have no effect: no image is trained on."""
 
     _target: type = field(default_factory=lambda: EventDataManager)
     train_num_rays_per_batch: int = 8192
@@ -31,7 +31,7 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
 
 
 class EventDataManager(VanillaDataManager[EventDataset]):
-    """Nerfstudio's datamanager with events to train on.
+    """Nerfstudio's datamanager, with events to train on.
 
     Raises:
         SystemExit: with one clear line, when the dataset cannot be used.
@@ -52,13 +52,16 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             super().__init__(config, device=device, test_mode=test_mode, **kwargs)
         except DataError as error:
             raise SystemExit(f"Error: {error}") from None
-        # A run is opened with what the dataparser has made of its options, such as the format it recognised.
+        # A run is opened with the options that the dataparser resolved, such as the format it recognised.
         config.dataparser = self.dataparser.config
         config.data = config.dataparser.data
 
     def create_eval_dataset(self) -> EventDataset | None:
-        """The reference views. Where there are none, none while training, and else the places on the trajectory, so
-        that the framework's renderers have cameras to start from."""
+        """Return the reference views.
+
+        Without reference views: None while training, else the training cameras, so that the framework's renderers have
+        cameras to start from.
+        """
         views = self.reference_views(self.test_split)
         self.has_reference_views = views is not None
         if views is None and self.test_mode != "val":
@@ -66,7 +69,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return views
 
     def reference_views(self, split: Literal["val", "test"]) -> EventDataset | None:
-        """The reference views of a split, whichever one the run was opened with; None where there are none."""
+        """Return the reference views of a split, or None where there are none."""
         outputs = self.dataparser.get_dataparser_outputs(split=split)
         if not outputs.image_filenames:
             return None
@@ -92,20 +95,20 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             raise SystemExit(f"Error: {error}") from None
 
     def setup_eval(self) -> None:
-        """Only what gives whole reference views: no pixels are sampled from them."""
+        """Make the loaders of whole reference views. No pixels are sampled from them."""
         options = {"input_dataset": self.eval_dataset, "device": self.device, "num_workers": self.world_size * 4}
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**options)
         self.eval_dataloader = RandIndicesEvalDataloader(**options)
 
     def place_reference_views(self, poses: Tensor) -> None:
-        """Gives the reference views the poses (N, 3, 4), camera-to-world in the scene, for good."""
+        """Give the reference views the poses (N, 3, 4), camera-to-world in the scene, for good."""
         _place(self.eval_dataset, poses)
         if self.test_mode != "inference":
             # The loaders have copies of the cameras.
             self.setup_eval()
 
     def place_training_cameras(self, poses: Tensor) -> None:
-        """Gives the training cameras, which are only shown, the poses (N, 3, 4), likewise."""
+        """Give the training cameras, which are only shown, the poses (N, 3, 4), camera-to-world in the scene."""
         _place(self.train_dataset, poses)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
@@ -126,6 +129,6 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
 
 def _place(dataset: EventDataset, poses: Tensor) -> None:
-    # Without metadata: these cameras are in the scene's frame, and nothing is to carry them there again.
+    # Without metadata: these cameras are in the scene's frame, and must not be carried there again.
     cameras = dataset.cameras
     dataset.cameras = replace(cameras, camera_to_worlds=poses.to(cameras.device), metadata={})

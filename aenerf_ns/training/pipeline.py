@@ -1,4 +1,4 @@
-"""The pipeline: colour correction on reference views, and honest loading and evaluation."""
+"""The pipeline: fits the colour correction, checks every step, loads strictly and evaluates."""
 
 from __future__ import annotations
 
@@ -41,8 +41,14 @@ class AENeRFPipelineConfig(VanillaPipelineConfig):
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Pixels to fit a colour correction on: the cameras, the (N, 1) index of each one's camera, its (N, 2) row and
-    column, and the (N, channels) radiance there, None where there are no references."""
+    """Pixels that a colour correction is fitted on.
+
+    Attributes:
+        cameras: of the views.
+        view: (N, 1) index of each pixel's camera.
+        coordinates: (N, 2) row and column.
+        radiance: (N, channels) of the reference image there, or None where there are no references.
+    """
 
     cameras: Cameras
     view: Tensor
@@ -65,25 +71,25 @@ class AENeRFPipeline(VanillaPipeline):
         **kwargs: Any,
     ) -> None:
         if test_mode != "val":
-            # ns-render asks for a program that pip cannot install, once the pipeline is made.
+            # Once the pipeline is made, ns-render asks for a program that pip cannot install.
             provide_ffmpeg()
         super().__init__(config, device, test_mode=test_mode, **kwargs)
         self._refined_test_poses = False
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
-        # Made once: a fit every so many steps would read the images again.
+        # Chosen once: otherwise every fit would read the images again.
         self._pixels_of_split: dict[str, _Pixels] = {}
         self._warn_of_test_views()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
-        """Loads a checkpoint, all of it: the framework would drop what does not fit without a word.
+        """Load all of a checkpoint. The framework would silently drop what does not fit.
 
         Raises:
-            RuntimeError: the checkpoint is of a model with other parameters.
+            RuntimeError: the checkpoint belongs to a model with other parameters.
         """
         super().load_state_dict(state_dict, strict=True)
         if self.test_mode != "val":
-            # The framework's renderers and exporters make cameras of their own from these.
+            # The framework's renderers and exporters derive their own cameras from these cameras.
             data, correction = self.datamanager, self.model.camera_optimizer
             if data.has_reference_views:
                 data.place_reference_views(correction.apply_to_camera(data.eval_dataset.cameras.to(self.device)))
@@ -91,14 +97,15 @@ class AENeRFPipeline(VanillaPipeline):
             correction.training_cameras_are_corrected = True
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
-        """Outputs, weighted losses and metrics of a training batch; now and then with the errors of the corrected poses
-        among the metrics.
+        """Return outputs, weighted losses and metrics of a training batch.
+
+        Every hundredth step the errors of the corrected poses are among the metrics.
 
         Raises:
             SystemExit: a loss is not finite.
         """
         outputs, losses, metrics = super().get_train_loss_dict(step)
-        # With mixed precision, too: the scaler would skip every step from now on without a word.
+        # With mixed precision too: otherwise the scaler would silently skip every step from now on.
         _require_finite(losses, "loss", step)
         if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
             errors = self.pose_errors()
@@ -109,12 +116,11 @@ class AENeRFPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Adds the colour correction's to those of datamanager and model, and a look at the gradients to every
-        optimizer."""
+        """Return all callbacks, with the colour correction's, and make every optimizer check its gradients."""
         trainer = training_callback_attributes.trainer
         assert trainer is not None
-        # The dataparser has resolved the time window by now: opening the run again must give the same cameras without
-        # reading the events.
+        # Saved again, because the dataparser has resolved the time window by now: opening the run must give the same
+        # cameras without reading the events.
         if trainer.local_rank == 0:
             trainer.config.save_config()
         last_step = trainer._start_step + trainer.config.max_num_iterations - 1
@@ -126,35 +132,36 @@ class AENeRFPipeline(VanillaPipeline):
                 self.fit_color_correction(_ROUGH_FIT_SHARE)
 
         for optimizer in trainer.optimizers.optimizers.values():
-            # Called by mixed precision's scaler only when it has found the gradients finite.
+            # Mixed precision's scaler calls it only when it has found the gradients finite.
             optimizer.register_step_pre_hook(
                 lambda optimizer, *_: self._require_finite_gradients(optimizer, trainer.step)
             )
-        # After every step, since the trainer saves its last checkpoint before its callbacks for the end of training.
+        # After every step, because the trainer saves its last checkpoint before it calls the callbacks for the end.
         callback = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], fit, update_every_num_iters=1)
         return [*super().get_training_callbacks(training_callback_attributes), callback]
 
     def replace_color_correction(self, protocol: ColorCorrectionProtocol) -> None:
-        """Replaces the run's colour correction by that of another protocol, fitted anew on the run's data."""
+        """Replace the run's colour correction by another protocol, fitted anew on the run's data."""
         self.model.color_correction = self.model.new_color_correction(protocol).to(self.device)
         self._warn_of_test_views()
         self.fit_color_correction()
 
     def _require_finite_gradients(self, optimizer: torch.optim.Optimizer, step: int) -> None:
-        """Raises SystemExit when an optimizer is about to make weights not finite."""
+        """Raise SystemExit if the gradients would make the weights of an optimizer not finite."""
         names = {parameter: name for name, parameter in self.model.named_parameters()}
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        # A norm that overflows is more than Adam can square.
+        # Adam squares gradients: it cannot use a gradient whose norm overflows.
         norms = {names[p]: p.grad.norm() for p in parameters if p.grad is not None}
         _require_finite(norms, "gradient", step)
 
     @torch.no_grad()
     def fit_color_correction(self, share: float = 1.0) -> None:
-        """Fits the colour correction on its protocol's reference views, or where there are none stretches what the
-        training cameras see over the display's range.
+        """Fit the colour correction on its protocol's reference views.
+
+        Without such views, the percentiles of the training cameras' renderings are stretched over the display's range.
 
         Args:
-            share: of the configured number of pixels to fit it on. Less than all makes a rough fit.
+            share: share of the configured number of pixels to fit on. A share below 1 makes a rough fit.
         """
         correction = self.model.color_correction
         if isinstance(correction, NoColorCorrection):
@@ -163,7 +170,7 @@ class AENeRFPipeline(VanillaPipeline):
             self._pixels_of_split[correction.split] = self._pixels(correction.split)
         pixels = self._pixels_of_split[correction.split]
         count = max(round(share * len(pixels.view)), 1)
-        # Reference views are carried over to the frame that the corrected poses have by now.
+        # Reference views are carried over to the frame that the corrected poses have at this step.
         cameras = replace(pixels.cameras, camera_to_worlds=self.model.camera_optimizer.apply_to_camera(pixels.cameras))
         rays = cameras.generate_rays(pixels.view[:count], coords=pixels.coordinates[:count])
         log_radiance = self.model.render_log_radiance(rays)
@@ -180,14 +187,16 @@ class AENeRFPipeline(VanillaPipeline):
             )
 
     def _pixels(self, split: Literal["val", "test"]) -> _Pixels:
-        """Random pixels of all reference views of a split, the same in every run; without references, of all training
-        cameras."""
+        """Return random pixels of all reference views of a split, the same in every run.
+
+        Without references the pixels are those of the training cameras.
+        """
         references = self.datamanager.reference_views(split)
         views = references or self.datamanager.train_dataset
         generator = torch.Generator().manual_seed(0)
         cameras = views.cameras
         count = max(self.model.config.color_correction_num_rays, len(views))
-        # Every view as often as the others, in random order: any part of it is spread over the views, too.
+        # Every view is drawn as often as the others, in random order, so any part is spread over the views too.
         index = (torch.arange(count) % len(views))[torch.randperm(count, generator=generator)]
         size = torch.cat([cameras.height, cameras.width], -1)[index]
         pixels = (torch.rand(count, 2, generator=generator) * size).long()
@@ -202,8 +211,7 @@ class AENeRFPipeline(VanillaPipeline):
         return replace(chosen, radiance=self.model.reference_radiance(image).to(device))
 
     def in_recording(self, poses: Tensor) -> Tensor:
-        """(N, 3, 4) poses with OpenCV axes, in the world and the units of the recording, of (N, 3, 4) ones with OpenGL
-        axes in the scene's."""
+        """Convert scene poses (N, 3, 4) with OpenGL axes to the recording's world and units, with OpenCV axes."""
         outputs = self.datamanager.train_dataparser_outputs
         to_scene = homogeneous(outputs.dataparser_transform.double())
         poses = homogeneous(poses.cpu())
@@ -211,8 +219,10 @@ class AENeRFPipeline(VanillaPipeline):
         return (torch.linalg.inv(to_scene) @ poses @ OPENCV_TO_OPENGL)[:, :3]
 
     def pose_errors(self) -> dict[str, dict[str, float]] | None:
-        """Errors of the ``estimated`` and the ``corrected`` poses against the true ones, in the units of the recording
-        (see :func:`~aenerf_ns.camera.alignment.pose_errors`); None where these are not known."""
+        """Return the errors of the ``estimated`` and of the ``corrected`` poses, in the units of the recording.
+
+        They are those of :func:`~aenerf_ns.camera.alignment.pose_errors`. None where the true poses are not known.
+        """
         correction = self.model.camera_optimizer
         if not correction.has_ground_truth:
             return None
@@ -220,7 +230,7 @@ class AENeRFPipeline(VanillaPipeline):
         return {"estimated": pose_errors(estimated, reference), "corrected": pose_errors(corrected, reference)}
 
     def refine_test_poses(self) -> None:
-        """Refines the poses of the reference views photometrically, for all evaluation from now on."""
+        """Refine the poses of the reference views photometrically, for every evaluation from now on."""
         self._require_reference_views()
         views = self.datamanager.fixed_indices_eval_dataloader
         self.eval()
@@ -242,7 +252,7 @@ class AENeRFPipeline(VanillaPipeline):
 
     @property
     def _test_poses(self) -> str:
-        """How the reference views' cameras were placed."""
+        """How the cameras of the reference views were placed."""
         if self.model.camera_optimizer.has_ground_truth:
             placed = "Sim(3) of the corrected to the true trajectory"
         else:
@@ -252,17 +262,18 @@ class AENeRFPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Mean metrics over the reference views, and what they were computed with. Without such views, where true poses
-        are known, the errors of the poses alone.
+        """Return mean metrics over the reference views, and the protocol that they were computed with.
+
+        Without reference views, but with known true poses, return the errors of the poses alone.
 
         Raises:
-            SystemExit: there are neither; or, outside training, a metric is not a number.
+            SystemExit: there are neither views nor true poses; or, outside training, a metric is not a number.
         """
         metrics: dict[str, Any] = {}
         if self.datamanager.has_reference_views or not self.model.camera_optimizer.has_ground_truth:
             self._require_reference_views()
             metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
-            # A single view has no standard deviation, and NaN is no JSON.
+            # A single view has no standard deviation, and JSON has no NaN.
             metrics = {k: value for k, value in metrics.items() if not (k.endswith("_std") and math.isnan(value))}
             undefined = [name for name, value in metrics.items() if math.isnan(value)]
             if undefined and self.test_mode == "test":
@@ -271,7 +282,7 @@ class AENeRFPipeline(VanillaPipeline):
                     "the run renders values that are not finite; train it again"
                 )
         if self.test_mode == "test":
-            # The trainer's log, in the other mode, takes numbers only.
+            # In the other mode, the trainer's log takes numbers only.
             metrics["color_correction"] = self.model.color_correction.description
             metrics["num_views"] = len(self.datamanager.eval_dataset) if self.datamanager.has_reference_views else 0
             metrics["pose_correction"] = self.model.config.camera_optimizer.mode
@@ -285,10 +296,10 @@ class AENeRFPipeline(VanillaPipeline):
 
 
 def _require_finite(values: Mapping[str, Tensor], what: str, step: int) -> None:
-    """Raises SystemExit unless all scalar ``values`` are finite.
+    """Raise SystemExit unless all scalar ``values`` are finite.
 
-    A GPU's queue runs dry here, once a call however many values there are. That is the price of stopping ahead of the
-    first weight that would be lost.
+    The CPU waits for the GPU once a call, however many values there are. That is the price of stopping before the first
+    weight is lost.
     """
     finite = torch.stack([value.detach() for value in values.values()]).isfinite().tolist()
     if all(finite):

@@ -1,4 +1,4 @@
-"""Photometric refinement of a test camera's pose: a protocol of evaluation, which looks at the test image."""
+"""Photometric refinement of a test camera's pose: a protocol of evaluation that looks at the test image."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _LEARNING_RATE = 2e-3
 
 
 def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras:
-    """Moves a camera so that its rendering fits its image, the field and the colour correction held as they are.
+    """Move a camera so that its rendering fits its image, while field and colour correction stay as they are.
 
-    Minimises the mean squared error of display values over a twist in the camera's frame, from where
-    :meth:`PoseCorrection.apply_to_camera` puts the camera. The pixels drawn are the same in every run.
+    Minimise the mean squared error of display values over a twist in the camera's frame. The start is where
+    :meth:`PoseCorrection.apply_to_camera` puts the camera. The pixels are the same in every run.
 
     Args:
         model: in evaluation mode.
@@ -29,8 +29,8 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
         image: (H, W, 3) reference values in [0, 1].
 
     Returns:
-        The camera (1,) in the scene's frame: at the refined pose, or where that has a greater error, on pixels drawn
-        for the comparison, at the first.
+        The camera (1,) in the scene's frame. It is at the refined pose, or at the first pose where the refined pose has
+        the greater error on pixels drawn for the comparison.
     """
     camera = replace(camera, camera_to_worlds=model.camera_optimizer.apply_to_camera(camera), metadata={})
     reference = model.reference_display(image.to(model.device))
@@ -54,7 +54,7 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, NUM_STEPS)
     with torch.enable_grad():
         for _ in range(NUM_STEPS):
-            # Of the twist alone: the field's parameters are to get no gradients.
+            # By the twist alone: the field's parameters must get no gradients.
             (twist.grad,) = torch.autograd.grad(error(twist, pixels()), twist)
             optimizer.step()
             schedule.step()

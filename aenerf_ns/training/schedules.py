@@ -15,8 +15,8 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 class _StepsFactor:
     """Factor on a learning rate that rises linearly and falls at milestones.
 
-    An object, since only those go into checkpoints, and of plain numbers, since current torch refuses to load others,
-    such as those that the framework's exponential and cosine decay leave there.
+    It is an object of plain numbers, because a checkpoint stores objects but no functions, and because current torch
+    refuses to load NumPy's numbers, which the framework's exponential and cosine decay leave in checkpoints.
     """
 
     def __init__(self, warm_up: int, milestones: list[int], gamma: float) -> None:
@@ -29,7 +29,7 @@ class _StepsFactor:
 
 
 class _CosineFactor:
-    """Factor on a learning rate that is zero, rises linearly and falls as half a cosine. An object, see above."""
+    """Factor on a learning rate that is zero, rises linearly and falls as half a cosine."""
 
     def __init__(self, delay: int, warm_up: int, last_step: int, final_factor: float) -> None:
         self.delay = delay
@@ -52,8 +52,8 @@ def _rise(step: int, warm_up: int) -> float:
 class RelativeMultiStepSchedulerConfig(SchedulerConfig):
     """Learning rate that rises linearly at first, and falls by a factor at milestones given as parts of the run.
 
-    It must not begin at its height: Adam's first steps are of full size however little the gradients say, and what they
-    build is a fog in front of the cameras, which no camera motion changes and which a run can take long to leave.
+    The rate must not begin at its height. Adam's first steps are of full size however little the gradients say. They
+    build a fog in front of the cameras that no camera motion changes, and a run can take long to leave it.
     """
 
     _target: type = field(default_factory=lambda: RelativeMultiStepScheduler)
@@ -68,12 +68,12 @@ class RelativeMultiStepSchedulerConfig(SchedulerConfig):
 
 
 class RelativeMultiStepScheduler(Scheduler):
-    """The framework's has no warm-up, and milestones in steps."""
+    """The schedule of a :class:`RelativeMultiStepSchedulerConfig`. The framework's has no warm-up."""
 
     config: RelativeMultiStepSchedulerConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
-        """The schedule of an optimizer whose learning rate is ``lr_init``."""
+        """Return the schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
         milestones = [round(part * config.max_steps) for part in config.relative_milestones]
         return LambdaLR(optimizer, _StepsFactor(config.warm_up, milestones, config.gamma))
@@ -83,14 +83,14 @@ class RelativeMultiStepScheduler(Scheduler):
 class RelativeCosineSchedulerConfig(SchedulerConfig):
     """Learning rate that is zero for some steps, rises linearly, and falls as half a cosine until the end of the run.
 
-    For pose correction. Before the field has begun to take shape its gradients only lead poses astray; a field that has
-    taken shape holds on to wrong ones. And a single batch tells little of a pose, so the noise is averaged out by a
-    rate that ends low.
+    It is meant for pose correction. Before the field has begun to take shape, its gradients lead poses astray. A field
+    that has taken shape holds on to wrong poses. And a single batch tells little of a pose, so a rate that ends low
+    averages the noise out.
     """
 
     _target: type = field(default_factory=lambda: RelativeCosineScheduler)
     delay: int = 100
-    """Steps for which the rate is zero."""
+    """Steps in which the rate is zero."""
     warm_up: int = 100
     """Steps after these in which the rate rises."""
     final_factor: float = 0.01
@@ -100,19 +100,19 @@ class RelativeCosineSchedulerConfig(SchedulerConfig):
 
 
 class RelativeCosineScheduler(Scheduler):
-    """The framework's leaves NumPy's numbers in checkpoints."""
+    """The schedule of a :class:`RelativeCosineSchedulerConfig`."""
 
     config: RelativeCosineSchedulerConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
-        """The schedule of an optimizer whose learning rate is ``lr_init``."""
+        """Return the schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
         return LambdaLR(optimizer, _CosineFactor(config.delay, config.warm_up, config.max_steps, config.final_factor))
 
 
 @dataclass
 class AENeRFTrainerConfig(TrainerConfig):
-    """A trainer that tells the schedules how long the run is."""
+    """Nerfstudio's trainer, which tells the schedules how long the run is."""
 
     def __post_init__(self) -> None:
         for group in self.optimizers.values():

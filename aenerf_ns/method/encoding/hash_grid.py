@@ -1,4 +1,4 @@
-"""The multiresolution hash encoding, several times as fast in plain torch as the framework's."""
+"""The multiresolution hash encoding in plain torch, several times as fast as the framework's."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _PRIMES = (1, 2654435761 - 2**32, 805459861)
 class HashEncoding(FrameworkHashEncoding):
     """Nerfstudio's hash encoding with two features a level: the same parameters and values, computed in fewer passes.
 
-    All corners of all levels are looked up at once, each as one complex number in place of two real ones: a
-    one-dimensional lookup takes torch's quickest path, and makes one gradient of the table instead of eight. Made of
-    plain operations, it can be differentiated in every mode.
+    All corners of all levels are looked up at once, each as one complex number in place of two real ones. A
+    one-dimensional lookup takes torch's quickest path, and it makes one gradient of the table instead of eight. All
+    operations are plain, so the encoding can be differentiated in every mode.
     """
 
     _scales: Tensor
@@ -34,7 +34,7 @@ class HashEncoding(FrameworkHashEncoding):
             self.register_buffer(name, value, persistent=False)
 
     def pytorch_fwd(self, in_tensor: Tensor) -> Tensor:
-        """Features (N, 2 levels) of positions (N, 3) in [0, 1]."""
+        """Return features (N, 2 levels) of positions (N, 3) in [0, 1]."""
         scaled = in_tensor.mT[:, None] * self._scales
         lower = scaled.detach().floor()
         products = lower.to(torch.int32) * self._primes
