@@ -184,7 +184,7 @@ class NetworkColorCorrection(AffineColorCorrection):
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
-        """Fit the affine map, then the network to the error that is left, by least squares of display values, with Adam.
+        """Fit the affine map, then the network to the error of display values that is left, by Adam.
 
         Args:
             log_radiance: (N, channels) rendered.

@@ -229,7 +229,7 @@ def world_rays(poses: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _compared_times(trajectory: Trajectory, ground_truth: Trajectory | None) -> Tensor:
-    """Return times in nanoseconds of at most _MAX_COMPARED knots that the ground truth covers, evenly spread."""
+    """Return times in nanoseconds of at most _MAX_COMPARED knots that the ground truth covers."""
     times = trajectory.times if ground_truth is None else trajectory.knots_covered_by(ground_truth)
     count = min(len(times), _MAX_COMPARED)
     return times[torch.linspace(0, len(times) - 1, count, dtype=torch.float64).round().long()]
@@ -261,8 +261,8 @@ class TwistNetwork(nn.Module):
         size = self.encoding.get_out_dim()
         for _ in range(4):
             linear = nn.Linear(size, width)
-            # With PyTorch's initialisation and a blunt softplus, hardly any of the input's variation reaches the output.
-            # For long, such a network learns only one correction for all times.
+            # With PyTorch's initialisation and a blunt softplus, hardly any variation of the input reaches the output:
+            # for long, such a network learns only one correction for all times.
             nn.init.kaiming_normal_(linear.weight)
             nn.init.zeros_(linear.bias)
             layers += [linear, nn.Softplus(beta=100)]
