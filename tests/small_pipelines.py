@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,15 +22,17 @@ from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipeline, AENeRFPipelineConfig
 
 
-def make_pipeline(
+def make_pipeline_config(
     folder: Path,
-    test_mode: Literal["test", "val"],
     num_views: int = 2,
     pose_correction: str = "off",
     true_world: Callable[[torch.Tensor], torch.Tensor] | None = None,
-) -> AENeRFPipeline:
-    """A small untrained model of a colour sensor: grey validation views, and one test view more, orange. With
-    ``true_world`` there are true poses, in the world that it maps to, and the views' are in that as well."""
+) -> AENeRFPipelineConfig:
+    """Make the configuration of a small model of a colour sensor, and its dataset where it does not exist.
+
+    The validation views are grey, the test views, one more, orange. With ``true_world`` there are true poses, in the
+    world that it maps to, where the views are too.
+    """
     if not folder.exists():
         camera = EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
         poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
@@ -51,6 +53,12 @@ def make_pipeline(
         color_correction_num_rays=64,
         camera_optimizer=PoseCorrectionConfig(mode=pose_correction),
     )
-    torch.manual_seed(0)
     datamanager = EventDataManagerConfig(dataparser=NativeDataParserConfig(data=folder))
-    return AENeRFPipelineConfig(datamanager=datamanager, model=model).setup(device="cpu", test_mode=test_mode)
+    return AENeRFPipelineConfig(datamanager=datamanager, model=model)
+
+
+def make_pipeline(folder: Path, test_mode: Literal["test", "val"], **options: Any) -> AENeRFPipeline:
+    """A small untrained pipeline, with the options of :func:`make_pipeline_config`."""
+    config = make_pipeline_config(folder, **options)
+    torch.manual_seed(0)
+    return config.setup(device="cpu", test_mode=test_mode)

@@ -1,0 +1,98 @@
+"""The seam: a supervision that this package does not know is trained by the same model, datamanager and pipeline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from small_pipelines import make_pipeline_config
+from torch import Tensor, nn
+
+from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision, SupervisionConfig
+
+
+@dataclass
+class GreyConfig(SupervisionConfig):
+    """Says that everything looks the same."""
+
+    _target: type = field(default_factory=lambda: Grey)
+
+
+class Grey(Supervision):
+    batch = "moments"
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.level = nn.Parameter(torch.tensor(-1.0))
+
+    def place(self, rays: RayBundle) -> dict[str, Tensor]:
+        return {"level": self.level * 1.0}
+
+    def unit(self, outputs: Mapping[str, Any]) -> float:
+        return self.sensor.negative_contrast_threshold
+
+    def losses(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Tensor]:
+        return {"grey_loss": (outputs["log_radiance"] - outputs["level"] - batch["offset"]).square().mean()}
+
+    def learned(self) -> dict[str, float]:
+        return {"level": self.level.item()}
+
+
+@dataclass
+class MomentSamplerConfig(SamplerConfig):
+    """Draws rays straight ahead at random moments."""
+
+    _target: type = field(default_factory=lambda: MomentSampler)
+
+
+class MomentSampler(Sampler):
+    batch = "moments"
+
+    def prepare(self) -> None:
+        self.duration = (self.dataset.scene.trajectory.end - self.dataset.scene.trajectory.start) * 1e-9
+
+    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
+        ahead = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(num_rays, 3)
+        rays = RayBundle(
+            origins=torch.zeros(num_rays, 3),
+            directions=ahead.float(),
+            pixel_area=torch.ones(num_rays, 1),
+            camera_indices=torch.zeros(num_rays, 1, dtype=torch.long),
+            times=self.duration * torch.rand(num_rays, 1, dtype=torch.float64),
+            metadata={CAMERA_DIRECTIONS: ahead},
+        )
+        return rays, {"offset": 0.5}
+
+
+def test_another_supervision_is_trained_and_what_it_learns_is_logged(tmp_path: Path) -> None:
+    config = make_pipeline_config(tmp_path / "data", pose_correction="spline")
+    config.model = replace(config.model, supervision=GreyConfig(), loss_coefficients={"grey_loss": 2.0})
+    config.datamanager = replace(config.datamanager, sampler=MomentSamplerConfig(), train_num_rays_per_batch=30)
+    pipeline = config.setup(device="cpu", test_mode="val")
+    groups = pipeline.get_param_groups()
+    assert [parameter.shape for parameter in groups["sensor"]] == [()]
+    optimizer = torch.optim.Adam([p for group in groups.values() for p in group], lr=0.02)
+    history = []
+    for step in range(40):
+        optimizer.zero_grad()
+        outputs, losses, metrics = pipeline.get_train_loss_dict(step)
+        sum(losses.values()).backward()
+        optimizer.step()
+        history.append(losses["grey_loss"].item())
+    assert len(outputs["log_radiance"]) == 30
+    assert history[-1] < 0.05 * history[0]
+    assert metrics["level"] != -1.0
+    assert pipeline.model.camera_optimizer.twists.control_twists.abs().max() > 0
+
+
+def test_a_sampler_for_another_supervision_is_refused(tmp_path: Path) -> None:
+    config = make_pipeline_config(tmp_path / "data")
+    config.datamanager = replace(config.datamanager, sampler=MomentSamplerConfig())
+    with pytest.raises(SystemExit, match="its sampler draws moments and its supervision compares pairs; give it"):
+        config.setup(device="cpu", test_mode="val")
