@@ -45,8 +45,8 @@ aenerf_mlp = MethodSpecification(
         optimizers={
             **_base.optimizers,
             "networks": {
-                # PyTorch's defaults but for rate and decay, as in the paper. Its rate of 0.01 collapses these networks:
-                # this is the one of NerfAcc's MLP example.
+                # PyTorch's defaults but for rate and decay, as in the paper. The paper's rate of 0.01 collapses these
+                # networks. This rate is that of NerfAcc's MLP example.
                 "optimizer": AdamOptimizerConfig(lr=5e-4, weight_decay=1e-6),
                 "scheduler": _base.optimizers["networks"]["scheduler"],
             },
@@ -55,7 +55,7 @@ aenerf_mlp = MethodSpecification(
                 "scheduler": _base.optimizers["camera_opt"]["scheduler"],
             },
         },
-        # Every ray of a batch tells of all weights of the poses' network.
+        # Every ray of a batch has gradients for all weights of the poses' network.
         gradient_accumulation_steps={"camera_opt": 1},
     ),
     description="AE-NeRF with the paper's MLPs: slow.",

@@ -35,7 +35,7 @@ aenerf_small = MethodSpecification(
                     log2_hashmap_size=14,
                     weights_anneal_iterations=200,
                 ),
-                # On a CPU twice as fast as with 8192: what a piece needs stays small.
+                # On a CPU twice as fast as 8192, because the memory of a piece stays small.
                 eval_num_rays_per_chunk=1 << 10,
             ),
         ),
