@@ -18,7 +18,10 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[1]
 
 # Glob patterns, from the root of the repository, of the pages and files outside docs/ that are on the site.
-OUTSIDE = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "benchmarks/**/*.md", "benchmarks/results/**/*")
+OUTSIDE = (
+    *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE"),
+    *("benchmarks/**/*.md", "benchmarks/**/*.py", "benchmarks/results/**/*"),
+)
 
 _LINK = re.compile(r"(?P<before>\]\()(?P<target>[^)#\s]+)(?P<after>#[^)\s]*)?\)")
 
