@@ -4,4 +4,4 @@ Importing this package must stay cheap and must not fail: every ``ns-*`` command
 also for users who run another method. Import what you need from its modules.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
-# Lint and type-check. The type checker sees the package as it is laid out when installed.
+# Checks style, spelling and types with the tools of the active environment (extra "dev").
 set -euo pipefail
 cd "$(dirname "$0")/.."
 ruff check .
 ruff format --check .
+codespell
+# mypy sees the package as it is laid out when installed.
 layout=$(mktemp -d)
 trap 'rm -rf "$layout"' EXIT
 mkdir "$layout/aenerf_ns"

@@ -12,13 +12,13 @@ if [ ! -d .venv ]; then
 fi
 # shellcheck disable=SC1091
 source .venv/bin/activate
-# Installed once, and again whenever what is to be installed changes.
+# Each set of extras is installed once, and again whenever pyproject.toml changes.
 wanted="$1 $(cksum pyproject.toml)"
-if [ "$(cat .venv/installed 2>/dev/null)" != "$wanted" ]; then
+if ! grep -qxF "$wanted" .venv/installed 2>/dev/null; then
   echo "Installing (a few minutes and several GB the first time) ..."
   python -m pip install --quiet --upgrade pip
   python -m pip install --quiet --editable ".[$1]"
-  echo "$wanted" > .venv/installed
+  echo "$wanted" >> .venv/installed
 fi
 # PyTorch's threads wait for each other on small machines that do something else as well; see docs/nerfstudio.md.
 if [ "$(nproc 2>/dev/null || echo 2)" -le 4 ]; then

@@ -1,16 +1,21 @@
-"""What is installed: the wheel's content, the entry points, and the cost of importing the package."""
+"""What is installed: the wheel, what it depends on, the entry points, and the cost of importing the package."""
 
 from __future__ import annotations
 
+import ast
+import email.message
 import os
+import re
 import subprocess
 import sys
 import zipfile
-from importlib.metadata import entry_points
+from collections.abc import Iterable
+from importlib.metadata import entry_points, packages_distributions
 from pathlib import Path
 
 import pytest
 
+import aenerf_ns
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
 
@@ -51,6 +56,57 @@ def test_the_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
     for target in targets:
         module, attribute = target.split(":")
         assert attribute in wheel.read(module.replace(".", "/") + ".py").decode()
+
+
+def _imported(paths: Iterable[Path]) -> set[str]:
+    """The distributions that source files import, outside the standard library and this repository."""
+    paths = list(paths)
+    own = {"aenerf_ns", "benchmarks", *(path.stem for path in (*paths, *(ROOT / "tests").glob("*.py")))}
+    modules = set()
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                modules |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                modules.add(node.module or "")
+    tops = {module.split(".")[0] for module in modules} - own - set(sys.stdlib_module_names)
+    by_module = packages_distributions()
+    # Some modules are shared: cv2 by two distributions, backports by any number.
+    return {"/".join(sorted({_normal(name) for name in by_module.get(top, [top])})) for top in tops}
+
+
+def _declared(wheel: zipfile.ZipFile, without_extras: tuple[str, ...] = ()) -> set[str]:
+    """The distributions that the wheel asks for, with all extras but some."""
+    requirements = _metadata(wheel).get_all("Requires-Dist", [])
+    extras = [re.search(r"extra == [\"'](\w[\w-]*)", requirement) for requirement in requirements]
+    return {
+        _normal(re.split(r"[^\w.-]", requirement)[0])
+        for requirement, extra in zip(requirements, extras, strict=True)
+        if extra is None or extra[1] not in without_extras
+    }
+
+
+def _metadata(wheel: zipfile.ZipFile) -> email.message.Message:
+    return email.message_from_bytes(wheel.read(next(name for name in wheel.namelist() if name.endswith("/METADATA"))))
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_every_package_that_is_imported_is_declared(wheel: zipfile.ZipFile) -> None:
+    package = [path for name in ("aenerf_ns", "dataparsers", "method_configs") for path in (ROOT / name).rglob("*.py")]
+    around = [path for name in ("benchmarks", "scripts", "tests") for path in (ROOT / name).rglob("*.py")]
+    for paths, declared in ((package, _declared(wheel, ("test", "docs", "dev"))), (around, _declared(wheel))):
+        undeclared = {imported for imported in _imported(paths) if not set(imported.split("/")) & declared}
+        assert not undeclared, f"imported but not in pyproject.toml: {undeclared}"
+
+
+def test_the_version_is_stated_alike(wheel: zipfile.ZipFile) -> None:
+    version = aenerf_ns.__version__
+    assert _metadata(wheel)["Version"] == version
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\n## [{version}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def test_the_dataparsers_are_registered() -> None:

@@ -47,6 +47,20 @@ def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orient
         with_scale: Sim(3) if true, else SE(3).
         with_orientations: if false, positions alone count (Umeyama 1991), as is usual for the absolute trajectory
             error.
+
+    Returns:
+        The map from the world of ``poses`` to the world of ``reference``.
+
+    Example:
+        >>> poses = torch.eye(4)[:3].repeat(3, 1, 1)
+        >>> poses[:, :, 3] = torch.eye(3)
+        >>> reference = poses.clone()
+        >>> reference[:, :, 3] = 2 * poses[:, :, 3] + 1
+        >>> similarity = align(poses, reference)
+        >>> round(similarity.scale.item(), 3)
+        2.0
+        >>> torch.allclose(similarity(poses.double()), reference.double())
+        True
     """
     poses, reference = poses.double(), reference.double()
     mean, reference_mean = poses[..., 3].mean(0), reference[..., 3].mean(0)

@@ -37,6 +37,14 @@ class EventCamera:
     Raises:
         ValueError: a focal length or a size is not positive, a value is not finite, or the number of distortion
             parameters does not fit the model.
+
+    Example:
+        >>> camera = EventCamera(width=346, height=260, fx=330.0, fy=330.0, cx=172.5, cy=129.5)
+        >>> directions, is_valid = camera.pixel_directions()
+        >>> directions.shape
+        (260, 346, 3)
+        >>> directions[129, 172]  # the principal point is the centre of this pixel
+        array([ 0., -0., -1.])
     """
 
     width: int

@@ -42,6 +42,15 @@ class Trajectory(nn.Module):
     Raises:
         DataError: fewer than two poses, times that do not increase, a value that is not finite, or a matrix that is
             not a rotation.
+
+    Example:
+        A camera that moves one unit along x within a second, seen after half of it:
+
+        >>> poses = torch.eye(4).repeat(2, 1, 1)
+        >>> poses[1, 0, 3] = 1.0
+        >>> trajectory = Trajectory([0, 1_000_000_000], poses)
+        >>> trajectory.interpolate(500_000_000)[:, 3]
+        tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
     """
 
     times: Tensor

@@ -57,6 +57,16 @@ def open_event_file(
 
     Raises:
         DataError: the format is not known, or a size is not given and the file is missing or does not tell it.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> import numpy as np
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "events.txt"  # seconds, x, y, polarity
+        ...     np.savetxt(path, [[0.001, 3, 4, 1], [0.002, 5, 6, 0]], fmt="%.3f %d %d %d")
+        ...     for events in open_event_file(path, width=8, height=8).read_chunks():
+        ...         print(events.x, events.y, events.t, events.p)
+        [3 5] [4 6] [1000000 2000000] [ 1 -1]
     """
     if not path.exists() and width is not None and height is not None:
         return _MissingEventFile(path, width, height)
