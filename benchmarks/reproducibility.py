@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -69,6 +70,8 @@ class Reproducibility:
                 }
             )
             write_result(self.output, {"rows": rows, "threads": self.threads})
+        if not rows:
+            sys.exit(f"Error: {self.bench}: it has none of the datasets; give the options that the benchmark was given")
 
     def _generate(self, dataset: Dataset, scene: str) -> dict[str, str]:
         with TemporaryDirectory() as folder:
