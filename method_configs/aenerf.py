@@ -51,7 +51,7 @@ aenerf = MethodSpecification(
             },
         },
         # A batch has few rays for each knot of the spline. A field whose poses follow every one of them stays blurred,
-        # at lower rates and in longer runs too (docs/experiments.md).
+        # at lower rates and in longer runs too (benchmarks/README.md).
         gradient_accumulation_steps={"camera_opt": 8},
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
         vis="viewer",
