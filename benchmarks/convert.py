@@ -1,29 +1,24 @@
-"""Throughput and peak memory of aenerf convert.
+"""Measure throughput and peak memory of aenerf convert.
 
-    python benchmarks/convert.py --output benchmarks/results/NAME.json
+    python -m benchmarks.convert --output benchmarks/results/NAME.json
 
-Each measurement runs in a process of its own, so that the peak of its resident memory is its own. The dataset is made
-beforehand: events at random pixels of a 1280 x 720 sensor, uncompressed, which no real recording is as hard to compress
-as.
+Each measurement has a process of its own, and so its own peak memory. The dataset holds uncompressed events at random
+pixels of a 1280 x 720 sensor. Real recordings are easier to compress.
 """
 
 from __future__ import annotations
 
-import json
-import resource
-import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import h5py
 import numpy as np
 import torch
 import tyro
 
-from aenerf_ns.bench.environment import environment
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.convert import Convert
@@ -31,19 +26,20 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.recording.writer import NativeDatasetWriter
+from benchmarks.common import in_own_process, peak_mib, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
 _CHUNK = 1 << 22
 # Nanoseconds between events, on average.
 _STEP = 100
-_VARIANTS: dict[str, dict] = {
+_VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "filtered": {"shortest_interval_ns": 1_000_000, "pixel_share": 0.5, "drop_hot_pixels": True},
 }
 
 
 def make_dataset(folder: Path, num_events: int) -> None:
-    """A dataset of random events."""
+    """Write a dataset of random events."""
     camera = EventCamera(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2)
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 1
@@ -69,8 +65,8 @@ def make_dataset(folder: Path, num_events: int) -> None:
             columns["p"][part] = 2 * rng.integers(0, 2, count, dtype=np.int8) - 1
 
 
-def measure(what: str, folder: Path) -> dict:
-    """Runs one measurement in this process: "nothing", or a variant."""
+def measure(what: str, folder: Path) -> dict[str, float]:
+    """Convert by a variant, or do "nothing". Return the times and the peak memory of this process."""
     wall, cpu = time.perf_counter(), time.process_time()
     written = 0
     if what != "nothing":
@@ -80,7 +76,7 @@ def measure(what: str, folder: Path) -> dict:
     return {
         "seconds": time.perf_counter() - wall,
         "cpu_seconds": time.process_time() - cpu,
-        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "peak_gib": peak_mib() / 2**10,
         "written_events": written,
     }
 
@@ -95,17 +91,13 @@ class ConvertBenchmark:
     """Numbers of events."""
 
     def main(self) -> None:
-        """Measures and writes the figures."""
+        """Measure and write the figures."""
         rows = []
         for size in self.sizes:
             with TemporaryDirectory() as temporary:
                 folder = Path(temporary) / "dataset"
-                make_dataset(folder, size)
-                results = {}
-                for what in ("nothing", *_VARIANTS):
-                    command = [sys.executable, __file__, "--measure", what, str(folder)]
-                    done = subprocess.run(command, check=True, capture_output=True, text=True)
-                    results[what] = json.loads(done.stdout.splitlines()[-1])
+                in_own_process(make_dataset, folder, size)
+                results = {what: in_own_process(measure, what, folder) for what in ("nothing", *_VARIANTS)}
             idle = results.pop("nothing")
             for what, result in results.items():
                 row = {
@@ -118,14 +110,8 @@ class ConvertBenchmark:
                     "peak_gib_of_the_process_without_conversion": idle["peak_gib"],
                 }
                 rows.append(row)
-                print(json.dumps(row, indent=2))
-        self.output.write_text(
-            json.dumps({"sensor": [_WIDTH, _HEIGHT], "rows": rows, **environment()}, indent=2) + "\n"
-        )
+        write_result(self.output, {"sensor": [_WIDTH, _HEIGHT], "rows": rows})
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--measure"]:
-        print(json.dumps(measure(sys.argv[2], Path(sys.argv[3]))))
-    else:
-        tyro.cli(ConvertBenchmark).main()
+    tyro.cli(ConvertBenchmark).main()

@@ -1,35 +1,32 @@
-"""Throughput and peak memory of pairing events, beside sorting them with NumPy.
+"""Measure throughput and peak memory of pairing events, beside sorting them with NumPy.
 
-    python benchmarks/pairing.py --output benchmarks/results/NAME.json
+    python -m benchmarks.pairing --output benchmarks/results/NAME.json
 
-Each measurement runs in a process of its own, so that the peak of its resident memory is its own. The stream is made
-in pieces as a file would give them; making it is timed apart and taken off.
+Each measurement has a process of its own, and so its own peak memory. The events come in chunks, as from a file. The
+time of making them is measured alone and subtracted.
 """
 
 from __future__ import annotations
 
-import json
-import resource
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
 
-from aenerf_ns.bench.environment import environment
 from aenerf_ns.events.pairs import pair_events
 from aenerf_ns.events.stream import EventStream
+from benchmarks.common import in_own_process, peak_mib, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
 _CHUNK = 1 << 22
 
 
 def stream(num_events: int) -> Iterator[EventStream]:
-    """Events at random pixels of a 1280 x 720 sensor, one each 100 ns on average, as a reader's pieces."""
+    """Yield events at random pixels of a 1280 x 720 sensor in chunks, one event each 100 ns on average."""
     rng = np.random.default_rng(0)
     start = 0
     for begin in range(0, num_events, _CHUNK):
@@ -43,12 +40,12 @@ def stream(num_events: int) -> Iterator[EventStream]:
 
 
 def with_numpy(num_events: int) -> int:
-    """What one would write with NumPy: sort all events by pixel, then by time, and take neighbours."""
+    """Pair events as one would with NumPy: sort by pixel, then by time, and take neighbours."""
     chunks = list(stream(num_events))
     x, y, t, p = (np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in "xytp")
     del chunks
     pixel = y.astype(np.int64) * _WIDTH + x
-    # The stream is sorted by time, so that a stable sort by pixel is enough.
+    # A stable sort by pixel is enough, because the events are sorted by time.
     order = np.argsort(pixel, kind="stable")
     same = pixel[order][1:] == pixel[order][:-1]
     previous, time, polarity = t[order][:-1][same], t[order][1:][same], p[order][1:][same]
@@ -56,9 +53,9 @@ def with_numpy(num_events: int) -> int:
     return len(time)
 
 
-def measure(what: str, num_events: int) -> dict:
-    """Runs one measurement in this process."""
-    # Compiled ahead of the measurement.
+def measure(what: Literal["stream", "pair_events", "numpy"], num_events: int) -> dict[str, float]:
+    """Return seconds, peak memory of this process and the number of pairs."""
+    # Compile before the measurement.
     pair_events(stream(10))
     begin = time.perf_counter()
     if what == "stream":
@@ -68,7 +65,7 @@ def measure(what: str, num_events: int) -> dict:
     else:
         pairs = len(pair_events(stream(num_events), expected_events=num_events))
     seconds = time.perf_counter() - begin
-    return {"seconds": seconds, "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, "pairs": pairs}
+    return {"seconds": seconds, "peak_gib": peak_mib() / 2**10, "pairs": pairs}
 
 
 @dataclass
@@ -81,14 +78,10 @@ class Pairing:
     """Numbers of events."""
 
     def main(self) -> None:
-        """Measures and writes the figures."""
+        """Measure and write the figures."""
         rows = []
         for size in self.sizes:
-            results = {}
-            for what in ("stream", "pair_events", "numpy"):
-                command = [sys.executable, __file__, "--measure", what, str(size)]
-                done = subprocess.run(command, check=True, capture_output=True, text=True)
-                results[what] = json.loads(done.stdout)
+            results = {what: in_own_process(measure, what, size) for what in ("stream", "pair_events", "numpy")}
             idle = results["stream"]["seconds"]
             own, numpy = (results[what]["seconds"] - idle for what in ("pair_events", "numpy"))
             row = {
@@ -103,14 +96,8 @@ class Pairing:
                 "seconds_making_the_stream": idle,
             }
             rows.append(row)
-            print(json.dumps(row, indent=2))
-        self.output.write_text(
-            json.dumps({"sensor": [_WIDTH, _HEIGHT], "rows": rows, **environment()}, indent=2) + "\n"
-        )
+        write_result(self.output, {"sensor": [_WIDTH, _HEIGHT], "rows": rows})
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--measure"]:
-        print(json.dumps(measure(sys.argv[2], int(sys.argv[3]))))
-    else:
-        tyro.cli(Pairing).main()
+    tyro.cli(Pairing).main()

@@ -1,30 +1,27 @@
-"""Quality on novel views of a built-in scene, through the framework's own commands.
+"""Measure quality on novel views of a built-in scene, through the framework's own commands.
 
-    python benchmarks/quality.py --name room_easy --steps 3000
+    python -m benchmarks.quality --name room_easy --steps 3000
 
-Simulates, trains and evaluates; writes benchmarks/results/NAME.json with the metrics and the commands, and
-benchmarks/results/NAME.png with truth, reconstruction and depth of some test views.
+Simulates, trains and evaluates. Writes benchmarks/results/NAME.json with the metrics, and benchmarks/results/NAME.png
+with the truth, the reconstruction and the depth of some test views.
 """
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-import time
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-import torch
 import tyro
 from PIL import Image
 
-from aenerf_ns.bench.environment import environment
+from benchmarks.common import config_of, evaluate, run_script, train, write_result
 
 _RESULTS = Path(__file__).parent / "results"
 _NUM_PICTURES = 3
-_EVALUATE = ("aenerf", "evaluate", "--output", "other.json")
 
 
 @dataclass
@@ -40,58 +37,44 @@ class Quality:
     simulate: str = "--scene room --speed easy --width 160 --height 120"
     """Options of aenerf simulate."""
     protocols: tuple[str, ...] = ()
-    """Other colour corrections than the run's to evaluate it under, with aenerf evaluate --color-correction."""
+    """More colour corrections to evaluate the run with, as in aenerf evaluate --color-correction."""
     train: str = ""
     """More options of ns-train, as in --train="--machine.seed 1"."""
 
     def main(self) -> None:
-        """Measures and writes the figures and the picture."""
-        with TemporaryDirectory() as folder:
-            root = Path(folder)
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-            simulate = ["aenerf", "simulate", "--output", "scene", *self.simulate.split()]
-            train = ["ns-train", self.method, "--machine.device-type", device, "--vis", "tensorboard",
-                     "--max-num-iterations", str(self.steps), *self.train.split(), "--data", "scene"]  # fmt: skip
-            seconds = {"simulate": self._run(simulate, root), "train": self._run(train, root)}
-            config = str(next(root.rglob("config.yml")).relative_to(root))
-            evaluate = ["ns-eval", "--load-config", config, "--output-path", "out.json", "--render-output-path", "out"]
-            seconds["evaluate"] = self._run(evaluate, root)
-            others = {}
-            for protocol in self.protocols:
-                self._run([*_EVALUATE, "--load-config", config, "--color-correction", protocol], root)
-                others[protocol] = json.loads((root / "other.json").read_text())["results"]
-            results = json.loads((root / "out.json").read_text())["results"]
-            self._picture(root / "out")
-        report = {
-            "results": results,
-            "results_under": others,
-            "seconds": seconds,
-            "commands": [" ".join(command) for command in (simulate, train, evaluate)],
-            **environment(),
-        }
-        (_RESULTS / f"{self.name}.json").write_text(json.dumps(report, indent=2) + "\n")
-        print(json.dumps(report, indent=2))
+        """Measure, and write the figures and the picture."""
+        with TemporaryDirectory() as name:
+            folder = Path(name)
+            simulating = run_script(folder, "aenerf", "simulate", "--output", "scene", *shlex.split(self.simulate))
+            training = train(folder, "run", self.method, self.steps, shlex.split(self.train), ("--data", "scene"))
+            results = evaluate(folder, "run", "--render-output-path", "pictures")
+            _picture(folder / "pictures").save(_RESULTS / f"{self.name}.png", optimize=True)
+            others = {protocol: _evaluate_under(folder, protocol) for protocol in self.protocols}
+        seconds = {"simulate": simulating, "train": training}
+        write_result(_RESULTS / f"{self.name}.json", {"results": results, "results_under": others, "seconds": seconds})
 
-    def _run(self, command: list[str], folder: Path) -> float:
-        begin = time.perf_counter()
-        script = Path(sys.executable).parent / command[0]
-        subprocess.run([script, *command[1:]], cwd=folder, check=True, capture_output=True)
-        return time.perf_counter() - begin
 
-    def _picture(self, folder: Path) -> None:
-        """Some of the test views below each other: truth, reconstruction, depth."""
-        files = sorted(folder.glob("eval_img_*.png"))
-        rows = []
-        for file in files[:: max(len(files) // _NUM_PICTURES, 1)][:_NUM_PICTURES]:
-            pair, depth = Image.open(file), Image.open(str(file).replace("_img_", "_depth_"))
-            row = Image.new("RGB", (pair.width + depth.width, pair.height))
-            row.paste(pair, (0, 0))
-            row.paste(depth, (pair.width, 0))
-            rows.append(row)
-        picture = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)))
-        for index, row in enumerate(rows):
-            picture.paste(row, (0, index * row.height))
-        picture.save(_RESULTS / f"{self.name}.png", optimize=True)
+def _evaluate_under(folder: Path, protocol: str) -> dict[str, Any]:
+    """Evaluate the run under another colour correction than its own."""
+    options = ("--load-config", config_of(folder, "run"), "--color-correction", protocol, "--output", "other.json")
+    run_script(folder, "aenerf", "evaluate", *options)
+    return json.loads((folder / "other.json").read_text("utf8"))["results"]
+
+
+def _picture(folder: Path) -> Image.Image:
+    """Return some test views in rows: truth, reconstruction and depth."""
+    files = sorted(folder.glob("eval_img_*.png"))
+    rows = []
+    for file in files[:: max(len(files) // _NUM_PICTURES, 1)][:_NUM_PICTURES]:
+        pair, depth = Image.open(file), Image.open(str(file).replace("_img_", "_depth_"))
+        row = Image.new("RGB", (pair.width + depth.width, pair.height))
+        row.paste(pair, (0, 0))
+        row.paste(depth, (pair.width, 0))
+        rows.append(row)
+    picture = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)))
+    for index, row in enumerate(rows):
+        picture.paste(row, (0, index * row.height))
+    return picture
 
 
 if __name__ == "__main__":

@@ -1,19 +1,15 @@
-"""Throughput and peak memory of the readers of event files.
+"""Measure throughput and peak memory of the readers of event files, beside faery where it reads the format.
 
-    python benchmarks/readers.py --output benchmarks/results/NAME.json
+    python -m benchmarks.readers --output benchmarks/results/NAME.json
 
-Each file holds the same random events, and is in the page cache. Each measurement runs in a process of its own, after
-the reader has read a small file, so that neither compilation nor imports count. Time is that of the processor, so that
-other work on the machine does not count either. Beside it, where it is installed and reads the format: faery.
+All files hold the same random events and are in the page cache. Each measurement has a process of its own, in which the
+reader has read a small file before: compilation and imports do not count. The time is CPU time: other work on the
+machine does not count either.
 """
 
 from __future__ import annotations
 
-import json
-import resource
 import struct
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,26 +21,26 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from aenerf_ns.bench.environment import environment
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
+from benchmarks.common import in_own_process, peak_mib, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
 _START = 1_600_000_000_000_000
 _FAERY = (".raw", ".dat", ".aedat4")
-# Slow to write, and measured at the smallest size only.
+# Slow to write, and therefore measured at the smallest size only.
 _TEXT = (".csv", ".txt")
 
 
 def events(count: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """x, y, t (microseconds from zero) and p (0 or 1): one event a microsecond on average, at random pixels."""
+    """Return x, y, t (microseconds from zero) and p (0 or 1): one event a microsecond on average, at random pixels."""
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.integers(0, 3, count))
     return rng.integers(0, _WIDTH, count), rng.integers(0, _HEIGHT, count), t, rng.integers(0, 2, count)
 
 
 def write_evt2(path: Path, count: int) -> None:
-    """Writes the upper bits of the time whenever they change."""
+    """Write EVT 2.0, with the upper bits of the time whenever they change."""
     x, y, t, p = events(count)
     words = (p << 28 | (t & 0x3F) << 22 | x << 11 | y).astype("<u4")
     high = t >> 6
@@ -54,7 +50,7 @@ def write_evt2(path: Path, count: int) -> None:
 
 
 def evt3_words(count: int) -> NDArray[np.uint16]:
-    """A time, a row and a column for each event: no vectors, the worst case."""
+    """Return a time, a row and a column word for each event: no vectors, which is the worst case."""
     x, y, t, p = events(count)
     words = np.stack([0x6000 | t & 0xFFF, y, 0x2000 | p << 11 | x], -1).astype("<u2").reshape(-1)
     high = t >> 12
@@ -63,13 +59,13 @@ def evt3_words(count: int) -> NDArray[np.uint16]:
 
 
 def write_evt3(path: Path, count: int) -> None:
-    """Writes the words after a header."""
+    """Write EVT 3.0."""
     header = f"% evt 3.0\n% geometry {_WIDTH}x{_HEIGHT}\n% end\n".encode()
     path.write_bytes(header + evt3_words(count).tobytes())
 
 
 def write_dat(path: Path, count: int) -> None:
-    """Writes version 2."""
+    """Write DAT of version 2."""
     x, y, t, p = events(count)
     words = np.stack([t, p << 28 | y << 14 | x], -1).astype("<u4")
     header = f"% Data file containing CD events\n% Version 2\n% Width {_WIDTH}\n% Height {_HEIGHT}\n".encode()
@@ -77,7 +73,7 @@ def write_dat(path: Path, count: int) -> None:
 
 
 def write_aedat4(path: Path, count: int) -> None:
-    """Writes LZ4 packets of 10 ms, without a table."""
+    """Write LZ4 packets of 10 ms, without a table."""
     from lz4.frame import compress
 
     x, y, t, p = events(count)
@@ -89,7 +85,7 @@ def write_aedat4(path: Path, count: int) -> None:
         f'<attr key="sizeX" type="int">{_WIDTH}</attr><attr key="sizeY" type="int">{_HEIGHT}</attr></node></node>'
         "</node></dv>"
     ).encode()
-    # FlatBuffers: the place of the table, an identifier, the places of the table's fields, the table.
+    # FlatBuffers: offset of the table, identifier, offsets of the table's fields, table.
     header = struct.pack("<I4s5H2xiiqII", 20, b"IOHE", 10, 24, 4, 8, 16, 12, 1, -1, 4, len(info)) + info + b"\0"
     with path.open("wb") as file:
         file.write(b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header)
@@ -111,7 +107,7 @@ def _write_bag(path: Path, kind: str, messages: list[tuple[int, bytes]]) -> None
 
 
 def write_arrays(path: Path, count: int) -> None:
-    """Writes dvs_msgs/EventArray of 10 ms."""
+    """Write dvs_msgs/EventArray messages of 10 ms."""
     x, y, t, p = events(count)
     t += _START
     records = np.zeros(count, [("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
@@ -126,7 +122,7 @@ def write_arrays(path: Path, count: int) -> None:
 
 
 def write_packets(path: Path, count: int) -> None:
-    """Writes event_camera_msgs/EventPacket of 60,000 bytes of EVT 3.0, about 10 ms."""
+    """Write event_camera_msgs/EventPacket messages of 60,000 bytes of EVT 3.0, about 10 ms."""
     parts = np.split(evt3_words(count), range(30_000, 3 * count, 30_000))
     messages = [
         (
@@ -144,7 +140,7 @@ def _table(count: int) -> NDArray[np.int64]:
 
 
 def write_native(path: Path, count: int) -> None:
-    """Writes the dataset format of this project (gzip)."""
+    """Write the dataset format of this project (gzip)."""
     x, y, t, p = events(count)
     with Hdf5EventWriter(path) as writer:
         columns = x.astype(np.uint16), y.astype(np.uint16), t * 1000, (2 * p - 1).astype(np.int8)
@@ -152,7 +148,7 @@ def write_native(path: Path, count: int) -> None:
 
 
 def write_blosc(path: Path, count: int) -> None:
-    """Writes the layout of TUM-VIE and DSEC (Blosc)."""
+    """Write the layout of TUM-VIE and DSEC (Blosc)."""
     import h5py
     import hdf5plugin
 
@@ -165,23 +161,23 @@ def write_blosc(path: Path, count: int) -> None:
 
 
 def write_npy(path: Path, count: int) -> None:
-    """Writes a matrix of float64, as E-NeRF's ESIM scenes have it."""
+    """Write a matrix of float64, as in E-NeRF's ESIM scenes."""
     np.save(path, _table(count).astype(np.float64))
 
 
 def write_npz(path: Path, count: int) -> None:
-    """Writes an array for each column, compressed where the name says so."""
+    """Write an array for each column, compressed where the name says so."""
     save = np.savez_compressed if "compressed" in path.name else np.savez
     save(path, **dict(zip("xytp", events(count), strict=True)))
 
 
 def write_csv(path: Path, count: int) -> None:
-    """Writes whole microseconds."""
+    """Write CSV with whole microseconds."""
     np.savetxt(path, _table(count), fmt="%d", delimiter=",", header="x,y,t,p", comments="")
 
 
 def write_text(path: Path, count: int) -> None:
-    """Writes the Event Camera Dataset's lines, in seconds."""
+    """Write the text format of the Event Camera Dataset, with times in seconds."""
     table = _table(count)
     np.savetxt(path, np.column_stack([table[:, 2] * 1e-6, table[:, [0, 1, 3]]]), fmt=["%.6f", "%d", "%d", "%d"])
 
@@ -204,7 +200,7 @@ WRITERS: dict[str, Callable[[Path, int], None]] = {
 
 
 def count_events(reader: str, path: Path) -> int:
-    """Reads a file from end to end, in pieces."""
+    """Read a file in chunks and return its number of events."""
     if reader == "aenerf":
         from aenerf_ns.files.open import open_event_file
 
@@ -214,17 +210,17 @@ def count_events(reader: str, path: Path) -> int:
     return sum(map(len, faery.events_stream_from_file(path)))
 
 
-def measure(reader: str, small: Path, path: Path) -> dict:
-    """Runs one measurement in this process."""
+def measure(reader: str, small: Path, path: Path) -> dict[str, float]:
+    """Read a file and return the throughput and the peak memory of this process."""
     count_events(reader, small)
-    before = _peak_mib()
+    before = peak_mib()
     begin = time.process_time()
     count = count_events(reader, path)
     seconds = time.process_time() - begin
     row = {
         "events": count,
         "million_events_per_second": count / seconds / 1e6,
-        "peak_mib": _peak_mib(),
+        "peak_mib": peak_mib(),
         "peak_mib_of_the_process_before": before,
     }
     if reader == "aenerf":
@@ -234,18 +230,6 @@ def measure(reader: str, small: Path, path: Path) -> dict:
         open_event_file(path, _WIDTH, _HEIGHT).time_span()
         row["seconds_of_time_span"] = time.process_time() - begin
     return row
-
-
-def _run(*arguments: object) -> str:
-    """Runs a part in a process of its own: this one must stay small, for the peak memory of a process counts that of
-    the process it was forked from.
-    """
-    command = [sys.executable, __file__, *map(str, arguments)]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
-
-
-def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
 
 @dataclass
@@ -258,31 +242,23 @@ class Readers:
     """Numbers of events."""
 
     def main(self) -> None:
-        """Measures and writes the figures."""
+        """Measure and write the figures."""
         rows = []
         with tempfile.TemporaryDirectory() as folder:
             for name in WRITERS:
                 small, path = Path(folder) / f"small_{name}", Path(folder) / name
-                _run("--write", name, small, 1000)
+                in_own_process(WRITERS[name], small, 1000)
                 for size in self.sizes if path.suffix not in _TEXT else (min(self.sizes),):
                     path.unlink(missing_ok=True)
-                    _run("--write", name, path, size)
+                    in_own_process(WRITERS[name], path, size)
                     for reader in ("aenerf", "faery"):
                         if reader == "faery" and (path.suffix not in _FAERY or not find_spec("faery")):
                             continue
-                        measured = json.loads(_run("--measure", reader, small, path).splitlines()[-1])
+                        measured = in_own_process(measure, reader, small, path)
                         row = {"file": name, "reader": reader, "mib": path.stat().st_size / 2**20, **measured}
                         rows.append(row)
-                        print(json.dumps(row, indent=2))
-        self.output.write_text(
-            json.dumps({"sensor": [_WIDTH, _HEIGHT], "rows": rows, **environment()}, indent=2) + "\n"
-        )
+        write_result(self.output, {"sensor": [_WIDTH, _HEIGHT], "rows": rows})
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--write"]:
-        WRITERS[sys.argv[2]](Path(sys.argv[3]), int(sys.argv[4]))
-    elif sys.argv[1:2] == ["--measure"]:
-        print(json.dumps(measure(sys.argv[2], Path(sys.argv[3]), Path(sys.argv[4]))))
-    else:
-        tyro.cli(Readers).main()
+    tyro.cli(Readers).main()

@@ -5,7 +5,7 @@
     ns-train aenerf-small --machine.device-type cpu --max-num-iterations 1500 --data forklift
     ns-eval --load-config .../config.yml --output-path corrected.json --render-output-path corrected
     (the same with --pipeline.model.camera-optimizer.mode off, as uncorrected)
-    python benchmarks/readme_picture.py --data forklift --uncorrected uncorrected --corrected corrected \\
+    python -m benchmarks.readme_picture --data forklift --uncorrected uncorrected --corrected corrected \\
         --views 3 18 --output docs/images/pose_correction.png
 
 Prints the PSNR of each rendering shown, and how far the camera's path is from each view.

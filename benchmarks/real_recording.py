@@ -1,17 +1,16 @@
-r"""How well a field trained on a real recording agrees with the recording's own frames, which training never saw.
+r"""Measure how well a field trained on a real recording agrees with the recording's frames, which training never saw.
 
     ns-train aenerf-small --machine.device-type cpu --vis tensorboard --max-num-iterations 1500 \
         --pipeline.model.near-plane 0.25 --pipeline.model.far-plane 20 --data slider_depth ecd-data
-    python benchmarks/real_recording.py --load-config outputs/.../config.yml --output benchmarks/results/NAME.json
+    python -m benchmarks.real_recording --load-config outputs/.../config.yml --output benchmarks/results/NAME.json
 
-Reports the correlation of rendered log-radiance with the log-intensity of each held-out frame at the frame's pose, and
-the reconstruction loss over many pairs of consecutive events (1 for a constant field), for the trained field and for an
-untrained one.
+Reports, for the trained field and for an untrained one, the correlation of rendered log-radiance with the log-intensity
+of each held-out frame at the frame's pose, and the reconstruction loss over many pairs of consecutive events (1 for a
+constant field).
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,15 +18,15 @@ import torch
 import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
-from aenerf_ns.bench.environment import environment
 from aenerf_ns.training.pipeline import AENeRFPipeline
+from benchmarks.common import write_result
 
 _NUM_BATCHES = 20
 
 
 @dataclass
 class RealRecording:
-    """Correlation with real frames, and the loss, of a trained run."""
+    """Measure the correlation with real frames, and the loss, of a trained run."""
 
     load_config: Path
     """config.yml of the run."""
@@ -35,7 +34,7 @@ class RealRecording:
     """JSON file to write."""
 
     def main(self) -> None:
-        """Measures and writes the figures."""
+        """Measure and write the figures."""
         config, pipeline, _, step = eval_setup(self.load_config, test_mode="val")
         assert isinstance(pipeline, AENeRFPipeline)
         trained = self._measure(pipeline)
@@ -48,10 +47,8 @@ class RealRecording:
             "steps": step + 1,
             "trained": trained,
             "untrained": self._measure(pipeline),
-            **environment(),
         }
-        self.output.write_text(json.dumps(result, indent=2) + "\n")
-        print(json.dumps(result, indent=2))
+        write_result(self.output, result)
 
     @torch.no_grad()
     def _measure(self, pipeline: AENeRFPipeline) -> dict:

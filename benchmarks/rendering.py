@@ -1,6 +1,6 @@
 """Speed of rendering frames: the built-in room beside meshes of about 10^5 and 10^6 triangles.
 
-    python benchmarks/rendering.py --output benchmarks/results/NAME.json
+    python -m benchmarks.rendering --output benchmarks/results/NAME.json
 
 CPU time of all threads, so that what else the machine does matters little; one frame of each in turns. The meshes are
 procedural: a textured, dented sphere seen from inside by the room's camera, so that every ray hits it. The light of the
@@ -20,13 +20,13 @@ import numpy as np
 import trimesh
 import tyro
 
-from aenerf_ns.bench.environment import environment
 from aenerf_ns.simulator.open_scene import built_in_scene
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import sky
 from aenerf_ns.simulator.rendering.light_baking import AreaLight
 from aenerf_ns.simulator.rendering.mesh_lighting import baked_mesh, light_mesh, light_points
 from aenerf_ns.simulator.rendering.mesh_loading import Mesh, scaled
+from benchmarks.environment import environment
 
 
 @dataclass

@@ -1,15 +1,14 @@
-"""Whether two generations of the benchmark's datasets are identical byte for byte.
+"""Test whether the benchmark's datasets, simulated twice, are identical byte for byte.
 
-    python benchmarks/reproducibility.py --bench BENCH --scenes scenes/*/scene.json --output JSON
+    python -m benchmarks.reproducibility --bench BENCH --scenes scenes/*/scene.json --output JSON
 
-Makes each dataset of a benchmark's folder again, with another number of threads, and compares all files with those that
-are there. Lists a hash of each: SHA-256 over the names and the contents of its files.
+Simulates each dataset of a benchmark's folder again, with another number of threads, and compares all files. The result
+lists a SHA-256 hash of each dataset, over the names and the contents of its files.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import subprocess
 import sys
@@ -20,33 +19,33 @@ from typing import Literal
 
 import tyro
 
-from aenerf_ns.bench.environment import environment
-from aenerf_ns.bench.plan import Dataset, Poses, Scale, plan, scene_name
+from benchmarks.common import script, write_result
+from benchmarks.paper.plan import Dataset, Poses, Scale, plan, scene_name
 
 
 @dataclass
 class Reproducibility:
-    """Make the benchmark's datasets again and compare."""
+    """Simulate the benchmark's datasets again and compare."""
 
     bench: Path
-    """Folder of aenerf bench."""
+    """Folder that python -m benchmarks.paper has written."""
     output: Path
     """JSON file to write."""
     scenes: tuple[str, ...] = ("room", "object")
-    """As aenerf bench was given them."""
+    """As given to the benchmark."""
     again: tuple[str, ...] = ()
-    """The same scenes built or copied elsewhere, to make the datasets from; by default the same files."""
+    """The same scenes, built or copied elsewhere. By default the same files."""
     speeds: tuple[Literal["easy", "hard"], ...] = ("easy", "hard")
-    """As aenerf bench was given them."""
+    """As given to the benchmark."""
     scale: Scale = "tiny"
-    """As aenerf bench was given it."""
+    """As given to the benchmark."""
     poses: Poses = "noise"
-    """As aenerf bench was given it."""
+    """As given to the benchmark."""
     threads: int = 2
-    """Threads to render with."""
+    """Number of threads that render."""
 
     def main(self) -> None:
-        """Compares and writes the hashes."""
+        """Compare, and write the hashes after each dataset."""
         again = dict(zip(self.scenes, self.again or self.scenes, strict=True))
         runs = plan(self.scenes, self.speeds, self.poses, ("methods",), (0,), self.scale)
         rows = []
@@ -55,7 +54,7 @@ class Reproducibility:
             if not folder.exists():
                 continue
             first, second = hashes(folder), self._generate(dataset, again[dataset.scene])
-            # aenerf bench adds this for image methods.
+            # The benchmark adds this file for image methods.
             first.pop("transforms_ground_truth.json", None)
             different = sorted(name for name in {*first, *second} if first.get(name) != second.get(name))
             rows.append(
@@ -70,10 +69,9 @@ class Reproducibility:
                     "events_sha256": first["events.h5"],
                 }
             )
-            print(json.dumps(rows[-1]), flush=True)
-            self.output.write_text(
-                json.dumps({"rows": rows, "threads": self.threads, **environment()}, indent=2) + "\n"
-            )
+            write_result(self.output, {"rows": rows, "threads": self.threads})
+        if not rows:
+            sys.exit(f"Error: {self.bench}: it has none of the datasets; give the options that the benchmark was given")
 
     def _generate(self, dataset: Dataset, scene: str) -> dict[str, str]:
         with TemporaryDirectory() as folder:
@@ -81,7 +79,7 @@ class Reproducibility:
             options = ("--output", str(output), "--scene", scene, *dataset.command[2:])
             threads = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
             subprocess.run(
-                [Path(sys.executable).parent / "aenerf", "simulate", *options],
+                [script("aenerf"), "simulate", *options],
                 check=True,
                 capture_output=True,
                 env={**os.environ, **threads},
@@ -90,7 +88,7 @@ class Reproducibility:
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file, by its name in the folder."""
+    """Return the SHA-256 of each file, by its name in the folder."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))

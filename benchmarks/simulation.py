@@ -1,16 +1,16 @@
-"""Frames and events a second of the simulator, and its self-test, on whatever scene.
+"""Measure frames and events a second of the simulator, and test its events, on any scenes.
 
-    python benchmarks/simulation.py --scenes room scenes/*/scene.json --output benchmarks/results/simulation_cpu2.json
+    python -m benchmarks.simulation --scenes room scenes/*/scene.json --output benchmarks/results/simulation_cpu2.json
 
 The first frames of each scene's path are rendered and turned into events, as ``aenerf simulate`` does. The self-test
-takes the log-radiance of some pixels in every frame, and compares how much it moved between two events of a pixel with
-the contrast threshold. Times are whole nanoseconds, so a pair may be off by what the log-radiance moves within the half
-nanosecond by which each of its events was rounded; what an error has beyond that must be below 1e-6.
+takes the log-radiance of some pixels in every frame. It compares the change of log-radiance between two events of a
+pixel with the contrast threshold. Times of events are rounded to whole nanoseconds, so the change may differ from the
+threshold by what the log-radiance changes in half a nanosecond at each event. Beyond that rounding, an error must be
+below 1e-6.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,14 +19,15 @@ from typing import Any
 import numba
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
-from aenerf_ns.bench.environment import environment
-from aenerf_ns.bench.plan import scene_name
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.events.sensor import LUMINANCE, SensorModel
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.frames import frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene
+from benchmarks.common import write_result
+from benchmarks.paper.plan import scene_name
 
 _TESTED_PIXELS = 2000
 
@@ -47,10 +48,10 @@ class SimulationCost:
     """Pixel rows."""
 
     def main(self) -> None:
-        """Measures and writes the figures."""
+        """Measure and write the figures."""
         rows = [self._measure(name) for name in self.scenes]
         size = {"width": self.width, "height": self.height, "numba_threads": numba.get_num_threads()}
-        self.output.write_text(json.dumps({"rows": rows, **size, **environment()}, indent=2) + "\n")
+        write_result(self.output, {"rows": rows, **size})
 
     def _measure(self, name: str) -> dict[str, Any]:
         begin = time.process_time()
@@ -78,7 +79,7 @@ class SimulationCost:
         wall = time.perf_counter() - wall
         x, y, t, p = (np.concatenate(column) for column in zip(*columns, strict=True))
         frames = len(levels)
-        row = {
+        return {
             "scene": scene_name(name),
             "frames": frames,
             "frames_of_the_path": len(parameters),
@@ -91,12 +92,26 @@ class SimulationCost:
                 np.array(levels), times[:frames], tested, y.astype(np.int64) * self.width + x, t, p
             ),
         }
-        print(json.dumps(row), flush=True)
-        return row
 
 
-def _self_test(levels, times, tested, pixels, event_times, polarities) -> dict[str, float]:  # type: ignore[no-untyped-def]
-    """How far the change of log-radiance between two events of a pixel is from the contrast threshold."""
+def _self_test(
+    levels: NDArray[np.float64],
+    times: NDArray[np.int64],
+    tested: NDArray[np.int64],
+    pixels: NDArray[np.int64],
+    event_times: NDArray[np.int64],
+    polarities: NDArray[np.int8],
+) -> dict[str, float]:
+    """Compare the change of log-radiance between two events of a pixel with the contrast threshold.
+
+    Args:
+        levels: (F, P) log-radiance of the tested pixels in each frame.
+        times: (F,) of the frames in nanoseconds.
+        tested: (P,) indices of the tested pixels.
+        pixels: (N,) indices of the events' pixels.
+        event_times: (N,) in nanoseconds, in order.
+        polarities: (N,) -1 or 1.
+    """
     threshold, errors, excesses = SensorModel().positive_contrast_threshold, [], []
     order = np.argsort(pixels, kind="stable")
     firsts = np.searchsorted(pixels[order], tested)
@@ -109,7 +124,7 @@ def _self_test(levels, times, tested, pixels, event_times, polarities) -> dict[s
             error = np.abs(np.diff(level) - threshold * polarities[mine][1:].astype(np.float64))
             before = np.searchsorted(times, stamps) - 1
             slope = np.abs(levels[before + 1, index] - levels[before, index]) / (times[before + 1] - times[before])
-            # An event is at least 1 ns later than a frame: one whose time is rounded to the frame's moves by up to 1.
+            # An event comes at least 1 ns after a frame: rounding moves the earliest ones by up to 1 ns.
             rounding = slope * np.where(stamps == times[before] + 1, 1.0, 0.5)
             errors.append(error)
             excesses.append(error - rounding[1:] - rounding[:-1])

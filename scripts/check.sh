@@ -12,4 +12,5 @@ mkdir "$layout/aenerf_ns"
 for entry in aenerf_ns/* dataparsers method_configs; do
   ln -s "$PWD/$entry" "$layout/aenerf_ns/$(basename "$entry")"
 done
-(cd "$layout" && mypy --config-file "$OLDPWD/pyproject.toml" --cache-dir "$OLDPWD/.mypy_cache" -p aenerf_ns)
+ln -s "$PWD/benchmarks" "$layout/benchmarks"
+(cd "$layout" && mypy --config-file "$OLDPWD/pyproject.toml" --cache-dir "$OLDPWD/.mypy_cache" -p aenerf_ns -p benchmarks.paper)

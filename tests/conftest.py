@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,10 @@ import torch
 
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.events.stream import EventStream
+
+# For the package `benchmarks`, which is not installed. At the end, because the repository's own `aenerf_ns` lacks two
+# folders of the installed one.
+sys.path.append(str(Path(__file__).parents[1]))
 
 # Examples of each test that feeds readers with damaged and random input; many more when they are set to.
 FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))

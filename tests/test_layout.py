@@ -82,6 +82,16 @@ def test_the_floors_are_in_order_and_none_is_forgotten() -> None:
         assert used <= needed, f"{place} no longer uses {used - needed}"
 
 
+def test_nothing_that_is_installed_imports_the_benchmarks() -> None:
+    for _, path in _modules():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            else:
+                names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert "benchmarks" not in {name.split(".")[0] for name in names}, path
+
+
 def test_the_hallway_is_empty() -> None:
     assert {path.name for path in (ROOT / "aenerf_ns").iterdir() if path.is_file()} == {
         "__init__.py",

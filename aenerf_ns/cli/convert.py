@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +11,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
+from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile, hot_pixel_summary
 from aenerf_ns.events.stream import EventFile, EventStream
@@ -99,7 +97,7 @@ class Convert:
                 )
         try:
             with (
-                _ended_by_exception(),
+                ended_by_exception(),
                 NativeDatasetWriter(
                     self.output,
                     camera,
@@ -222,13 +220,3 @@ def _with_estimated_poses(
         reference_views=splits,
         image_encoding=frames.image_encoding,
     ), report
-
-
-@contextmanager
-def _ended_by_exception() -> Iterator[None]:
-    """Has a request to end the process raise an exception, which cleans up, as an interrupt from the keyboard does."""
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

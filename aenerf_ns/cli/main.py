@@ -6,7 +6,6 @@ import sys
 
 import tyro
 
-from aenerf_ns.cli.bench import Bench
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.cli.evaluate import Evaluate
@@ -24,7 +23,6 @@ def main() -> None:
             "check": Check,
             "evaluate": Evaluate,
             "export-trajectory": ExportTrajectory,
-            "bench": Bench,
         },
         prog="aenerf",
         description="AE-NeRF tools; train with ns-train aenerf.",

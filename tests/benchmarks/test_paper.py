@@ -1,4 +1,4 @@
-"""The benchmark: its plan, its tables against hand-made figures, and a whole small one through the command."""
+"""The paper's tables: the plan, the tables against hand-made figures, and a whole small benchmark by the command."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,19 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from PIL import Image
 
-from aenerf_ns.bench import environment, tables
-from aenerf_ns.bench.figures import draw, error_map
-from aenerf_ns.bench.nerfacto import prepare
-from aenerf_ns.bench.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_small import aenerf_small
+from benchmarks import environment
+from benchmarks.paper import tables
+from benchmarks.paper.figures import draw, error_map
+from benchmarks.paper.nerfacto import prepare
+from benchmarks.paper.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
+
+ROOT = Path(__file__).parents[2]
+# Published results, which a benchmark with the same options must find again.
+PUBLISHED = ROOT / "benchmarks" / "results" / "tiny"
 
 
 def small_plan(**changes: Any) -> list[Run]:
@@ -80,6 +86,15 @@ def test_whatever_a_run_depends_on_is_in_its_name() -> None:
         assert not changed & names, change
 
 
+def test_published_runs_are_found_by_their_names() -> None:
+    scenes = sorted({path.name.split("_hard_")[0] for path in PUBLISHED.glob("*_hard_*.json")})
+    files = tuple(f"scenes/{scene}/scene.json" for scene in scenes)
+    runs = {run.name for run in small_plan(scenes=files, seeds=(42,))}
+    published = {path.stem for path in PUBLISHED.glob("*.json")}
+    assert len(published) == 96
+    assert published <= runs
+
+
 def test_a_scene_file_goes_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (run, *_) = small_plan(scenes=("scenes/piano/scene.json",))
     assert run.name.startswith("piano_easy_")
@@ -89,8 +104,15 @@ def test_a_scene_file_goes_by_its_folder(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path / "hall")
     (run, *_) = small_plan(scenes=("scene.json",))
     assert run.name.startswith("hall_easy_")
-    with pytest.raises(DataError, match="two scenes go by the name piano"):
+    with pytest.raises(DataError, match="two scenes have the name piano"):
         small_plan(scenes=("old/piano/scene.json", "new/piano/scene.json"))
+
+
+def test_a_command_is_recorded_as_it_is_typed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [str(ROOT / "benchmarks" / "paper" / "__main__.py"), "--output", "bench"])
+    for name in ("benchmarks.paper.__main__", "benchmarks.paper"):
+        monkeypatch.setattr(sys.modules["__main__"], "__spec__", ModuleSpec(name, None))
+        assert environment.environment()["command"] == "python -m benchmarks.paper --output bench"
 
 
 def test_a_commit_is_that_of_this_package_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,14 +274,18 @@ def small_bench(folder: Path, *tables: str) -> list[str]:
     """The command of a small benchmark."""
     (folder / "object").mkdir()  # A folder by the name of a built-in scene is no scene.
     return [
-        str(Path(sys.executable).parent / "aenerf"), "bench", "--output", "bench", "--scale", "tiny", "--device", "cpu",
+        sys.executable, "-m", "benchmarks.paper", "--output", "bench", "--scale", "tiny", "--device", "cpu",
         "--scenes", "object", "--speeds", "hard", "--steps", "8", "--tables", *tables,
         "--simulate=--width 32 --height 24 --duration 0.5 --validation-views 3 --test-views 3 --train-images 6",
     ]  # fmt: skip
 
 
+# Behind what is there already: the package as it is installed comes first.
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(ROOT))))}
+
+
 def test_a_benchmark_that_is_ended_leaves_no_command_at_work(tmp_path: Path) -> None:
-    process = subprocess.Popen(small_bench(tmp_path, "methods"), cwd=tmp_path, start_new_session=True)
+    process = subprocess.Popen(small_bench(tmp_path, "methods"), cwd=tmp_path, env=ENVIRONMENT, start_new_session=True)
     while not list(tmp_path.glob("bench/logs/*")):
         assert process.poll() is None
         time.sleep(0.1)
@@ -272,7 +298,7 @@ def test_a_benchmark_that_is_ended_leaves_no_command_at_work(tmp_path: Path) -> 
 @pytest.mark.slow
 def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path) -> None:
     command = small_bench(tmp_path, "methods", "losses")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment = {**ENVIRONMENT, "OMP_NUM_THREADS": "1"}
     first = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
     while not list(tmp_path.glob("bench/runs/*.json")):
         assert first.poll() is None

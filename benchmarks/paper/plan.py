@@ -1,4 +1,4 @@
-"""Which runs a benchmark consists of."""
+"""The runs of a benchmark."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _SIMULATE = {
     "full": ("--width", "346", "--height", "260", "--validation-views", "100", "--test-views", "100"),
     "tiny": ("--width", "96", "--height", "72", "--validation-views", "20", "--test-views", "20"),
 }
-# At full size about what COLMAP leaves on the benchmark's scenes: 0.5 degrees and 4 cm at easy speed, 1.1 degrees and
-# 8 cm at hard (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json).
-# With fewer pixels more, or they would not see it.
+# At full size about the errors that COLMAP leaves on the benchmark's scenes: 0.5 degrees and 4 cm at easy speed, 1.1
+# degrees and 8 cm at hard (medians over the sequences of the mean errors,
+# benchmarks/results/estimated_poses_scenes_cpu2.json). Larger at tiny size, where a pixel covers a larger angle.
 _NOISE = {
     "full": ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03"),
     "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
 }
 _METHOD = {"full": "aenerf", "tiny": "aenerf-small"}
 _STEPS = {"full": 30000, "tiny": 1500}
-# Of a batch, in the table of losses: the methods' own, whose rays are two a pair.
+# Pairs of a batch in the table of losses. They are as many as the methods' own batches hold, at two rays a pair.
 _PAIRS = {"full": 4096, "tiny": 512}
 
 OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
@@ -36,7 +36,7 @@ OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
     "true poses",
     "images, nerfacto",
 )
-"""The rows of the table of methods. The last two are no rivals but bounds: what remains when the poses are right, and
+"""The rows of the table of methods. The last two are bounds, not rivals: the event method with true poses, and
 Nerfstudio's own method on sharp images with true poses."""
 
 LOSSES = {
@@ -45,11 +45,11 @@ LOSSES = {
     "l_p + l_r + l_d": {"temporal-loss": 0.0, "distortion-loss": 1e-3},
     "all": {"temporal-loss": 1e-3, "distortion-loss": 1e-3},
 }
-"""The rows of the paper's table 4: weights of the terms. All have the same pairs in a batch, which with the
-temporal loss take three rays in place of two."""
+"""The rows of the paper's table 4: weights of the terms. All rows have equally many pairs in a batch. A pair takes two
+rays, or three with the temporal loss."""
 
 _OFF = ("--pipeline.model.camera-optimizer.mode", "off")
-# A full-size nerfacto in the proportions of aenerf-small.
+# nerfacto in the proportions of aenerf-small.
 _SMALL_NERFACTO = (
     "--pipeline.datamanager.train-num-rays-per-batch", "1024",
     "--pipeline.model.num-levels", "8",
@@ -71,7 +71,7 @@ class Dataset:
     Attributes:
         scene: name or file, as aenerf simulate takes it.
         speed: "easy" or "hard".
-        poses: how the estimated ones come about, "noise" or "colmap".
+        poses: where the estimated poses come from, "noise" or "colmap".
         options: of aenerf simulate.
     """
 
@@ -82,12 +82,12 @@ class Dataset:
 
     @property
     def name(self) -> str:
-        """Folder name: what it is, and a digest of the options."""
+        """Name of the folder: scene, speed, poses and a digest of the options."""
         return f"{scene_name(self.scene)}_{self.speed}_{self.poses}_{digest((self.scene, *self.options))}"
 
     @property
     def command(self) -> tuple[str, ...]:
-        """Arguments of aenerf simulate, but for the output."""
+        """Arguments of aenerf simulate without the output."""
         return ("--scene", self.scene, "--speed", self.speed, *self.options)
 
 
@@ -96,9 +96,9 @@ class Run:
     """A training and its evaluation.
 
     Attributes:
-        table: which table it is a row of.
-        row: its name there.
-        dataset: what it is trained and evaluated on.
+        table: the table that the run is a row of.
+        row: name of the row.
+        dataset: to train and evaluate on.
         method: registered method.
         steps: of the training.
         seed: of the training.
@@ -115,12 +115,12 @@ class Run:
 
     @property
     def true_poses(self) -> bool:
-        """Whether the true poses take the place of the estimated ones."""
+        """Whether the run gets the true poses in place of the estimated ones."""
         return self.row in (TRUE_POSES, CEILING)
 
     @property
     def name(self) -> str:
-        """File name: what it is, and a digest of the options that it depends on."""
+        """Name of the files: scene, speed, row, seed and a digest of the other options."""
         unique = digest((self.dataset.name, self.method, str(self.steps), *self.options))
         row = self.row.replace(",", "").replace(" + ", "+").replace(" ", "-")
         return f"{scene_name(self.dataset.scene)}_{self.dataset.speed}_{row}_seed{self.seed}_{unique}"
@@ -137,13 +137,13 @@ def plan(
     simulate: Sequence[str] = (),
     train: Sequence[str] = (),
 ) -> list[Run]:
-    """All runs, in the order in which they are made.
+    """Return all runs, in the order in which they are made.
 
     Args:
         scenes: names or files, as aenerf simulate takes them.
         speeds: "easy" and "hard".
-        poses: how the estimated poses come about.
-        tables: "methods" are those of the paper's tables 1 and 3; "losses", its table 4, is of hard speed only.
+        poses: where the estimated poses come from.
+        tables: "methods" for the paper's tables 1 and 3; "losses" for its table 4, at hard speed only.
         seeds: of the trainings.
         scale: "full" or, for a CPU, "tiny".
         steps: of every training; 30,000 or 1500 by default.
@@ -155,7 +155,7 @@ def plan(
     """
     for scene in scenes:
         if [scene_name(other) for other in scenes].count(scene_name(scene)) > 1:
-            raise DataError("aenerf bench", f"two scenes go by the name {scene_name(scene)}", "give one another folder")
+            raise DataError("--scenes", f"two scenes have the name {scene_name(scene)}", "give one another folder")
 
     def dataset(scene: str, speed: str) -> Dataset:
         estimated = _NOISE[scale] if poses == "noise" else ("--poses", "colmap")
@@ -188,11 +188,11 @@ def plan(
 
 
 def scene_name(scene: str) -> str:
-    """Short name of a scene, which may be given as a file."""
+    """Return the short name of a scene: a built-in name, or for a file its stem, or the folder of a scene.json."""
     path = Path(scene)
     return path.resolve().parent.name if path.name == "scene.json" else path.stem
 
 
 def digest(words: Sequence[str]) -> str:
-    """Tells apart what was made with other options."""
+    """Return eight hexadecimal digits that differ for other words."""
     return hashlib.sha256("\0".join(words).encode()).hexdigest()[:8]

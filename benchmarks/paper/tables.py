@@ -1,4 +1,4 @@
-"""Tables of a benchmark's figures, in the layout of the paper's tables 1, 3 and 4, as Markdown."""
+"""Markdown tables of a benchmark's figures, in the layout of the paper's tables 1, 3 and 4."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
-from aenerf_ns.bench.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION
+from benchmarks.paper.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION
 
 Figures = dict[str, Any]
 _METRICS = ("psnr", "ssim", "lpips")
@@ -15,11 +15,11 @@ _METHODS = (WITHOUT_CORRECTION, OURS, TRUE_POSES, CEILING)
 
 
 def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
-    """All tables of the figures of some runs.
+    """Return all tables of some runs.
 
     Args:
-        figures: of the runs.
-        missing: names of the runs that have none, and why not, or nothing where they have not been tried.
+        figures: of the runs that have been made.
+        missing: names of the other runs with the reason, which is empty for runs that were not tried.
     """
     methods, losses = ([one for one in figures if one["table"] == table] for table in ("methods", "losses"))
     parts = ["# Benchmark", _conditions(figures)]
@@ -48,8 +48,11 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
 
 
 def methods_table(figures: Sequence[Figures]) -> str:
-    """Means for each method, kind of scene and speed, over the scenes and seeds that all methods of the column have:
-    where runs are missing, a method would look good that lacks the hard scenes."""
+    """Return the means for each method, kind of scene and speed.
+
+    A mean covers the scenes and seeds that all methods of the column have: a method whose difficult scenes are missing
+    would otherwise look better.
+    """
     columns = [(kind, speed) for kind in ("object", "large") for speed in ("easy", "hard")]
     columns = [column for column in columns if _of(figures, kind=column[0], speed=column[1])]
     header, rows = ["method"], [[method] for method in _METHODS if _of(figures, row=method)]
@@ -63,7 +66,7 @@ def methods_table(figures: Sequence[Figures]) -> str:
 
 
 def poses_table(figures: Sequence[Figures]) -> str:
-    """Errors of the poses after the correction and before it, means over scenes and seeds."""
+    """Return the errors of the poses with and without correction, means over scenes and seeds."""
     corrected = _of(figures, row=OURS)
     speeds = [speed for speed in ("easy", "hard") if _of(corrected, speed=speed)]
     header = ["", *(f"{speed}: {which} ψ" for speed in speeds for which in ("with", "without"))]
@@ -79,14 +82,14 @@ def poses_table(figures: Sequence[Figures]) -> str:
 
 
 def losses_table(figures: Sequence[Figures]) -> str:
-    """Means for each set of losses over the scenes and seeds that all of them have."""
+    """Return the means for each set of losses, over the scenes and seeds that all sets have."""
     figures = _common(figures)
     rows = [[name, *(_mean(_of(figures, row=name), m) for m in _METRICS)] for name in LOSSES if _of(figures, row=name)]
     return _markdown(["losses", *map(str.upper, _METRICS)], rows)
 
 
 def scenes_table(figures: Sequence[Figures]) -> str:
-    """Every row of every scene and speed, means over seeds with the standard deviation of PSNR where there are more."""
+    """Return every row of every scene and speed, means over seeds with the standard deviation of PSNR."""
     errors_of_poses = ("RE before", "RE after", "TE before", "TE after")
     header = ["scene", "speed", "row", "seeds", *map(str.upper, _METRICS), *errors_of_poses]
     rows = []
@@ -106,7 +109,7 @@ def scenes_table(figures: Sequence[Figures]) -> str:
 
 
 def sequences_table(figures: Sequence[Figures]) -> str:
-    """What COLMAP made of each sequence, given one run of each: mean errors at the frames, and between them."""
+    """Return COLMAP's mean errors on each sequence, at the frames and between them, given one run of each sequence."""
     header = ["scene", "speed", "frames", "registered", "misplaced", "RE", "TE", "RE between", "TE between"]
     rows = []
     for one in figures:
@@ -119,7 +122,7 @@ def sequences_table(figures: Sequence[Figures]) -> str:
 
 
 def _common(figures: Sequence[Figures]) -> list[Figures]:
-    """Those of the scenes, speeds and seeds that every row among them has."""
+    """Return the figures of the scenes, speeds and seeds that every row has."""
     made: dict[str, set[tuple]] = {}
     for one in figures:
         made.setdefault(one["row"], set()).add((one["scene"], one["speed"], one["seed"]))
@@ -128,7 +131,7 @@ def _common(figures: Sequence[Figures]) -> list[Figures]:
 
 
 def _conditions(figures: Sequence[Figures]) -> str:
-    """Where and how the figures were made."""
+    """Return a list of where and how the figures were made."""
     trained = dict.fromkeys((one["method"], one["steps"]) for one in figures)
     lines = [f"- {method}, {steps} steps" for method, steps in trained]
     lines += [f"- data: `{command}`" for command in dict.fromkeys(_simulation(one) for one in figures)]
@@ -142,7 +145,7 @@ def _conditions(figures: Sequence[Figures]) -> str:
 
 
 def _simulation(figures: Figures) -> str:
-    """The command that made the data, whichever the scene and the speed."""
+    """Return the command that made the data, with SCENE and SPEED in place of their values."""
     words = shlex.split(figures["simulate"])
     for option in ("--scene", "--speed"):
         words[words.index(option) + 1] = option[2:].upper()

@@ -1,13 +1,14 @@
-"""Making the runs of a benchmark: simulate, train, evaluate, and keep the figures.
+"""Make the runs of a benchmark: simulate, train, evaluate, and keep the figures.
 
-Everything lies in one folder, which can be worked on again and by several processes at once, each of which leaves alone
-what another is making:
+All files lie in one folder:
 
-    datasets/DATASET/       what was simulated
-    outputs/RUN/            what was trained, as ns-train leaves it
-    logs/                   what the commands printed
-    runs/RUN.json           the figures of a run; a run that has them is not made again
+    datasets/DATASET/       simulated datasets
+    outputs/RUN/            trained runs, as ns-train writes them
+    logs/                   output of the commands
+    runs/RUN.json           figures of a run; a run that has them is not made again
     runs/RUN/               pictures of the test views, and the corrected trajectory
+
+Several processes can work on the folder at once, or one after the other. Each skips the run that another is making.
 """
 
 from __future__ import annotations
@@ -26,20 +27,23 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from aenerf_ns.bench.environment import environment
-from aenerf_ns.bench.plan import CEILING, OURS, Dataset, Run, scene_name
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from benchmarks.common import script
+from benchmarks.environment import environment
+from benchmarks.paper.plan import CEILING, OURS, Dataset, Run, scene_name
 
-# Parts of a training. The framework looks at the views after each but the last, whose final step it counts as one less.
+# A training has so many parts. The framework evaluates the validation views after each part but the last, because it
+# counts the final step as one less.
 _CURVE_PARTS = 5
 _CURVE = "Eval Images Metrics Dict (all images)/psnr"
-_NERFACTO = (sys.executable, "-m", "aenerf_ns.bench.nerfacto")
+# By its path, because the command runs in the benchmark's folder, where the package `benchmarks` is not found.
+_NERFACTO = (sys.executable, str(Path(__file__).with_name("nerfacto.py")))
 
 
 class Runner:
-    """Makes runs in a folder.
+    """Make runs in a folder.
 
     Args:
         folder: of the benchmark.
@@ -54,14 +58,14 @@ class Runner:
             (folder / name).mkdir(parents=True, exist_ok=True)
 
     def figures(self, run: Run) -> dict[str, Any] | None:
-        """The figures of a run, None where it has not been made."""
+        """Return the figures of a run, or None if the run has not been made."""
         return _read(self._figures_file(run))
 
     def make(self, run: Run) -> dict[str, Any] | None:
-        """Makes a run, unless that has been done.
+        """Make a run, unless it has been made.
 
         Returns:
-            Its figures; None where another process is making it.
+            The figures of the run, or None if another process is making it.
 
         Raises:
             DataError: a command failed.
@@ -73,10 +77,10 @@ class Runner:
             return None
 
     def _make(self, run: Run) -> dict[str, Any]:
-        # What the run is made with, not what is there by its end.
+        # Taken first, because the checkout may change during the run.
         origin = environment()
         data = self._dataset(run.dataset)
-        # What was left by a training that was killed.
+        # A training that was killed leaves files.
         shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)
         begin = time.perf_counter()
         training = self._train(run, data)
@@ -113,54 +117,55 @@ class Runner:
 
     def _dataset(self, dataset: Dataset) -> Path:
         if dataset.name in self._failed:
-            # Every one of its runs would simulate anew, and fail at the same place.
+            # Each run of this dataset would simulate again and fail again.
             raise self._failed[dataset.name]
         folder = self._folder / "datasets" / dataset.name
-        # Where another process is making the same, its work is waited for.
+        # If another process is making the dataset, wait until it has finished.
         with FileLock(folder.with_name(f".{dataset.name}.lock")):
             if not folder.exists():
-                # A built-in scene's name has no suffix; a file's path is relative to where the benchmark was started.
+                # A file is relative to the folder in which the benchmark was started. A built-in scene has no suffix.
                 scene = str(Path(dataset.scene).resolve()) if Path(dataset.scene).suffix else dataset.scene
                 options = ("--scene", scene, *dataset.command[2:])
                 output = str(folder.resolve())
                 try:
-                    self._call(dataset.name, _script("aenerf"), "simulate", "--output", output, *options)
+                    self._call(dataset.name, script("aenerf"), "simulate", "--output", output, *options)
                 except DataError as error:
                     self._failed[dataset.name] = error
                     raise
         return folder
 
     def _train(self, run: Run, data: Path) -> tuple[str, ...]:
-        """Returns the command, without the folders of this machine."""
+        """Train and return the command, without the folders of this machine."""
         common = (
             run.method, "--machine.device-type", self._device, "--machine.seed", str(run.seed), "--vis", "tensorboard",
             "--experiment-name", run.name, "--output-dir", "outputs", "--max-num-iterations", str(run.steps),
             "--steps-per-eval-all-images", str(max(run.steps // _CURVE_PARTS, 1)),
         )  # fmt: skip
         if run.row == CEILING:
-            # Of the framework's implementations, the one that needs no CUDA extension.
+            # The framework's implementation that needs no CUDA extension.
             command = [
                 *_NERFACTO, "ns-train", *common, "--pipeline.model.implementation", "torch",
                 "--pipeline.model.camera-optimizer.mode", "off", "--pipeline.model.use-appearance-embedding", "False",
             ]  # fmt: skip
             if self._device == "cpu":
-                # The same pictures, sooner: what a piece needs stays small.
+                # Renders the same pictures faster, because a small chunk fits the cache.
                 command += ["--pipeline.model.eval-num-rays-per-chunk", "1024"]
             command += [*run.options, "nerfstudio-data", "--data", str(_with_true_poses(data).resolve())]
         else:
-            # LPIPS is reported where its network can be had, as nerfacto's is.
-            command = [_script("ns-train"), *common, "--pipeline.model.lpips", "True", *run.options]
+            # As for nerfacto, LPIPS is reported where its network can be downloaded.
+            command = [script("ns-train"), *common, "--pipeline.model.lpips", "True", *run.options]
             poses = "ground-truth" if run.true_poses else "estimated"
             command += ["aenerf-data", "--data", str(data.resolve()), "--poses", poses]
         self._call(run.name, *command)
-        words = (word.replace(f"{self._folder.resolve()}/", "") for word in command[1:])
+        folder, root = f"{self._folder.resolve()}/", f"{Path(__file__).parents[2]}/"
+        words = (word.replace(folder, "").replace(root, "") for word in command[1:])
         return (Path(command[0]).name, *words)
 
     def _evaluate(self, run: Run, config: Path) -> dict[str, Any]:
         relative = str(config.relative_to(self._folder))
         folder = Path("runs") / run.name
         output = folder / "evaluation.json"
-        command = (*_NERFACTO, "ns-eval") if run.row == CEILING else (_script("ns-eval"),)
+        command = (*_NERFACTO, "ns-eval") if run.row == CEILING else (script("ns-eval"),)
         pictures = ("--render-output-path", str(folder / "pictures"))
         self._call(run.name, *command, "--load-config", relative, "--output-path", str(output), *pictures)
         results = json.loads((self._folder / output).read_text("utf8"))["results"]
@@ -171,18 +176,18 @@ class Runner:
         if run.row == OURS:
             corrected = str(folder / "corrected.txt")
             self._call(
-                run.name, _script("aenerf"), "export-trajectory", "--load-config", relative, "--output", corrected
+                run.name, script("aenerf"), "export-trajectory", "--load-config", relative, "--output", corrected
             )
         return results
 
     def _call(self, log: str, *command: str) -> None:
-        """Runs a command in the benchmark's folder.
+        """Run a command in the benchmark's folder.
 
         Raises:
             DataError: it failed.
         """
         file = self._folder / "logs" / f"{log}.log"
-        # ns-eval has no option for this.
+        # ns-eval has no option for the device.
         hidden = {"CUDA_VISIBLE_DEVICES": ""} if self._device == "cpu" else {}
         with file.open("a", encoding="utf8") as output:
             output.write(f"$ {shlex.join(command)}\n")
@@ -193,7 +198,7 @@ class Runner:
                 try:
                     status = process.wait()
                 except BaseException:
-                    # Left alone, it would go on beside what the next call starts in its place.
+                    # Otherwise the command would continue beside its successor from the next call.
                     process.terminate()
                     raise
         if status:
@@ -204,13 +209,8 @@ def _read(file: Path) -> dict[str, Any] | None:
     return json.loads(file.read_text("utf8")) if file.exists() else None
 
 
-def _script(name: str) -> str:
-    """A console script of this environment."""
-    return str(Path(sys.executable).parent / name)
-
-
 def _with_true_poses(data: Path) -> Path:
-    """A transforms.json whose train images have their true poses, beside the dataset's own, for image methods."""
+    """Write a transforms.json in which the train images have their true poses, for image methods. Return its path."""
     file = data / "transforms_ground_truth.json"
     truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
     meta = json.loads((data / "transforms.json").read_text("utf8"), parse_float=Decimal)
@@ -225,8 +225,7 @@ def _with_true_poses(data: Path) -> Path:
 
 
 def _curve(run: Path) -> list[tuple[int, float]]:
-    """PSNR over the validation views, which is what the framework looks at while it trains: steps and values, from a
-    training's TensorBoard log."""
+    """Return steps and PSNR over the validation views during a training, from its TensorBoard log."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     log = EventAccumulator(str(run))

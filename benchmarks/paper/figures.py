@@ -10,30 +10,31 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from aenerf_ns.bench.plan import OURS, Run, scene_name
+from benchmarks.paper.plan import OURS, Run, scene_name
 
 _TRUTH = "truth"
 _GAP = 4
 _LABEL = 14
 _MIN_WIDTH = 190
-"""In pixels: smaller pictures are enlarged, or the names above them would not fit."""
+"""In pixels. Smaller pictures are enlarged, because the names above them would not fit."""
 
 
 def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]]) -> list[Path]:
-    """Draws all figures of the runs that have been made into ``folder / "figures"``: one of each kind for every scene
-    and speed, and a view of every scene beside each other.
+    """Draw the figures of the runs that have been made into ``folder / "figures"``.
+
+    Each kind of figure is drawn for every scene, speed and table. One more figure has a view of every scene.
 
     Args:
         folder: of the benchmark.
         runs: all runs.
-        figures: of the runs that have been made, by the name of the run.
+        figures: results of the runs that have been made, by the name of the run.
 
     Returns:
-        The files.
+        The files that were drawn.
     """
     output = folder / "figures"
     output.mkdir(exist_ok=True)
-    # Figures can come without the pictures, from results that are published.
+    # Published results come without pictures.
     made = [run for run in runs if run.name in figures and (folder / "runs" / run.name / "pictures").exists()]
     files = []
     for speed, table in dict.fromkeys((run.dataset.speed, run.table) for run in made):
@@ -41,7 +42,7 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
         files += _scenes(folder, rows, output / f"{speed}_{table}.jpg")
     for scene, speed, table in dict.fromkeys((run.dataset.scene, run.dataset.speed, run.table) for run in made):
         rows = [run for run in made if (run.dataset.scene, run.dataset.speed, run.table) == (scene, speed, table)]
-        # Of several seeds one will do: the first there is.
+        # The first seed that has been made stands for all seeds.
         rows = [run for run in rows if run.seed == rows[0].seed]
         stem = f"{scene_name(scene)}_{speed}_{table}"
         files += [
@@ -56,7 +57,7 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
 
 
 def _views(folder: Path, runs: Sequence[Run], file: Path) -> Path:
-    """A test view: the truth, and what each run made of it with the error below, white from a quarter of the range."""
+    """Draw a test view: the truth and each run's rendering, with its error map below."""
     columns: dict[str, list[NDArray[np.uint8]]] = {}
     for run in runs:
         truth, rendered = _view(folder, run)
@@ -67,11 +68,11 @@ def _views(folder: Path, runs: Sequence[Run], file: Path) -> Path:
 
 
 def _scenes(folder: Path, runs: Sequence[Run], file: Path) -> list[Path]:
-    """A test view of every scene of which all rows have been made: the truth, and what each run made of it."""
+    """Draw a test view of every scene whose rows have all been made: the truth and each run's rendering."""
     names = list(dict.fromkeys(run.row for run in runs))
     columns: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in (_TRUTH, *names)}
     for scene in dict.fromkeys(run.dataset.scene for run in runs):
-        # Of several seeds, the first.
+        # The first seed stands for all seeds: later entries of a dict win.
         rows = {run.row: run for run in reversed(runs) if run.dataset.scene == scene}
         if set(rows) == set(names):
             views = {name: _view(folder, rows[name]) for name in names}
@@ -85,7 +86,7 @@ def _scenes(folder: Path, runs: Sequence[Run], file: Path) -> list[Path]:
 
 
 def _view(folder: Path, run: Run) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """The truth and the rendering of the middle one of a run's test views."""
+    """Return the truth and the rendering of the middle test view of a run."""
     pictures = sorted((folder / "runs" / run.name / "pictures").glob("eval_img_*.png"))
     both = np.asarray(Image.open(pictures[len(pictures) // 2]).convert("RGB"))
     truth, rendered = np.split(both, 2, axis=1)
@@ -93,7 +94,7 @@ def _view(folder: Path, run: Run) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 def _grid(columns: Mapping[str, Sequence[NDArray[np.uint8]]]) -> Image.Image:
-    """Columns of pictures of one size, with their names above."""
+    """Return a picture of columns of equally large pictures, with the names of the columns above."""
     height, width = next(iter(columns.values()))[0].shape[:2]
     factor = -(-_MIN_WIDTH // width)
     height, width = factor * height, factor * width
@@ -111,8 +112,10 @@ def _grid(columns: Mapping[str, Sequence[NDArray[np.uint8]]]) -> Image.Image:
 
 
 def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) picture of the mean absolute error over the channels: black for none, white for a quarter of the range
-    and more."""
+    """Return an (H, W, 3) picture of the absolute error, averaged over the channels.
+
+    Black is no error. White is a quarter of the range of display values or more.
+    """
     from matplotlib import colormaps
 
     error = np.abs(rendered.astype(np.float64) - truth).mean(-1) / 255
@@ -120,7 +123,7 @@ def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[
 
 
 def _paths(data: Path, corrected: Path, file: Path) -> Path:
-    """The given and the corrected path from above, aligned with the true one, and their errors over time."""
+    """Draw the true, the estimated and the corrected path from above, and the rotation errors over time."""
     import torch
     from matplotlib.figure import Figure
 
@@ -149,7 +152,7 @@ def _paths(data: Path, corrected: Path, file: Path) -> Path:
 
 
 def _curves(runs: Sequence[Run], figures: Mapping[str, dict[str, Any]], file: Path) -> Path:
-    """PSNR during the trainings."""
+    """Draw PSNR during the trainings."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 3.5), layout="constrained")

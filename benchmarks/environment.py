@@ -14,11 +14,15 @@ _PACKAGES = (
     "aenerf-ns", "nerfstudio", "torch", "numpy", "numba", "scipy", "open3d", "opencv-contrib-python-headless", "pillow",
     "h5py", "pycolmap",
 )  # fmt: skip
-"""Whatever decides the bytes of a simulated dataset, and what is trained with."""
+"""The packages that a training uses, or that the bytes of a simulated dataset depend on."""
 
 
 def environment() -> dict[str, Any]:
-    """Machine, versions, commit (None where this is no checkout, or without git) and command of this process."""
+    """Return the machine, the versions, the commit and the command of this process.
+
+    The commit is None outside a checkout of this project, or without git. It ends in ``+changes`` where files differ
+    from the commit.
+    """
     import torch
 
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
@@ -39,7 +43,7 @@ def _commit() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        # An installed package may lie within the checkout of something else.
+        # An unpacked copy of this project may lie within the checkout of another one.
         git("ls-files", "--error-unmatch", Path(__file__).name)
         return git("rev-parse", "--short", "HEAD") + ("+changes" if git("status", "--porcelain") else "")
     except (OSError, subprocess.CalledProcessError):
@@ -47,15 +51,15 @@ def _commit() -> str | None:
 
 
 def _program() -> str:
-    """The console script or the script that runs."""
-    program = Path(sys.argv[0])
-    return program.name if program.is_absolute() else f"python {program}"
+    """Return how this process was started: ``python -m MODULE``, or the name of a script."""
+    spec = sys.modules["__main__"].__spec__
+    return Path(sys.argv[0]).name if spec is None else f"python -m {spec.name.removesuffix('.__main__')}"
 
 
 def _portable(argument: str) -> str:
-    """An argument without the folders of this machine."""
+    """Return an argument without the folders of this machine."""
     path = Path(argument)
-    return str(Path("...", *path.parts[-3:])) if path.is_absolute() else argument
+    return str(Path("...", *path.parts[1:][-3:])) if path.is_absolute() else argument
 
 
 def _cpu() -> str:

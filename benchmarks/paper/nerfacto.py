@@ -1,11 +1,13 @@
-"""Nerfstudio's nerfacto, where it would not run.
+"""Run Nerfstudio's nerfacto where it would fail, and with metrics that can be compared.
 
-    python -m aenerf_ns.bench.nerfacto ns-train nerfacto ...
-    python -m aenerf_ns.bench.nerfacto ns-eval ...
+    python benchmarks/paper/nerfacto.py ns-train nerfacto ...
+    python benchmarks/paper/nerfacto.py ns-eval ...
 
-Its constructor builds LPIPS, asked for or not, and dies without a connection: here the metric is left out then. Its
-checkpoints hold NumPy's numbers, which current torch refuses to load unless told that they are trusted. And its SSIM
-takes for the range of the data that of each picture: here it is 1, or its figures could not stand beside others.
+Three things differ from Nerfstudio's own commands:
+
+- nerfacto always builds LPIPS, which fails without a connection. The metric is then NaN.
+- nerfacto's checkpoints hold NumPy numbers, which recent versions of torch refuse to load unless the file is trusted.
+- nerfacto's SSIM takes the range of each picture as the data range. Here the data range is 1, as in all other rows.
 """
 
 from __future__ import annotations
@@ -23,12 +25,14 @@ _MODULES = {"ns-train": "nerfstudio.scripts.train", "ns-eval": "nerfstudio.scrip
 
 
 class _Absent(nn.Module):
+    """A metric that cannot be computed."""
+
     def forward(self, *_: Tensor) -> Tensor:
         return torch.tensor(torch.nan)
 
 
 def prepare() -> None:
-    """Changes what this module is for, in this process."""
+    """Change LPIPS, SSIM and the loading of checkpoints, in this process."""
     import torchmetrics.functional as functional
     import torchmetrics.image.lpip as lpip
 
@@ -38,7 +42,7 @@ def prepare() -> None:
         try:
             return build(*arguments, **options)
         except Exception:
-            # torch.hub raises whatever its connection raises.
+            # torch.hub passes on all exceptions of the connection.
             return _Absent()
 
     lpip.LearnedPerceptualImagePatchSimilarity = build_or_leave_out  # type: ignore[misc,assignment]
@@ -49,7 +53,7 @@ def prepare() -> None:
 
 
 def main() -> None:
-    """Runs a command of Nerfstudio's."""
+    """Run the command of Nerfstudio that the arguments name."""
     prepare()
     sys.argv = sys.argv[1:]
     importlib.import_module(_MODULES[sys.argv[0]]).entrypoint()

@@ -1,1 +1,0 @@
-"""The benchmark: its runs, how they are made, and what is written about them."""

@@ -1,0 +1,22 @@
+"""How a command ends when it is asked to."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def ended_by_exception() -> Iterator[None]:
+    """Turn SIGTERM into :class:`SystemExit` within the context, so that a command that is ended cleans up.
+
+    Schedulers and ``kill`` send SIGTERM, which by default ends a process at once. Python already turns the keyboard's
+    interrupt into an exception. Enter this context in the main thread only.
+    """
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,104 @@
+"""The command ``python -m benchmarks.paper --output FOLDER``, which runs from the repository's root."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from filelock import FileLock
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.cli.termination import ended_by_exception
+from aenerf_ns.errors import DataError
+from aenerf_ns.progress import progress_bar
+from benchmarks.paper.figures import draw
+from benchmarks.paper.plan import Poses, Run, Scale, Table, plan
+from benchmarks.paper.running import Runner
+from benchmarks.paper.tables import report
+
+
+@dataclass
+class Bench:
+    """Simulate, train and evaluate scenes x speeds x methods x seeds, and write tables and figures.
+
+    Stop the command at any time and repeat it: finished runs are kept. Several processes can work on one folder: start
+    the same command several times, or as a scheduler's array.
+    """
+
+    output: Path
+    """Folder of the benchmark."""
+    scale: Scale = "full"
+    """full: 346 x 260 pixels with aenerf. tiny, for a CPU: 96 x 72 pixels with aenerf-small."""
+    scenes: tuple[str, ...] = ("room", "object")
+    """Scenes as aenerf simulate takes them: built-in ones and files."""
+    speeds: tuple[Literal["easy", "hard"], ...] = ("easy", "hard")
+    """Constant speed, and 8^sin(2 pi t) times that speed."""
+    poses: Poses = "noise"
+    """Where the estimated poses come from: true poses with noise, or COLMAP."""
+    tables: tuple[Table, ...] = ("methods", "losses")
+    """Methods (the paper's tables 1 and 3), losses (its table 4)."""
+    seeds: tuple[int, ...] = (42,)
+    """Seeds of the trainings."""
+    steps: int | None = None
+    """Steps of every training. By default 30,000 at full scale and 1500 at tiny scale."""
+    simulate: str = ""
+    """More options of aenerf simulate, as in --simulate="--bayer-pattern RGGB"."""
+    train: str = ""
+    """More options of the event method's trainings."""
+    device: Literal["cuda", "cpu"] = "cuda"
+    """Where to train."""
+
+    def main(self) -> None:
+        """Make the runs and write ``report.md`` and the figures.
+
+        Raises:
+            DataError: two scenes have one name, or some runs failed.
+        """
+        runs = plan(
+            self.scenes, self.speeds, self.poses, self.tables, self.seeds, self.scale, self.steps,
+            shlex.split(self.simulate), shlex.split(self.train),
+        )  # fmt: skip
+        runner = Runner(self.output, self.device)
+        # The exception reaches the command that is running, which is then ended too.
+        with ended_by_exception():
+            failures = _make(runner, runs)
+            self._report(runner, runs, failures)
+        if failures:
+            raise DataError(self.output, f"{len(failures)} runs failed", "see above, and repeat the command")
+
+    def _report(self, runner: Runner, runs: list[Run], failures: dict[str, str]) -> None:
+        file = self.output / "report.md"
+        # One process at a time: the last one to write then writes all figures.
+        with FileLock(self.output / ".report.lock"):
+            figures = {run.name: one for run in runs if (one := runner.figures(run)) is not None}
+            missing = {run.name: failures.get(run.name, "") for run in runs if run.name not in figures}
+            file.write_text(report(list(figures.values()), missing), "utf8")
+            drawn = draw(self.output, runs, figures)
+        CONSOLE.print(f"{file}, {len(drawn)} figures beside it; {len(missing)} of {len(runs)} runs are missing.")
+
+
+def _make(runner: Runner, runs: list[Run]) -> dict[str, str]:
+    """Make all runs and return the errors of the failed ones, by the name of the run."""
+    failures = {}
+    with progress_bar() as progress:
+        for run in progress.track(runs, description="Runs"):
+            try:
+                made = runner.make(run)
+            except DataError as error:
+                failures[run.name] = str(error)
+                CONSOLE.print(f"[red]{run.name}: {error}")
+            else:
+                done = "another process is making it" if made is None else f"PSNR {made['results']['psnr']:.2f} dB"
+                CONSOLE.print(f"{run.name}: {done}")
+    return failures
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(Bench, prog="python -m benchmarks.paper").main()
+    except DataError as error:
+        sys.exit(f"Error: {error}")
