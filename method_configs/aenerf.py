@@ -46,8 +46,8 @@ aenerf = MethodSpecification(
                 "scheduler": RelativeCosineSchedulerConfig(),
             },
         },
-        # A batch has few rays for each knot of the spline. If poses follow every single batch, the field stays blurred, at
-        # lower rates and in longer runs too (docs/experiments.md).
+        # A batch has few rays for each knot of the spline. If poses follow every single batch, the field stays blurred,
+        # at lower rates and in longer runs too (docs/experiments.md).
         gradient_accumulation_steps={"camera_opt": 8},
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
         vis="viewer",
