@@ -1,14 +1,12 @@
-"""Events in NumPy's files and in CSV."""
+"""Events in NumPy's files."""
 
 from __future__ import annotations
 
 import struct
-import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
-from aenerf_ns.files.event_table import (
-    SAMPLE,
-    EventLayout,
-    EventTableFile,
-    events_from_columns,
-    guess_time_unit,
-)
-from aenerf_ns.files.text import NANOSECONDS, TimeUnit, first_and_last_row, is_row
+from aenerf_ns.events.stream import EventFile, require_event_file
+from aenerf_ns.files.event_table import EventLayout, EventTableFile
+from aenerf_ns.files.text import TimeUnit
 
 # Robust e-NeRF.
 POSITION_TIMESTAMP_POLARITY = EventLayout(
@@ -36,7 +28,6 @@ XYTP_MEMBERS = EventLayout({name: (name, None) for name in "xytp"}, time_unit=No
 XYTP_MATRIX = EventLayout({name: ("", index) for index, name in enumerate("xytp")}, time_unit=None)
 _XYTP_RECORDS = EventLayout({name: ("", name) for name in "xytp"}, time_unit=None)
 
-_CHUNK_LINES = 1_000_000
 # What zipfile and NumPy raise for files that are damaged or not theirs.
 NPZ_ERRORS = (
     ValueError,
@@ -68,88 +59,6 @@ class NpyEventFile(EventTableFile):
         yield {"": load_npy(self.path)}
 
 
-class CsvEventFile(EventFile):
-    """Comma-separated values; the first line names the columns, x, y, t and p among them, in any order.
-
-    Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
-        time_unit: of the times, or None for the rule of :func:`guess_time_unit`.
-    """
-
-    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
-        super().__init__(path, width, height)
-        self._time_unit = time_unit
-
-    def read_chunks(self) -> Iterator[EventStream]:
-        with self.path.open(encoding="utf-8", errors="replace") as file:
-            names = self._names(next((line for line in file if is_row(line.encode())), ""))
-            tick, done = None, 0
-            while block := list(islice(file, _CHUNK_LINES)):
-                columns = self._parse(block, names)
-                if tick is None and len(columns["t"]):
-                    tick = NANOSECONDS[self._time_unit or guess_time_unit(columns["t"][:SAMPLE])]
-                if tick is not None:
-                    yield self._events(columns, tick, done)
-                    done += len(columns["t"])
-
-    def time_span(self) -> tuple[int, int]:
-        self.require()
-        header, last = first_and_last_row(self.path)
-        names = self._names(header)
-        if last.strip() == header.strip():
-            raise self.empty_error()
-        with self.path.open(encoding="utf-8", errors="replace") as file:
-            rows = (line for line in file if is_row(line.encode()))
-            next(rows)
-            sample = self._parse(list(islice(rows, SAMPLE)), names)
-        tick = NANOSECONDS[self._time_unit or guess_time_unit(sample["t"])]
-        first = {name: column[:1] for name, column in sample.items()}
-        start, end = (int(self._events(row, tick, 0).t[0]) for row in (first, self._parse([last], names)))
-        return start, end
-
-    def _names(self, header: str) -> list[str]:
-        names = [name.strip().strip('"').lower() for name in header.split(",")]
-        if not set("xytp") <= set(names):
-            raise DataError(
-                self.path,
-                f"its first line is {header.strip()[:60]!r}",
-                "it must name the columns, x, y, t and p among them, separated by commas",
-            )
-        return names
-
-    def _parse(self, block: list[str], names: list[str]) -> dict[str, NDArray]:
-        first = next((line for line in block if is_row(line.encode())), "")
-        # Integers are exact, also where float64 is not.
-        whole = all(field.strip().lstrip("+-").isdigit() for field in first.split("#")[0].split(","))
-        for dtype in (np.int64, np.float64) if whole else (np.float64,):
-            try:
-                with warnings.catch_warnings():
-                    # What NumPy says when it cuts the decimals off a later line.
-                    warnings.simplefilter("error", DeprecationWarning)
-                    table = np.loadtxt(block, dtype=dtype, delimiter=",", ndmin=2)
-                break
-            except (ValueError, OverflowError, DeprecationWarning) as failure:
-                error = failure
-        else:
-            raise DataError(self.path, f"it holds what is not a number ({error})", "write numbers only")
-        if table.size == 0:
-            table = table.reshape(0, len(names))
-        if table.shape[1] != len(names):
-            raise DataError(
-                self.path,
-                f"its lines have {table.shape[1]} fields, its header {len(names)}",
-                "give every line a field for each name",
-            )
-        return {name: table[:, names.index(name)] for name in "xytp"}
-
-    def _events(self, columns: dict[str, NDArray], tick: int, first: int) -> EventStream:
-        return events_from_columns(
-            columns, width=self.width, height=self.height, tick=tick, source=self.path, first=first
-        )
-
-
 def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
     """An .npz, .npy or .csv file of events, told from its content.
 
@@ -166,8 +75,6 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
         DataError: the file is missing or malformed, or holds no events in a known layout.
     """
     suffix = path.suffix.lower()
-    if suffix == ".csv":
-        return CsvEventFile(path, width, height, time_unit)
     require_event_file(path)
     if suffix == ".npy":
         layout = XYTP_MATRIX if load_npy(path).dtype.names is None else _XYTP_RECORDS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,7 +141,7 @@ class EventTableFile(EventFile):
             tick=tick,
             offset=offset,
             source=self.path,
-            first=first,
+            place=lambda index: f"event {first + index}",
         )
 
 
@@ -149,7 +149,7 @@ _DOCS = "see the formats in the docs"
 
 
 def guess_time_unit(times: NDArray) -> TimeUnit:
-    """Microseconds, which event cameras count, for whole numbers; seconds for decimals.
+    """Return microseconds, which event cameras count, for whole numbers, and seconds for decimals.
 
     Args:
         times: (N,) the first times of a file.
@@ -166,22 +166,24 @@ def events_from_columns(
     height: int,
     tick: int,
     offset: int = 0,
+    fraction: NDArray[np.float64] | None = None,
     source: str | Path,
-    first: int = 0,
+    place: Callable[[int], str] = "event {}".format,
 ) -> EventStream:
-    """Events of columns of any numeric type.
+    """Return the events of columns of any numeric type.
 
     Args:
         columns: x, y, t and p, (N,) each. Polarities are 0 and 1, or −1 and 1.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
-        tick: nanoseconds of the times' unit.
+        tick: nanoseconds of the unit of the times.
         offset: added to the times, in their unit.
-        source: where they came from, for messages.
-        first: index of the first of these events there, for messages.
+        fraction: (N,) added to the times, in their unit, where the times are integers; between −1 and 1.
+        source: names the origin of the columns, for messages.
+        place: names the place of an event in the source, for messages.
 
     Raises:
-        DataError: a value cannot be.
+        DataError: a value is not one that an event can have.
     """
     for name in _COLUMNS:
         if columns[name].dtype.kind not in "iufb":
@@ -189,7 +191,7 @@ def events_from_columns(
 
     def error(name: str, bad: NDArray[np.bool_], remedy: str) -> DataError:
         index = int(np.argmax(bad))
-        return DataError(source, f"event {first + index} has {name} = {columns[name][index]:g}", remedy)
+        return DataError(source, f"{place(index)} has {name} = {columns[name][index]:g}", remedy)
 
     pixels = {}
     for name, size in (("x", width), ("y", height)):
@@ -209,12 +211,12 @@ def events_from_columns(
     if not good.all():
         raise error("t", ~good, "check the unit of the times and the order of the columns")
     if times.dtype.kind == "f":
-        times = times.astype(np.float64)
-        whole = np.floor(times)
         # In two parts: nanoseconds since 1970 would be rounded.
-        nanoseconds = (whole.astype(np.int64) + offset) * tick + np.rint((times - whole) * tick).astype(np.int64)
-    else:
-        nanoseconds = (times.astype(np.int64) + offset) * tick
+        fraction = times.astype(np.float64) % 1
+        times = np.floor(times)
+    nanoseconds = (times.astype(np.int64) + offset) * tick
+    if fraction is not None:
+        nanoseconds += np.rint(fraction * tick).astype(np.int64)
 
     # Written with care for booleans and unsigned integers.
     positive, zero = polarities == 1, polarities == 0

@@ -49,14 +49,12 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     return rows
 
 
-def first_and_last_row(path: Path) -> tuple[str, str]:
-    """The first and the last line that are neither empty nor a comment, "" where there is none."""
+def last_row(path: Path) -> bytes:
+    """Return the last line of a file that is neither empty nor a comment, b"" where the end of the file has none."""
     with path.open("rb") as file:
-        first = next((line for line in file if is_row(line)), b"")
         file.seek(0, 2)
         file.seek(max(file.tell() - _TAIL_BYTES, 0))
-        last = next((line for line in reversed(file.read().splitlines()) if is_row(line)), b"")
-    return first.decode("ascii", "replace"), last.decode("ascii", "replace")
+        return next((line for line in reversed(file.read().splitlines()) if is_row(line)), b"")
 
 
 def is_row(line: bytes) -> bool:
