@@ -22,13 +22,13 @@ from aenerf_ns.files.text import TimeUnit
 POSITION_TIMESTAMP_POLARITY = EventLayout(
     {"x": ("position", 0), "y": ("position", 1), "t": ("timestamp", None), "p": ("polarity", None)}, time_unit="ns"
 )
-# EventNeRF, and what people write by themselves.
+# EventNeRF, and files that people write by themselves.
 XYTP_MEMBERS = EventLayout({name: (name, None) for name in "xytp"}, time_unit=None)
-# E-NeRF's ESIM, and what people write by themselves.
+# E-NeRF's ESIM, and files that people write by themselves.
 XYTP_MATRIX = EventLayout({name: ("", index) for index, name in enumerate("xytp")}, time_unit=None)
 _XYTP_RECORDS = EventLayout({name: ("", name) for name in "xytp"}, time_unit=None)
 
-# What zipfile and NumPy raise for files that are damaged or not theirs.
+# The exceptions of zipfile and NumPy for files that are damaged or in another format.
 NPZ_ERRORS = (
     ValueError,
     OSError,
@@ -42,7 +42,7 @@ NPZ_ERRORS = (
 
 
 class NpzEventFile(EventTableFile):
-    """An .npz file. Members that are not compressed are mapped into memory, others are read as a whole."""
+    """Read an .npz file. Members that are not compressed are mapped into memory, others are read as a whole."""
 
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, NDArray]]:
@@ -51,7 +51,7 @@ class NpzEventFile(EventTableFile):
 
 
 class NpyEventFile(EventTableFile):
-    """An .npy file: a matrix or an array of records, mapped into memory."""
+    """Read an .npy file: a matrix or an array of records, mapped into memory."""
 
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, NDArray]]:
@@ -60,16 +60,16 @@ class NpyEventFile(EventTableFile):
 
 
 def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
-    """An .npz, .npy or .csv file of events, told from its content.
+    """Open an .npz or .npy file of events. The names of its arrays tell the layout.
 
-    .npz: x, y, t and p, or position, timestamp and polarity as Robust e-NeRF has them. .npy: a matrix whose first four
-    columns are x, y, t and p, or records with fields of these names.
+    An .npz file holds x, y, t and p, or position, timestamp and polarity as Robust e-NeRF has them. An .npy file holds
+    a matrix whose first four columns are x, y, t and p, or records with fields of these names.
 
     Args:
         path: the file.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
-        time_unit: of its times. By default whole numbers are microseconds and decimals seconds.
+        time_unit: of the times. By default whole numbers are microseconds and decimals seconds.
 
     Raises:
         DataError: the file is missing or malformed, or holds no events in a known layout.
@@ -91,7 +91,7 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
 
 
 def npz_members(path: Path) -> set[str]:
-    """The names of the arrays in an .npz file.
+    """Return the names of the arrays in an .npz file.
 
     Raises:
         DataError: the file is missing or not an .npz file.
@@ -101,10 +101,10 @@ def npz_members(path: Path) -> set[str]:
 
 
 def read_npz_member(path: Path, name: str) -> NDArray:
-    """An array of an .npz file, mapped into memory where it is not compressed.
+    """Return an array of an .npz file, mapped into memory where it is not compressed.
 
     Raises:
-        DataError: the file is missing or malformed, or has no such array, or one of Python objects.
+        DataError: the file is missing or malformed, or has no such array, or the array holds Python objects.
     """
     with _open_npz(path) as archive:
         try:
@@ -121,7 +121,7 @@ def read_npz_member(path: Path, name: str) -> NDArray:
                 with archive.open(entry) as member:
                     return np.lib.format.read_array(member, allow_pickle=False)
             with path.open("rb") as file:
-                # The local header repeats name and extra field, of lengths of its own (PKZIP's APPNOTE, 4.3.7).
+                # The local header has a name and an extra field of other lengths (PKZIP's APPNOTE, 4.3.7).
                 file.seek(entry.header_offset + 26)
                 start = entry.header_offset + 30 + sum(struct.unpack("<HH", file.read(4))) + header
             return np.memmap(path, dtype, "r", start, shape, "F" if fortran else "C")
@@ -146,10 +146,10 @@ def read_npy_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def load_npy(path: Path) -> NDArray:
-    """The array of an .npy file, mapped into memory.
+    """Return the array of an .npy file, mapped into memory.
 
     Raises:
-        DataError: the file is malformed, or an array of Python objects.
+        DataError: the file is malformed, or its array holds Python objects.
     """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)

@@ -1,4 +1,4 @@
-"""Events in columns of any numeric type, read piece by piece: what the formats of other projects have in common."""
+"""Events in columns of any numeric type, read piece by piece: the common part of the formats of other projects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
 _COLUMNS = ("x", "y", "t", "p")
 # Events read at once: 32 MB of a matrix of float64.
 _CHUNK = 1 << 20
-# Events looked at to find the unit of their times.
+# Number of events that tell the unit of the times.
 SAMPLE = 4096
 
 
@@ -28,10 +28,10 @@ class EventLayout:
     """Where a file has the columns of its events.
 
     Attributes:
-        columns: for x, y, t and p the name of an array, and None for an array of numbers, the index of a column for a
-            matrix, or the name of a field for an array of records.
+        columns: for x, y, t and p the name of an array and a place in it: None for an array of numbers, the index of a
+            column for a matrix, or the name of a field for an array of records.
         time_unit: of the times, or None for the rule of :func:`guess_time_unit`.
-        time_offset: name of a number that is to be added to all times, in their unit; 0 where it is missing.
+        time_offset: name of a number that is added to all times, in their unit. A missing number is 0.
     """
 
     columns: Mapping[str, tuple[str, int | str | None]]
@@ -40,19 +40,19 @@ class EventLayout:
 
     @property
     def arrays(self) -> set[str]:
-        """The names of the arrays that hold columns."""
+        """Return the names of the arrays that hold columns."""
         return {name for name, _ in self.columns.values()}
 
 
 class EventTableFile(EventFile):
-    """A file whose arrays hold events as an :class:`EventLayout` says. Readers implement :meth:`open_arrays`.
+    """Read a file whose arrays hold events as an :class:`EventLayout` says. Formats implement :meth:`open_arrays`.
 
     Args:
         path: the file.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
         layout: where the columns are.
-        time_unit: of the times, in place of the layout's.
+        time_unit: of the times, in place of the unit of the layout.
     """
 
     def __init__(
@@ -64,15 +64,16 @@ class EventTableFile(EventFile):
 
     @abstractmethod
     def open_arrays(self) -> AbstractContextManager[Mapping[str, Any]]:
-        """The layout's arrays by their names, and its time offset where there is one. They are sliced along their first
-        dimension.
+        """Open the arrays of the layout, by their names, and its time offset where there is one.
+
+        Arrays are sliced along their first dimension.
 
         Raises:
             DataError: the file or an array is missing, or cannot be read.
         """
 
     def read_array(self, array: Any, piece: slice) -> NDArray:
-        """A piece of one of these arrays."""
+        """Read a piece of an array."""
         return array[piece]
 
     def read_chunks(self) -> Iterator[EventStream]:
@@ -94,7 +95,7 @@ class EventTableFile(EventFile):
             return self._length(arrays)
 
     def _length(self, arrays: Mapping[str, Any]) -> int:
-        """The number of events, of arrays that have the form the layout says."""
+        """Return the number of events. Check that the arrays have the form that the layout says."""
         lengths = {}
         for column, (name, place) in self._layout.columns.items():
             array = arrays[name]
@@ -127,7 +128,7 @@ class EventTableFile(EventFile):
         return columns
 
     def _tick(self, arrays: Mapping[str, Any]) -> int:
-        """Nanoseconds of the times' unit."""
+        """Return the nanoseconds of the unit of the times."""
         if self._time_unit is None:
             return NANOSECONDS[guess_time_unit(self._columns(arrays, 0, SAMPLE)["t"])]
         return NANOSECONDS[self._time_unit]

@@ -92,7 +92,7 @@ class RosbagEventFile(EventFile):
         path: a bag of ROS 1; or of ROS 2, as a folder with metadata.yaml or as a single .db3 or .mcap file.
         width: pixel columns of the sensor. By default the messages tell them. With both sizes given, the bag is not
             opened before its events are asked for.
-        height: pixel rows of the sensor, by default from the messages.
+        height: pixel rows of the sensor; by default the messages tell them.
         topic: the topic, or None when only one holds events.
 
     Raises:

@@ -15,7 +15,7 @@ TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 _UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
-# In nanoseconds: what an int64 holds, which is 285 years.
+# In nanoseconds: 285 years, just below the largest int64.
 MAX_TIME = 9 * 10**18
 
 # Longer than any line of a file of events.
@@ -23,7 +23,7 @@ _TAIL_BYTES = 4096
 
 
 def read_rows(path: Path, columns: str) -> list[list[str]]:
-    """Rows of white-space separated fields; empty lines and comments after # are left out.
+    """Read rows of fields between white space. Leave out empty lines and comments after #.
 
     Args:
         path: the file.
@@ -58,12 +58,12 @@ def last_row(path: Path) -> bytes:
 
 
 def is_row(line: bytes) -> bool:
-    """Whether a line is neither empty nor a comment."""
+    """Tell whether a line is neither empty nor a comment."""
     return bool(line.split(b"#", 1)[0].strip())
 
 
 def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:
-    """(N, M) float64 numbers of the rows' fields.
+    """Return the (N, M) float64 numbers of the fields of rows.
 
     Raises:
         DataError: a field is not a number.
@@ -75,7 +75,7 @@ def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:
 
 
 def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[np.int64]:
-    """Exact (N,) nanoseconds of decimal times: float64 cannot hold the nanoseconds of the Unix time.
+    """Return the exact (N,) nanoseconds of decimal times. float64 cannot hold the nanoseconds of the Unix time.
 
     Raises:
         DataError: a field is not a finite number.
@@ -95,6 +95,6 @@ def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[
 
 
 def format_seconds(nanoseconds: int) -> str:
-    """Decimal seconds of integer nanoseconds, exact."""
+    """Format integer nanoseconds as decimal seconds, exactly."""
     sign, magnitude = ("-" if nanoseconds < 0 else ""), abs(nanoseconds)
     return f"{sign}{magnitude // 1_000_000_000}.{magnitude % 1_000_000_000:09d}"

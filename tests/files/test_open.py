@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writers import PACKET, START, array_bag, packet_messages, write_bag
+from bag_writers import PACKET, START, array_bag, packet_messages, write_bag, write_bag2
 from conftest import FUZZ_EXAMPLES
 from event_file_checks import (
     EDITS,
@@ -234,6 +234,9 @@ def made_files(folder: Path) -> dict[str, bytes]:
             files[f"arrays {compress_bag}"] = array_bag(folder / "fuzz_base.bag", rows, compress_bag).read_bytes()
         messages = packet_messages(ROWS, [START + 1000 * row[2] for row in ROWS], 9)
         files["packets"] = write_bag(folder / "fuzz_base.bag", {"/events": (PACKET, messages)}).read_bytes()
+        for storage, suffix in (("SQLITE3", "db3"), ("MCAP", "mcap")):
+            (stored,) = write_bag2(folder / "fuzz_base", messages, PACKET, storage).glob(f"*.{suffix}")
+            files[f"packets.{suffix}"] = stored.read_bytes()
     except ImportError:
         pass
     return files
@@ -241,17 +244,20 @@ def made_files(folder: Path) -> dict[str, bytes]:
 
 def test_damaged_files_raise_nothing_but_clear_errors(folder: Path) -> None:
     files = made_files(folder)
-    path = folder / "fuzz"
+
+    def place(name: str) -> Path:
+        # The suffix tells the storage of bags of ROS 2.
+        return folder / f"fuzz{Path(name).suffix}"
 
     @settings(max_examples=FUZZ_EXAMPLES * 5, deadline=None, suppress_health_check=list(HealthCheck))
     @given(st.sampled_from(sorted(files)), EDITS)
     def check(name: str, edits: list[tuple[str, float, int]]) -> None:
-        path.write_bytes(edited(files[name], edits))
-        survives(path)
+        place(name).write_bytes(edited(files[name], edits))
+        survives(place(name))
 
-    for content in files.values():
-        path.write_bytes(content)
-        attempt(path)
+    for name, content in files.items():
+        place(name).write_bytes(content)
+        attempt(place(name))
     check()
 
 
