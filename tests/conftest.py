@@ -42,6 +42,12 @@ def tum_vie_calibration() -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One folder for the files of all examples of a module."""
+    return tmp_path_factory.mktemp("files")
+
+
 @pytest.fixture
 def random_poses() -> torch.Tensor:
     """(8, 3, 4) float64 random camera-to-world poses with rotations up to 2.5 rad."""

@@ -1,14 +1,12 @@
-"""Events in NumPy's files and in CSV."""
+"""Events in NumPy's files."""
 
 from __future__ import annotations
 
 import struct
-import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
-from aenerf_ns.files.event_table import (
-    SAMPLE,
-    EventLayout,
-    EventTableFile,
-    events_from_columns,
-    guess_time_unit,
-)
-from aenerf_ns.files.text import NANOSECONDS, TimeUnit, first_and_last_row, is_row
+from aenerf_ns.events.stream import EventFile, require_event_file
+from aenerf_ns.files.event_table import EventLayout, EventTableFile
+from aenerf_ns.files.text import TimeUnit
 
 # Robust e-NeRF.
 POSITION_TIMESTAMP_POLARITY = EventLayout(
     {"x": ("position", 0), "y": ("position", 1), "t": ("timestamp", None), "p": ("polarity", None)}, time_unit="ns"
 )
-# EventNeRF, and what people write by themselves.
+# EventNeRF, and files that people write by themselves.
 XYTP_MEMBERS = EventLayout({name: (name, None) for name in "xytp"}, time_unit=None)
-# E-NeRF's ESIM, and what people write by themselves.
+# E-NeRF's ESIM, and files that people write by themselves.
 XYTP_MATRIX = EventLayout({name: ("", index) for index, name in enumerate("xytp")}, time_unit=None)
 _XYTP_RECORDS = EventLayout({name: ("", name) for name in "xytp"}, time_unit=None)
 
-_CHUNK_LINES = 1_000_000
-# What zipfile and NumPy raise for files that are damaged or not theirs.
+# The exceptions of zipfile and NumPy for files that are damaged or in another format.
 NPZ_ERRORS = (
     ValueError,
     OSError,
@@ -51,7 +42,7 @@ NPZ_ERRORS = (
 
 
 class NpzEventFile(EventTableFile):
-    """An .npz file. Members that are not compressed are mapped into memory, others are read as a whole."""
+    """Read an .npz file. Members that are not compressed are mapped into memory, others are read as a whole."""
 
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, NDArray]]:
@@ -60,7 +51,7 @@ class NpzEventFile(EventTableFile):
 
 
 class NpyEventFile(EventTableFile):
-    """An .npy file: a matrix or an array of records, mapped into memory."""
+    """Read an .npy file: a matrix or an array of records, mapped into memory."""
 
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, NDArray]]:
@@ -68,106 +59,22 @@ class NpyEventFile(EventTableFile):
         yield {"": load_npy(self.path)}
 
 
-class CsvEventFile(EventFile):
-    """Comma-separated values; the first line names the columns, x, y, t and p among them, in any order.
-
-    Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
-        time_unit: of the times, or None for the rule of :func:`guess_time_unit`.
-    """
-
-    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
-        super().__init__(path, width, height)
-        self._time_unit = time_unit
-
-    def read_chunks(self) -> Iterator[EventStream]:
-        with self.path.open(encoding="utf-8", errors="replace") as file:
-            names = self._names(next((line for line in file if is_row(line.encode())), ""))
-            tick, done = None, 0
-            while block := list(islice(file, _CHUNK_LINES)):
-                columns = self._parse(block, names)
-                if tick is None and len(columns["t"]):
-                    tick = NANOSECONDS[self._time_unit or guess_time_unit(columns["t"][:SAMPLE])]
-                if tick is not None:
-                    yield self._events(columns, tick, done)
-                    done += len(columns["t"])
-
-    def time_span(self) -> tuple[int, int]:
-        self.require()
-        header, last = first_and_last_row(self.path)
-        names = self._names(header)
-        if last.strip() == header.strip():
-            raise self.empty_error()
-        with self.path.open(encoding="utf-8", errors="replace") as file:
-            rows = (line for line in file if is_row(line.encode()))
-            next(rows)
-            sample = self._parse(list(islice(rows, SAMPLE)), names)
-        tick = NANOSECONDS[self._time_unit or guess_time_unit(sample["t"])]
-        first = {name: column[:1] for name, column in sample.items()}
-        start, end = (int(self._events(row, tick, 0).t[0]) for row in (first, self._parse([last], names)))
-        return start, end
-
-    def _names(self, header: str) -> list[str]:
-        names = [name.strip().strip('"').lower() for name in header.split(",")]
-        if not set("xytp") <= set(names):
-            raise DataError(
-                self.path,
-                f"its first line is {header.strip()[:60]!r}",
-                "it must name the columns, x, y, t and p among them, separated by commas",
-            )
-        return names
-
-    def _parse(self, block: list[str], names: list[str]) -> dict[str, NDArray]:
-        first = next((line for line in block if is_row(line.encode())), "")
-        # Integers are exact, also where float64 is not.
-        whole = all(field.strip().lstrip("+-").isdigit() for field in first.split("#")[0].split(","))
-        for dtype in (np.int64, np.float64) if whole else (np.float64,):
-            try:
-                with warnings.catch_warnings():
-                    # What NumPy says when it cuts the decimals off a later line.
-                    warnings.simplefilter("error", DeprecationWarning)
-                    table = np.loadtxt(block, dtype=dtype, delimiter=",", ndmin=2)
-                break
-            except (ValueError, OverflowError, DeprecationWarning) as failure:
-                error = failure
-        else:
-            raise DataError(self.path, f"it holds what is not a number ({error})", "write numbers only")
-        if table.size == 0:
-            table = table.reshape(0, len(names))
-        if table.shape[1] != len(names):
-            raise DataError(
-                self.path,
-                f"its lines have {table.shape[1]} fields, its header {len(names)}",
-                "give every line a field for each name",
-            )
-        return {name: table[:, names.index(name)] for name in "xytp"}
-
-    def _events(self, columns: dict[str, NDArray], tick: int, first: int) -> EventStream:
-        return events_from_columns(
-            columns, width=self.width, height=self.height, tick=tick, source=self.path, first=first
-        )
-
-
 def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
-    """An .npz, .npy or .csv file of events, told from its content.
+    """Open an .npz or .npy file of events. The names of its arrays tell the layout.
 
-    .npz: x, y, t and p, or position, timestamp and polarity as Robust e-NeRF has them. .npy: a matrix whose first four
-    columns are x, y, t and p, or records with fields of these names.
+    An .npz file holds x, y, t and p, or position, timestamp and polarity as Robust e-NeRF has them. An .npy file holds
+    a matrix whose first four columns are x, y, t and p, or records with fields of these names.
 
     Args:
         path: the file.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
-        time_unit: of its times. By default whole numbers are microseconds and decimals seconds.
+        time_unit: of the times. By default whole numbers are microseconds and decimals seconds.
 
     Raises:
         DataError: the file is missing or malformed, or holds no events in a known layout.
     """
     suffix = path.suffix.lower()
-    if suffix == ".csv":
-        return CsvEventFile(path, width, height, time_unit)
     require_event_file(path)
     if suffix == ".npy":
         layout = XYTP_MATRIX if load_npy(path).dtype.names is None else _XYTP_RECORDS
@@ -184,7 +91,7 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
 
 
 def npz_members(path: Path) -> set[str]:
-    """The names of the arrays in an .npz file.
+    """Return the names of the arrays in an .npz file.
 
     Raises:
         DataError: the file is missing or not an .npz file.
@@ -194,10 +101,10 @@ def npz_members(path: Path) -> set[str]:
 
 
 def read_npz_member(path: Path, name: str) -> NDArray:
-    """An array of an .npz file, mapped into memory where it is not compressed.
+    """Return an array of an .npz file, mapped into memory where it is not compressed.
 
     Raises:
-        DataError: the file is missing or malformed, or has no such array, or one of Python objects.
+        DataError: the file is missing or malformed, or has no such array, or the array holds Python objects.
     """
     with _open_npz(path) as archive:
         try:
@@ -214,7 +121,7 @@ def read_npz_member(path: Path, name: str) -> NDArray:
                 with archive.open(entry) as member:
                     return np.lib.format.read_array(member, allow_pickle=False)
             with path.open("rb") as file:
-                # The local header repeats name and extra field, of lengths of its own (PKZIP's APPNOTE, 4.3.7).
+                # The local header has a name and an extra field of other lengths (PKZIP's APPNOTE, 4.3.7).
                 file.seek(entry.header_offset + 26)
                 start = entry.header_offset + 30 + sum(struct.unpack("<HH", file.read(4))) + header
             return np.memmap(path, dtype, "r", start, shape, "F" if fortran else "C")
@@ -239,10 +146,10 @@ def read_npy_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def load_npy(path: Path) -> NDArray:
-    """The array of an .npy file, mapped into memory.
+    """Return the array of an .npy file, mapped into memory.
 
     Raises:
-        DataError: the file is malformed, or an array of Python objects.
+        DataError: the file is malformed, or its array holds Python objects.
     """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)

@@ -1,4 +1,4 @@
-"""Events in HDF5: the event file of the native dataset format, and those of other projects."""
+"""Events in HDF5: the event file of the native dataset format, and the files of other projects."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import h5py
 
 _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
-# Units that the native file may state; its times are integers.
+# Units that the native file may state. Its times are integers.
 _UNITS: tuple[TimeUnit, ...] = ("ns", "us", "ms")
-# The code under which Prophesee's compression of events registers itself.
+# The number of the HDF5 filter of Prophesee's compression of events.
 _ECF = 0x8ECF
 # Events read at once: 50 MB.
 _CHUNK = 1 << 22
@@ -30,8 +30,10 @@ _WRITE_CHUNK = 1 << 18
 
 
 class Hdf5EventFile(EventFile):
-    """/events/{x u16, y u16, t i64, p i8}, with the attributes ``time_unit`` ("ns", "us" or "ms") and ``time_offset``
-    (an integer in that unit, added to every time) on /events.
+    """Read the native file: /events/{x u16, y u16, t i64, p i8}.
+
+    The group /events may have the attributes ``time_unit`` ("ns", "us" or "ms") and ``time_offset`` (an integer in that
+    unit, added to every time).
 
     Args:
         path, width, height: see :class:`EventFile`.
@@ -43,7 +45,7 @@ class Hdf5EventFile(EventFile):
         self._time_unit = time_unit
 
     def _columns(self, file: h5py.File) -> tuple[dict[str, h5py.Dataset], int, int]:
-        """The four columns, the nanoseconds of a tick, and the offset in nanoseconds."""
+        """Return the four columns, the nanoseconds of a tick, and the offset in nanoseconds."""
         columns = {name: file.get(f"events/{name}") for name in _DTYPES}
         for name, column in columns.items():
             if not hasattr(column, "dtype"):
@@ -63,7 +65,7 @@ class Hdf5EventFile(EventFile):
         unit = unit.decode() if isinstance(unit, bytes) else unit
         if self._time_unit not in (None, unit):
             raise DataError(
-                self.path, f"it states its time unit, {unit!r}, but {self._time_unit} was given", "leave that out"
+                self.path, f"it states its time unit, {unit!r}, but {self._time_unit} was given", "leave it out"
             )
         if unit not in _UNITS:
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
@@ -111,7 +113,7 @@ _LAYOUTS = (PROPHESEE_RECORDS, COLUMNS_IN_GROUP, COLUMNS_AT_TOP, TXYP_MATRIX)
 
 
 class Hdf5TableFile(EventTableFile):
-    """HDF5 of another project."""
+    """Read an HDF5 file of another project."""
 
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, Any]]:
@@ -134,13 +136,13 @@ class Hdf5TableFile(EventTableFile):
 
 
 def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
-    """An HDF5 file of events: the native one, or one of DSEC, TUM-VIE, EDS, Prophesee or PAEv3D, told from its content.
+    """Open an HDF5 file of events. Its content tells the format: native, DSEC, TUM-VIE, EDS, Prophesee or PAEv3D.
 
     Args:
         path: the file.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
-        time_unit: of its times, where the format states none.
+        time_unit: of the times, where the format states none.
 
     Raises:
         DataError: the file is missing or not HDF5, or holds no events in a known layout.
@@ -163,11 +165,11 @@ def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | 
 
 
 def _open(path: Path) -> h5py.File:
-    # Late, for every command of every method would wait for it.
+    # Imported lazily: every command of every method imports this module.
     import h5py
 
     with suppress(ImportError):
-        # Registers Blosc and other compression filters, where the extra is installed.
+        # The import registers Blosc and other compression filters, where the extra is installed.
         import hdf5plugin  # noqa: F401
     require_event_file(path)
     try:
@@ -184,7 +186,7 @@ def _read(path: Path, array: h5py.Dataset, index: slice | int) -> Any:
 
 
 def _filter_remedy(array: h5py.Dataset) -> str:
-    """What to do about a dataset that cannot be read, by the compression filters it was written with."""
+    """Return the remedy for a dataset that cannot be read, from its compression filters."""
     import h5py
 
     settings = array.id.get_create_plist()
@@ -199,12 +201,12 @@ def _filter_remedy(array: h5py.Dataset) -> str:
 
 
 def _scalar(attribute: Any) -> Any:
-    """The one value of an attribute, which some writers store as an array of one."""
+    """Return the value of an attribute. Some writers store it as an array of one value."""
     return attribute.item() if isinstance(attribute, np.ndarray) and attribute.size == 1 else attribute
 
 
 class Hdf5EventWriter:
-    """Writes events piece by piece. Use it as a context manager.
+    """Write events piece by piece. Use it as a context manager.
 
     Args:
         path: the file to create.
@@ -227,7 +229,7 @@ class Hdf5EventWriter:
                 compression="gzip",
                 compression_opts=1,
                 shuffle=True,
-                # Equal content makes equal files.
+                # Equal events make equal files.
                 track_times=False,
             )
             for name, dtype in _DTYPES.items()
@@ -243,10 +245,10 @@ class Hdf5EventWriter:
         self._file.close()
 
     def append(self, events: EventStream) -> None:
-        """Appends events.
+        """Append events.
 
         Raises:
-            DataError: they are earlier than those already written.
+            DataError: the events are earlier than the last event written.
         """
         if len(events) == 0:
             return

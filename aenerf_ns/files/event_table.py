@@ -1,9 +1,9 @@
-"""Events in columns of any numeric type, read piece by piece: what the formats of other projects have in common."""
+"""Events in columns of any numeric type, read piece by piece: the common part of the formats of other projects."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
 _COLUMNS = ("x", "y", "t", "p")
 # Events read at once: 32 MB of a matrix of float64.
 _CHUNK = 1 << 20
-# Events looked at to find the unit of their times.
+# Number of events that tell the unit of the times.
 SAMPLE = 4096
 
 
@@ -28,10 +28,10 @@ class EventLayout:
     """Where a file has the columns of its events.
 
     Attributes:
-        columns: for x, y, t and p the name of an array, and None for an array of numbers, the index of a column for a
-            matrix, or the name of a field for an array of records.
+        columns: for x, y, t and p the name of an array and a place in it: None for an array of numbers, the index of a
+            column for a matrix, or the name of a field for an array of records.
         time_unit: of the times, or None for the rule of :func:`guess_time_unit`.
-        time_offset: name of a number that is to be added to all times, in their unit; 0 where it is missing.
+        time_offset: name of a number that is added to all times, in their unit. A missing number is 0.
     """
 
     columns: Mapping[str, tuple[str, int | str | None]]
@@ -40,19 +40,19 @@ class EventLayout:
 
     @property
     def arrays(self) -> set[str]:
-        """The names of the arrays that hold columns."""
+        """Return the names of the arrays that hold columns."""
         return {name for name, _ in self.columns.values()}
 
 
 class EventTableFile(EventFile):
-    """A file whose arrays hold events as an :class:`EventLayout` says. Readers implement :meth:`open_arrays`.
+    """Read a file whose arrays hold events as an :class:`EventLayout` says. Formats implement :meth:`open_arrays`.
 
     Args:
         path: the file.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
         layout: where the columns are.
-        time_unit: of the times, in place of the layout's.
+        time_unit: of the times, in place of the unit of the layout.
     """
 
     def __init__(
@@ -64,15 +64,16 @@ class EventTableFile(EventFile):
 
     @abstractmethod
     def open_arrays(self) -> AbstractContextManager[Mapping[str, Any]]:
-        """The layout's arrays by their names, and its time offset where there is one. They are sliced along their first
-        dimension.
+        """Open the arrays of the layout, by their names, and its time offset where there is one.
+
+        Arrays are sliced along their first dimension.
 
         Raises:
             DataError: the file or an array is missing, or cannot be read.
         """
 
     def read_array(self, array: Any, piece: slice) -> NDArray:
-        """A piece of one of these arrays."""
+        """Read a piece of an array."""
         return array[piece]
 
     def read_chunks(self) -> Iterator[EventStream]:
@@ -94,7 +95,7 @@ class EventTableFile(EventFile):
             return self._length(arrays)
 
     def _length(self, arrays: Mapping[str, Any]) -> int:
-        """The number of events, of arrays that have the form the layout says."""
+        """Return the number of events. Check that the arrays have the form that the layout says."""
         lengths = {}
         for column, (name, place) in self._layout.columns.items():
             array = arrays[name]
@@ -127,7 +128,7 @@ class EventTableFile(EventFile):
         return columns
 
     def _tick(self, arrays: Mapping[str, Any]) -> int:
-        """Nanoseconds of the times' unit."""
+        """Return the nanoseconds of the unit of the times."""
         if self._time_unit is None:
             return NANOSECONDS[guess_time_unit(self._columns(arrays, 0, SAMPLE)["t"])]
         return NANOSECONDS[self._time_unit]
@@ -141,7 +142,7 @@ class EventTableFile(EventFile):
             tick=tick,
             offset=offset,
             source=self.path,
-            first=first,
+            place=lambda index: f"event {first + index}",
         )
 
 
@@ -149,7 +150,7 @@ _DOCS = "see the formats in the docs"
 
 
 def guess_time_unit(times: NDArray) -> TimeUnit:
-    """Microseconds, which event cameras count, for whole numbers; seconds for decimals.
+    """Return microseconds, which event cameras count, for whole numbers, and seconds for decimals.
 
     Args:
         times: (N,) the first times of a file.
@@ -166,22 +167,24 @@ def events_from_columns(
     height: int,
     tick: int,
     offset: int = 0,
+    fraction: NDArray[np.float64] | None = None,
     source: str | Path,
-    first: int = 0,
+    place: Callable[[int], str] = "event {}".format,
 ) -> EventStream:
-    """Events of columns of any numeric type.
+    """Return the events of columns of any numeric type.
 
     Args:
         columns: x, y, t and p, (N,) each. Polarities are 0 and 1, or −1 and 1.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
-        tick: nanoseconds of the times' unit.
+        tick: nanoseconds of the unit of the times.
         offset: added to the times, in their unit.
-        source: where they came from, for messages.
-        first: index of the first of these events there, for messages.
+        fraction: (N,) added to the times, in their unit, where the times are integers; between −1 and 1.
+        source: names the origin of the columns, for messages.
+        place: names the place of an event in the source, for messages.
 
     Raises:
-        DataError: a value cannot be.
+        DataError: a value is not one that an event can have.
     """
     for name in _COLUMNS:
         if columns[name].dtype.kind not in "iufb":
@@ -189,7 +192,7 @@ def events_from_columns(
 
     def error(name: str, bad: NDArray[np.bool_], remedy: str) -> DataError:
         index = int(np.argmax(bad))
-        return DataError(source, f"event {first + index} has {name} = {columns[name][index]:g}", remedy)
+        return DataError(source, f"{place(index)} has {name} = {columns[name][index]:g}", remedy)
 
     pixels = {}
     for name, size in (("x", width), ("y", height)):
@@ -209,12 +212,12 @@ def events_from_columns(
     if not good.all():
         raise error("t", ~good, "check the unit of the times and the order of the columns")
     if times.dtype.kind == "f":
-        times = times.astype(np.float64)
-        whole = np.floor(times)
         # In two parts: nanoseconds since 1970 would be rounded.
-        nanoseconds = (whole.astype(np.int64) + offset) * tick + np.rint((times - whole) * tick).astype(np.int64)
-    else:
-        nanoseconds = (times.astype(np.int64) + offset) * tick
+        fraction = times.astype(np.float64) % 1
+        times = np.floor(times)
+    nanoseconds = (times.astype(np.int64) + offset) * tick
+    if fraction is not None:
+        nanoseconds += np.rint(fraction * tick).astype(np.int64)
 
     # Written with care for booleans and unsigned integers.
     positive, zero = polarities == 1, polarities == 0

@@ -1,71 +1,187 @@
-"""Text files of events, as the Event Camera Dataset (Mueggler et al. 2017) and many DAVIS recordings have them."""
+"""Text files with one event a line: the Event Camera Dataset's, and comma-separated values."""
 
 from __future__ import annotations
 
+import re
+from abc import abstractmethod
 from collections.abc import Iterator
-from itertools import islice
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files.text import first_and_last_row, is_row
+from aenerf_ns.files.event_table import SAMPLE, events_from_columns
+from aenerf_ns.files.text import NANOSECONDS, TimeUnit, is_row, last_row
 
-_CHUNK_LINES = 1_000_000
+_COLUMNS = "xytp"
+# Bytes read at once: about 150,000 events.
+_BLOCK = 1 << 22
+_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
-class TextEventFile(EventFile):
-    """events.txt: t[s] x y p, with polarity 0 or 1."""
+@dataclass(frozen=True)
+class _Lines:
+    """Parsed lines of a file.
+
+    Attributes:
+        text: the lines.
+        num_before: number of lines ahead of them, or None for the last line of a file.
+        whole: (4, N) integer parts of x, y, t and p.
+        fraction: (4, N) fractional parts.
+    """
+
+    text: bytes
+    num_before: int | None
+    whole: NDArray[np.int64]
+    fraction: NDArray[np.float64]
+
+    def place(self, row: int) -> str:
+        """Name the line of an event, for messages."""
+        rows = [i for i, line in enumerate(self.text.split(b"\n")) if is_row(line)]
+        return _line_name(rows[row], self.num_before)
+
+
+def _line_name(line: int, num_before: int | None) -> str:
+    return "the last line" if num_before is None else f"line {num_before + line + 1}"
+
+
+class _EventLines(EventFile):
+    """A text file with one event a line. Formats implement :meth:`_names` and :meth:`_tick`."""
+
+    with_commas = False
+
+    @abstractmethod
+    def _names(self, file: BinaryIO) -> list[str]:
+        """Return the names of the columns, x, y, t and p among them. Read the header, if the format has one."""
+
+    @abstractmethod
+    def _tick(self, time_fractions: NDArray[np.float64]) -> int:
+        """Return the nanoseconds of the unit of the times.
+
+        Args:
+            time_fractions: (N,) fractional parts of the first times.
+        """
 
     def read_chunks(self) -> Iterator[EventStream]:
-        with self.path.open(encoding="ascii", errors="replace") as file:
-            lines = 0
-            while block := list(islice(file, _CHUNK_LINES)):
-                yield self._parse(block, lines)
-                lines += len(block)
-
-    def _parse(self, block: list[str], lines_before: int) -> EventStream:
-        try:
-            table = np.loadtxt(block, dtype=np.float64, ndmin=2)
-        except ValueError as error:
-            raise DataError(
-                self.path, f"after line {lines_before}: {error}", "each line must hold the four numbers t x y p"
-            ) from None
-        if table.size == 0:
-            table = table.reshape(0, 4)
-        if table.shape[1] != 4:
-            raise DataError(
-                self.path, f"its lines have {table.shape[1]} fields", "each line must hold the four numbers t x y p"
-            )
-        checks = (
-            ("time", 0, np.isfinite(table[:, 0]) & (np.abs(table[:, 0]) < 9e9), "times are in seconds"),
-            ("x", 1, _is_pixel(table[:, 1], self.width), f"pixel columns are whole numbers below {self.width}"),
-            ("y", 2, _is_pixel(table[:, 2], self.height), f"pixel rows are whole numbers below {self.height}"),
-            ("polarity", 3, (table[:, 3] == 0) | (table[:, 3] == 1), "polarities are 0 or 1 in this format"),
-        )
-        for name, column, good, remedy in checks:
-            if not good.all():
-                row = int(np.argmin(good))
-                line = [i for i, text in enumerate(block) if is_row(text.encode("ascii", "replace"))][row]
-                raise DataError(self.path, f"line {lines_before + line + 1} has {name} {table[row, column]:g}", remedy)
-        return EventStream(
-            table[:, 1].astype(np.uint16),
-            table[:, 2].astype(np.uint16),
-            np.rint(table[:, 0] * 1e9).astype(np.int64),
-            (2 * table[:, 3] - 1).astype(np.int8),
-            self.width,
-            self.height,
-            self.path,
-        )
+        tick = None
+        with self.path.open("rb") as file:
+            for lines in self._lines(file, self._names(file)):
+                tick = tick or self._tick(lines.fraction[2, :SAMPLE])
+                yield self._events(lines, tick)
 
     def time_span(self) -> tuple[int, int]:
         self.require()
-        first, last = first_and_last_row(self.path)
-        if not first or not last:
+        with self.path.open("rb") as file:
+            names = self._names(file)
+            beginning = next(self._lines(file, names), None)
+        if beginning is None:
             raise self.empty_error()
-        start, end = (int(self._parse([line], 0).t[0]) for line in (first, last))
+        tick = self._tick(beginning.fraction[2, :SAMPLE])
+        first = replace(beginning, whole=beginning.whole[:, :1], fraction=beginning.fraction[:, :1])
+        last = self._parse(last_row(self.path) + b"\n", None, names)
+        start, end = (int(self._events(lines, tick).t[0]) for lines in (first, last))
         return start, end
 
+    def _lines(self, file: BinaryIO, names: list[str]) -> Iterator[_Lines]:
+        """Parse a file after its header, in pieces of at least one event."""
+        header_end = file.tell()
+        file.seek(0)
+        num_before = file.read(header_end).count(b"\n")
+        while text := file.read(_BLOCK):
+            text += file.readline()
+            text += b"" if text.endswith(b"\n") else b"\n"
+            lines = self._parse(text, num_before, names)
+            if lines.whole.shape[1]:
+                yield lines
+            num_before += text.count(b"\n")
 
-def _is_pixel(values: np.ndarray, size: int) -> np.ndarray:
-    return (values >= 0) & (values < size) & (values == np.floor(values))
+    def _parse(self, text: bytes, num_before: int | None, names: list[str]) -> _Lines:
+        # Imported lazily: every command of every method imports this module, and numba is slow to import.
+        from aenerf_ns.files.number_lines import parse_lines
+
+        # A name that comes twice means its first column.
+        slots = [_COLUMNS.find(name) if names.index(name) == i else -1 for i, name in enumerate(names)]
+        whole, fraction, fault = parse_lines(text, self.with_commas, slots)
+        if fault is not None:
+            line = _line_name(text.count(b"\n", 0, fault), num_before)
+            raise self._malformed(line, text[fault : text.index(b"\n", fault)], names)
+        return _Lines(text, num_before, whole, fraction)
+
+    def _malformed(self, place: str, line: bytes, names: list[str]) -> DataError:
+        fields = [field.strip() for field in line.split(b"#")[0].split(b"," if self.with_commas else None)]
+        if len(fields) != len(names):
+            remedy = f"each line must hold the {len(names)}: {' '.join(names)}"
+            return DataError(self.path, f"{place} has {len(fields)} fields", remedy)
+        bad = next(i for i, field in enumerate(fields) if not _NUMBER.fullmatch(field))
+        value = fields[bad][:40].decode("ascii", "replace") or "nothing"
+        return DataError(self.path, f"{place} has {names[bad]} = {value}", "write plain decimal numbers")
+
+    def _events(self, lines: _Lines, tick: int) -> EventStream:
+        columns = {}
+        for name, whole, fraction in zip(_COLUMNS, lines.whole, lines.fraction, strict=True):
+            columns[name] = whole + fraction if name != "t" and fraction.any() else whole
+        return events_from_columns(
+            columns,
+            width=self.width,
+            height=self.height,
+            tick=tick,
+            fraction=lines.fraction[2],
+            source=self.path,
+            place=lines.place,
+        )
+
+
+class TextEventFile(_EventLines):
+    """Read events.txt: lines of t in seconds, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017)."""
+
+    def _names(self, file: BinaryIO) -> list[str]:
+        return ["t", "x", "y", "p"]
+
+    def _tick(self, time_fractions: NDArray[np.float64]) -> int:
+        return NANOSECONDS["s"]
+
+    def _events(self, lines: _Lines, tick: int) -> EventStream:
+        negative = lines.whole[3] < 0
+        if negative.any():
+            row = int(np.argmax(negative))
+            raise DataError(
+                self.path,
+                f"{lines.place(row)} has p = {lines.whole[3, row]}",
+                "polarities are 0 or 1 in this format",
+            )
+        return super()._events(lines, tick)
+
+
+class CsvEventFile(_EventLines):
+    """Read comma-separated values. The first line names the columns in any order, x, y, t and p among them.
+
+    Args:
+        path: the file.
+        width: number of pixel columns of the sensor.
+        height: number of pixel rows of the sensor.
+        time_unit: of the times. By default whole numbers are microseconds and decimals seconds.
+    """
+
+    with_commas = True
+
+    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
+        super().__init__(path, width, height)
+        self._time_unit = time_unit
+
+    def _names(self, file: BinaryIO) -> list[str]:
+        header = next((line for line in iter(file.readline, b"") if is_row(line)), b"").decode("utf-8", "replace")
+        names = [name.strip().strip('"').lower() for name in header.split(",")]
+        if not set(_COLUMNS) <= set(names):
+            raise DataError(
+                self.path,
+                f"its first line is {header.strip()[:60]!r}",
+                "it must name the columns, x, y, t and p among them, separated by commas",
+            )
+        return names
+
+    def _tick(self, time_fractions: NDArray[np.float64]) -> int:
+        return NANOSECONDS[self._time_unit or ("s" if time_fractions.any() else "us")]

@@ -1,4 +1,4 @@
-"""Decoding of Prophesee's event encodings EVT 2.0 and EVT 3.0.
+"""Decode Prophesee's event encodings EVT 2.0 and EVT 3.0.
 
 https://docs.prophesee.ai/stable/data/encoding_formats/evt2.html and evt3.html
 
@@ -17,26 +17,26 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 
-# Events given at once: 13 MB.
+# Events yielded at once: 13 MB.
 _CHUNK = 1 << 20
-# Events in one word, at most.
+# The largest number of events in one word.
 _MOST_PER_WORD = 12
 
-# What a decoder remembers from one word to the next.
+# The state of a decoder from one word to the next.
 _HIGH, _LOW, _ROW, _BASE, _POLARITY, _OFFSET = range(6)
 _UNKNOWN = np.iinfo(np.int64).min
 
 _EVT2_HIGH_BITS = 28
 _EVT3_HIGH_BITS = 12
-# Steps of 4.096 ms by which the upper bits of a time may be behind without having wrapped. Such files are out of order
-# and are rejected; but a smaller value, like a larger one, is a time further ahead, up to 16.7 s.
+# Upper bits of a time that are up to this many steps of 4.096 ms below the last ones go back in time, and the file is
+# rejected. Any other upper bits are ahead, by up to 16.7 s.
 _EVT3_BEHIND = 16
 
 Columns = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
 
 
 def initial_state(offset: int = 0) -> NDArray[np.int64]:
-    """The state of a decoder that has seen nothing.
+    """Return the state of a decoder that has seen nothing.
 
     Args:
         offset: nanoseconds to add to every time.
@@ -63,7 +63,7 @@ def _decode_evt2(words, position, x, y, t, p, n, state):
                 n += 1
         elif kind == 0x8:
             new = word & mask
-            # The nearest time with these lower bits: the 34 bits of a time wrap every 4.8 h.
+            # Take the nearest time with these bits, because the 34 bits of a time wrap every 4.8 h.
             high = new if high == _UNKNOWN else high + ((new - high + half) & mask) - half
         elif kind != 0xA and kind != 0xE and kind != 0xF:
             break
@@ -115,7 +115,7 @@ def _decode_evt3(words, position, x, y, t, p, n, state):
             if ready and base != _UNKNOWN:
                 for bit in range(length):
                     if (value >> bit) & 1:
-                        # Beyond any sensor, but not so far that it would come round.
+                        # Columns beyond any sensor must not wrap to small numbers.
                         x[n] = min(base + bit, 0xFFFF)
                         y[n] = row
                         t[n] = time
@@ -145,7 +145,7 @@ class Encoding:
     decode: Callable
 
 
-# Words that carry no event (triggers and those of vendors) are passed over; kinds that are not documented are not.
+# Words without events (triggers, and words of vendors) are skipped. Undocumented kinds of words are errors.
 EVT2 = Encoding("EVT 2.0", np.dtype("<u4"), _decode_evt2)
 EVT3 = Encoding("EVT 3.0", np.dtype("<u2"), _decode_evt3)
 
@@ -153,12 +153,12 @@ EVT3 = Encoding("EVT 3.0", np.dtype("<u2"), _decode_evt3)
 def decode_words(
     blocks: Iterable[NDArray], encoding: Encoding, state: NDArray[np.int64], source: Path
 ) -> Iterator[Columns]:
-    """Decodes words to events. What comes before the first complete time cannot be dated and is left out.
+    """Decode words to events. Events before the first complete time cannot be dated and are left out.
 
     Args:
         blocks: (N,) words in pieces; a piece may end anywhere.
         encoding: the encoding of the words.
-        state: from :func:`initial_state`; whoever makes the blocks may reset it between two of them.
+        state: from :func:`initial_state`. The iterator of the blocks may reset it between two blocks.
         source: the file, for messages.
 
     Yields:

@@ -21,13 +21,14 @@ _LENS_MODELS: dict[str, LensModel] = {
 
 
 def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
-    """The cameras of a camchain by their names.
+    """Read the cameras of a camchain, by their names.
 
     Returns:
-        For each its lens, and the (4, 4) float64 matrix that takes points from the first camera's to its coordinates.
+        For each camera its lens, and the (4, 4) float64 matrix that takes points from the first camera's coordinates to
+        its own.
 
     Raises:
-        DataError: the file is missing or malformed, or a camera model is not known here.
+        DataError: the file is missing or malformed, or a camera model is not supported.
     """
     if not path.is_file():
         raise DataError(path, "there is no such file", "give the camchain that Kalibr wrote")
@@ -63,7 +64,7 @@ def _camera(meta: Metadata) -> EventCamera:
     if lens == "radial_tangential":
         distortion.append(0.0)
     try:
-        # Kalibr counts from the centre of the first pixel.
+        # Kalibr puts the origin at the centre of the first pixel, this project at its corner.
         return EventCamera(int(width), int(height), fx, fy, cx + 0.5, cy + 0.5, lens, tuple(distortion))
     except ValueError as error:
         raise meta.error("intrinsics:", str(error)) from None

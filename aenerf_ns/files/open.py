@@ -1,4 +1,4 @@
-"""Opening an event file of any format."""
+"""Open an event file of any format."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 from aenerf_ns.files.aedat4 import Aedat4File
 from aenerf_ns.files.event_arrays import open_array_events
 from aenerf_ns.files.event_hdf5 import open_hdf5_events
-from aenerf_ns.files.event_text import TextEventFile
+from aenerf_ns.files.event_text import CsvEventFile, TextEventFile
 from aenerf_ns.files.prophesee_dat import PropheseeDatFile
 from aenerf_ns.files.prophesee_header import read_header
 from aenerf_ns.files.prophesee_raw import PropheseeRawFile
@@ -23,14 +23,18 @@ _FORMAT_OF_SUFFIX = {
     ".dat": "dat",
     ".aedat4": "aedat4",
     ".bag": "bag",
+    ".db3": "bag",
+    ".mcap": "bag",
     ".h5": "hdf5",
     ".hdf5": "hdf5",
     ".npz": "arrays",
     ".npy": "arrays",
-    ".csv": "arrays",
+    ".csv": "csv",
     ".txt": "text",
 }
-_WITHOUT_MAGIC = ("arrays", "text")
+# ROS 1, and the two storages of ROS 2.
+_BAG_MAGIC = (b"#ROSBAG", b"SQLite format 3\0", b"\x89MCAP0\r\n")
+_WITHOUT_MAGIC = ("arrays", "csv", "text")
 
 SUFFIXES = tuple(_FORMAT_OF_SUFFIX)
 """The endings of names of event files."""
@@ -43,15 +47,15 @@ def open_event_file(
     topic: str | None = None,
     time_unit: TimeUnit | None = None,
 ) -> EventFile:
-    """Opens an event file in the format that its first bytes tell (NumPy's and text: its suffix).
+    """Open an event file. Its first bytes tell the format; for NumPy's files, CSV and text its suffix does.
 
     With both sizes given, a missing file is an error only when its events are asked for: a trained run opens without
-    them.
+    its events.
 
     Args:
-        path: the file.
+        path: the file, or the folder of a bag of ROS 2.
         width: pixel columns of the sensor; needed where the file does not tell them.
-        height: pixel rows, likewise.
+        height: pixel rows of the sensor; needed where the file does not tell them.
         topic: the topic of a bag, or the number of the stream of an AEDAT4 file, where several hold events.
         time_unit: of the times of HDF5, npz, npy and csv, where the file states none.
 
@@ -70,10 +74,8 @@ def open_event_file(
     """
     if not path.exists() and width is not None and height is not None:
         return _MissingEventFile(path, width, height)
-    if path.is_dir():
-        raise DataError(path, "it is a folder", "name the event file in it (bags of ROS 2: convert them to ROS 1)")
     name = _format(path)
-    if time_unit is not None and name not in ("hdf5", "arrays"):
+    if time_unit is not None and name not in ("hdf5", "arrays", "csv"):
         raise DataError(path, f"its format has a time unit, but {time_unit} was given", "leave it out")
     if name == "aedat4":
         return Aedat4File(path, width, height, topic)
@@ -88,7 +90,9 @@ def open_event_file(
     size = sensor_size(path, None, width, height)
     if name == "hdf5":
         return open_hdf5_events(path, *size, time_unit)
-    return open_array_events(path, *size, time_unit) if name == "arrays" else TextEventFile(path, *size)
+    if name == "arrays":
+        return open_array_events(path, *size, time_unit)
+    return CsvEventFile(path, *size, time_unit) if name == "csv" else TextEventFile(path, *size)
 
 
 class _MissingEventFile(EventFile):
@@ -102,6 +106,10 @@ class _MissingEventFile(EventFile):
 
 
 def _format(path: Path) -> str:
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            return "bag"
+        raise DataError(path, "it is a folder without the metadata.yaml of a bag of ROS 2", "name the event file in it")
     require_event_file(path)
     suffix = path.suffix.lower()
     with path.open("rb") as file:
@@ -110,7 +118,7 @@ def _format(path: Path) -> str:
         raise DataError(path, "the file is empty", "record or copy it again")
     if beginning.startswith(b"#!AER-DAT"):
         return "aedat4"
-    if beginning.startswith(b"#ROSBAG"):
+    if beginning.startswith(_BAG_MAGIC):
         return "bag"
     if beginning.startswith(b"\x89HDF\r\n\x1a\n"):
         return "hdf5"
@@ -124,5 +132,5 @@ def _format(path: Path) -> str:
     raise DataError(
         path,
         f"its format is not known (it begins with {beginning[:8]!r})",
-        "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS 1, HDF5, npz, npy, csv and text are read",
+        "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS, HDF5, npz, npy, csv and text are read",
     )

@@ -19,21 +19,21 @@ from aenerf_ns.files.sensor_size import sensor_size
 _CHUNK = 1 << 20
 # Microseconds, then 14 bits of x, 14 of y and 4 of polarity.
 _RECORD = np.dtype([("time", "<u4"), ("address", "<u4")])
-# Records of Event2d and of EventCd, which are equal.
+# Records of Event2d and of EventCd have the same fields.
 _EVENT_TYPES = (0x00, 0x0C)
 _LAP = 1 << 32
-# Times looked at to find how often they wrapped. Between two of them less than half a lap, 36 min, may pass.
+# Number of times read to find how often the times wrapped. Between two of them less than half a lap, 36 min, may pass.
 _MAX_SAMPLES = 10_000
 
 
 class PropheseeDatFile(EventFile):
-    """A DAT file of version 2: a text header, the type and size of a record, then records of 8 bytes.
+    """Read a DAT file of version 2: a text header, the type and size of a record, then records of 8 bytes.
 
     Args:
         path: the file.
         width: pixel columns of the sensor; needed where the header does not tell them. With both sizes given, the file
             is not opened before its events are asked for.
-        height: pixel rows, likewise.
+        height: pixel rows of the sensor; needed where the file does not tell them.
 
     Raises:
         DataError: a size is not given, and the file is missing or its header does not tell it.
@@ -45,7 +45,7 @@ class PropheseeDatFile(EventFile):
         super().__init__(path, width, height)
 
     def _records(self) -> tuple[int, int]:
-        """Place of the first record, and the number of records."""
+        """Return the position of the first record, and the number of records."""
         header = read_header(self.path)
         sensor_size(self.path, header.size, self.width, self.height)
         version = header.fields.get("version", "none")
@@ -98,11 +98,11 @@ class PropheseeDatFile(EventFile):
 
 
 def _unwrapped(time: NDArray[np.uint32], previous: int | None) -> NDArray[np.int64]:
-    """(N,) microseconds of times whose upper bits are cut off: each the one nearest to its predecessor.
+    """Return the (N,) microseconds of times whose upper bits are cut off. Each time is the nearest to its predecessor.
 
     Args:
         time: (N,) lower 32 bits of times.
-        previous: the whole time before the first of them, or None at the beginning.
+        previous: the whole time before the first one, or None at the beginning.
     """
     steps = np.diff(time.astype(np.int64), prepend=int(time[0]) if previous is None else previous)
     steps = (steps + _LAP // 2) % _LAP - _LAP // 2

@@ -12,13 +12,13 @@ from pathlib import Path
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import require_event_file
 
-# Far more than any header has.
+# Far more bytes than any header has.
 _MAX_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
 class PropheseeHeader:
-    """The lines ``% keyword value``.
+    """The lines ``% keyword value`` of a header.
 
     Attributes:
         fields: values by keyword in lower case.
@@ -30,14 +30,14 @@ class PropheseeHeader:
 
     @property
     def format_options(self) -> dict[str, str]:
-        """What ``% format NAME;option=value;…`` holds, with the name, in capitals, under "name"; empty without it."""
+        """Return the options of ``% format NAME;option=value;…``, and its name in capitals as the option "name"."""
         name, *options = self.fields.get("format", "").split(";")
         pairs = (option.partition("=") for option in options)
         return {"name": name.strip().upper(), **{key.strip().lower(): value.strip() for key, _, value in pairs}}
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Width and height of the sensor in pixels, or None where the header does not tell them."""
+        """Return the width and height of the sensor in pixels, or None where the header does not tell them."""
         geometry = re.fullmatch(r"(\d{1,9})\s*x\s*(\d{1,9})", self.fields.get("geometry", ""))
         if geometry:
             return int(geometry[1]), int(geometry[2])
@@ -49,7 +49,7 @@ class PropheseeHeader:
 
 
 def read_header(path: Path) -> PropheseeHeader:
-    """Reads the header of a RAW or DAT file.
+    """Read the header of a RAW or DAT file.
 
     Raises:
         DataError: the file is missing or has no such header.
@@ -59,7 +59,7 @@ def read_header(path: Path) -> PropheseeHeader:
         text = file.read(_MAX_BYTES)
     fields: dict[str, str] = {}
     end = 0
-    # The keyword "end" is optional: without it, the header ends where a line begins otherwise.
+    # The keyword "end" is optional. Without it, the header ends at the first line that does not begin with "% ".
     while text.startswith(b"% ", end):
         line_end = text.find(b"\n", end) + 1
         if line_end == 0:

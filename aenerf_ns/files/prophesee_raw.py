@@ -25,17 +25,17 @@ _BLOCK = 1 << 20
 
 
 class PropheseeRawFile(EventFile):
-    """A RAW file: a text header, then the words that the camera sent.
+    """Read a RAW file: a text header, then the words that the camera sent.
 
     Args:
         path: the file.
         width: pixel columns of the sensor; needed where the header does not tell them. With both sizes given, the file
             is not opened before its events are asked for.
-        height: pixel rows, likewise.
+        height: pixel rows of the sensor; needed where the header does not tell them.
 
     Raises:
-        DataError: a size is not given, and the file is missing, its header does not tell it or tells that the file
-            cannot be read.
+        DataError: a size is not given, and the file is missing, or its header does not tell the size or names an
+            encoding that is not read.
     """
 
     def __init__(self, path: Path, width: int | None = None, height: int | None = None) -> None:
@@ -46,7 +46,7 @@ class PropheseeRawFile(EventFile):
         super().__init__(path, width, height)
 
     def _decoded(self) -> Iterator[Columns]:
-        # Late, for every command of every method would wait for numba.
+        # Imported lazily: every command of every method imports this module, and numba is slow to import.
         from aenerf_ns.files.evt_words import EVT2, EVT3, decode_words, initial_state
 
         header = read_header(self.path)
@@ -67,7 +67,7 @@ class PropheseeRawFile(EventFile):
             yield EventStream(x, y, t, p, self.width, self.height, self.path)
 
     def time_span(self) -> tuple[int, int]:
-        # Only the lower bits of times are in the file, so that it must be gone through to count how often they wrap.
+        # The file holds only the lower bits of times. Only a pass through the whole file tells how often they wrap.
         start = end = None
         for _, _, t, _ in self._decoded():
             start = int(t[0]) if start is None else start
@@ -78,7 +78,7 @@ class PropheseeRawFile(EventFile):
 
 
 def _encoding_name(path: Path, header: PropheseeHeader) -> str:
-    """EVT2 or EVT3."""
+    """Return EVT2 or EVT3."""
     options = header.format_options
     version = header.fields.get("evt", "")
     name = options["name"] or {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}.get(version, version)

@@ -1,8 +1,11 @@
-"""Events in bags of ROS 1: arrays of events, and packets of encoded events.
+"""Events in bags of ROS 1 and ROS 2: arrays of events, and packets of encoded events.
 
-* ``dvs_msgs/EventArray`` (and ``prophesee_event_msgs/EventArray``, which is equal):
+* ``dvs_msgs/EventArray``, and ``prophesee_event_msgs/EventArray`` with the same fields:
   https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
 * ``event_camera_msgs/EventPacket``: https://github.com/ros-event-camera/event_camera_msgs
+
+The package rosbags reads the bags. The messages are taken apart here, because rosbags makes a Python object of each
+event.
 """
 
 from __future__ import annotations
@@ -23,16 +26,31 @@ from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.sensor_size import sensor_size
 
 if TYPE_CHECKING:
+    from rosbags import rosbag1, rosbag2
     from rosbags.interfaces import Connection
-    from rosbags.rosbag1 import Reader
 
     from aenerf_ns.files.evt_words import Columns
 
 _CHUNK = 1 << 20
+_ROS1_MAGIC = b"#ROSBAG"
 _PACKET_TYPE = "event_camera_msgs/msg/EventPacket"
 _ARRAY_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
-# As messages are serialized: without padding.
-_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("seconds", "<u4"), ("nanoseconds", "<u4"), ("polarity", "?")])
+# ROS 1 serializes an event without padding. ROS 2 aligns each number to its size; see `_aligned_events`.
+_EVENT_FIELDS = {"x": "<u2", "y": "<u2", "seconds": "<u4", "nanoseconds": "<u4", "polarity": "?"}
+_PACKED_EVENT = np.dtype(list(_EVENT_FIELDS.items()))
+_ALIGNED_EVENT = np.dtype(
+    {
+        "names": list(_EVENT_FIELDS),
+        "formats": list(_EVENT_FIELDS.values()),
+        "offsets": [0, 2, 6, 10, 14],
+        "itemsize": 16,
+    }
+)
+# CDR, little-endian: the serialization of ROS 2.
+_CDR_HEADER = b"\0\1"
+_CDR_HEADER_BYTES = 4
+# Some middleware pads messages of ROS 2 to a multiple of this number of bytes.
+_CDR_PADDING = 4
 _WORD = np.dtype("<u2")
 # Nanoseconds after which the 24 bits of a time in EVT 3.0 come again.
 _LAP = (1 << 24) * 1000
@@ -44,28 +62,37 @@ _TAIL_SECONDS = (1, 10, 100)
 
 @dataclass(frozen=True)
 class _Message:
-    """A message of either type; ``sequence`` is None for arrays, and ``stamp`` is in nanoseconds."""
+    """A message of either type.
+
+    Attributes:
+        stamp: time in nanoseconds.
+        width: pixel columns of the sensor.
+        height: pixel rows of the sensor.
+        sequence: number of a packet, or None for an array.
+        encoding: encoding of the words of a packet.
+        content: the events of an array, or the bytes of a packet.
+    """
 
     stamp: int
     width: int
     height: int
     sequence: int | None
     encoding: str
-    payload: bytes
+    content: NDArray
 
 
 class RosbagEventFile(EventFile):
-    """The events of one topic of a bag, at the times of ROS.
+    """Read the events of one topic of a bag, at the times of ROS.
 
-    The times of an EventPacket are those of the camera's own clock. One offset brings them all to the clock of ROS:
-    the smallest difference between the stamp of a packet and its first time, among the first hundred packets. It is
-    right up to the delay of the fastest of these packets, typically below a millisecond.
+    An EventPacket has the times of the camera's own clock. One offset brings them all to the clock of ROS: the smallest
+    difference between the stamp of a packet and its first time, among the first hundred packets. The offset is late by
+    the delay of the fastest of these packets, typically below a millisecond.
 
     Args:
-        path: the bag.
-        width: pixel columns of the sensor. Messages tell them; but with both sizes given, the bag is not opened before
-            its events are asked for.
-        height: pixel rows, likewise.
+        path: a bag of ROS 1; or of ROS 2, as a folder with metadata.yaml or as a single .db3 or .mcap file.
+        width: pixel columns of the sensor. By default the messages tell them. With both sizes given, the bag is not
+            opened before its events are asked for.
+        height: pixel rows of the sensor; by default the messages tell them.
         topic: the topic, or None when only one holds events.
 
     Raises:
@@ -85,29 +112,47 @@ class RosbagEventFile(EventFile):
             width, height = sensor_size(path, (first.width, first.height), width, height)
         super().__init__(path, width, height)
 
-    def _open(self) -> Reader:
+    def require(self) -> None:
+        """Raise a DataError when the bag does not exist. A bag of ROS 2 may be a folder."""
+        if not self.path.is_dir():
+            super().require()
+
+    def _open(self) -> rosbag1.Reader | rosbag2.Reader:
         self.require()
         try:
-            from rosbags.rosbag1 import Reader
+            if self._is_ros2():
+                from rosbags.rosbag2 import Reader
+            else:
+                from rosbags.rosbag1 import Reader
         except ImportError:
             raise DataError(
                 self.path, "a ROS bag is read with the package rosbags", "pip install 'aenerf-ns[rosbag]'"
             ) from None
-        reader = Reader(self.path)
         try:
+            reader = Reader(self.path)
             reader.open()
-        # Whatever its parser stumbles over.
+        # The parser raises whatever it stumbles over.
         except Exception as error:
             raise self._damaged(error) from None
         return reader
 
+    def _is_ros2(self) -> bool:
+        if self.path.is_dir():
+            return True
+        with self.path.open("rb") as file:
+            return file.read(len(_ROS1_MAGIC)) != _ROS1_MAGIC
+
     def _damaged(self, error: Exception) -> DataError:
-        reason = str(error) or type(error).__name__
-        return DataError(self.path, f"not a readable bag of ROS 1 ({reason})", "try `rosbag reindex` or copy it again")
+        reason = " ".join(str(error).split())[:150] or type(error).__name__
+        version, command = (2, "ros2 bag") if self._is_ros2() else (1, "rosbag")
+        return DataError(
+            self.path, f"not a readable bag of ROS {version} ({reason})", f"try `{command} reindex` or copy it again"
+        )
 
     def _messages(self, start: int | None = None) -> Iterator[_Message]:
-        """The topic's messages in the order in which they were received, from a time in nanoseconds on."""
+        """Yield the messages of the topic in the order in which they were received, from a time in nanoseconds on."""
         with closing(self._open()) as reader:
+            is_ros2 = self._is_ros2()
             chosen = _choose(self.path, reader.connections, self._topic)
             connections = [connection for connection in reader.connections if connection.topic == chosen.topic]
             messages = reader.messages(connections, start=start)
@@ -119,8 +164,8 @@ class RosbagEventFile(EventFile):
                 except Exception as error:
                     raise self._damaged(error) from None
                 try:
-                    yield _parse(data, connection.msgtype == _PACKET_TYPE)
-                except (struct.error, IndexError):
+                    yield _parse(data, connection.msgtype == _PACKET_TYPE, is_ros2)
+                except struct.error:
                     raise DataError(
                         self.path, f"a message of {chosen.topic} does not have the parts of its type", "copy it again"
                     ) from None
@@ -131,7 +176,7 @@ class RosbagEventFile(EventFile):
             yield message
 
     def _columns(self, start: int | None = None) -> Iterator[Columns]:
-        """Columns x, y, t (nanoseconds) and p (±1) of the messages received from a time on."""
+        """Yield columns x, y, t (nanoseconds) and p (±1) of the messages received from a time on."""
         first = next(self._messages(), None)
         if first is None:
             return
@@ -144,9 +189,8 @@ class RosbagEventFile(EventFile):
         waiting: list[NDArray] = []
         count = 0
         for message in self._sized_messages(start):
-            events = np.frombuffer(message.payload, _EVENT)
-            waiting.append(events)
-            count += len(events)
+            waiting.append(message.content)
+            count += len(message.content)
             if count >= _CHUNK:
                 yield _array_columns(waiting)
                 waiting, count = [], 0
@@ -154,7 +198,7 @@ class RosbagEventFile(EventFile):
             yield _array_columns(waiting)
 
     def _columns_of_packets(self, start: int | None) -> Iterator[Columns]:
-        # Late, for every command of every method would wait for numba.
+        # Imported lazily: every command of every method imports this module, and numba is slow to import.
         from aenerf_ns.files.evt_words import EVT3, decode_words, initial_state
 
         state = initial_state()
@@ -165,7 +209,7 @@ class RosbagEventFile(EventFile):
             for message in self._sized_messages(start):
                 words = self._words(message)
                 if message.sequence != expected:
-                    # The first packet, or packets before it were lost: what the decoder remembers is of no use.
+                    # At the first packet, and after lost packets, the state of the decoder is of no use.
                     expected = None
                     time = _first_time(words)
                     if time is None:
@@ -184,13 +228,13 @@ class RosbagEventFile(EventFile):
                 f"its packets are encoded as {message.encoding!r}; evt3 is read",
                 "republish them as dvs_msgs/EventArray with event_camera_tools",
             )
-        if len(message.payload) % _WORD.itemsize:
+        if len(message.content) % _WORD.itemsize:
             raise DataError(self.path, "a packet ends within a word", "copy it again")
         # Copied, so that the decoder is compiled for one kind of array.
-        return np.frombuffer(message.payload, _WORD).copy()
+        return message.content.view(_WORD).copy()
 
     def _clock_offset(self) -> int:
-        """Nanoseconds from the camera's clock to that of ROS."""
+        """Return the nanoseconds from the camera's clock to the clock of ROS."""
         offsets = [
             message.stamp - time
             for message in islice(self._messages(), _CLOCK_PACKETS)
@@ -222,7 +266,7 @@ class RosbagEventFile(EventFile):
 
 
 def _choose(path: Path, connections: list[Connection], topic: str | None) -> Connection:
-    """The connection with the events."""
+    """Return the connection with the events."""
     known = {c.topic: c for c in connections if c.msgtype in (_PACKET_TYPE, *_ARRAY_TYPES)}
     if topic is None and len(known) == 1:
         return next(iter(known.values()))
@@ -237,29 +281,82 @@ def _choose(path: Path, connections: list[Connection], topic: str | None) -> Con
     raise DataError(path, problem, f"choose one of {', '.join(sorted(known))} as topic")
 
 
-def _parse(data: bytes, is_packet: bool) -> _Message:
-    """Splits a serialized message.
+class _Fields:
+    """Read the fields of a serialized message, one after the other.
+
+    Args:
+        data: the message.
+        is_aligned: whether each number is aligned to its size, as in ROS 2, or follows without padding, as in ROS 1.
 
     Raises:
-        struct.error: it is shorter or longer than its parts.
+        struct.error: the message ends too early, or has another byte order.
     """
-    _, seconds, nanoseconds, name_length = struct.unpack_from("<4I", data)
-    position = 16 + name_length
-    height, width = struct.unpack_from("<2I", data, position)
-    position += 8
-    sequence, encoding, item_size = None, "", _EVENT.itemsize
+
+    def __init__(self, data: bytes, is_aligned: bool) -> None:
+        if is_aligned and data[: len(_CDR_HEADER)] != _CDR_HEADER:
+            raise struct.error("not little-endian CDR")
+        # Numbers are aligned relative to the end of the header.
+        self._data = data[_CDR_HEADER_BYTES:] if is_aligned else data
+        self._is_aligned = is_aligned
+        self._position = 0
+
+    def number(self, kind: str) -> int:
+        """Return the next number, of a type of the module struct."""
+        size = struct.calcsize(kind)
+        self._position += -self._position % size if self._is_aligned else 0
+        (value,) = struct.unpack_from(f"<{kind}", self._data, self._position)
+        self._position += size
+        return value
+
+    def text(self) -> str:
+        """Return the next string. Strings of ROS 2 end with a zero."""
+        length = self.number("I")
+        begin, self._position = self._position, self._position + length
+        return self._data[begin : self._position].rstrip(b"\0").decode("ascii", "replace")
+
+    def rest(self, size: int) -> bytes:
+        """Return the last field, of a number of bytes."""
+        rest = self._data[self._position :]
+        if not size <= len(rest) < size + (_CDR_PADDING if self._is_aligned else 1):
+            raise struct.error("the message has another length")
+        return rest[:size]
+
+
+def _parse(data: bytes, is_packet: bool, is_ros2: bool) -> _Message:
+    """Split a serialized message.
+
+    Raises:
+        struct.error: the message is shorter or longer than its parts.
+    """
+    fields = _Fields(data, is_ros2)
+    if not is_ros2:
+        fields.number("I")  # sequence number of the header
+    stamp = fields.number("I") * 1_000_000_000 + fields.number("I")
+    fields.text()  # frame of the header
+    height, width = fields.number("I"), fields.number("I")
     if is_packet:
-        sequence, _, length = struct.unpack_from("<2QI", data, position)
-        position += 20
-        encoding = data[position : position + length].decode("ascii", "replace")
-        # Words are in the byte order of the camera, which the flag after the encoding does not change.
-        position += length + 1
-        item_size = 1
-    (count,) = struct.unpack_from("<I", data, position)
-    payload = data[position + 4 :]
-    if len(payload) != count * item_size:
-        raise struct.error("the array has another length")
-    return _Message(seconds * 1_000_000_000 + nanoseconds, width, height, sequence, encoding, payload)
+        sequence = fields.number("Q")
+        fields.number("Q")  # base of the times in other encodings
+        encoding = fields.text()
+        # Words are in the byte order of the camera, which this flag does not change.
+        fields.number("?")
+        content = np.frombuffer(fields.rest(fields.number("I")), np.uint8)
+        return _Message(stamp, width, height, sequence, encoding, content)
+    count = fields.number("I")
+    events = _aligned_events(fields, count) if is_ros2 else fields.rest(count * _PACKED_EVENT.itemsize)
+    return _Message(stamp, width, height, None, "", np.frombuffer(events, _ALIGNED_EVENT if is_ros2 else _PACKED_EVENT))
+
+
+def _aligned_events(fields: _Fields, count: int) -> bytes:
+    """Return the bytes of events of ROS 2 in steps of 16.
+
+    Alignment puts two bytes between y and the time, and one byte behind the polarity. Only the first event has no bytes
+    between y and the time, and only the last has no byte behind the polarity. Both are added here.
+    """
+    if count == 0:
+        return fields.rest(0)
+    data = fields.rest(_ALIGNED_EVENT.itemsize * count - 3)
+    return data[:4] + data[2:] + b"\0"
 
 
 def _array_columns(arrays: list[NDArray]) -> Columns:
@@ -273,7 +370,7 @@ def _array_columns(arrays: list[NDArray]) -> Columns:
 
 
 def _first_time(words: NDArray[np.uint16]) -> int | None:
-    """The first complete time of a packet in EVT 3.0 in nanoseconds, or None when it has none."""
+    """Return the first complete time of a packet in EVT 3.0 in nanoseconds, or None when the packet has none."""
     kinds = words >> 12
     highs = np.flatnonzero(kinds == 0x8)
     if len(highs) == 0:

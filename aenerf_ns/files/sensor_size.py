@@ -6,18 +6,18 @@ from pathlib import Path
 
 from aenerf_ns.errors import DataError
 
-# The widest address that any of the formats has: 14 bits.
+# The widest address of all formats has 14 bits.
 _MAX_SIZE = 1 << 14
 
 
 def sensor_size(path: Path, stated: tuple[int, int] | None, width: int | None, height: int | None) -> tuple[int, int]:
-    """Width and height in pixels: what the file states, or else what was given.
+    """Return the width and height in pixels that the file states, or else the given ones.
 
     Args:
         path: the event file, for messages.
-        stated: width and height that the file states, or None where it states none.
-        width: width that was given, or None.
-        height: height that was given, or None.
+        stated: width and height that the file states, or None.
+        width: the given width, or None.
+        height: the given height, or None.
 
     Raises:
         DataError: neither is known, the two differ, or a size is not one a sensor can have.

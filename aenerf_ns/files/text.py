@@ -15,7 +15,7 @@ TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 _UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
-# In nanoseconds: what an int64 holds, which is 285 years.
+# In nanoseconds: 285 years, just below the largest int64.
 MAX_TIME = 9 * 10**18
 
 # Longer than any line of a file of events.
@@ -23,7 +23,7 @@ _TAIL_BYTES = 4096
 
 
 def read_rows(path: Path, columns: str) -> list[list[str]]:
-    """Rows of white-space separated fields; empty lines and comments after # are left out.
+    """Read rows of fields between white space. Leave out empty lines and comments after #.
 
     Args:
         path: the file.
@@ -49,23 +49,21 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     return rows
 
 
-def first_and_last_row(path: Path) -> tuple[str, str]:
-    """The first and the last line that are neither empty nor a comment, "" where there is none."""
+def last_row(path: Path) -> bytes:
+    """Return the last line of a file that is neither empty nor a comment, b"" where the end of the file has none."""
     with path.open("rb") as file:
-        first = next((line for line in file if is_row(line)), b"")
         file.seek(0, 2)
         file.seek(max(file.tell() - _TAIL_BYTES, 0))
-        last = next((line for line in reversed(file.read().splitlines()) if is_row(line)), b"")
-    return first.decode("ascii", "replace"), last.decode("ascii", "replace")
+        return next((line for line in reversed(file.read().splitlines()) if is_row(line)), b"")
 
 
 def is_row(line: bytes) -> bool:
-    """Whether a line is neither empty nor a comment."""
+    """Tell whether a line is neither empty nor a comment."""
     return bool(line.split(b"#", 1)[0].strip())
 
 
 def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:
-    """(N, M) float64 numbers of the rows' fields.
+    """Return the (N, M) float64 numbers of the fields of rows.
 
     Raises:
         DataError: a field is not a number.
@@ -77,7 +75,7 @@ def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:
 
 
 def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[np.int64]:
-    """Exact (N,) nanoseconds of decimal times: float64 cannot hold the nanoseconds of the Unix time.
+    """Return the exact (N,) nanoseconds of decimal times. float64 cannot hold the nanoseconds of the Unix time.
 
     Raises:
         DataError: a field is not a finite number.
@@ -97,6 +95,6 @@ def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[
 
 
 def format_seconds(nanoseconds: int) -> str:
-    """Decimal seconds of integer nanoseconds, exact."""
+    """Format integer nanoseconds as decimal seconds, exactly."""
     sign, magnitude = ("-" if nanoseconds < 0 else ""), abs(nanoseconds)
     return f"{sign}{magnitude // 1_000_000_000}.{magnitude % 1_000_000_000:09d}"

@@ -14,16 +14,16 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.text import TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
 
-# Trajectories are commonly printed with six or more digits.
+# Trajectories are commonly printed with six or more digits, so quaternions have rounding errors.
 _MAX_NORM_ERROR = 1e-3
 
 
 def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
-    """Reads a trajectory.
+    """Read a trajectory.
 
     Args:
         path: text file of t tx ty tz qx qy qz qw; # starts a comment.
-        unit: of its times. Some datasets have the same rows with other units.
+        unit: of the times. Some datasets have the same rows with other units.
 
     Returns:
         Camera-to-world poses with the axes of the file.
@@ -41,7 +41,7 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
 
 
 def poses_from_quaternions(source: Path, positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> Tensor:
-    """(N, 4, 4) float64 poses of (N, 3) positions and (N, 4) quaternions with w last.
+    """Return the (N, 4, 4) float64 poses of (N, 3) positions and (N, 4) quaternions with w last.
 
     Raises:
         DataError: a value is not finite, or a quaternion is not of unit length.
@@ -65,7 +65,7 @@ def poses_from_quaternions(source: Path, positions: NDArray[np.float64], quatern
 
 
 def write_tum_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Writes a trajectory; reading it again gives the same poses to 12 digits and the same times exactly."""
+    """Write a trajectory with poses to 12 digits and times to the nanosecond."""
     quaternions = quaternion_from_rotation(trajectory.camera_to_worlds[:, :, :3])
     values = torch.cat([trajectory.camera_to_worlds[:, :, 3], quaternions], -1)
     with path.open("w", encoding="utf-8") as file:

@@ -270,7 +270,7 @@ def test_ecd_text_may_hold_comments_and_empty_lines(tmp_path: Path) -> None:
     assert dataset.metadata[SCENE].window == TimeWindow(10_000_000, 310_000_000)
     assert dataset.pairs.num_events == 4
     replace_line("events.txt", 4, "0.03 9 3 1")(folder)
-    with pytest.raises(DataError, match="line 5 has x 9"):
+    with pytest.raises(DataError, match="line 5 has x = 9"):
         list(dataset.metadata[SCENE].event_file.chunks())
 
 

@@ -1,0 +1,306 @@
+"""Open event files of any format: real ones beside independent readers, made ones there and back, damaged ones."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_writers import PACKET, START, array_bag, packet_messages, write_bag, write_bag2
+from conftest import FUZZ_EXAMPLES
+from event_file_checks import (
+    EDITS,
+    assert_rejected,
+    attempt,
+    edited,
+    lapless,
+    read,
+    survives,
+    table,
+    vendor_file,
+)
+from event_file_writers import (
+    ENCODERS,
+    HEADER2,
+    HEADER3,
+    HEIGHT,
+    ROWS,
+    WIDTH,
+    Rows,
+    aedat4_file,
+    dat,
+    evt2,
+)
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.files import aedat4, evt_words, prophesee_dat, prophesee_raw
+from aenerf_ns.files.open import open_event_file
+
+# Microseconds in which times can be told apart from wrapped ones, less a margin.
+LONGEST_GAP = {"evt2": 8_000_000_000, "evt3": 16_600_000, "dat": 2_100_000_000, "aedat4": 10**15 // 100}
+
+
+LAPS = {"evt2": 1 << 34, "evt3": 1 << 24, "dat": 1 << 32, "aedat4": 1 << 60}
+
+
+@st.composite
+def recordings(draw: st.DrawFn, longest_gap: int) -> Rows:
+    """Events with equal times, neighbours in a row, short and long gaps."""
+    gap = st.one_of(st.just(0), st.integers(0, 5000), st.integers(0, longest_gap))
+    rows, time = [], draw(st.integers(0, 20_000_000))
+    for step, x, y, p, neighbours in draw(
+        st.lists(
+            st.tuples(
+                gap,
+                st.integers(0, WIDTH - 1),
+                st.integers(0, HEIGHT - 1),
+                st.sampled_from([-1, 1]),
+                st.lists(st.integers(1, 4), max_size=12),
+            ),
+            min_size=1,
+            max_size=30,
+        )
+    ):
+        time += step
+        columns = np.cumsum([x, *neighbours])
+        rows += [(int(column), y, time, p) for column in columns if column < WIDTH]
+    # The first time of such a file is only known up to its laps.
+    return rows
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+def test_what_was_encoded_is_read_whatever_the_size_of_the_pieces(name: str, folder: Path) -> None:
+    @settings(max_examples=60, deadline=None)
+    @given(recordings(LONGEST_GAP[name]), st.integers(12, 60), st.integers(1, 9))
+    def check(rows: Rows, chunk: int, block: int) -> None:
+        path = folder / f"there_and_back.{name}"
+        path.write_bytes(ENCODERS[name](rows))
+        expected = lapless(rows, LAPS[name])
+        for is_small in (False, True):
+            with pytest.MonkeyPatch.context() as patch:
+                if is_small:
+                    for module in (evt_words, prophesee_dat, aedat4):
+                        patch.setattr(module, "_CHUNK", chunk)
+                    patch.setattr(prophesee_raw, "_BLOCK", block)
+                file = open_event_file(path)
+                assert (file.width, file.height) == (WIDTH, HEIGHT)
+                np.testing.assert_array_equal(read(file), expected)
+                assert file.time_span() == (expected[0, 2], expected[-1, 2])
+                assert file.count() in (None, len(rows))
+
+    check()
+
+
+@pytest.mark.parametrize("name", ["evt3.raw", "evt2.raw", "gen4.dat", "davis346.aedat4"])
+def test_real_files_agree_with_an_independent_reader(name: str) -> None:
+    faery = pytest.importorskip("faery")
+    path = vendor_file(name)
+    # Its header does not tell; the camera is a Gen3 VGA.
+    size = (640, 480) if name == "evt2.raw" else (None, None)
+    events = read(open_event_file(path, *size))
+    other = faery.events_stream_from_file(path, dimensions_fallback=(640, 480)).to_array()
+    np.testing.assert_array_equal(events[:, 0], other["x"])
+    np.testing.assert_array_equal(events[:, 1], other["y"])
+    np.testing.assert_array_equal(events[:, 2], other["t"].astype(np.int64) * 1000)
+    np.testing.assert_array_equal(events[:, 3] > 0, other["on"])
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "count", "first", "last"),
+    [
+        ("evt2.raw", (640, 480), 521_252, (35, 443, 913_716_224_000, 1), (12, 471, 913_812_095_000, -1)),
+        ("evt3.raw", (1280, 720), 1_218_618, (484, 315, 11_200_224_000, 1), (471, 350, 21_968_221_000, -1)),
+        ("gen4.dat", (1280, 720), 1_218_618, (484, 315, 5_856_000, 1), (471, 350, 10_773_853_000, -1)),
+        (
+            "davis346.aedat4",
+            (346, 260),
+            78_830,
+            (215, 164, 1_589_163_147_368_868_000, 1),
+            (233, 205, 1_589_163_149_728_813_000, 1),
+        ),
+    ],
+)
+def test_real_files(
+    name: str, size: tuple[int, int], count: int, first: tuple[int, ...], last: tuple[int, ...]
+) -> None:
+    file = open_event_file(vendor_file(name), *size)
+    events = read(file)
+    assert len(events) == count
+    assert tuple(events[0]) == first
+    assert tuple(events[-1]) == last
+    assert file.time_span() == (first[2], last[2])
+    assert file.count() == (None if name.endswith(".raw") else count)
+
+
+def test_two_formats_of_one_recording_hold_the_same_events() -> None:
+    raw, dat = (read(open_event_file(vendor_file(name))) for name in ("evt3.raw", "gen4.dat"))
+    # The conversion to DAT moved the clock.
+    raw[:, 2] -= raw[0, 2] - dat[0, 2]
+    np.testing.assert_array_equal(raw, dat)
+
+
+def test_pieces_of_real_files_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [open_event_file(vendor_file(name)) for name in ("evt3.raw", "gen4.dat", "davis346.aedat4")]
+    whole = [read(file) for file in files]
+    for module in (evt_words, prophesee_dat, aedat4):
+        monkeypatch.setattr(module, "_CHUNK", 10_007)
+    monkeypatch.setattr(prophesee_raw, "_BLOCK", 9_973)
+    for file, events in zip(files, whole, strict=True):
+        assert max(map(len, file.chunks())) < 11_000
+        np.testing.assert_array_equal(read(file), events)
+
+
+def test_a_recording_that_goes_back_in_time_is_rejected(folder: Path) -> None:
+    for name, step in (("evt2", 1000), ("evt3", 60_000), ("dat", 1), ("aedat4", 1)):
+        path = folder / f"back.{name}"
+        path.write_bytes(ENCODERS[name]([(1, 1, 1_000_000, 1), (2, 2, 1_000_000 - step, 1)]))
+        with pytest.raises(DataError, match="before the event ahead of it"):
+            read(open_event_file(path))
+
+
+def test_the_size_comes_from_the_file_or_else_from_its_user(folder: Path) -> None:
+    rows = [(1, 2, 3, 1)]
+    path = folder / "sized.raw"
+    without = evt2(rows).replace(f"% geometry {WIDTH}x{HEIGHT}\n".encode(), b"")
+    path.write_bytes(without)
+    with pytest.raises(DataError, match="does not state the size"):
+        open_event_file(path)
+    file = open_event_file(path, 10, 20)
+    assert (file.width, file.height) == (10, 20)
+    for encode in ENCODERS.values():
+        path.write_bytes(encode(rows))
+        with pytest.raises(DataError, match=r"64 x 48 pixels, but 10 x 20 were given"):
+            open_event_file(path, 10, 20).time_span()
+    path.write_bytes(aedat4_file(rows, size=""))
+    with pytest.raises(DataError, match="does not state the size"):
+        open_event_file(path)
+    np.testing.assert_array_equal(read(open_event_file(path, 10, 20)), table(rows))
+
+
+def test_a_trained_run_opens_without_its_events(folder: Path) -> None:
+    for suffix in ("raw", "dat", "aedat4", "bag", "h5", "npy", "txt"):
+        file = open_event_file(folder / f"gone.{suffix}", WIDTH, HEIGHT)
+        assert (file.width, file.height) == (WIDTH, HEIGHT)
+        with pytest.raises(DataError, match="there is no such event file"):
+            file.time_span()
+        with pytest.raises(DataError, match="there is no such event file"):
+            next(file.chunks())
+
+
+def test_the_content_tells_the_format(folder: Path) -> None:
+    for name, encode in ENCODERS.items():
+        path = folder / "misnamed.txt"
+        path.write_bytes(encode([(1, 2, 3, 1)]))
+        assert read(open_event_file(path)).tolist() == [[1, 2, 3000, 1]], name
+
+
+def test_paths_that_are_no_files(folder: Path) -> None:
+    for path, message in ((folder, "it is a folder without"), (folder / "none.raw", "there is no such event file")):
+        with pytest.raises(DataError, match=message):
+            open_event_file(path)
+
+
+MALFORMED: dict[str, tuple[bytes, str]] = {
+    "empty": (b"", "the file is empty"),
+    "unknown": (b"RIFF....WAVE", "its format is not known"),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_malformed_files_are_told_in_one_line(name: str, folder: Path) -> None:
+    content, message = MALFORMED[name]
+    assert_rejected(folder / name.replace(" ", "_"), content, message)
+
+
+def made_files(folder: Path) -> dict[str, bytes]:
+    """One small file of each kind."""
+    files = {name: encode(ROWS) for name, encode in ENCODERS.items()}
+    files["aedat4 with a table"] = aedat4_file(ROWS, with_table=True)
+    try:
+        from lz4.frame import compress
+
+        files["aedat4 in lz4"] = aedat4_file(ROWS, 1, compress, with_table=True)
+    except ImportError:
+        pass
+    try:
+        import rosbags  # noqa: F401
+
+        rows = [(x, y, START // 1000 + t, p) for x, y, t, p in ROWS]
+        for compress_bag in ("", "LZ4", "BZ2"):
+            files[f"arrays {compress_bag}"] = array_bag(folder / "fuzz_base.bag", rows, compress_bag).read_bytes()
+        messages = packet_messages(ROWS, [START + 1000 * row[2] for row in ROWS], 9)
+        files["packets"] = write_bag(folder / "fuzz_base.bag", {"/events": (PACKET, messages)}).read_bytes()
+        for storage, suffix in (("SQLITE3", "db3"), ("MCAP", "mcap")):
+            (stored,) = write_bag2(folder / "fuzz_base", messages, PACKET, storage).glob(f"*.{suffix}")
+            files[f"packets.{suffix}"] = stored.read_bytes()
+    except ImportError:
+        pass
+    return files
+
+
+def test_damaged_files_raise_nothing_but_clear_errors(folder: Path) -> None:
+    files = made_files(folder)
+
+    def place(name: str) -> Path:
+        # The suffix tells the storage of bags of ROS 2.
+        return folder / f"fuzz{Path(name).suffix}"
+
+    @settings(max_examples=FUZZ_EXAMPLES * 5, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(st.sampled_from(sorted(files)), EDITS)
+    def check(name: str, edits: list[tuple[str, float, int]]) -> None:
+        place(name).write_bytes(edited(files[name], edits))
+        survives(place(name))
+
+    for name, content in files.items():
+        place(name).write_bytes(content)
+        attempt(place(name))
+    check()
+
+
+def beginning_of(name: str) -> bytes:
+    """A whole file of the first 40,000 bytes or so of a recording."""
+    content = vendor_file(name).read_bytes()
+    if name.endswith("aedat4"):
+        # Without a table of packets, and up to the end of one.
+        content = content[:54] + struct.pack("<q", -1) + content[62:]
+        end = 18 + int.from_bytes(content[14:18], "little")
+        while end < 40_000:
+            end += 8 + int.from_bytes(content[end + 4 : end + 8], "little")
+        return content[:end]
+    header = re.match(rb"(% [^\n]*\n)+", content)
+    assert header
+    return content[: header.end() + (2 if name.endswith("dat") else 0) + 40_000]
+
+
+def test_real_files_that_are_damaged_raise_nothing_but_clear_errors(folder: Path) -> None:
+    files = {name: beginning_of(name) for name in ("evt3.raw", "gen4.dat", "davis346.aedat4")}
+    path = folder / "fuzz_real"
+
+    @settings(max_examples=FUZZ_EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(st.sampled_from(sorted(files)), EDITS)
+    def check(name: str, edits: list[tuple[str, float, int]]) -> None:
+        path.write_bytes(edited(files[name], edits))
+        survives(path)
+
+    for content in files.values():
+        path.write_bytes(content)
+        attempt(path)
+
+    check()
+
+
+def test_bytes_after_a_beginning_raise_nothing_but_clear_errors(folder: Path) -> None:
+    path = folder / "fuzz_magic"
+    magics = [HEADER2, HEADER3, dat([]), b"% ", b"#!AER-DAT4.0\r\n", b"#ROSBAG V2.0\n", b""]
+
+    @settings(max_examples=FUZZ_EXAMPLES, deadline=None)
+    @given(st.sampled_from(magics), st.binary(max_size=400))
+    def check(magic: bytes, content: bytes) -> None:
+        path.write_bytes(magic + content)
+        survives(path)
+
+    check()

@@ -1,0 +1,239 @@
+"""Bags of ROS 1 and ROS 2."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_writers import (
+    ARRAY,
+    PACKET,
+    START,
+    array_bag,
+    array_message,
+    packet_message,
+    packet_messages,
+    typestore,
+    write_bag,
+    write_bag2,
+)
+from event_file_checks import (
+    assert_one_line,
+    assert_rejected,
+    attempt,
+    read,
+    table,
+    vendor_file,
+)
+from event_file_writers import (
+    HEIGHT,
+    ROWS,
+    WIDTH,
+    evt3_words,
+    words,
+)
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.files import rosbag
+from aenerf_ns.files.open import open_event_file
+
+
+@pytest.mark.parametrize("compress", ["", "LZ4", "BZ2"])
+def test_arrays_of_events_in_a_bag(compress: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [(x, 47 - x // 2, START // 1000 + 300_000 * x, 1 - 2 * (x % 2)) for x in range(63)]
+    file = open_event_file(array_bag(folder / "arrays.bag", rows, compress))
+    assert (file.width, file.height) == (WIDTH, HEIGHT)
+    np.testing.assert_array_equal(read(file), table(rows))
+    assert file.time_span() == (rows[0][2] * 1000, rows[-1][2] * 1000)
+    monkeypatch.setattr(rosbag, "_CHUNK", 5)
+    assert len(list(file.chunks())) == 8
+    np.testing.assert_array_equal(read(file), table(rows))
+
+
+def test_packets_of_events_in_a_bag_are_at_the_times_of_ros(folder: Path) -> None:
+    # Ten seconds, which wrap once; two packets an event.
+    rows = [(x, 5, 12_000_000 + 200_000 * x, 1 - 2 * (x % 2)) for x in range(50)]
+    words = len(evt3_words(rows[:1]))
+    assert words % 9 == 0
+    # Received with a delay that is shortest, 2 ms, for the fourth event.
+    arrivals = [START + 1000 * row[2] + (2_000_000 if row[0] == 3 else 5_000_000) for row in rows]
+    messages = packet_messages(rows, arrivals, words)
+    path = write_bag(folder / "packets.bag", {"/events": (PACKET, messages)})
+    file = open_event_file(path)
+    expected = table(rows)
+    expected[:, 2] += START + 2_000_000
+    np.testing.assert_array_equal(read(file), expected)
+    assert file.time_span() == (expected[0, 2], expected[-1, 2])
+    # Lost packets, also over more than a period of the camera's time, move nothing.
+    rows = [(x, 5, 12_000_000 + 9_000_000 * x, 1) for x in range(50)]
+    arrivals = [START + 1000 * row[2] for row in rows]
+    messages = packet_messages(rows, arrivals, words)
+    kept = [*range(5), 8, 9, *range(20, 50)]
+    path = write_bag(path, {"/events": (PACKET, [messages[i] for i in kept])})
+    expected = table(rows)[kept]
+    expected[:, 2] += START
+    np.testing.assert_array_equal(read(open_event_file(path)), expected)
+    assert open_event_file(path).time_span() == (expected[0, 2], expected[-1, 2])
+
+
+def test_what_a_decoder_remembers_does_not_outlive_lost_packets(folder: Path) -> None:
+    packets = [[0x8001, 0x6001, 0x0005, 0x2001], [0x0006], [0x2002, 0x8001, 0x6003, 0x2003, 0x0007, 0x2004]]
+    messages = [
+        (START + i, packet_message(i, START + i, np.array(words, "<u2").tobytes())) for i, words in enumerate(packets)
+    ]
+    path = write_bag(folder / "lost.bag", {"/events": (PACKET, [messages[0], messages[2]])})
+    # The events of the last packet before its row are at no known place.
+    assert read(open_event_file(path))[:, :2].tolist() == [[1, 5], [4, 7]]
+
+
+def test_real_packets_agree_with_an_independent_reader_of_their_words(folder: Path) -> None:
+    faery = pytest.importorskip("faery")
+    rosbag1 = pytest.importorskip("rosbags.rosbag1")
+    path = vendor_file("evt3_packets.bag")
+    file = open_event_file(path)
+    events = read(file)
+    with rosbag1.Reader(path) as reader:
+        payloads = []
+        for _, _, data in reader.messages():
+            begin = data.index(b"\x04\0\0\0evt3") + 9
+            payloads.append(data[begin + 4 :])
+    raw = folder / "packets.raw"
+    raw.write_bytes(b"% evt 3.0\n% geometry 640x480\n" + b"".join(payloads))
+    other = faery.events_stream_from_file(raw).to_array()
+    assert len(events) == len(other) == 343_474
+    np.testing.assert_array_equal(events[:, 0], other["x"])
+    np.testing.assert_array_equal(events[:, 1], other["y"])
+    np.testing.assert_array_equal(events[:, 3] > 0, other["on"])
+    times = other["t"].astype(np.int64) * 1000
+    np.testing.assert_array_equal(events[:, 2] - events[0, 2], times - times[0])
+    # No packet is stamped before its events, and the fastest not long after them.
+    assert file.time_span() == (events[0, 2], events[-1, 2])
+    assert events[0, 2] == 1_675_956_550_314_694_990
+
+
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+@pytest.mark.parametrize("num_events", [1, 2, 3, 63])
+def test_arrays_of_events_in_a_bag_of_ros2(storage: str, num_events: int, folder: Path) -> None:
+    rows = [(x, 47 - x // 2, START // 1000 + 300_000 * x, 1 - 2 * (x % 2)) for x in range(num_events)]
+    parts = [rows, [], [(*row[:2], row[2] + 60_000_000, row[3]) for row in rows]]
+    messages = [(part[0][2] * 1000 if part else START + 1, array_message(part)) for part in parts]
+    path = write_bag2(folder / "arrays", messages, ARRAY, storage)
+    (stored,) = (file for file in path.iterdir() if file.name != "metadata.yaml")
+    for place in (path, stored):
+        file = open_event_file(place)
+        assert (file.width, file.height) == (WIDTH, HEIGHT)
+        np.testing.assert_array_equal(read(file), table(parts[0] + parts[2]))
+        assert file.time_span() == (rows[0][2] * 1000, parts[2][-1][2] * 1000)
+
+
+def test_packets_of_events_in_a_bag_of_ros2_are_those_of_ros1(folder: Path) -> None:
+    rows = [(x, 5, 12_000_000 + 200_000 * x, 1 - 2 * (x % 2)) for x in range(50)]
+    messages = packet_messages(rows, [START + 1000 * row[2] for row in rows], len(evt3_words(rows[:1])))
+    # One is lost.
+    del messages[7]
+    one = open_event_file(write_bag(folder / "packets.bag", {"/events": (PACKET, messages)}))
+    two = open_event_file(write_bag2(folder / "packets", messages, PACKET))
+    np.testing.assert_array_equal(read(one), read(two))
+    assert one.time_span() == two.time_span()
+
+
+def test_real_packets_converted_to_ros2_are_the_same_events(folder: Path) -> None:
+    path = vendor_file("evt3_packets.bag")
+    converter = pytest.importorskip("rosbags.convert")
+    converted = folder / "converted"
+    converter.convert([path], converted, "sqlite3", 8, None, "file", None, typestore(), [], [], [], [])
+    file = open_event_file(converted)
+    np.testing.assert_array_equal(read(file), read(open_event_file(path)))
+    assert file.time_span() == open_event_file(path).time_span()
+
+
+def test_a_trained_run_opens_without_its_bag_of_ros2(folder: Path) -> None:
+    path = write_bag2(folder / "gone", [(START, array_message([(1, 2, START // 1000, 1)]))], ARRAY)
+    file = open_event_file(path, WIDTH, HEIGHT)
+    assert len(read(file)) == 1
+    (path / "metadata.yaml").unlink()
+    with pytest.raises(DataError, match=r"not a readable bag of ROS 2 \(.*try `ros2 bag reindex`"):
+        file.time_span()
+
+
+@pytest.mark.parametrize("cut", [1, 10, 30, 61])
+def test_messages_of_ros2_that_are_cut_are_told_in_one_line(cut: int, folder: Path) -> None:
+    path = write_bag2(folder / "cut", [(START, array_message([(1, 2, START // 1000, 1)]))], ARRAY)
+    (stored,) = path.glob("*.db3")
+    with closing(sqlite3.connect(stored)) as database, database:
+        (data,) = database.execute("SELECT data FROM messages").fetchone()
+        database.execute("UPDATE messages SET data = ?", (data[:-cut],))
+    with pytest.raises(DataError, match="does not have the parts of its type"):
+        attempt(stored)
+    with closing(sqlite3.connect(stored)) as database, database:
+        # As middleware writes that pads messages.
+        database.execute("UPDATE messages SET data = ?", (data + bytes(-len(data) % 4),))
+    assert len(read(open_event_file(stored))) == 1
+
+
+def test_one_of_several_topics(folder: Path) -> None:
+    array = [(START, array_message([(1, 2, START // 1000, 1)]))]
+    path = write_bag(folder / "topics.bag", {"/left": (ARRAY, array), "/right": (ARRAY, array)})
+    with pytest.raises(DataError, match="choose one of /left, /right as topic"):
+        open_event_file(path)
+    assert len(read(open_event_file(path, topic="/right"))) == 1
+    with pytest.raises(DataError, match="topic /up holds no events; choose one of /left"):
+        open_event_file(path, topic="/up")
+
+
+def test_a_missing_package_for_bags_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder / "missing_package.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n")
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
+    with pytest.raises(DataError, match=re.escape("pip install 'aenerf-ns[rosbag]'")):
+        open_event_file(path)
+
+
+MALFORMED: dict[str, tuple[bytes, str]] = {
+    "bag with its magic alone": (b"#ROSBAG V2.0\n", "not a readable bag"),
+    "bag of version 1": (b"#ROSBAG V1.2\n", "not a readable bag"),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_malformed_files_are_told_in_one_line(name: str, folder: Path) -> None:
+    pytest.importorskip("rosbags")
+    content, message = MALFORMED[name]
+    assert_rejected(folder / name.replace(" ", "_"), content, message)
+
+
+def malformed_bags() -> dict[str, tuple[str, list[tuple[int, bytes]], str]]:
+    good = array_message(ROWS)
+    packet = packet_message(0, START, evt3_words(ROWS).tobytes())
+    return {
+        "no events": (ARRAY, [(START, array_message([]))], "holds no events"),
+        "cut": (ARRAY, [(START, good[:-1])], "does not have the parts"),
+        "cut in its header": (ARRAY, [(START, good[:10])], "does not have the parts"),
+        "of another length": (ARRAY, [(START, good + b"\0")], "does not have the parts"),
+        "of two sizes": (
+            ARRAY,
+            [(START, good), (START + 1, array_message(ROWS, (9, 9)))],
+            "has 9 x 9 pixels, but 64 x 48",
+        ),
+        "out of order": (ARRAY, [(START, good), (START + 1, good)], "before the event ahead of it"),
+        "of another encoding": (PACKET, [(START, packet_message(0, START, b"", "libcaer"))], "encoded as 'libcaer'"),
+        "within a word": (PACKET, [(START, packet_message(0, START, b"\1\2\3"))], "ends within a word"),
+        "of no time": (PACKET, [(START, packet_message(0, START, words("<u2", 1, 0x2001)))], "holds no events"),
+        "of garbage": (PACKET, [(START, packet), (START + 1, packet_message(1, START, b"\0\x90"))], "0x9000"),
+        "of nothing we know": ("sensor_msgs/msg/Image", [(START, b"")], "the bag holds sensor_msgs/Image"),
+    }
+
+
+@pytest.mark.parametrize("name", malformed_bags())
+def test_malformed_bags_are_told_in_one_line(name: str, folder: Path) -> None:
+    kind, messages, message = malformed_bags()[name]
+    path = write_bag(folder / "malformed.bag", {"/events": (kind, messages)})
+    with pytest.raises(DataError) as caught:
+        attempt(path)
+    assert_one_line(caught.value, path)
+    assert message in str(caught.value)
