@@ -13,6 +13,7 @@ from PIL import Image
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.report import Report
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
+from aenerf_ns.cli.operands import Dataset
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.recording.scene import SCENE
@@ -26,8 +27,7 @@ class Check:
     if there are problems, 2 if the dataset cannot be read. Options of a format come after its name; by default the
     format is recognised."""
 
-    data: Path
-    """The dataset."""
+    data: Dataset
     picture: Path | None = None
     """PNG file to write: events as they came, and warped to one view by the poses."""
     format: DatasetFormat = field(default_factory=Automatic)
