@@ -21,7 +21,7 @@ MAY_USE = {
     "supervision": {"errors", "events", "camera", "recording"},
     "method": {"camera", "recording", "supervision"},
     "training": {"errors", "progress", "camera", "recording", "supervision", "method"},
-    "checking": {"camera", "events"},
+    "checking": {"progress", "events", "camera", "recording"},
     "simulator": {"errors", "progress", "events", "camera", "recording"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},

@@ -1,26 +1,41 @@
-"""``aenerf convert``: any dataset as a native one."""
+"""``aenerf convert``: a dataset of any format as a dataset folder of aenerf-ns."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
+from aenerf_ns.cli.operands import Dataset
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile, hot_pixel_summary
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.progress import tracked
 from aenerf_ns.recording.dataparser import thinned
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.recording import FrameSequence, Recording, ReferenceView, Split
 from aenerf_ns.recording.structure_from_motion import compare_with_truth, estimate_poses
 from aenerf_ns.recording.writer import NativeDatasetWriter
+
+# Takes exactly four words. As an optional tuple, the option would also take the dataset if it follows.
+Region = Annotated[
+    tuple[int, int, int, int] | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=4,
+        metavar="X Y WIDTH HEIGHT",
+        instance_from_str=lambda words: tuple(int(word) for word in words),
+        is_instance=lambda value: value is None or isinstance(value, tuple),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
 
 
 @dataclass
@@ -29,32 +44,32 @@ class Convert:
     The events are read and written piece by piece, and the folder appears when it is complete. Options of a format come
     after its name; by default the format is recognised."""
 
-    data: Path
-    """The dataset to read."""
+    data: Dataset
     output: Path
     """Dataset folder to create."""
     poses: Literal["given", "colmap"] = "given"
-    """Take the poses that are there, or have COLMAP estimate them from the recording's frames. These have no metric
-    scale. Given poses are then kept as ground truth, to compare with."""
+    """given: take the dataset's poses. colmap: have COLMAP estimate poses from the recording's frames, without metric
+    scale. The given poses are then kept as ground truth, to compare with."""
     start_time_ns: int | None = None
-    """Leave out what happened before this time on the clock of the events, in nanoseconds."""
+    """Leave out events and images before this time on the clock of the events, in nanoseconds."""
     end_time_ns: int | None = None
-    """Leave out what happened after this time, likewise."""
-    region: tuple[int, int, int, int] | None = None
-    """Keep only this part of the sensor: x y width height, in pixels."""
+    """Leave out events and images after this time on the clock of the events, in nanoseconds."""
+    region: Region = None
+    """Keep only this part of the sensor, in pixels."""
     drop_hot_pixels: bool = False
     """Leave out pixels that fire by themselves. Reads the events twice."""
     shortest_interval_ns: int = 0
-    """Leave out events that follow the last one kept of their pixel by less than this, in nanoseconds: repeated firing
-    for one change of light. Each event that was none of these takes a contrast threshold with it."""
+    """Leave out events that follow the last kept event of their pixel by less than this, in nanoseconds. Meant for
+    pixels that fire repeatedly for one change of light. Leaving out any other event loses a change of light of one
+    contrast threshold."""
     pixel_share: float = 1.0
-    """Keep the events of this share of the pixels, chosen at random; to train on less."""
+    """Keep the events of this share of the pixels, chosen at random, to train on fewer events."""
     seed: int = 0
-    """Seed of the pixels that are kept, and of COLMAP."""
+    """Seed of the choice of pixels, and of COLMAP."""
     format: DatasetFormat = field(default_factory=Automatic)
 
     def main(self) -> None:
-        """Reads the dataset and writes it."""
+        """Read the dataset and write it."""
         if self.output.exists():
             raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
         try:
@@ -73,14 +88,15 @@ class Convert:
         longest_gap = parser.config.max_pose_gap_ns
         report = None
         if self.poses == "colmap":
-            recording, report = _with_estimated_poses(parser.read_frames(), self._within, self.data, self.seed)
+            recording, report = _with_estimated_poses(parser.read_frames(), filters.window, self.data, self.seed)
         else:
             recording = parser.recording
         events = FilteredEventFile(recording.event_file, filters)
-        trajectory = self._cut(recording, events)
+        trajectory = _cut(recording, events, filters.window)
         views = {
             split: thinned(
-                [view for view in views if view.time is None or self._within(view.time)], recording.max_views
+                [view for view in views if view.time is None or filters.window.contains(view.time)],
+                recording.max_views,
             )
             for split, views in recording.reference_views.items()
         }
@@ -118,55 +134,48 @@ class Convert:
                 num_read, num_written = _copy_events(recording.event_file, events, writer)
         except OSError as error:
             raise DataError(self.output, f"it cannot be written ({error})", "check the space and the rights") from None
-        # What the format does by default goes on.
+        # Poses that the format does not scale by default are not scaled in the converted dataset either.
         keeps_scale = not parser.config.auto_scale_poses and recording.scene_box is None
         unscaled = "aenerf-data --auto-scale-poses False " if keeps_scale else ""
         counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
         CONSOLE.print(
             f"{self.output}: {num_written:,} of {num_read:,} events, {len(trajectory)} poses, images: {counts}.\n"
-            f"Look it over with: aenerf check --data {self.output}\n"
+            f"Look it over with: aenerf check {self.output}\n"
             f"Train with: ns-train aenerf {unscaled}--data {self.output}",
             highlight=False,
             soft_wrap=True,
         )
 
-    def _within(self, time: int) -> bool:
-        return (self.start_time_ns is None or self.start_time_ns <= time) and (
-            self.end_time_ns is None or time <= self.end_time_ns
-        )
 
-    def _cut(self, recording: Recording, events: FilteredEventFile) -> Trajectory:
-        """The poses that cover the time window: all of them without one."""
-        first, last = recording.event_file.ordered_time_span()
-        start, end = events.time_span()
-        if end < start:
-            raise DataError(
-                recording.event_file.path,
-                f"its events are from {first} to {last} ns, all outside the time window",
-                "widen the time window (--start-time-ns, --end-time-ns)",
-            )
-        covered = recording.trajectory.between(start, end)
-        return recording.trajectory if self.start_time_ns is None and self.end_time_ns is None else covered
+def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) -> Trajectory:
+    """Return the poses that cover the time window, or all poses if the window has no bounds."""
+    first, last = recording.event_file.ordered_time_span()
+    start, end = events.time_span()
+    if end < start:
+        raise DataError(
+            recording.event_file.path,
+            f"its events are from {first} to {last} ns, all outside the time window",
+            "widen the time window (--start-time-ns, --end-time-ns)",
+        )
+    covered = recording.trajectory.between(start, end)
+    return recording.trajectory if window == TimeWindow() else covered
 
 
 def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDatasetWriter) -> tuple[int, int]:
-    """Writes what is kept of the events; returns how many were read and how many written."""
+    """Write the kept events, and return how many events were read and how many were written."""
     num_read = num_written = 0
-    with progress_bar() as progress:
 
-        def tracked(description: str) -> Iterator[EventStream]:
-            nonlocal num_read
-            num_read = 0
-            task = progress.add_task(description, total=source.count())
-            for chunk in source.chunks():
-                yield chunk
-                num_read += len(chunk)
-                progress.advance(task, len(chunk))
+    def read(description: str) -> Iterator[EventStream]:
+        nonlocal num_read
+        num_read = 0
+        for chunk in tracked(source.chunks(), description, source.count()):
+            yield chunk
+            num_read += len(chunk)
 
-        events.find_hot_pixels(tracked("Looking for hot pixels"))
-        for chunk in events.filtered(tracked("Converting events")):
-            writer.events.append(chunk)
-            num_written += len(chunk)
+    events.find_hot_pixels(read("Looking for hot pixels"))
+    for chunk in events.filtered(read("Converting events")):
+        writer.events.append(chunk)
+        num_written += len(chunk)
     if num_written == 0:
         raise events.empty_error()
     if events.hot_pixels is not None and events.counts is not None:
@@ -175,22 +184,22 @@ def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDat
 
 
 def _with_estimated_poses(
-    frames: FrameSequence, within: Callable[[int], bool], source: Path, seed: int
+    frames: FrameSequence, window: TimeWindow, source: Path, seed: int
 ) -> tuple[Recording, dict[str, Any]]:
-    """The recording with COLMAP's poses as the estimated ones, and what COLMAP says of itself."""
+    """Return the recording with COLMAP's poses as the estimated poses, and COLMAP's report."""
     if frames.frame_camera != frames.event_camera:
         raise DataError(
             source,
-            "its frames are of another camera than its events, and COLMAP finds the poses of the frames",
-            "estimate poses elsewhere, carry them over to the event camera, and give them as the trajectory",
+            "its frames are of another camera than its events, and COLMAP finds the poses of the frames only",
+            "estimate poses elsewhere, convert them to poses of the event camera, and give them as the trajectory",
         )
-    kept = [(time, file) for time, file in zip(frames.times, frames.files, strict=True) if within(time)]
+    kept = [(time, file) for time, file in zip(frames.times, frames.files, strict=True) if window.contains(time)]
     found = estimate_poses([file for _, file in kept], [time for time, _ in kept], frames.frame_camera, source, seed)
     trajectory, report, given = found.trajectory, found.report(), frames.recording
     CONSOLE.print(found.summary(), highlight=False, soft_wrap=True)
     CONSOLE.print(
-        "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale: frames of one camera "
-        "tell no lengths.",
+        "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale, because frames of one "
+        "camera tell no lengths.",
         soft_wrap=True,
     )
     if given is not None:
@@ -206,7 +215,7 @@ def _with_estimated_poses(
                 highlight=False,
                 soft_wrap=True,
             )
-        # A box in the world of the given poses is none in COLMAP's, and their gaps are not COLMAP's.
+        # The scene box is in the world of the given poses, and the longest gap is about the given poses.
         return replace(given, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None), report
     placed = [(time, file) for time, file in kept if trajectory.start <= time <= trajectory.end]
     views = [ReferenceView(file, homogeneous(trajectory.interpolate(time)), time) for time, file in placed]

@@ -1,4 +1,4 @@
-"""Which format a dataset is in, as subcommands of the commands that read one."""
+"""The format of a dataset, as subcommands of the commands that read a dataset."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfi
 
 @dataclass
 class Automatic:
-    """Recognise the format from what is there."""
+    """Recognise the format from the files of the dataset."""
 
 
 def _format_options(config: EventDataParserConfig) -> Any:
-    """The config with those options hidden that make a scene of a recording: these commands keep its world."""
+    """Return the config without the options that place a recording in a scene.
+
+    Commands that read a dataset keep the world of the recording.
+    """
     kind = type(config)
     hints, suppress = get_type_hints(kind), cast(Any, tyro.conf.Suppress)
     hidden = [
         (option.name, suppress[hints[option.name]], field(default=getattr(config, option.name)))
         for option in fields(EventDataParserConfig)
-        # Which is about the recording.
+        # The longest gap between poses belongs to the recording, not to the scene.
         if option.name != "max_pose_gap_ns"
     ]
     options = make_dataclass(kind.__name__, hidden, bases=(kind,), namespace={"__doc__": kind.__doc__})
@@ -39,7 +42,7 @@ else:
         tyro.extras.subcommand_type_from_defaults(
             {"auto": Automatic(), **{name: _format_options(config) for name, config in FORMATS.items()}},
             descriptions={
-                "auto": "recognise the format from what is there",
+                "auto": "recognise the format from the files of the dataset",
                 **{name: (type(config).__doc__ or "").splitlines()[0] for name, config in FORMATS.items()},
             },
             prefix_names=False,
@@ -48,10 +51,10 @@ else:
 
 
 def open_dataset(data: Path, dataset_format: DatasetFormat) -> EventDataParser:
-    """The parser of a dataset.
+    """Return the parser of a dataset.
 
     Raises:
-        DataError: its format is not recognised.
+        DataError: the format is not recognised.
     """
     config = copy(FORMATS[recognise(data)] if isinstance(dataset_format, Automatic) else dataset_format)
     config.data = data

@@ -1,4 +1,4 @@
-"""``aenerf evaluate``: the metrics of ``ns-eval``, under the run's colour correction or another."""
+"""``aenerf evaluate``: the metrics of ``ns-eval``, under the run's colour correction or another one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Literal
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from aenerf_ns.cli.operands import RunConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.color_correction import ColorCorrectionProtocol
 from aenerf_ns.training.pipeline import AENeRFPipeline
@@ -20,20 +21,19 @@ class Evaluate:
     """Compare a trained run's renderings with the test views, as ns-eval does and in the same JSON layout, optionally
     under another protocol than the run's. Nothing in the run's folder changes."""
 
-    load_config: Path
-    """config.yml of the run."""
+    load_config: RunConfig
     output: Path
     """JSON file to write."""
     color_correction: ColorCorrectionProtocol | None = None
-    """Fit this colour correction on the run's data and use it; by default the one that was stored with the run."""
+    """Fit this colour correction on the run's data and use it; by default the correction stored with the run."""
     test_poses: Literal["aligned", "photometric"] = "aligned"
-    """Render the test views from where their poses, carried into the frame of the corrected poses, put them; or let
-    each first be moved to where it fits its image best, which looks at the test images."""
+    """aligned: render each test view from its pose, carried into the frame of the corrected poses. photometric: first
+    move each pose to where its rendering fits its test image best, which looks at the test images."""
     render_output: Path | None = None
     """Folder for pictures: truth beside reconstruction, accumulation, depth."""
 
     def main(self) -> None:
-        """Loads the run, evaluates it and writes the metrics."""
+        """Load the run, evaluate it and write the metrics."""
         if not self.load_config.is_file():
             raise DataError(self.load_config, "there is no such file", "give the config.yml of a trained run")
         config, pipeline, checkpoint, _ = eval_setup(self.load_config)

@@ -1,4 +1,4 @@
-"""``aenerf export-trajectory``: the poses of a trained run, in the recording's world, for other tools."""
+"""``aenerf export-trajectory``: the poses of a trained run as a file, in the world of the recording."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.cli.operands import RunConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.training.pipeline import AENeRFPipeline
@@ -21,17 +22,17 @@ class ExportTrajectory:
     """Write the poses of a trained run in TUM format: t tx ty tz qx qy qz qw, in seconds, camera-to-world, OpenCV axes,
     in the world and the units of the recording."""
 
-    load_config: Path
-    """config.yml of the run."""
+    load_config: RunConfig
     output: Path
     """Text file to write."""
     poses: Literal["corrected", "estimated", "ground-truth"] = "corrected"
-    """After the run's pose correction, as they were given, or the true ones (within the run's time window)."""
+    """corrected: after the run's pose correction. estimated: as given to the run. ground-truth: the true poses, within
+    the run's time window."""
     rate: float | None = None
     """Poses a second; by default at the times of the given poses."""
 
     def main(self) -> None:
-        """Loads the run and writes its poses."""
+        """Load the run and write its poses."""
         if self.rate is not None and not 0 < self.rate <= 1e9:
             raise DataError("aenerf export-trajectory", f"a rate of {self.rate}", "give one above 0 and up to 1e9")
         if not self.load_config.is_file():

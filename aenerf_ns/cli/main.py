@@ -1,4 +1,4 @@
-"""``aenerf``: what Nerfstudio's own commands do not do."""
+"""The ``aenerf`` command: simulate, convert and check datasets, evaluate and export trained runs."""
 
 from __future__ import annotations
 
@@ -15,18 +15,25 @@ from aenerf_ns.errors import DataError
 
 
 def main() -> None:
-    """Entry point of the ``aenerf`` command. Bad input ends it with one line and exit status 1."""
-    command = tyro.extras.subcommand_cli_from_dict(
-        {
-            "simulate": Simulate,
-            "convert": Convert,
-            "check": Check,
-            "evaluate": Evaluate,
-            "export-trajectory": ExportTrajectory,
-        },
-        prog="aenerf",
-        description="AE-NeRF tools; train with ns-train aenerf.",
-    )
+    """Run the ``aenerf`` command.
+
+    Bad input ends the process with one line and exit status 1, bad arguments with exit status 2.
+    """
+    try:
+        command = tyro.extras.subcommand_cli_from_dict(
+            {
+                "simulate": Simulate,
+                "convert": Convert,
+                "check": Check,
+                "evaluate": Evaluate,
+                "export-trajectory": ExportTrajectory,
+            },
+            prog="aenerf",
+            description="AE-NeRF tools; train with ns-train aenerf.",
+        )
+    except DataError as error:
+        print(f"Error: {error}", file=sys.stderr)
+        sys.exit(2)
     try:
         command.main()
     except DataError as error:

@@ -1,4 +1,4 @@
-"""Leaving events out of a stream: by time, by pixel, or because they follow another too closely."""
+"""Leave events out of a stream: by time, by pixel, or because they follow another event too closely."""
 
 from __future__ import annotations
 
@@ -12,33 +12,31 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.events.time_window import FIRST_TIME, LAST_TIME
+from aenerf_ns.events.time_window import FIRST_TIME, LAST_TIME, TimeWindow
 
 _NEVER = np.iinfo(np.int64).min
 
-# A hot pixel has more events than its neighbours by this factor,
+# A hot pixel has more events than its neighbours by this factor and by so many standard deviations.
 _HOT_FACTOR = 4.0
-# and by so many standard deviations: of what pixels that see alike differ by, at least of a Poisson process.
 _HOT_DEVIATIONS = 6.0
 _MAX_SHOWN = 10
 
 
 @dataclass(frozen=True)
 class EventFilters:
-    """Which events of a stream are kept.
+    """The events of a stream that are kept.
 
-    Applied in this order: time window, hot pixels, region, share of the pixels, shortest interval.
+    The filters are applied in this order: time window, hot pixels, region, share of the pixels, shortest interval.
 
     Attributes:
-        start: events before this time in nanoseconds are left out.
-        end: events after this time in nanoseconds are left out.
-        region: x, y, width and height of the part of the sensor that is kept, in pixels. The pixels of what is kept
-            count from its corner.
+        start: nanoseconds; events before this time are left out.
+        end: nanoseconds; events after this time are left out.
+        region: x, y, width and height in pixels of the part of the sensor that is kept. The kept events' pixels are
+            counted from the corner of the region.
         hot_pixels: whether the events of hot pixels (:func:`find_hot_pixels`) are left out.
-        pixel_share: share of the pixels whose events are kept, all of them. Which ones is random.
-        shortest_interval: an event that follows the last kept one of its pixel by less than this, in nanoseconds, is
-            left out.
-        seed: of the random pixels.
+        pixel_share: share of the pixels that are kept, chosen at random. All events of a kept pixel are kept.
+        shortest_interval: nanoseconds; an event that follows the last kept event of its pixel by less is left out.
+        seed: seed of the choice of pixels.
 
     Raises:
         ValueError: a value is out of range.
@@ -62,9 +60,14 @@ class EventFilters:
         if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) <= 0):
             raise ValueError(f"the region of interest {self.region} must be x, y, width, height, of positive size")
 
+    @property
+    def window(self) -> TimeWindow:
+        """Times of the events that are kept."""
+        return TimeWindow(FIRST_TIME if self.start is None else self.start, LAST_TIME if self.end is None else self.end)
+
 
 def count_events(chunks: Iterable[EventStream], width: int, height: int) -> NDArray[np.int64]:
-    """Number of events of every pixel (height, width), in one pass over the stream."""
+    """Return the (height, width) int64 number of events of every pixel, in one pass over the stream."""
     counts = np.zeros(width * height, np.int64)
     for chunk in chunks:
         counts += np.bincount(chunk.y.astype(np.int64) * width + chunk.x, minlength=counts.size)
@@ -72,19 +75,19 @@ def count_events(chunks: Iterable[EventStream], width: int, height: int) -> NDAr
 
 
 def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Pixels that fire by themselves.
+    """Find the pixels that fire by themselves.
 
-    What a moving camera sees passes over many pixels, so that a pixel has about as many events as those around it. A
-    hot one has more than four times the median of the 5 x 5 pixels around it, and by more than 6 standard deviations.
-    For these, numbers are compared after Anscombe's transformation 2 sqrt(n + 3/8), under which the noise of a Poisson
-    process is 1; the standard deviation is the larger of that and 1.4826 times the median absolute deviation over the
-    sensor.
+    Edges pass over many pixels when the camera moves, so that a pixel has about as many events as the pixels around it.
+    A hot pixel has more than four times the median of the 5 x 5 pixels around it, and exceeds the median by more than 6
+    standard deviations. Deviations are taken after Anscombe's transformation 2 sqrt(n + 3/8), which gives the noise of
+    a Poisson process a standard deviation of 1. The standard deviation used is 1.4826 times the median absolute
+    deviation over the sensor, but at least 1.
 
     Args:
         counts: (height, width) number of events of every pixel.
 
     Returns:
-        (height, width) whether a pixel is hot.
+        (height, width) bool, whether a pixel is hot.
     """
     around = cv2.medianBlur(counts.astype(np.float32), 5)
     excess = 2 * (np.sqrt(counts + 0.375) - np.sqrt(around + 0.375))
@@ -93,7 +96,12 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
 
 
 def hot_pixel_summary(hot: NDArray[np.bool_], counts: NDArray[np.integer]) -> str:
-    """One line about (height, width) hot pixels and the number of events of all pixels."""
+    """Describe the hot pixels in one line, those with the most events by name.
+
+    Args:
+        hot: (height, width) whether a pixel is hot.
+        counts: (height, width) number of events of every pixel.
+    """
     if not hot.any():
         return "Hot pixels: none."
     rows, columns = np.nonzero(hot)
@@ -105,19 +113,19 @@ def hot_pixel_summary(hot: NDArray[np.bool_], counts: NDArray[np.integer]) -> st
 
 
 class FilteredEventFile(EventFile):
-    """An event file of which only some events are kept, read through as it is.
+    """Read an event file and keep only some of its events.
 
     Args:
         source: the event file.
-        filters: which events are kept.
+        filters: the events to keep.
 
     Raises:
         DataError: the region of interest is not on the sensor.
 
     Attributes:
-        hot_pixels: (height, width) which pixels of the source are hot, known once they were looked for; None when they
-            are kept.
-        counts: (height, width) number of events of every pixel of the source, likewise.
+        hot_pixels: (height, width) bool, whether a pixel of the source is hot; None before :meth:`find_hot_pixels`, and
+            if the filters keep hot pixels.
+        counts: (height, width) number of events of every pixel of the source; None when ``hot_pixels`` is None.
     """
 
     def __init__(self, source: EventFile, filters: EventFilters) -> None:
@@ -137,10 +145,10 @@ class FilteredEventFile(EventFile):
         self.counts: NDArray[np.int64] | None = None
 
     def find_hot_pixels(self, chunks: Iterable[EventStream] | None = None) -> None:
-        """Looks for hot pixels when they are to be left out. Reads the whole source.
+        """Find the hot pixels if the filters leave them out. Reads the whole source.
 
         Args:
-            chunks: of the source, to show progress; by default they are read here.
+            chunks: all chunks of the source, given by a caller that shows progress; by default they are read here.
         """
         if self._filters.hot_pixels:
             within = self._within(self._source.chunks() if chunks is None else chunks)
@@ -151,7 +159,7 @@ class FilteredEventFile(EventFile):
         yield from self.filtered(self._source.chunks())
 
     def filtered(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
-        """What is kept of chunks of the source, all of which must come, in order."""
+        """Yield the kept events of each chunk. Pass every chunk of the source, in order."""
         if self._filters.hot_pixels and self.hot_pixels is None:
             self.find_hot_pixels()
         keep = self._kept_pixels()
@@ -172,12 +180,12 @@ class FilteredEventFile(EventFile):
             )
 
     def _within(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
-        start, end = self._filters.start, self._filters.end
+        window = self._filters.window
         for chunk in chunks:
-            yield chunk.between(FIRST_TIME if start is None else start, LAST_TIME if end is None else end)
+            yield chunk.between(window.start, window.end)
 
     def _kept_pixels(self) -> NDArray[np.bool_]:
-        """(height, width) pixels of the source whose events are kept."""
+        """Return (height, width) bool, whether the events of a pixel of the source are kept."""
         (x, y), shape = self._corner, (self._source.height, self._source.width)
         keep = np.zeros(shape, bool)
         keep[y : y + self.height, x : x + self.width] = True
@@ -188,18 +196,19 @@ class FilteredEventFile(EventFile):
         return keep
 
     def time_span(self) -> tuple[int, int]:
-        """Times that bound those of the events that are kept, in nanoseconds."""
+        """Return the first and the last time in nanoseconds that a kept event can have."""
         first, last = self._source.time_span()
-        start, end = self._filters.start, self._filters.end
-        return first if start is None else max(first, start), last if end is None else min(last, end)
+        window = self._filters.window
+        return max(first, window.start), min(last, window.end)
 
     def empty_error(self) -> DataError:
+        """Return the error for a file without kept events."""
         return DataError(self.path, "no event is left", "widen the time window, the region of interest or the share")
 
 
 @numba.njit(cache=True)
 def _select(x, y, t, keep, width, shortest_interval, last_kept):
-    """Which events are kept, (N,) bool; ``last_kept`` is carried from chunk to chunk."""
+    """Return (N,) bool, whether each event is kept. Updates ``last_kept``, which is passed on from chunk to chunk."""
     kept = np.zeros(x.shape[0], np.bool_)
     for i in range(x.shape[0]):
         pixel = np.int64(y[i]) * width + x[i]

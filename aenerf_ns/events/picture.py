@@ -1,4 +1,4 @@
-"""Events as a picture."""
+"""Pictures of events."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NEGATIVE_STEP = np.array([-90, -60, 90])
 def polarity_picture(
     x: NDArray[np.integer], y: NDArray[np.integer], polarity: NDArray[np.integer], width: int, height: int
 ) -> NDArray[np.uint8]:
-    """Accumulates polarities over pixels: red where positive events prevail, blue where negative ones do.
+    """Add up polarities over pixels, and draw pixels red where positive events prevail, blue where negative ones do.
 
     Args:
         x: (N,) pixel columns.
@@ -24,7 +24,7 @@ def polarity_picture(
         height: number of pixel rows.
 
     Returns:
-        (height, width, 3) uint8 display colours, grey where nothing happened.
+        (height, width, 3) uint8 display colours; grey where there are no events.
     """
     net = np.zeros((height, width), dtype=np.int64)
     np.add.at(net, (y, x), polarity)

@@ -1,4 +1,4 @@
-"""What a stream of events is like, in one pass and bounded memory."""
+"""Statistics of a stream of events, in one pass and bounded memory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from aenerf_ns.events.stream import EventStream
 
 _NEVER = np.iinfo(np.int64).min
-# Pairs that are kept as a sample: every one until there are twice as many, then every second, every fourth ...
+# Size of the sample of pairs. Every pair is kept until there are twice as many, then every second, every fourth ...
 _MAX_PAIRS = 100_000
 
 
@@ -22,10 +22,11 @@ class EventStatistics:
 
     Attributes:
         counts: (height, width) int64 number of events of every pixel.
-        num_positive: events of polarity +1.
-        num_repeated: events of a pixel and a time that another event has too.
-        rate: (N,) int64 number of events in equal parts of the time span.
-        pair_times: (M, 2) int64 times in nanoseconds of an even sample of the pairs of consecutive events of a pixel.
+        num_positive: number of events of polarity +1.
+        num_repeated: number of events that have the pixel and the time of an earlier event.
+        rate: (N,) int64 number of events in each of N equal parts of the time span.
+        pair_times: (M, 2) int64 times in nanoseconds of pairs of consecutive events of a pixel. The pairs are an even
+            sample of all pairs.
         start: time of the first event in nanoseconds.
         end: time of the last event in nanoseconds.
     """
@@ -47,7 +48,7 @@ class EventStatistics:
 def event_statistics(
     chunks: Iterable[EventStream], width: int, height: int, time_span: tuple[int, int], num_parts: int
 ) -> EventStatistics:
-    """Reads a stream through and counts.
+    """Read a stream to its end and count.
 
     Args:
         chunks: the stream in pieces, in the order of time.
@@ -64,7 +65,7 @@ def event_statistics(
     for chunk in chunks:
         num_positive += int((chunk.p > 0).sum())
         num_repeated += _count(chunk.x, chunk.y, chunk.t, width, counts, last_time, sample, state)
-        # Exact in integers up to 292 years: float64 seconds since 1970 would put events into other parts.
+        # Integers are exact up to 292 years. Seconds since 1970 in float64 would put events into other parts.
         part = (chunk.t - start) // max(-(-(end - start + 1) // num_parts), 1)
         rate += np.bincount(part.clip(0, num_parts - 1), minlength=num_parts)
     return EventStatistics(
@@ -74,8 +75,10 @@ def event_statistics(
 
 @numba.njit(cache=True)
 def _count(x, y, t, width, counts, last_time, sample, state):
-    """Continues the counts with one chunk, and returns the number of repeated events. ``state`` holds the number of
-    pairs, that of the sampled ones, and the step between two of these."""
+    """Continue the counts with one chunk, and return the number of repeated events.
+
+    ``state`` holds the number of pairs, the number of sampled pairs, and the step from one sampled pair to the next.
+    """
     repeated = 0
     for i in range(t.shape[0]):
         pixel = np.int64(y[i]) * width + x[i]

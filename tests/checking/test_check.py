@@ -1,27 +1,27 @@
-"""The check of a dataset: true poses beat wrong ones, and a planted mistake is named."""
+"""The check of a dataset: true poses beat wrong poses, and a planted mistake is named."""
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from conftest import make_stream
 from PIL import Image
+from small_datasets import write_native
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.checking.contrast import WarpedEvents, clock_hypothesis
+from aenerf_ns.checking.contrast import WarpedEvents
+from aenerf_ns.checking.hypotheses import clock_hypothesis
 from aenerf_ns.cli import check as command
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
-from aenerf_ns.events.statistics import event_statistics
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
@@ -51,7 +51,7 @@ def simulated(room: Path) -> tuple[Recording, EventStream]:
 
 
 def named(events: EventStream, trajectory: Trajectory, recording: Recording) -> list[str]:
-    """Alternatives that are clearly better, the best first."""
+    """Return the names of the alternatives that are clearly better, the best first."""
     covered = events.between(trajectory.start, trajectory.end)
     warped = WarpedEvents([covered], trajectory, recording.event_camera)
     return [c.hypothesis.name for c in warped.comparisons() if c.is_clearly_better]
@@ -84,7 +84,7 @@ def with_pixels(function: Callable[[EventStream], tuple[np.ndarray, np.ndarray]]
 
 
 def read_with_w_first(poses: torch.Tensor) -> torch.Tensor:
-    """What is read when qw qx qy qz are taken for qx qy qz qw."""
+    """Return the poses that are read if qw qx qy qz are taken for qx qy qz qw."""
     wrong = quaternion_from_rotation(poses[:, :3, :3]).roll(1, -1)
     return torch.cat([torch.cat([rotation_from_quaternion(wrong), poses[:, :3, 3:]], -1), poses[:, 3:]], 1)
 
@@ -136,7 +136,7 @@ def test_the_real_recording_prefers_its_poses(slider_depth: Path) -> None:
     warped = WarpedEvents([events], trajectory, recording.event_camera)
     assert warped.without_motion().is_clearly_worse
     found = {c.hypothesis.name: c for c in warped.comparisons()}
-    # The camera moves along its x axis and does not turn: what leaves that axis alone does not show.
+    # The camera moves along its x axis and does not turn, so that mistakes that keep this axis do not show.
     unseen = {"the poses have OpenGL camera axes (y up, z backward)", "the pixels are mirrored in y"}
     for name in MISTAKES:
         assert found[name].is_untold if name in unseen else found[name].is_clearly_worse, name
@@ -151,13 +151,13 @@ def test_mistakes_planted_in_the_real_recording_are_named(slider_depth: Path) ->
     events = all_events(recording)
     for name in ("the poses are world-to-camera", "the camera axes x and z are flipped"):
         assert name in named(*MISTAKES[name](events, recording.trajectory), recording)
-    # The first pose is where the camera still gathers speed; then its speed is constant, which tells no time.
+    # The camera gathers speed at the first pose. Afterwards its speed is constant, and no clock offset shows.
     (best, *_) = named(*shifted(-0.1)(events, recording.trajectory), recording)
     assert "behind that of the events" in best
 
 
 def run(folder: Path, **options: Path) -> tuple[int, str]:
-    """Exit status of the check, and what it printed."""
+    """Return the exit status of the check, and its output."""
     status = 0
     with command.CONSOLE.capture() as output:
         try:
@@ -231,6 +231,26 @@ def test_the_command_reports_gaps_and_poses_that_end_early(shorter: Path) -> Non
     assert "100.0% of the events are positive" in output
 
 
+def test_the_scene_box_must_hold_what_is_seen(shorter: Path) -> None:
+    path = shorter / "transforms.json"
+    meta = json.loads(path.read_text())
+    for side, status in ((8.0, 0), (0.5, 1)):
+        meta["scene_box"] = [[-side, -side, -side], [side, side, side]]
+        path.write_text(json.dumps(meta))
+        found, output = run(shorter)
+        assert found == status, output
+        assert "Within the scene box: " in output
+        assert ("the scene box holds only" in output) == (status == 1)
+
+
+def test_few_events_are_not_warped(tmp_path: Path) -> None:
+    picture = tmp_path / "warped.png"
+    _, output = run(write_native(tmp_path / "few"), picture=picture)
+    assert "Contrast of warped events: not computed, because only" in output
+    assert f"{picture}: not written" in output
+    assert not picture.exists()
+
+
 def test_what_cannot_be_read_is_one_line_and_status_2(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -242,50 +262,3 @@ def test_what_cannot_be_read_is_one_line_and_status_2(
         assert error.startswith("Error: ")
         assert error.count("\n") == 1
         assert str(data) in error
-
-
-def test_statistics_are_those_of_brute_force_however_the_stream_is_cut() -> None:
-    rng = np.random.default_rng(0)
-    t = np.sort(rng.integers(10, 200, 400))
-    rows = list(
-        zip(
-            rng.integers(0, 5, 400).tolist(),
-            rng.integers(0, 4, 400).tolist(),
-            t.tolist(),
-            rng.choice([-1, 1], 400).tolist(),
-            strict=True,
-        )
-    )
-    events = make_stream(rows, 5, 4)
-    counts = np.zeros((4, 5), int)
-    np.add.at(counts, (events.y, events.x), 1)
-    previous: dict[tuple[int, int], int] = {}
-    pairs, repeated = [], 0
-    for x, y, time, _ in rows:
-        if previous.get((x, y)) == time:
-            repeated += 1
-        elif (x, y) in previous:
-            pairs.append([previous[x, y], time])
-        previous[x, y] = time
-    for cuts in ([], [1, 7, 100]):
-        edges = [0, *cuts, 400]
-        chunks = (events[a:b] for a, b in pairwise(edges))
-        found = event_statistics(chunks, 5, 4, (int(t[0]), int(t[-1])), 6)
-        np.testing.assert_array_equal(found.counts, counts)
-        assert (found.num_events, found.num_repeated) == (400, repeated)
-        assert found.num_positive == sum(row[3] > 0 for row in rows)
-        assert found.pair_times.tolist() == pairs
-        assert found.rate.sum() == 400
-
-
-def test_the_sample_of_pairs_is_even_and_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aenerf_ns.events.statistics._MAX_PAIRS", 8)
-    n = 1000
-    zeros = np.zeros(n, np.uint16)
-    events = EventStream(zeros, zeros, np.arange(n), np.ones(n, np.int8), 1, 1)
-    found = event_statistics([events[:300], events[300:]], 1, 1, (0, n - 1), 4)
-    steps = np.diff(found.pair_times[:, 0])
-    assert 8 <= len(found.pair_times) <= 16
-    assert len(set(steps.tolist())) == 1
-    np.testing.assert_array_equal(found.pair_times[:, 1] - found.pair_times[:, 0], 1)
-    assert found.rate.tolist() == [250] * 4

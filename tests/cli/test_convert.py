@@ -1,4 +1,4 @@
-"""Converting to the native format: nothing changes but what is asked for, and nothing is left half-written."""
+"""Converting to the native format: only what the options ask for changes, and nothing is left half-written."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def convert(data: Path, output: Path, **options: object) -> Recording:
 
 
 def assert_same(one: Recording, other: Recording) -> None:
-    """Events, poses, lenses, sensor and images are the same."""
+    """Assert that events, poses, lenses, sensor and images are the same."""
     for name, values in columns(one).items():
         np.testing.assert_array_equal(values, columns(other)[name])
     for name in ("trajectory", "ground_truth"):
@@ -85,7 +85,7 @@ def test_a_native_dataset_converts_to_itself(box: np.ndarray | None, tmp_path: P
     assert (box is None) == (after.scene_box is None)
     if box is not None and after.scene_box is not None:
         np.testing.assert_array_equal(after.scene_box.numpy(), box)
-    # Rays, as Nerfstudio is given them.
+    # Nerfstudio is given the same rays.
     converted = NativeDataParserConfig(data=tmp_path / "converted").setup()
     for split in ("train", "val", "test"):
         one, other = (parser.get_dataparser_outputs(split).cameras for parser in (before, converted))
@@ -102,7 +102,7 @@ def test_text_files_convert(tmp_path: Path) -> None:
         config.data = data
         after = convert(data, tmp_path / name, format=config)
         assert_same(config.setup().read_recording(), after)
-        # An image that is in several splits is there once.
+        # An image of several splits is written once.
         assert len(list((tmp_path / name / "images").rglob("*.png"))) == 4
     assert not list(tmp_path.glob(".*"))
 
@@ -169,7 +169,7 @@ def test_filters_cut_events_camera_poses_and_images(tmp_path: Path) -> None:
     assert after.event_camera == before.event_camera.cropped(2, 0, 3, 2)
     assert after.frame_camera == before.frame_camera
     assert (after.trajectory.start, after.trajectory.end) == (start, START + 1_500_000_000)
-    # Of three train images one is within the window; those without a time stay.
+    # One of three train images is within the window. Images without a time are kept.
     assert [len(after.reference_views[split]) for split in ("train", "val", "test")] == [1, 1, 2]
 
 
@@ -192,7 +192,7 @@ def test_hot_pixels_are_named(tmp_path: Path) -> None:
 
 
 def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # COLMAP itself is tested elsewhere; here a stand-in places all frames but the last.
+    # COLMAP itself is tested elsewhere. This stand-in places all frames but the last.
     def place(files: list[Path], times: list[int], camera: object, source: Path, seed: int) -> EstimatedPoses:
         assert [file.name for file in files] == ["0.png", "1.png", "2.png", "3.png"]
         poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
@@ -213,9 +213,9 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
     torch.testing.assert_close(with_truth.ground_truth.camera_to_worlds, truth.camera_to_worlds)
     report = json.loads((tmp_path / "with_truth" / "poses_report.json").read_text())
     assert report["registered_frames"] == 3
-    # Both move straight on at constant speed.
+    # Both trajectories are straight, at constant speed.
     assert report["errors"]["translation_error"] < 1e-9
-    # The images keep the true poses, and are all there.
+    # All images are kept, with the true poses.
     assert [len(with_truth.reference_views[split]) for split in ("train", "val", "test")] == [4, 2, 2]
     (data / "groundtruth.txt").unlink()
     without = convert(data, tmp_path / "without", poses="colmap", format=EcdDataParserConfig())
@@ -332,7 +332,7 @@ def test_a_killed_command_leaves_no_dataset(end: signal.Signals, tmp_path: Path)
     assert not output.exists()
     if end is signal.SIGTERM:
         assert not partial.exists()
-    # What the other leaves behind is cleared by the next attempt.
+    # The next attempt clears what SIGKILL leaves behind.
     with Hdf5EventWriter(data / "events.h5") as writer:
         zeros = np.zeros(2, np.uint16)
         writer.append(EventStream(zeros, zeros, np.array([START, END]), np.ones(2, np.int8), 6, 4))

@@ -1,0 +1,181 @@
+"""The arguments of ``aenerf``: what a command works on is given as a word, or with its option."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from commands import run as run_command
+
+from aenerf_ns.cli.check import Check
+from aenerf_ns.cli.convert import Convert
+from aenerf_ns.cli.dataset_format import Automatic
+from aenerf_ns.cli.evaluate import Evaluate
+from aenerf_ns.cli.export_trajectory import ExportTrajectory
+from aenerf_ns.cli.main import main
+from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
+from aenerf_ns.dataparsers.formats import FORMATS
+
+Command = Check | Convert | Evaluate | ExportTrajectory
+
+
+def parsed(line: str, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Return the command made of the words after ``aenerf``, without running it."""
+    made: list[Command] = []
+    for kind in (Check, Convert, Evaluate, ExportTrajectory):
+        monkeypatch.setattr(kind, "main", lambda command: made.append(command))
+    monkeypatch.setattr(sys, "argv", ["aenerf", *line.split()])
+    main()
+    (command,) = made
+    return command
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "check --data F --picture P",
+        "check --data=F --picture P",
+        "check --picture P --data F",
+        "check --data F --picture P auto",
+        "check F --picture P",
+        "check --picture P F",
+    ],
+)
+def test_a_dataset_is_checked(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = parsed(line, monkeypatch)
+    assert isinstance(command, Check)
+    assert (command.data, command.picture) == (Path("F"), Path("P"))
+    assert isinstance(command.format, Automatic)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "check --data F ecd-data --refractory-period-ns 7",
+        "check --data F ecd-data --refractory_period_ns 7",
+        "check --data=F ecd-data --refractory-period-ns=7",
+        "check F ecd-data --refractory-period-ns 7",
+        "check ecd-data F --refractory-period-ns 7",
+        "check ecd-data --refractory-period-ns 7 F",
+        "check ecd-data --data F --refractory-period-ns 7",
+        "check ecd-data --refractory-period-ns 7 --data F",
+        # A folder by the name of a format.
+        "check --data ecd-data ecd-data --refractory-period-ns 7",
+        "check ./ecd-data ecd-data --refractory-period-ns 7",
+    ],
+)
+def test_a_format_and_its_options_follow_or_precede_the_dataset(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = parsed(line, monkeypatch)
+    assert isinstance(command, Check)
+    assert command.data == Path("ecd-data" if "ecd-data ecd-data" in line else "F")
+    assert isinstance(command.format, EcdDataParserConfig)
+    assert command.format.refractory_period_ns == 7
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_takes_the_dataset_as_a_word(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for line in (f"check F {name}", f"check --data F {name}", f"check {name} --data F"):
+        command = parsed(line, monkeypatch)
+        assert isinstance(command, Check)
+        assert command.data == Path("F")
+        assert isinstance(command.format, type(FORMATS[name]))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "convert --data F --output O --region 1 2 3 4 ecd-data --refractory-period-ns 7",
+        "convert --output O --region 1 2 3 4 --data F ecd-data --refractory-period-ns 7",
+        "convert F --output O --region 1 2 3 4 ecd-data --refractory-period-ns 7",
+        "convert --output O --region 1 2 3 4 F ecd-data --refractory-period-ns 7",
+        "convert --output O --region 1 2 3 4 ecd-data --refractory-period-ns 7 --data F",
+    ],
+)
+def test_a_dataset_is_converted(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = parsed(line, monkeypatch)
+    assert isinstance(command, Convert)
+    assert (command.data, command.output, command.region) == (Path("F"), Path("O"), (1, 2, 3, 4))
+    assert isinstance(command.format, EcdDataParserConfig)
+    assert command.format.refractory_period_ns == 7
+
+
+def test_an_option_after_the_name_of_a_format_is_that_of_the_format(monkeypatch: pytest.MonkeyPatch) -> None:
+    command = parsed("convert F --output O event-recording-data --poses poses.txt", monkeypatch)
+    assert isinstance(command, Convert)
+    assert command.poses == "given"
+    assert str(getattr(command.format, "poses", None)) == "poses.txt"
+
+
+@pytest.mark.parametrize("name", ["evaluate", "export-trajectory"])
+@pytest.mark.parametrize("run", ["--load-config C", "--load_config C", "--load-config=C", "C"])
+def test_a_run_is_given(name: str, run: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for line in (f"{name} {run} --output O", f"{name} --output O {run}"):
+        command = parsed(line, monkeypatch)
+        assert isinstance(command, Evaluate | ExportTrajectory)
+        assert (command.load_config, command.output) == (Path("C"), Path("O"))
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("check F --data G", "Error: F: --data G is given as well; leave out one of the two"),
+        ("check --data G --picture P F", "Error: F: --data G is given as well; leave out one of the two"),
+        ("check F ecd-data --data G", "Error: F: --data G is given as well; leave out one of the two"),
+        ("convert F --data G --output O", "Error: F: --data G is given as well; leave out one of the two"),
+        ("evaluate F --load-config G --output O", "Error: F: --load-config G is given as well; leave out one"),
+        ("export-trajectory F --load-config G --output O", "Error: F: --load-config G is given as well; leave out one"),
+        ("check", "Error: aenerf: nothing to work on is given; name it after the command, or with --data"),
+        ("check ecd-data", "Error: aenerf: nothing to work on is given; name it after the command, or with --data"),
+        ("evaluate --output O", "nothing to work on is given; name it after the command, or with --load-config"),
+    ],
+)
+def test_what_a_command_works_on_is_given_once(
+    line: str, complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        parsed(line, monkeypatch)
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert complaint in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "unknown"), [("check F G", "G"), ("check F --pictures P", "--pictures"), ("convert F O", "--output")]
+)
+def test_other_words_are_refused(
+    line: str, unknown: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        parsed(line, monkeypatch)
+    assert end.value.code == 2
+    assert unknown in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "word", "option"),
+    [
+        ("check", "DATA", "--data DATA"),
+        ("convert", "DATA", "--data DATA"),
+        ("evaluate", "CONFIG", "--load-config CONFIG"),
+        ("export-trajectory", "CONFIG", "--load-config CONFIG"),
+    ],
+)
+def test_the_help_names_both_ways(
+    name: str, word: str, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        parsed(f"{name} --help", monkeypatch)
+    assert end.value.code == 0
+    # Without the frames and the line breaks of the help.
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    positional, options = printed.split("positional arguments")[1].split(" options", 1)
+    assert word in positional
+    assert f"(required, here or with {option.split()[0]})" in positional
+    assert option in options
+
+
+def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
+    printed = run_command("aenerf", "check", tmp_path / "nothing", cwd=tmp_path, fails=True)
+    assert printed.strip().splitlines()[-1].startswith(f"Error: {tmp_path / 'nothing'}: there is no such folder")
