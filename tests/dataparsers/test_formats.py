@@ -405,8 +405,8 @@ def test_converted_to_the_native_format_nothing_changes(written: tuple[str, Trut
     folder = write_native(recording_of(config), tmp_path / "native")
     before, after = outputs_of(config).metadata, outputs_of(NativeDataParserConfig(data=folder, **AS_RECORDED)).metadata
     # Equal lenses have equal rays.
-    for key in ("event_camera", "sensor", "time_window", "pose_gaps", "image_encoding", "bounded"):
-        assert before[key] == after[key], key
+    for key in ("event_camera", "sensor", "window", "image_encoding", "bounded"):
+        assert getattr(before[SCENE], key) == getattr(after[SCENE], key), key
     assert torch.equal(before[SCENE].trajectory.times, after[SCENE].trajectory.times)
     assert_same_poses(after[SCENE].trajectory.camera_to_worlds, before[SCENE].trajectory.camera_to_worlds.numpy())
     before_events, after_events = (list(metadata[SCENE].event_file.chunks()) for metadata in (before, after))
@@ -1167,11 +1167,11 @@ def test_images_are_thinned_out_within_the_time_window(tmp_path: Path) -> None:
     windowed = config_of("event-recording-data", truth.data, **window)
     assert [len(outputs_of(windowed, split).image_filenames) for split in ("val", "test")] == [10, 10]
     # Poses are estimated from all of them, also where there are none yet.
-    assert len(config.setup().read_frames().files) == 200
+    assert len(config.setup().read_frames().images) == 200
     (truth.data / "trajectory.txt").unlink()
     frames = config.setup().read_frames()
-    assert len(frames.files) == 200
-    assert frames.recording is None
+    assert len(frames.images) == 200
+    assert not isinstance(frames.capture, Recording)
 
 
 def test_a_broken_image_is_one_clear_line(tmp_path: Path) -> None:
