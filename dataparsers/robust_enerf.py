@@ -171,7 +171,7 @@ def _read_view(frame: Metadata, folder: Path) -> ReferenceView:
     files = [folder / f"{name}{suffix}" for suffix in ("", *IMAGE_SUFFIXES)]
     file = next((file for file in files if file.is_file()), None)
     if file is None:
-        raise frame.error("file_path", f"names {name}, of which there is no PNG or JPEG image")
+        raise frame.error("file_path", f"names {name}, which is no PNG or JPEG image")
     pose = frame.rigid_motion("transform_matrix")
     if pose is None:
         raise frame.error("transform_matrix", "is missing")

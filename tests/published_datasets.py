@@ -29,8 +29,8 @@ DURATION = 2_000_000
 
 @dataclass(frozen=True)
 class Truth:
-    """What was written: OpenCV camera-to-world poses (N, 4, 4) with times in ns, events, and the lens in OpenCV's
-    terms."""
+    """The content of a written dataset: OpenCV camera-to-world poses (N, 4, 4) with times in ns, events, and the lens
+    in OpenCV's terms."""
 
     data: Path
     times: NDArray[np.int64]

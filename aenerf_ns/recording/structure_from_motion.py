@@ -152,8 +152,8 @@ def estimate_poses(
     if not models:
         raise DataError(
             source,
-            f"COLMAP places none of {len(times)} frames of {features:.0f} features (median), of which {pairs} pairs "
-            "match",
+            f"COLMAP places none of {len(times)} frames: they have {features:.0f} features (median), and {pairs} pairs "
+            "of frames match",
             "it needs a moving camera and sharp, textured frames: a shorter exposure, a higher frame rate, more pixels",
         )
     model = models[0]

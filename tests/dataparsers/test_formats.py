@@ -79,7 +79,7 @@ def test_every_format_is_recognised(written: tuple[str, Truth]) -> None:
     pairs = EventDataset(parser.get_dataparser_outputs("train")).pairs
     assert pairs.num_events == N_EVENTS
     assert len(pairs) > 100
-    # What is shared among runs stays as it was.
+    # The defaults, which all runs share, are unchanged.
     assert FORMATS[name].start_time_ns is None
     assert FORMATS[name].data == type(FORMATS[name])().data
 

@@ -91,7 +91,7 @@ FAULTS = {
     "views are no JSON": (write_text(VIEWS, "{"), f"{VIEWS}: not valid JSON"),
     "no frames": (write_text(VIEWS, "{}"), "frames is missing"),
     "frame is a number": (write_text(VIEWS, '{"frames": [3]}'), r"frames\[0\] is 3, not an object"),
-    "no image": (remove("views/val/r_1.png"), r"frames\[1\].file_path names ./val/r_1, of which there is no"),
+    "no image": (remove("views/val/r_1.png"), r"frames\[1\].file_path names ./val/r_1, which is no PNG"),
     "scaled pose": (
         edit_json(VIEWS, lambda m: m["frames"][0].update(transform_matrix=SCALED)),
         "is not a rigid motion",

@@ -53,7 +53,7 @@ def test_a_scene_box_sets_the_scale_and_bounds_the_scene(tmp_path: Path) -> None
 def test_training_cameras_show_images_where_they_were_taken_and_events_elsewhere(tmp_path: Path) -> None:
     dataset = EventDataset(parse(NativeDataParserConfig(data=write_native(tmp_path / "made"))))
     has_image = dataset.metadata[SCENE].has_image
-    # Knots, of which two are also image times, and one image between two knots.
+    # The 21 knots, two of them image times, and one image between two knots.
     assert len(dataset) == 22
     assert [i for i, image in enumerate(has_image) if image] == [0, 2, 21]
     assert (dataset.get_numpy_image(2) == 77).all()
@@ -72,7 +72,7 @@ def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> N
     assert dataset.pairs.previous_time.min() >= start
     assert dataset.pairs.time.max() <= end
     assert dataset.pairs.num_outside > 0
-    # What lies outside the poses is no part of the window either.
+    # The window is cut to the poses.
     config = NativeDataParserConfig(data=folder, start_time_ns=0, end_time_ns=END + 10**12)
     assert parse(config).metadata[SCENE].window == TimeWindow(START, END)
     with pytest.raises(DataError, match="nothing is left from 9 to 9 ns"):
