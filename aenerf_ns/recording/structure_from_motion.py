@@ -137,7 +137,7 @@ def estimate_poses(
     """
     times = np.asarray(times, np.int64)
     if len(times) < 2:
-        raise DataError(source, f"{len(times)} frames", "give at least two")
+        raise DataError(source, f"{len(times)} frames", "poses can be estimated from two frames or more")
     if (np.diff(times) <= 0).any():
         index = int(np.argmax(np.diff(times) <= 0)) + 1
         raise DataError(source, f"frame {index} is not after the frame before it", "sort the frames by time")
