@@ -1,1 +1,1 @@
-"""Dataset formats, one file each. Nothing outside this package knows a file format."""
+"""Dataset formats, one file each. Nothing outside this package knows a dataset's layout."""

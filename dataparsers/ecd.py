@@ -6,7 +6,7 @@ camera-to-world, OpenCV axes) and ``calib.txt`` (fx fy cx cy k1 k2 p1 p2 k3).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
@@ -17,9 +17,10 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.text import parse_numbers, read_rows
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.images import image_size_and_mode
-from aenerf_ns.recording.recording import FrameSequence, Recording
+from aenerf_ns.recording.options import PublishedDataParserConfig
+from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
 from aenerf_ns.recording.views import read_image_list, views_on_trajectory
 
 
@@ -31,7 +32,7 @@ class EcdDataParserConfig(PublishedDataParserConfig):
 
 
 class EcdDataParser(EventDataParser):
-    """Reads a folder of the Event Camera Dataset. Its images alternate between the validation and the test split."""
+    """Read a folder of the Event Camera Dataset. Its images alternate between the validation and the test split."""
 
     config: EcdDataParserConfig
     layout = "events.txt with groundtruth.txt and calib.txt"
@@ -41,46 +42,35 @@ class EcdDataParser(EventDataParser):
         return all((data / name).is_file() for name in ("events.txt", "groundtruth.txt", "calib.txt"))
 
     def read_recording(self) -> Recording:
-        frames = self._read_all_but_poses()
+        capture, images = self._read_all_but_poses()
         reference = read_tum_trajectory(Path(self.config.data) / "groundtruth.txt")
         trajectory, ground_truth = self.config.estimated(reference)
-        images = list(zip(frames.times, frames.files, strict=True))
-        return Recording(
-            event_file=frames.event_file,
-            event_camera=frames.event_camera,
-            sensor=frames.sensor,
-            trajectory=trajectory,
-            ground_truth=ground_truth,
-            frame_camera=frames.frame_camera,
-            reference_views=views_on_trajectory(images, reference),
-            image_encoding=frames.image_encoding,
-        )
+        return capture.with_poses(trajectory, views_on_trajectory(images, reference), ground_truth)
 
     def read_frames(self) -> FrameSequence:
-        frames = self._read_all_but_poses()
+        capture, images = self._read_all_but_poses()
         has_poses = (Path(self.config.data) / "groundtruth.txt").exists()
-        return replace(frames, recording=self.recording if has_poses else None)
+        return FrameSequence(self.recording if has_poses else capture, images)
 
-    def _read_all_but_poses(self) -> FrameSequence:
+    def _read_all_but_poses(self) -> tuple[Capture, list[tuple[int, Path]]]:
+        """Read the cameras, and the times in nanoseconds and the files of the images."""
         folder = Path(self.config.data)
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
         images = read_image_list(folder / "images.txt") if (folder / "images.txt").exists() else []
         camera = _read_calibration(folder / "calib.txt", _image_size(images[0][1] if images else None))
-        return FrameSequence(
+        capture = Capture(
             event_file=TextEventFile(folder / "events.txt", camera.width, camera.height),
             event_camera=camera,
             sensor=self.config.sensor(SensorModel(0.5, 0.5)),
             frame_camera=camera,
-            files=[file for _, file in images],
-            times=[time for time, _ in images],
             image_encoding="linear",
-            recording=None,
         )
+        return capture, images
 
 
 def _image_size(image: Path | None) -> tuple[int, int]:
-    """Size of the sensor: that of its frames, or of the DAVIS240C, which recorded the dataset."""
+    """Return the size of the sensor: the size of its frames, or of the DAVIS240C, which recorded the dataset."""
     if image is None:
         return 240, 180
     return image_size_and_mode(image)[0]

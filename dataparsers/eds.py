@@ -1,5 +1,4 @@
-"""EDS (Hidalgo-Carrió et al. 2022) as it is downloaded: a Prophesee event camera and a frame camera behind a beam
-splitter."""
+"""EDS (Hidalgo-Carrió et al. 2022) as downloaded: an event camera and a frame camera behind a beam splitter."""
 
 from __future__ import annotations
 
@@ -16,12 +15,13 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_AT_TOP, Hdf5TableFile
 from aenerf_ns.files.kalibr import read_camchain
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
 
-# The authors' calibration of the recordings ("03_calib" in uzh-rpg/bundles-eds), which the sequences do not contain:
-# k1, k2, p1, p2, and what takes points from the frame camera's to the event camera's coordinates.
+# The sequences do not contain their calibration. This is the authors' ("03_calib" in uzh-rpg/bundles-eds).
+# Distortion: k1, k2, p1, p2, k3.
 _EVENT_CAMERA = EventCamera(
     640,
     480,
@@ -42,6 +42,7 @@ _FRAME_CAMERA = EventCamera(
     "radial_tangential",
     (-0.36965913545735024, 0.17414034009883844, 0.003915245015812422, 0.003666687416655559, 0.0),
 )
+# Takes points from the frame camera's to the event camera's coordinates.
 _EVENT_FROM_FRAME = (
     (0.9998964430808897, -0.0020335804041023736, -0.014246672065022661, -0.00011238613157578769),
     (0.001703024953250547, 0.9997299470300024, -0.023176123864880376, -0.0005981481496958399),
@@ -56,11 +57,11 @@ class EdsDataParserConfig(PublishedDataParserConfig):
 
     _target: type = field(default_factory=lambda: EdsDataParser)
     calibration: Path | None = None
-    """Kalibr's camchain with the frame camera as cam0 and the event camera as cam1, in place of the authors'."""
+    """Kalibr's camchain, in place of the authors' calibration. cam0 is the frame camera, cam1 the event camera."""
 
 
 class EdsDataParser(EventDataParser):
-    """Reads a sequence: its events, the poses of the event camera, and every image of the frame camera."""
+    """Read a sequence: its events, the poses of the event camera, and the images of the frame camera."""
 
     config: EdsDataParserConfig
     layout = "events.h5 with stamped_groundtruth.txt"
@@ -89,6 +90,7 @@ class EdsDataParser(EventDataParser):
         )
 
     def _calibration(self) -> tuple[EventCamera, EventCamera, Tensor]:
+        """Return event camera, frame camera, and the (4, 4) motion from frame camera to event camera coordinates."""
         path = self.config.calibration
         if path is None:
             return _EVENT_CAMERA, _FRAME_CAMERA, torch.tensor(_EVENT_FROM_FRAME, dtype=torch.float64)

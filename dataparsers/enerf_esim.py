@@ -1,4 +1,4 @@
-"""The synthetic scenes of E-NeRF (Klenk et al. 2023): ESIM's output in NumPy's files."""
+"""The synthetic scenes of E-NeRF (Klenk et al. 2023): the output of ESIM in NumPy files."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.event_arrays import XYTP_MATRIX, NpyEventFile, load_npy
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
 
 
 class EsimEventFolder(EventFile):
-    """A folder of .npy files with rows of x, y, t in nanoseconds and p, one stream in the order of their names."""
+    """A folder of .npy files with rows of x, y, t in nanoseconds and p: one stream, in the order of the names."""
 
     def _files(self) -> list[NpyEventFile]:
-        # By numbers, if they are not padded.
+        # By the numbers in the names, because these may lack leading zeros.
         paths = sorted(self.path.glob("*.npy"), key=lambda path: [int(n) for n in re.findall(r"\d+", path.name)])
         if not paths:
             raise DataError(self.path, "it holds no .npy file", "copy the events of the dataset to it")
@@ -58,7 +59,7 @@ class ENeRFEsimDataParserConfig(PublishedDataParserConfig):
 
 
 class ENeRFEsimDataParser(EventDataParser):
-    """Reads a scene of E-NeRF. Images are on the event sensor."""
+    """Read a scene of E-NeRF. Its images come from the event sensor."""
 
     config: ENeRFEsimDataParserConfig
     layout = "events/*.npy with *poses_all*.txt and poses_bounds.npy"
@@ -93,16 +94,16 @@ class ENeRFEsimDataParser(EventDataParser):
 
 
 def _read_camera(path: Path) -> EventCamera:
-    """The lens in LLFF's poses_bounds.npy: without distortion, its principal point in the middle as ESIM has it."""
+    """Read the lens in LLFF's poses_bounds.npy: no distortion, and the principal point in the middle of the image."""
     if not path.is_file():
         raise DataError(path, "there is no such file", "copy the whole scene")
     bounds = load_npy(path)
     if bounds.ndim != 2 or bounds.shape[1] != 17 or len(bounds) == 0 or bounds.dtype.kind != "f":
         raise DataError(path, f"it has type {bounds.dtype} and shape {bounds.shape}", "it must be N x 17 decimals")
-    # A 3 x 5 matrix, whose last column is height, width and focal length, and two depths.
+    # A row is a 3 x 5 matrix and two depths. The last column of the matrix is height, width and focal length.
     height, width, focal = np.asarray(bounds[0, :15], dtype=np.float64).reshape(3, 5)[:, 4].tolist()
     try:
-        # ESIM counts from the centre of the first pixel.
+        # ESIM counts pixels from the centre of the first pixel.
         return EventCamera(int(width), int(height), focal, focal, width / 2 + 0.5, height / 2 + 0.5)
     except (ValueError, OverflowError) as error:
         raise DataError(path, str(error), "its fifth column must hold height, width and focal length") from None

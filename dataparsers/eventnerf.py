@@ -1,5 +1,7 @@
-"""The format of EventNeRF (Rudnev et al. 2023), which follows NeRF++'s: text files of matrices, and events without a
-stated unit of time."""
+"""The format of EventNeRF (Rudnev et al. 2023).
+
+It follows the format of NeRF++: text files of matrices. The unit of the events' times is not stated.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +20,10 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
 from aenerf_ns.files.text import TimeUnit
-from aenerf_ns.recording.dataparser import EventDataParser, ObjectDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.options import ObjectDataParserConfig
 from aenerf_ns.recording.recording import Recording, ReferenceView, Split
-from aenerf_ns.recording.views import MAX_VIEWS, image_files, views_on_trajectory
+from aenerf_ns.recording.views import MAX_VIEWS, image_files, image_files_of_poses, views_on_trajectory
 
 # A DAVIS 346C.
 _WIDTH, _HEIGHT = 346, 260
@@ -30,19 +33,27 @@ UNIT_SPHERE = 1.0
 
 @dataclass
 class EvenPosesDataParserConfig(ObjectDataParserConfig):
-    """Poses without times, which are evenly spread over the events."""
+    """The options of formats whose poses have no times: the poses are evenly spread over the events."""
 
     time_unit: TimeUnit | None = None
     """Unit of the times of the events. By default whole numbers are microseconds and decimals seconds."""
     first_pose_time_ns: int | None = None
-    """Time of the first pose on the clock of the events, in nanoseconds, in place of the format's rule. A run's saved
+    """Time of the first pose on the clock of the events, in nanoseconds. The format states the default. A run's saved
     configuration holds the value that was used."""
     last_pose_time_ns: int | None = None
-    """Time of the last pose, likewise; by default that of the last event."""
+    """Time of the last pose on the clock of the events, in nanoseconds. By default the time of the last event."""
 
     def spread(self, poses: Tensor, event_file: EventFile, source: Path, first: int | None = None) -> Trajectory:
-        """The trajectory of (N, 4, 4) poses at even times, of which the first is by default that of the first event.
-        Stores them in the configuration, so that opening a trained run needs no events."""
+        """Return the trajectory of (N, 4, 4) poses at even times.
+
+        The first and the last time are stored in the configuration, so that opening a trained run needs no events.
+
+        Args:
+            poses: (N, 4, 4) camera-to-world.
+            event_file: the events, whose span gives the times that nothing else states.
+            source: the file or folder of the poses, for messages.
+            first: default time of the first pose in nanoseconds. None: the time of the first event.
+        """
         if self.last_pose_time_ns is None or (self.first_pose_time_ns is None and first is None):
             start, end = event_file.time_span()
             first = start if first is None else first
@@ -65,8 +76,10 @@ class EventNeRFDataParserConfig(EvenPosesDataParserConfig):
 
 
 class EventNeRFDataParser(EventDataParser):
-    """Reads the training split of a scene, with the views of its splits "validation" and "test" where there are any.
-    The folder given may be that of a split, for scenes with several to train on."""
+    """Read the training split of a scene, and the views of its splits "validation" and "test" where there are any.
+
+    Where a scene has several training splits, the folder of one is given in place of the scene's.
+    """
 
     config: EventNeRFDataParserConfig
     layout = "train/events/*.npz with train/pose and train/intrinsics"
@@ -95,14 +108,12 @@ class EventNeRFDataParser(EventDataParser):
             self.config.time_unit,
         )
         poses = _read_poses(split)
-        # Pose i of N is at i / (N - 1) of the last event's time.
+        # Pose i of N is at i / (N - 1) of the time of the last event.
         reference = self.config.spread(poses, event_file, split / "pose", first=0)
         trajectory, ground_truth = self.config.estimated(reference)
-        images = image_files(split / "rgb")
-        if images and len(images) != len(poses):
-            raise DataError(split / "rgb", f"it holds {len(images)} images for {len(poses)} poses", "copy all of them")
-        timed = list(zip(reference.times.tolist(), images, strict=True)) if images else []
-        views = views_on_trajectory(timed, reference)
+        # There may be no images.
+        images = zip(reference.times.tolist(), image_files_of_poses(split / "rgb", len(poses)), strict=False)
+        views = views_on_trajectory(list(images), reference)
         views.update(_held_out_views(split.parent))
         return Recording(
             event_file=event_file,
@@ -123,17 +134,13 @@ def _training_splits(data: Path) -> list[Path]:
 
 
 def _held_out_views(scene: Path) -> dict[Split, list[ReferenceView]]:
-    """The views of the splits that have any. Where one is missing, the other stands in for it."""
+    """Read the views of the splits "validation" and "test". Where one has none, both share the views of the other."""
     found: list[list[ReferenceView]] = []
     for name in ("validation", "test"):
-        images = image_files(scene / name / "rgb")
-        if images:
+        if image_files(scene / name / "rgb"):
             poses = _read_poses(scene / name)
-            if len(images) != len(poses):
-                raise DataError(
-                    scene / name / "rgb", f"it holds {len(images)} images for {len(poses)} poses", "copy all of them"
-                )
-            found.append([ReferenceView(file, pose, None) for file, pose in zip(images, poses, strict=True)])
+            files = image_files_of_poses(scene / name / "rgb", len(poses))
+            found.append([ReferenceView(file, pose, None) for file, pose in zip(files, poses, strict=True)])
     if not found:
         return {}
     if len(found) == 1:
@@ -142,7 +149,7 @@ def _held_out_views(scene: Path) -> dict[Split, list[ReferenceView]]:
 
 
 def _read_poses(split: Path) -> Tensor:
-    """(N, 4, 4) camera-to-world poses, OpenCV camera axes."""
+    """Read the (N, 4, 4) float64 camera-to-world poses of a split, OpenCV camera axes."""
     files = sorted((split / "pose").glob("*.txt"))
     if not files:
         raise DataError(split / "pose", "it holds no .txt file", "copy the poses of the dataset to it")
@@ -152,7 +159,14 @@ def _read_poses(split: Path) -> Tensor:
 
 
 def read_matrix(path: Path, *num_rows: int) -> np.ndarray:
-    """The float64 matrix of four columns in a text file, of one of the numbers of rows given.
+    """Read a text file that holds a matrix of four columns.
+
+    Args:
+        path: the file.
+        num_rows: the numbers of rows that the matrix may have.
+
+    Returns:
+        (rows, 4) float64.
 
     Raises:
         DataError: the file is missing or malformed, or a number is not finite.
@@ -174,10 +188,10 @@ def read_matrix(path: Path, *num_rows: int) -> np.ndarray:
 
 
 def read_intrinsics(folder: Path, width: int, height: int) -> EventCamera:
-    """The lens in the first of a folder's files, which holds a 4 x 4 matrix and perhaps a line with k1 and k2.
+    """Read the lens in the first file of a folder: a 4 x 4 matrix and perhaps a fifth line with k1 and k2.
 
     Raises:
-        DataError: there is none, or it is malformed.
+        DataError: the folder holds no file, or the file is malformed.
     """
     files = sorted(folder.glob("*.txt"))
     if not files:
@@ -185,7 +199,7 @@ def read_intrinsics(folder: Path, width: int, height: int) -> EventCamera:
     matrix = read_matrix(files[0], 4, 5).tolist()
     k1, k2 = matrix[4][:2] if len(matrix) == 5 else (0.0, 0.0)
     try:
-        # NeRF++ counts from the edge of the image, as here.
+        # NeRF++ counts pixels from the edge of the image, as EventCamera does.
         return EventCamera(
             width,
             height,

@@ -1,4 +1,4 @@
-"""All dataset formats by their names, and which of them a folder has."""
+"""The names of all dataset formats, and recognising which one a folder has."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from aenerf_ns.dataparsers.paev3d import paev3d_dataparser
 from aenerf_ns.dataparsers.robust_enerf import robust_enerf_dataparser
 from aenerf_ns.dataparsers.tum_vie import tum_vie_dataparser
 from aenerf_ns.errors import DataError
-from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.options import EventDataParserConfig
 
-# Under the names they are registered with, those first that are taken where a folder has several.
+# By the names they are registered with. Where a folder has several formats, the first one here is taken.
 FORMATS: dict[str, EventDataParserConfig] = {
     "aenerf-data": native_dataparser.config,
     "ecd-data": ecd_dataparser.config,
@@ -38,10 +39,10 @@ FORMATS: dict[str, EventDataParserConfig] = {
 
 
 def recognise(data: Path) -> str:
-    """The name of the format that a folder has, from the names of its files.
+    """Return the name of the format that a folder has, judged by the names of its files.
 
     Raises:
-        DataError: it does not exist, or has none of the formats.
+        DataError: the folder does not exist, or has none of the formats.
     """
     parsers: dict[str, type[EventDataParser]] = {name: config._target for name, config in FORMATS.items()}
     for name, parser in parsers.items():
@@ -55,15 +56,15 @@ def recognise(data: Path) -> str:
 
 @dataclass
 class AutomaticDataParserConfig(DataParserConfig):
-    """A recording in whichever format. The formats have options: name the format to set them."""
+    """A recording in any known format. To set a format's options, name the format."""
 
     _target: type = field(default_factory=lambda: EventDataParser)
 
     def setup(self, **kwargs: Any) -> Any:
-        """The dataparser of the format that ``data`` has, with that format's default configuration.
+        """Return the dataparser of the format that ``data`` has, with that format's default configuration.
 
         Raises:
-            DataError: it has none of the formats.
+            DataError: ``data`` does not exist, or has none of the formats.
         """
         name = recognise(Path(self.data))
         config = deepcopy(FORMATS[name])
@@ -73,5 +74,5 @@ class AutomaticDataParserConfig(DataParserConfig):
 
 
 automatic_dataparser = DataParserSpecification(
-    config=AutomaticDataParserConfig(), description="event camera recordings in whichever format"
+    config=AutomaticDataParserConfig(), description="event camera recordings in any known format"
 )

@@ -1,4 +1,4 @@
-"""The native dataset format (docs/dataset_format.md): reading it for Nerfstudio."""
+"""The native dataset format (docs/dataset_format.md)."""
 
 from __future__ import annotations
 
@@ -18,29 +18,22 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.files.json_object import Metadata, read_camera, read_image_encoding
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfig
-from aenerf_ns.recording.recording import Recording, ReferenceView, Split
-
-_SPLITS: tuple[Split, ...] = ("train", "val", "test")
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.options import EventDataParserConfig, SensorOptions
+from aenerf_ns.recording.recording import SPLITS, Recording, ReferenceView, Split
 
 
 @dataclass
-class NativeDataParserConfig(EventDataParserConfig):
+class NativeDataParserConfig(SensorOptions, EventDataParserConfig):
     """aenerf-ns dataset folder."""
 
     _target: type = field(default_factory=lambda: NativeDataParser)
-    positive_contrast_threshold: float | None = None
-    """C+, in place of the dataset's."""
-    negative_contrast_threshold: float | None = None
-    """C-, in place of the dataset's."""
-    refractory_period_ns: int | None = None
-    """Time for which a pixel is blind after each event, in place of the dataset's."""
     poses: Literal["estimated", "ground-truth"] = "estimated"
-    """Which trajectory to train on. The true one shows what the errors of the estimated one cost."""
+    """Which trajectory to train on. Training on the true one shows how much the errors of the estimated one cost."""
 
 
 class NativeDataParser(EventDataParser):
-    """Reads a dataset folder that holds transforms.json, an event file and trajectory_estimated.txt."""
+    """Read a dataset folder that holds transforms.json, an event file and trajectory_estimated.txt."""
 
     config: NativeDataParserConfig
     layout = "transforms.json with trajectory_estimated.txt"
@@ -84,18 +77,16 @@ class NativeDataParser(EventDataParser):
         )
 
     def _sensor(self, block: Metadata) -> SensorModel:
-        """The dataset's sensor, with what the options give in its place."""
-        options = self.config
-        chosen = {
-            name: block.get(name, float) if getattr(options, name) is None else getattr(options, name)
-            for name in ("positive_contrast_threshold", "negative_contrast_threshold")
-        }
-        period = options.refractory_period_ns
-        if period is None:
-            period = block.get("refractory_period_ns", int, 0)
+        """Return the sensor with the values of the options, and the dataset's values where the options give none."""
+        values = self.config.given_sensor_values()
+        for name in ("positive_contrast_threshold", "negative_contrast_threshold"):
+            if name not in values:
+                values[name] = block.get(name, float)
+        if "refractory_period" not in values:
+            values["refractory_period"] = block.get("refractory_period_ns", int, 0)
         pattern = block.get("bayer_pattern", str, "")
         try:
-            return SensorModel(**chosen, refractory_period=period, bayer_pattern=pattern)
+            return SensorModel(**values, bayer_pattern=pattern)
         except ValueError as error:
             raise DataError(block.path, f"event_camera: {error}", "correct it there or among the options") from None
 
@@ -110,7 +101,7 @@ def _scene_box(meta: Metadata, value: list) -> Tensor:
 def _reference_views(
     meta: Metadata, frames: list, trajectory: Trajectory, has_ground_truth: bool, frame_from_event: Tensor | None
 ) -> dict[Split, list[ReferenceView]]:
-    """The images of each split. A frame without a pose but with a time stamp gets that of the reference trajectory."""
+    """Return the images of each split. A frame that has a time but no pose gets the reference trajectory's pose."""
     if frame_from_event is None:
         frame_from_event = torch.eye(4, dtype=torch.float64)
     views: dict[str, ReferenceView] = {}
@@ -145,7 +136,7 @@ def _reference_views(
             f"{num_without_pose} of {len(frames)} frames are left out: the true trajectory has no pose for them."
         )
     splits: dict[Split, list[ReferenceView]] = {}
-    for split in _SPLITS:
+    for split in SPLITS:
         names = meta.get(f"{split}_filenames", list, [])
         unknown = [name for name in names if name not in known]
         if unknown:

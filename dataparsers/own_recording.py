@@ -1,4 +1,4 @@
-"""A recording of one's own: a file of events, the camera's calibration, and poses from wherever."""
+"""The user's own recording: a file of events, the camera's calibration, and poses from any source."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ from aenerf_ns.files.kalibr import read_camchain
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
-from aenerf_ns.recording.recording import FrameSequence, Recording
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.options import PublishedDataParserConfig
+from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_list, views_on_trajectory
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml")
@@ -36,30 +37,32 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
 
     _target: type = field(default_factory=lambda: OwnRecordingDataParser)
     events: Path | None = None
-    """The file of events. By default the one in the folder that is named "events", whatever its format."""
+    """The file of events. By default the file in the folder that is named "events", with the suffix of any format."""
     event_topic: str | None = None
     """Topic of a bag, or number of the stream of an AEDAT4 file, where several hold events."""
     event_time_unit: TimeUnit | None = None
-    """Unit of the times of npz, npy and csv, and of HDF5 that states none. By default whole numbers are microseconds
-    and decimals seconds."""
+    """Unit of the times in npz, npy and csv files, and in HDF5 files that state none. By default whole numbers are
+    microseconds and decimals seconds."""
     calibration: Path | None = None
-    """The cameras: calibration.json, or the camchain.yaml that Kalibr writes. By default the one in the folder."""
+    """The cameras: calibration.json, or the camchain.yaml that Kalibr writes. By default the file of
+    one of these names in the folder."""
     event_camera: str | None = None
     """Name of the event camera in a camchain of several cameras, such as cam1."""
     frame_camera: str | None = None
-    """Name in the camchain of the camera that took the images, where that is another."""
+    """Name in the camchain of the camera that took the images, if not the event camera."""
     poses: Path | None = None
     """Poses of the event camera as t tx ty tz qx qy qz qw in seconds, camera-to-world, OpenCV camera axes. By default
     trajectory.txt in the folder."""
     colmap: Path | None = None
-    """In place of these a COLMAP model, whose images are listed with their times in images.txt. By default the folder's
-    "colmap", where there is no trajectory.txt."""
+    """Folder of a COLMAP model, in place of the poses. images.txt must list the images of the model with their times.
+    By default "colmap" in the folder, where there is no trajectory.txt."""
     images: Path | None = None
-    """Lines of the time in seconds and the file of an image. By default images.txt in the folder, if it is there."""
+    """List of the images: on each line the time in seconds and the file. By default images.txt in the folder, if it is
+    there."""
 
 
 class OwnRecordingDataParser(EventDataParser):
-    """Reads a folder in which the files have the names that the options say, or those that the options give."""
+    """Read a recording from the files that the options name, or from the files of the default names in a folder."""
 
     config: OwnRecordingDataParserConfig
     layout = (
@@ -75,61 +78,49 @@ class OwnRecordingDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         folder, config = Path(self.config.data), self.config
-        if not folder.is_dir():
-            raise DataError(folder, "there is no such folder", "give the folder of the recording as --data")
-        calibration = _read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
-        event_camera = calibration.event_camera
-        timed = self._timed_images(folder)
+        capture, frame_from_event, timed = self._read_all_but_poses()
         poses = folder / "trajectory.txt" if config.poses is None else config.poses
         if config.colmap is not None or (config.poses is None and not poses.is_file() and (folder / "colmap").is_dir()):
             model = folder / "colmap" if config.colmap is None else config.colmap
             images = self._image_list(folder)
             if not timed:
                 raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
-            reference = _read_colmap(model, timed, images, calibration.frame_from_event)
+            reference = _read_colmap(model, timed, images, frame_from_event)
         else:
             reference = read_tum_trajectory(poses)
         trajectory, ground_truth = config.estimated(reference)
-        return Recording(
-            event_file=self._event_file(folder, event_camera),
-            event_camera=event_camera,
-            sensor=config.sensor(calibration.sensor),
-            trajectory=trajectory,
-            ground_truth=ground_truth,
-            frame_camera=calibration.frame_camera,
-            reference_views=views_on_trajectory(
-                timed,
-                reference,
-                torch.linalg.inv(calibration.frame_from_event),
-                max_pose_gap=config.max_pose_gap_ns,
-            ),
-            image_encoding=calibration.image_encoding,
-            max_views=MAX_VIEWS,
+        views = views_on_trajectory(
+            timed, reference, torch.linalg.inv(frame_from_event), max_pose_gap=config.max_pose_gap_ns
         )
+        return capture.with_poses(trajectory, views, ground_truth, MAX_VIEWS)
 
     def read_frames(self) -> FrameSequence:
         folder, config = Path(self.config.data), self.config
         if config.poses or config.colmap or (folder / "trajectory.txt").is_file() or (folder / "colmap").is_dir():
             return super().read_frames()
+        capture, _, timed = self._read_all_but_poses()
+        return FrameSequence(capture, timed)
+
+    def _read_all_but_poses(self) -> tuple[Capture, Tensor, list[tuple[int, Path]]]:
+        """Read the cameras, the (4, 4) motion from the event camera's to the frame camera's coordinates, and the times
+        in nanoseconds and the files of the images."""
+        folder, config = Path(self.config.data), self.config
+        if not folder.is_dir():
+            raise DataError(folder, "there is no such folder", "give the folder of the recording as --data")
         calibration = _read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
-        timed = self._timed_images(folder)
-        return FrameSequence(
+        images = self._image_list(folder)
+        timed = read_image_list(images) if config.images is not None or images.is_file() else []
+        capture = Capture(
             event_file=self._event_file(folder, calibration.event_camera),
             event_camera=calibration.event_camera,
             sensor=config.sensor(calibration.sensor),
             frame_camera=calibration.frame_camera,
-            files=[file for _, file in timed],
-            times=[time for time, _ in timed],
             image_encoding=calibration.image_encoding,
-            recording=None,
         )
+        return capture, calibration.frame_from_event, timed
 
     def _image_list(self, folder: Path) -> Path:
         return folder / "images.txt" if self.config.images is None else self.config.images
-
-    def _timed_images(self, folder: Path) -> list[tuple[int, Path]]:
-        images = self._image_list(folder)
-        return read_image_list(images) if self.config.images is not None or images.is_file() else []
 
     def _calibration_file(self, folder: Path) -> Path:
         if self.config.calibration is not None:
@@ -155,7 +146,7 @@ class OwnRecordingDataParser(EventDataParser):
                     "give the file of events as --events",
                 )
             path = found[0]
-        # So that opening a trained run needs no events.
+        # Stored, so that opening a trained run needs no events.
         self.config.events = path
         config = self.config
         return open_event_file(path, camera.width, camera.height, config.event_topic, config.event_time_unit)
@@ -163,7 +154,8 @@ class OwnRecordingDataParser(EventDataParser):
 
 @dataclass(frozen=True)
 class _Calibration:
-    """Both cameras, the sensor, and what takes points from the event camera's to the frame camera's coordinates."""
+    """Both cameras and the sensor. ``frame_from_event`` takes points from the event camera's to the frame camera's
+    coordinates, OpenCV axes in both."""
 
     event_camera: EventCamera
     frame_camera: EventCamera
@@ -189,7 +181,7 @@ def _read_calibration(path: Path, event_camera: str | None, frame_camera: str | 
 
 
 def _read_json(path: Path) -> _Calibration:
-    """The names of the native dataset's transforms.json."""
+    """Read calibration.json, which has the names of the native dataset's transforms.json."""
     meta = Metadata.read(path)
     block = meta.block("event_camera")
     event = read_camera(block, "width", "height")
@@ -213,8 +205,8 @@ def _read_json(path: Path) -> _Calibration:
 
 
 def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:
-    """The event camera's trajectory of the images that a COLMAP model places."""
-    # Late, for every command of every method would wait for it.
+    """Return the event camera's trajectory: a pose for each image that a COLMAP model places."""
+    # Imported lazily: every ns-* command imports this module, and pycolmap is slow to import.
     import pycolmap
 
     folders = [folder for folder in (model, model / "sparse" / "0", model / "0") if any(folder.glob("images.*"))]

@@ -1,4 +1,4 @@
-"""The format of PAEv3D (Wang et al. 2024): a matrix of events, and poses as VisionBlender writes them."""
+"""The format of PAEv3D (Wang et al. 2024): a matrix of events, and poses in VisionBlender's files."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from aenerf_ns.files.event_arrays import NPZ_ERRORS, read_npy_header
 from aenerf_ns.files.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.recording.views import MAX_VIEWS, image_files, views_on_trajectory
+from aenerf_ns.recording.views import MAX_VIEWS, image_files_of_poses, views_on_trajectory
 
 _WIDTH, _HEIGHT = 640, 480
-# All that NumPy's arrays and numbers need. A pickle may otherwise run what it likes.
+# The names that NumPy's arrays and numbers need. All others are refused, because a pickle may run any code.
 _HARMLESS = {("_reconstruct", "multiarray"), ("scalar", "multiarray"), ("ndarray", "numpy"), ("dtype", "numpy")}
 
 
@@ -36,7 +36,7 @@ class PAEv3DDataParserConfig(EvenPosesDataParserConfig):
 
 
 class PAEv3DDataParser(EventDataParser):
-    """Reads a scene, of which the folder of events is given, or the dataset's folder where it holds one scene."""
+    """Read a scene, given the folder of its events, or the dataset's folder where that holds one scene only."""
 
     config: PAEv3DDataParserConfig
     layout = "H5_Files/SCENE/event.h5 with Render_info/SCENE and Intrinsics"
@@ -60,13 +60,11 @@ class PAEv3DDataParser(EventDataParser):
         if not files:
             raise DataError(folder, "it holds no .npz file", "copy the poses of the scene to it")
         poses = torch.stack([_camera_pose(file) for file in files])
-        # The first is at the first event, the last at the last.
+        # The first pose is at the first event, the last pose at the last event.
         reference = self.config.spread(poses @ OPENCV_TO_OPENGL, event_file, folder)
         trajectory, ground_truth = self.config.estimated(reference)
-        images = image_files(folder)
-        if images and len(images) != len(files):
-            raise DataError(folder, f"it holds {len(images)} images for {len(files)} poses", "copy all of them")
-        timed = list(zip(reference.times.tolist(), images, strict=True)) if images else []
+        # There may be no images.
+        images = zip(reference.times.tolist(), image_files_of_poses(folder, len(files)), strict=False)
         return Recording(
             event_file=event_file,
             event_camera=camera,
@@ -74,7 +72,7 @@ class PAEv3DDataParser(EventDataParser):
             trajectory=trajectory,
             ground_truth=ground_truth,
             frame_camera=camera,
-            reference_views=views_on_trajectory(timed, reference),
+            reference_views=views_on_trajectory(list(images), reference),
             image_encoding="srgb",
             max_views=MAX_VIEWS,
             scene_box=self.config.scene_box(UNIT_SPHERE),
@@ -82,7 +80,7 @@ class PAEv3DDataParser(EventDataParser):
 
 
 def _scenes(data: Path) -> list[Path]:
-    """The folders of events. A trained run is opened without them, so the folder suffices."""
+    """Return the folders of events. A trained run is opened without its events, so the file need not exist."""
     if data.parent.name == "H5_Files":
         return [data]
     return sorted(path for path in data.glob("H5_Files/*") if path.is_dir())
@@ -96,11 +94,11 @@ class _HarmlessUnpickler(pickle.Unpickler):
 
 
 def _camera_pose(path: Path) -> Tensor:
-    """(4, 4) camera-to-world pose, OpenGL camera axes, of VisionBlender's object_poses."""
+    """Read the camera's pose in VisionBlender's object_poses: (4, 4) float64, camera-to-world, OpenGL camera axes."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open("object_poses.npy") as member:
             _, _, dtype = read_npy_header(member)
-            # An array of dictionaries, which NumPy would unpickle whatever is in it.
+            # An array of dictionaries. NumPy would unpickle it without looking at the names in it.
             objects = _HarmlessUnpickler(member).load() if dtype.hasobject else None
     except (*NPZ_ERRORS, KeyError, pickle.UnpicklingError, AttributeError, ImportError, IndexError, TypeError) as error:
         raise DataError(path, f"its object_poses cannot be read ({error})", "copy it again") from None

@@ -1,4 +1,4 @@
-"""The format of Robust e-NeRF (Low and Lee 2023): ESIM's output in NumPy's files, and posed views."""
+"""The format of Robust e-NeRF (Low and Lee 2023): the output of ESIM in NumPy files, and posed views."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import POSITION_TIMESTAMP_POLARITY, NpzEventFile, read_npz_member
 from aenerf_ns.files.json_object import Metadata
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions
-from aenerf_ns.recording.dataparser import EventDataParser, ObjectDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.images import image_size_and_mode
+from aenerf_ns.recording.options import ObjectDataParserConfig
 from aenerf_ns.recording.recording import Recording, ReferenceView, Split
 from aenerf_ns.recording.views import IMAGE_SUFFIXES
 
-# Of the synthetic scenes, in the authors' configuration.
+# Half the side of the box around the synthetic scenes, in the authors' configuration.
 _HALF_EXTENT = 1.5
 _LENS_MODELS: dict[str, LensModel] = {"plumb_bob": "radial_tangential", "equidistant": "fisheye"}
 
@@ -35,7 +36,7 @@ class RobustENeRFDataParserConfig(ObjectDataParserConfig):
 
 
 class RobustENeRFDataParser(EventDataParser):
-    """Reads a scene of Robust e-NeRF. The images of ``views`` are there or one folder up."""
+    """Read a scene of Robust e-NeRF. The folder ``views`` is in the scene's folder or one folder up."""
 
     config: RobustENeRFDataParserConfig
     layout = "raw_events.npz with camera_poses.npz and camera_calibration.npz"
@@ -49,7 +50,7 @@ class RobustENeRFDataParser(EventDataParser):
         camera, stated = _read_calibration(folder / "camera_calibration.npz")
         trajectory, ground_truth = self.config.estimated(_read_poses(folder / "camera_poses.npz"))
         frame_camera, views = _read_views(folder)
-        # Only what was simulated from Blender has it.
+        # Only scenes simulated from Blender have this file.
         synthetic = (folder / "renderer_params.npz").is_file()
         return Recording(
             event_file=NpzEventFile(
@@ -61,7 +62,7 @@ class RobustENeRFDataParser(EventDataParser):
             ground_truth=ground_truth,
             frame_camera=camera if frame_camera is None else frame_camera,
             reference_views={"train": [], **views},
-            # The events were simulated from these very values.
+            # The events were simulated from these values.
             image_encoding="linear",
             scene_box=self.config.scene_box(_HALF_EXTENT if synthetic else 0.0),
             image_background=(1.0, 1.0, 1.0),
@@ -69,7 +70,7 @@ class RobustENeRFDataParser(EventDataParser):
 
 
 def _numbers(path: Path, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """The array ``name``, of numbers and of a shape in which -1 stands for any size."""
+    """Return the array ``name`` as float64. It must hold numbers and have ``shape``, in which -1 means any size."""
     array = read_npz_member(path, name)
     fitting = tuple(size if wanted < 0 else wanted for size, wanted in zip(array.shape, shape, strict=False))
     if array.dtype.kind not in "iufb" or array.shape != fitting or array.ndim != len(shape):
@@ -97,7 +98,7 @@ def _read_calibration(path: Path) -> tuple[EventCamera, SensorModel]:
         if model not in _LENS_MODELS:
             raise DataError(path, f"distortion_model is {model!r}", f"use one of {', '.join(_LENS_MODELS)}")
         lens = _LENS_MODELS[model]
-    # OpenCV's four are k1, k2, p1 and p2.
+    # Four numbers are OpenCV's k1, k2, p1 and p2: k3 is zero.
     distortion += [0.0] * ((5 if lens == "radial_tangential" else 4) - len(distortion))
     single = {
         name: float(_numbers(path, name, ()))
@@ -145,7 +146,7 @@ def _read_poses(path: Path) -> Trajectory:
 
 
 def _read_views(folder: Path) -> tuple[EventCamera | None, dict[Split, list[ReferenceView]]]:
-    """The lens of the views, and the views of the splits that are there."""
+    """Read the lens of the views, or None where there are no views, and the views of the val and the test split."""
     root = next((place for place in (folder / "views", folder.parent / "views") if place.is_dir()), None)
     camera, splits = None, {}
     for split in ("val", "test"):
@@ -166,11 +167,11 @@ def _read_views(folder: Path) -> tuple[EventCamera | None, dict[Split, list[Refe
 
 def _read_view(frame: Metadata, folder: Path) -> ReferenceView:
     name = frame.get("file_path", str)
-    # The suffix is left out there.
+    # The dataset leaves the suffix out.
     files = [folder / f"{name}{suffix}" for suffix in ("", *IMAGE_SUFFIXES)]
     file = next((file for file in files if file.is_file()), None)
     if file is None:
-        raise frame.error("file_path", f"names {name}, of which there is no PNG or JPEG image")
+        raise frame.error("file_path", f"names {name}, which is no PNG or JPEG image")
     pose = frame.rigid_motion("transform_matrix")
     if pose is None:
         raise frame.error("transform_matrix", "is missing")

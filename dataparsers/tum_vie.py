@@ -1,4 +1,4 @@
-"""TUM-VIE (Klenk et al. 2021) as it is downloaded: Prophesee event cameras, motion capture, and kb4 fisheye lenses."""
+"""TUM-VIE (Klenk et al. 2021) as downloaded: Prophesee event cameras, motion capture, and kb4 fisheye lenses."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
 from aenerf_ns.files.json_object import Metadata
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
-from aenerf_ns.recording.dataparser import EventDataParser, PublishedDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
 
 _EVENTS = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
 _PARTS = ("-events_left.h5", "-vi_gt_data")
-# Recorded with the first of the two calibrations; all others with the second.
+# Sequences recorded with calibration A. All others were recorded with calibration B.
 _SET_A = {"loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"}
-# Places in the calibration's lists.
+# Indices into the lists of the calibration.
 _EVENT_CAMERAS = {"left": 2, "right": 3}
 _FRAME_CAMERAS = {"left": 0, "right": 1}
-# As Robust e-NeRF estimated them: C+ / C-, and the refractory period in nanoseconds.
+# The ratio C+ / C- and the refractory period (ns) are the estimates of Robust e-NeRF.
 _SENSOR = SensorModel(1.458 * 0.25, 0.25, 1375)
 
 
@@ -38,13 +39,16 @@ class TumVieDataParserConfig(PublishedDataParserConfig):
 
     _target: type = field(default_factory=lambda: TumVieDataParser)
     max_pose_gap_ns: int | None = 50_000_000
-    """Leave out what happened between consecutive poses that are further apart than this, in nanoseconds. The motion
+    """Leave out everything between consecutive poses that are further apart than this, in nanoseconds. The motion
     capture at 120 Hz covers only the start and the end of long sequences."""
 
 
 class TumVieDataParser(EventDataParser):
-    """Reads a sequence from the folder that it and the calibration were downloaded to. Where the folder holds several,
-    the event file of one is given in its place; a right one selects the right cameras."""
+    """Read a sequence from the folder that it and the calibration were downloaded to.
+
+    Where the folder holds several sequences, the event file of one is given in place of the folder. The event file of
+    the right camera selects the right cameras.
+    """
 
     config: TumVieDataParserConfig
     layout = "SEQUENCE-events_left.h5 with SEQUENCE-vi_gt_data"
@@ -63,7 +67,7 @@ class TumVieDataParser(EventDataParser):
         frame_camera = _camera(cameras, _FRAME_CAMERAS[side])
         imu_from_event = _pose(cameras.entry_block("T_imu_cam", _EVENT_CAMERAS[side]))
         imu_from_frame = _pose(cameras.entry_block("T_imu_cam", _FRAME_CAMERAS[side]))
-        # Poses are those of the motion capture's marker.
+        # The motion capture gives the poses of its marker.
         marker_from_event = torch.linalg.inv(_pose(mocap.block("T_imu_marker"))) @ imu_from_event
         ground_truth_folder = folder / f"{sequence}-vi_gt_data"
         markers = read_tum_trajectory(ground_truth_folder / "mocap_data.txt", "us")
@@ -91,7 +95,8 @@ class TumVieDataParser(EventDataParser):
 
 
 def _event_files(data: Path) -> list[Path]:
-    """Those of the sequences that a folder holds. A trained run is opened without them, so any part will do."""
+    """Return the event files of the sequences in a folder. A trained run is opened without its events, so any other
+    part of a sequence suffices."""
     if _EVENTS.fullmatch(data.name):
         return [data]
     names = {path.name.removesuffix(suffix) for suffix in _PARTS for path in data.glob(f"?*{suffix}")}
@@ -99,7 +104,7 @@ def _event_files(data: Path) -> list[Path]:
 
 
 def _choose(data: Path) -> tuple[Path, str, str]:
-    """The event file, and its sequence and side."""
+    """Return the event file, its sequence and its side."""
     files = _event_files(data)
     if not files:
         raise DataError(data, "there is no SEQUENCE-events_left.h5", "download a sequence to this folder")
@@ -113,7 +118,7 @@ def _choose(data: Path) -> tuple[Path, str, str]:
 
 
 def _read_json(folder: Path, name: str) -> Metadata:
-    """A calibration file, which is beside the sequences or, where each has a folder of its own, one folder up."""
+    """Read a calibration file, which is beside the sequence or one folder up."""
     place = folder.parent if not (folder / name).is_file() and (folder.parent / name).is_file() else folder
     if not (place / name).is_file():
         raise DataError(place / name, "there is no such file", "download the dataset's calibration to this folder")

@@ -1,8 +1,7 @@
-"""Small datasets on disk, and ways to damage them."""
+"""Small datasets in the native and the ECD format, and ways to damage them."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,24 +9,18 @@ from pathlib import Path
 import h5py
 import numpy as np
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from dataset_faults import edit_json, remove, replace_line, write_text
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from PIL import Image
 
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
-from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
-from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
 CAMERA = EventCamera(6, 4, 5.0, 5.5, 3.0, 2.0, "radial_tangential", (0.01, 0.0, 0.001, 0.0, 0.0))
-
-
 SENSOR = SensorModel(0.3, 0.2, 1000, "RGGB")
-
-
 START, END = 1_600_000_000_000_000_001, 1_600_000_002_000_000_001
 
 
@@ -77,30 +70,8 @@ def write_ecd(folder: Path) -> Path:
 AS_RECORDED = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
 
 
-def parse(config: EcdDataParserConfig | NativeDataParserConfig, split: str = "train") -> DataparserOutputs:
+def parse(config: DataParserConfig, split: str = "train") -> DataparserOutputs:
     return config.setup().get_dataparser_outputs(split)
-
-
-def read_everything(config: EcdDataParserConfig | NativeDataParserConfig) -> None:
-    parse(config, "val")
-    assert len(EventDataset(parse(config)).pairs)
-
-
-def replace_line(name: str, line: int, text: str) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        lines = (folder / name).read_text().splitlines()
-        lines[line] = text
-        (folder / name).write_text("\n".join(lines) + "\n")
-
-    return change
-
-
-def write_text(name: str, text: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).write_text(text) and None
-
-
-def remove(name: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).unlink()
 
 
 ECD_FAULTS = {
@@ -142,13 +113,8 @@ ECD_FAULTS = {
 }
 
 
-def edit_json(edit: Callable[[dict], object]) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        meta = json.loads((folder / "transforms.json").read_text())
-        edit(meta)
-        (folder / "transforms.json").write_text(json.dumps(meta))
-
-    return change
+def edit_transforms(edit: Callable[[dict], object]) -> Callable[[Path], None]:
+    return edit_json("transforms.json", edit)
 
 
 def replace_column(name: str, values: np.ndarray | None) -> Callable[[Path], None]:
@@ -182,46 +148,52 @@ NATIVE_FAULTS = {
     "no transforms": (remove("transforms.json"), "transforms.json: there is no such file"),
     "no JSON": (write_text("transforms.json", "{"), "transforms.json: not valid JSON"),
     "a list": (write_text("transforms.json", "[]"), "not a JSON object"),
-    "no event camera": (edit_json(lambda m: m.pop("event_camera")), "event_camera is missing"),
-    "no focal length": (edit_json(lambda m: m["event_camera"].pop("fl_x")), "event_camera.fl_x is missing"),
+    "no event camera": (edit_transforms(lambda m: m.pop("event_camera")), "event_camera is missing"),
+    "no focal length": (edit_transforms(lambda m: m["event_camera"].pop("fl_x")), "event_camera.fl_x is missing"),
     "width is a word": (
-        edit_json(lambda m: m["event_camera"].update(width="wide")),
+        edit_transforms(lambda m: m["event_camera"].update(width="wide")),
         "event_camera.width is 'wide'",
     ),
     "no threshold": (
-        edit_json(lambda m: m["event_camera"].pop("positive_contrast_threshold")),
+        edit_transforms(lambda m: m["event_camera"].pop("positive_contrast_threshold")),
         "event_camera.positive_contrast_threshold is missing",
     ),
     "negative threshold": (
-        edit_json(lambda m: m["event_camera"].update(negative_contrast_threshold=-1)),
+        edit_transforms(lambda m: m["event_camera"].update(negative_contrast_threshold=-1)),
         "negative_contrast_threshold must be a positive number",
     ),
-    "unknown Bayer pattern": (edit_json(lambda m: m["event_camera"].update(bayer_pattern="GRBG")), '"GRBG"'),
+    "unknown Bayer pattern": (edit_transforms(lambda m: m["event_camera"].update(bayer_pattern="GRBG")), '"GRBG"'),
     "unknown lens": (
-        edit_json(lambda m: m["event_camera"].update(camera_model="KB4")),
+        edit_transforms(lambda m: m["event_camera"].update(camera_model="KB4")),
         "camera_model is 'KB4', not one",
     ),
     "image of another size": (resize_image("images/val/00000.png"), "00000.png: the image has 3 x 2 pixels"),
     "mirrored pose": (
-        edit_json(lambda m: m["frames"][0].update(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist())),
+        edit_transforms(lambda m: m["frames"][0].update(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist())),
         r"frames\[0\].transform_matrix: pose 0 is not a rigid motion",
     ),
     "event camera that is scaled": (
-        edit_json(lambda m: m["event_camera"].update(T_frame_event=np.diag([1e3, 1e3, 1e3, 1]).tolist())),
+        edit_transforms(lambda m: m["event_camera"].update(T_frame_event=np.diag([1e3, 1e3, 1e3, 1]).tolist())),
         r"event_camera.T_frame_event: pose 0 is not a rigid motion",
     ),
-    "frame twice": (edit_json(lambda m: m["frames"].append(m["frames"][0])), r"names images/train/00000.png again"),
-    "unknown encoding": (edit_json(lambda m: m.update(image_encoding="log")), 'image_encoding is "log"'),
-    "box inside out": (edit_json(lambda m: m.update(scene_box=[[1, 1, 1], [0, 0, 0]])), "scene_box has corners"),
-    "box is flat": (edit_json(lambda m: m.update(scene_box=[[1, 1, 1]])), "scene_box must be 2 x 3"),
+    "frame twice": (
+        edit_transforms(lambda m: m["frames"].append(m["frames"][0])),
+        r"names images/train/00000.png again",
+    ),
+    "unknown encoding": (edit_transforms(lambda m: m.update(image_encoding="log")), 'image_encoding is "log"'),
+    "box inside out": (edit_transforms(lambda m: m.update(scene_box=[[1, 1, 1], [0, 0, 0]])), "scene_box has corners"),
+    "box is flat": (edit_transforms(lambda m: m.update(scene_box=[[1, 1, 1]])), "scene_box must be 2 x 3"),
     "missing image": (remove("images/val/00000.png"), "names images/val/00000.png, which does not exist"),
-    "unknown split file": (edit_json(lambda m: m.update(test_filenames=["x.png"])), "names x.png, which is not among"),
+    "unknown split file": (
+        edit_transforms(lambda m: m.update(test_filenames=["x.png"])),
+        "names x.png, which is not among",
+    ),
     "short matrix": (
-        edit_json(lambda m: m["frames"][0].update(transform_matrix=[[1]])),
+        edit_transforms(lambda m: m["frames"][0].update(transform_matrix=[[1]])),
         r"frames\[0\].transform_matrix must be 4 x 4",
     ),
     "neither pose nor time": (
-        edit_json(lambda m: [f.pop(k, None) for f in m["frames"] for k in ("transform_matrix", "timestamp")]),
+        edit_transforms(lambda m: [f.pop(k, None) for f in m["frames"] for k in ("transform_matrix", "timestamp")]),
         r"frames\[0\].transform_matrix is missing, and so is timestamp",
     ),
     "no events": (remove("events.h5"), "events.h5: there is no such event file"),

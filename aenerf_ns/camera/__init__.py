@@ -1,1 +1,1 @@
-"""Where a pixel looks, and when."""
+"""Cameras: where a pixel looks, and when."""

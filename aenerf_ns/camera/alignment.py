@@ -1,4 +1,4 @@
-"""How far one trajectory is from another, once the frame that neither can know is taken out."""
+"""Distances between trajectories, after alignment of their worlds."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ class Similarity:
     translation: Tensor
 
     def __call__(self, poses: Tensor) -> Tensor:
-        """Poses (..., 3, 4) of cameras, camera-to-world, in the target's world."""
+        """Map (..., 3, 4) camera-to-world poses to the target's world."""
         rotations = self.rotation @ poses[..., :3]
         positions = self.scale * poses[..., 3] @ self.rotation.mT + self.translation
         return torch.cat([rotations, positions[..., None]], -1)
 
     def inverse(self) -> Similarity:
-        """The map back."""
+        """Return the inverse map."""
         rotation, scale = self.rotation.mT, 1 / self.scale
         return Similarity(scale, rotation, -scale * (rotation @ self.translation))
 
 
 def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orientations: bool = True) -> Similarity:
-    """Least-squares map of poses onto reference poses of the same cameras at the same times.
+    """Return the least-squares map of poses onto reference poses of the same cameras at the same times.
 
     Positions alone leave the rotation uncertain, and on a straight line undetermined. So each camera contributes its
     position, in units of the root mean square distance of all positions from their mean, and the three axes of its
@@ -74,17 +74,17 @@ def align(poses: Tensor, reference: Tensor, with_scale: bool = True, with_orient
     sign[2] = torch.linalg.det(u @ vh).sign()
     rotation = u @ (sign[:, None] * vh)
     scale = torch.ones((), dtype=torch.float64, device=poses.device)
-    # Positions that do not spread tell no scale.
+    # Positions that do not spread give no scale.
     if with_scale and min(centered.norm(), reference_centered.norm()) > 1e-12:
         scale = (reference_centered * (centered @ rotation.mT)).sum() / centered.square().sum()
         if scale <= 0:
-            # Positions that contradict the orientations: a negative factor would be a reflection.
+            # The positions contradict the orientations. A negative factor would be a reflection.
             scale = reference_centered.norm() / centered.norm()
     return Similarity(scale, rotation, reference_mean - scale * (rotation @ mean))
 
 
 def pose_errors(poses: Tensor, reference: Tensor) -> dict[str, float]:
-    """Errors of poses against reference poses of the same cameras at the same times.
+    """Return errors of poses against reference poses of the same cameras at the same times.
 
     Args:
         poses: (N, 3, 4) camera-to-world.
@@ -112,9 +112,9 @@ def pose_errors(poses: Tensor, reference: Tensor) -> dict[str, float]:
 
 
 def rotation_angle(poses: Tensor, reference: Tensor) -> Tensor:
-    """Angles (N,) in radians between the orientations of (N, 3, 4) poses; exact also where it is small."""
+    """Return the (N,) angles in radians between the orientations of (N, 3, 4) poses. Small angles are exact too."""
     relative = reference[..., :3].mT @ poses[..., :3]
-    # Of the difference to the identity, sqrt(2) · 2 sin(angle / 2): no cancellation at small angles.
+    # The norm of the difference to the identity is sqrt(2) · 2 sin(angle / 2): no cancellation at small angles.
     identity = torch.eye(3, dtype=poses.dtype, device=poses.device)
     chord = (relative - identity).flatten(-2).norm(dim=-1) / 8**0.5
     return 2 * torch.asin(chord.clamp(max=1))

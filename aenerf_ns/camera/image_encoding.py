@@ -1,4 +1,4 @@
-"""What the values of an image mean: linear radiance, or its sRGB encoding for display."""
+"""Encodings of images: linear radiance, and sRGB for display."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ ImageEncoding = Literal["srgb", "linear"]
 
 
 def decode(image: Tensor, encoding: ImageEncoding) -> Tensor:
-    """Linear radiance in [0, 1] of image values in [0, 1] (sRGB: IEC 61966-2-1)."""
+    """Return the linear radiance in [0, 1] of image values in [0, 1] (sRGB: IEC 61966-2-1)."""
     if encoding == "linear":
         return image
     return torch.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
 
 
 def encode(radiance: Tensor, encoding: ImageEncoding) -> Tensor:
-    """Image values in [0, 1] of linear radiance, which is clipped to [0, 1]."""
+    """Return the image values in [0, 1] of linear radiance, which is clipped to [0, 1]."""
     radiance = radiance.clamp(0, 1)
     if encoding == "linear":
         return radiance
@@ -30,7 +30,7 @@ def encode(radiance: Tensor, encoding: ImageEncoding) -> Tensor:
 
 
 def to_channels(radiance: Tensor, num_channels: int) -> Tensor:
-    """Linear (..., 3) RGB as a sensor of 1 (luminance) or 3 channels sees it."""
+    """Return linear (..., 3) RGB as a sensor of 1 (luminance) or 3 channels sees it: (..., ``num_channels``)."""
     if num_channels == 3:
         return radiance
     return (radiance * radiance.new_tensor(LUMINANCE)).sum(-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""The event camera's lens: which direction each pixel looks in."""
+"""The event camera's lens: the direction in which each pixel looks."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class EventCamera:
         fx: focal length along the rows, in pixels.
         fy: focal length along the columns, in pixels.
         cx: principal point from the left edge of the image, in pixels. The centre of the first pixel is at 0.5
-            (Nerfstudio's convention); OpenCV, Kalibr and ESIM count from that centre: add 0.5 to theirs.
-        cy: principal point from the top edge of the image, in pixels, likewise.
+            (Nerfstudio's convention). OpenCV, Kalibr and ESIM count from that centre: add 0.5 to their values.
+        cy: principal point from the top edge of the image, in pixels, with the same convention.
         lens_model: "radial_tangential" (OpenCV's Brown-Conrady, "plumb_bob") or "fisheye" (OpenCV's fisheye,
             Kannala-Brandt, "equidistant", "kb4").
-        distortion: k1, k2, p1, p2, k3 of the first or k1, k2, k3, k4 of the second, in OpenCV's order.
+        distortion: in OpenCV's order: k1, k2, p1, p2, k3 ("radial_tangential") or k1, k2, k3, k4 ("fisheye").
 
     Raises:
         ValueError: a focal length or a size is not positive, a value is not finite, or the number of distortion
@@ -75,12 +75,12 @@ class EventCamera:
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
 
     def pixel_directions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Directions through the pixel centres, undistorted to the last digit.
+        """Return the directions through the pixel centres, undistorted to the last digit.
 
         Returns:
             (height, width, 3) float64 unit vectors in the camera's frame with Nerfstudio's axes (x right, y up,
-            z backward), and (height, width) whether the pixel has one: beyond the range in which a distortion model
-            can be inverted there is none.
+            z backward), and (height, width) whether the pixel has a direction. A pixel beyond the range in which the
+            distortion model can be inverted has none.
         """
         columns, rows = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
         pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
@@ -101,11 +101,11 @@ class EventCamera:
         return directions, error < _MAX_ROUND_TRIP_ERROR
 
     def cropped(self, x: int, y: int, width: int, height: int) -> EventCamera:
-        """The camera of the part of the sensor that begins at pixel (x, y) and has ``width`` x ``height`` pixels."""
+        """Return the camera of the part of the sensor that begins at pixel (x, y) and has the given size in pixels."""
         return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
 
     def cameras(self, camera_to_worlds: Tensor) -> Cameras:
-        """Nerfstudio's cameras with this lens.
+        """Return Nerfstudio's cameras with this lens.
 
         Args:
             camera_to_worlds: (N, 3, 4) poses, OpenGL camera axes.
@@ -126,6 +126,6 @@ class EventCamera:
             height=self.height,
             distortion_params=torch.tensor(distortion) if any(distortion) else None,
             camera_type=camera_type,
-            # The framework's renderers write into it.
+            # Nerfstudio's renderers write into it.
             metadata={},
         )

@@ -1,4 +1,4 @@
-"""Smooth, time-correlated pose noise: a controlled stand-in for the errors of structure from motion."""
+"""Smooth, time-correlated pose noise, which stands in for the errors of structure from motion."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _NUM_WAVES = 64
 def perturb(
     trajectory: Trajectory, rotation_degrees: float, translation: float, correlation_time: float, seed: int
 ) -> Trajectory:
-    """A trajectory with smooth errors of a given size.
+    """Return a trajectory with smooth errors of a given size.
 
     The error's three rotation and three translation components are independent, approximately Gaussian processes
-    with the correlation exp(−(Δt / correlation_time)² / 2), drawn as sums of random waves (random Fourier features),
-    so that they are defined at any time and do not depend on the rate of the poses.
+    with the correlation exp(−(Δt / correlation_time)² / 2). They are drawn as sums of random waves (random Fourier
+    features), which are defined at any time and do not depend on the rate of the poses.
 
     Args:
         trajectory: the true camera-to-world poses.

@@ -1,4 +1,7 @@
-"""Rotations as vectors, matrices and quaternions, in torch, differentiable everywhere including at zero angle."""
+"""Rotations as vectors, matrices and quaternions, in torch, differentiable everywhere including at zero angle.
+
+The exponential maps of roma and Nerfstudio are not smooth to second order at zero, so they are not used.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ _SMALL = 1e-4
 
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
-    """Rodrigues' formula, exp of so(3).
+    """Return the exponential of so(3) (Rodrigues' formula).
 
     Args:
         vector: (..., 3) axis times angle in radians.
@@ -24,7 +27,10 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
 
 
 def _exponential_coefficients(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³ of the angle θ of ``vector`` (..., 3), each (..., 1, 1)."""
+    """Return sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³, each (..., 1, 1).
+
+    θ is the angle of ``vector`` (..., 3).
+    """
     squared = (vector * vector).sum(-1)[..., None, None]
     small = squared < _SMALL
     # The unused branch of torch.where must stay finite too, or its gradient is NaN.
@@ -43,14 +49,14 @@ def _exponential_coefficients(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
-    """Matrices (..., 3, 3) whose product with any vector is the cross product of ``vector`` (..., 3) with it."""
+    """Return the (..., 3, 3) matrices [v]ₓ of vectors v (..., 3): [v]ₓ w is the cross product of v and w."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
 def vector_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Logarithm of unit quaternions.
+    """Return the logarithm of unit quaternions.
 
     Args:
         quaternion: (..., 4) unit quaternions x, y, z, w of either sign.
@@ -66,7 +72,7 @@ def vector_from_quaternion(quaternion: Tensor) -> Tensor:
 
 
 def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4) in the order x, y, z, w."""
+    """Return the (..., 3, 3) rotation matrices of unit quaternions (..., 4) in the order x, y, z, w."""
     x, y, z, w = quaternion.unbind(-1)
     return torch.stack(
         [
@@ -79,9 +85,9 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_from_rotation(rotation: Tensor) -> Tensor:
-    """Unit quaternions (..., 4), x, y, z, w with w >= 0, of rotation matrices (..., 3, 3).
+    """Return the unit quaternions (..., 4), x, y, z, w with w >= 0, of rotation matrices (..., 3, 3).
 
-    All four of the classical formulas are evaluated and the best-conditioned one is taken (Shepperd 1978).
+    All four classical formulas are evaluated, and the best-conditioned one is used (Shepperd 1978).
     """
     m = rotation.flatten(-2).unbind(-1)
     xx, yy, zz = m[0], m[4], m[8]
@@ -101,7 +107,7 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def motion_from_twist(twist: Tensor) -> Tensor:
-    """The exponential of se(3).
+    """Return the exponential of se(3).
 
     Args:
         twist: (..., 6) translation part ρ, then rotation part ω in radians.

@@ -18,8 +18,8 @@ from aenerf_ns.camera.rotation import (
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.time_window import TimeWindow
 
-# Multiplying by it from the right turns OpenCV camera axes (x right, y down, z forward) into OpenGL ones, which
-# Nerfstudio uses (x right, y up, z backward), and back.
+# Multiplying camera-to-world poses by it from the right turns OpenCV camera axes (x right, y down, z forward) into
+# Nerfstudio's OpenGL camera axes (x right, y up, z backward), and back.
 OPENCV_TO_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 # Matrices printed with five digits pass.
@@ -27,17 +27,18 @@ _MAX_RIGIDITY_ERROR = 1e-4
 
 
 class Trajectory(nn.Module):
-    """Camera-to-world poses in continuous time, by linear interpolation of the positions and spherical linear
-    interpolation of the rotations between knots (paper, appendix "Training").
+    """Camera-to-world poses in continuous time (paper, appendix "Training").
 
-    A module only so that the knots travel with a model to its device; it has no parameters and adds nothing to
-    checkpoints. Everything is float64, and times are integer nanoseconds or float64 seconds since ``start``: float32
-    cannot tell two events of one pixel apart.
+    Between knots, positions are interpolated linearly and rotations spherically.
+
+    It is a module so that the knots move with a model to its device. It has no parameters and adds nothing to
+    checkpoints. Everything is float64, and times are integer nanoseconds or float64 seconds since ``start``: in float32
+    two events of one pixel would get the same time.
 
     Args:
         times: (N,) times of the knots in nanoseconds, strictly increasing, N >= 2.
         camera_to_worlds: (N, 3, 4) or (N, 4, 4) poses, of any convention for the camera's axes.
-        source: where they came from, for messages.
+        source: the file or folder of the poses, for messages.
 
     Raises:
         DataError: fewer than two poses, times that do not increase, a value that is not finite, or a matrix that is
@@ -108,13 +109,14 @@ class Trajectory(nn.Module):
         return float((positions - positions.mean(0)).square().sum(-1).mean().sqrt())
 
     def seconds(self, times: Tensor) -> Tensor:
-        """Float64 seconds since ``start`` of integer times in nanoseconds."""
+        """Return the float64 seconds since ``start`` of integer times in nanoseconds."""
         return (times - self.times[0]).to(torch.float64) * 1e-9
 
     def pose(self, seconds: Tensor) -> Tensor:
-        """Poses at times inside the span, differentiable with respect to time.
+        """Return the poses at times inside the span, differentiable with respect to time.
 
-        Exact at the knots. Not checked against the span, which would stall a GPU: see :meth:`interpolate`.
+        They are exact at the knots. Times are not checked against the span, because the check would stall a GPU:
+        :meth:`interpolate` checks them.
 
         Args:
             seconds: (...) float64 seconds since ``start``.
@@ -129,10 +131,10 @@ class Trajectory(nn.Module):
         return torch.cat([rotation, translation[..., None]], -1)
 
     def pose_and_rate(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses as :meth:`pose` gives them, and their derivatives with respect to time.
+        """Return the poses of :meth:`pose` and their derivatives with respect to time.
 
-        In closed form, at a fraction of the cost of differentiating :meth:`pose`. At a knot the rate is that of the
-        segment after it.
+        The closed form costs a fraction of differentiating :meth:`pose`. At a knot the rate is the rate of the segment
+        after the knot.
 
         Args:
             seconds: (...) float64 seconds since ``start``.
@@ -142,21 +144,21 @@ class Trajectory(nn.Module):
         """
         segment, duration, _ = self._segment(seconds)
         pose = self.pose(seconds)
-        # The camera turns about one axis at one speed, so that its angular velocity is the same in all its frames.
+        # Along a segment the camera turns about one axis at one speed: its angular velocity is the same in every frame.
         spin = pose[..., :3] @ cross_matrix(self._rotation_steps[segment])
         rate = torch.cat([spin, self._translation_steps[segment][..., None]], -1)
         return pose, rate / duration[..., None, None]
 
     def _segment(self, seconds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Indices (...) of the knots ahead of given times, the seconds (...) to the next ones, and the parts (..., 1)
-        of the ways."""
+        """Return the segments that times lie in: (...) indices of the first knot, (...) durations in seconds, and the
+        (..., 1) share of the duration that has passed."""
         knots = self.seconds(self.times)
         segment = (torch.searchsorted(knots, seconds.detach(), right=True) - 1).clamp(0, len(knots) - 2)
         duration = knots[segment + 1] - knots[segment]
         return segment, duration, ((seconds - knots[segment]) / duration)[..., None]
 
     def interpolate(self, times: ArrayLike | Tensor) -> Tensor:
-        """Poses at given times.
+        """Return the poses at given times.
 
         Args:
             times: (...) integer times in nanoseconds.
@@ -179,7 +181,7 @@ class Trajectory(nn.Module):
         return self.pose(self.seconds(times))
 
     def between(self, start: int, end: int) -> Trajectory:
-        """The shortest run of knots that covers as much of [start, end] (nanoseconds) as the trajectory does.
+        """Return the shortest run of knots that covers as much of [start, end] (nanoseconds) as the trajectory does.
 
         Raises:
             DataError: the trajectory and the interval do not overlap.
@@ -208,14 +210,14 @@ class Trajectory(nn.Module):
         return TimeWindow(self.start, self.end, tuple(gaps))
 
     def knots_between(self, start: int, end: int) -> Tensor:
-        """Times in nanoseconds of the knots from one time to another, both included."""
+        """Return the times in nanoseconds of the knots from ``start`` to ``end``, both included."""
         return self.times[(self.times >= start) & (self.times <= end)]
 
     def knots_covered_by(self, reference: Trajectory) -> Tensor:
-        """Times in nanoseconds of the knots within the span of a reference trajectory.
+        """Return the times in nanoseconds of the knots within the span of a reference trajectory.
 
         Raises:
-            DataError: there are fewer than two.
+            DataError: there are fewer than two such knots.
         """
         times = self.knots_between(reference.start, reference.end)
         if len(times) < 2:
@@ -228,17 +230,17 @@ class Trajectory(nn.Module):
         return times
 
     def mapped(self, function) -> Trajectory:
-        """The trajectory with ``function`` applied to its (N, 4, 4) float64 camera-to-world matrices."""
+        """Return the trajectory with ``function`` applied to its (N, 4, 4) float64 camera-to-world matrices."""
         return Trajectory(self.times, function(homogeneous(self.camera_to_worlds)), self.source)
 
 
 def _as_times(times: ArrayLike | Tensor) -> Tensor:
-    # NumPy cannot see a tensor on a GPU, and torch takes no list of NumPy's integers.
+    # NumPy cannot read a tensor on a GPU, and torch does not take a list of NumPy's integers.
     return torch.as_tensor(times if isinstance(times, Tensor) else np.asarray(times), dtype=torch.int64)
 
 
 def require_rigid(poses: Tensor, source: str | Path) -> None:
-    """Raises a DataError unless the (N, 3 or 4, 4) poses are rotations and translations."""
+    """Raise a DataError unless the (N, 3 or 4, 4) poses are rotations and translations."""
     rotations = poses[:, :3, :3]
     error = (rotations @ rotations.mT - torch.eye(3, dtype=poses.dtype, device=poses.device)).abs().amax((1, 2))
     error = torch.maximum(error, (torch.linalg.det(rotations) - 1).abs())
@@ -251,7 +253,7 @@ def require_rigid(poses: Tensor, source: str | Path) -> None:
 
 
 def homogeneous(poses: Tensor) -> Tensor:
-    """(..., 4, 4) matrices of (..., 3, 4) poses."""
+    """Return the (..., 4, 4) matrices of (..., 3, 4) poses."""
     bottom = torch.zeros_like(poses[..., :1, :])
     bottom[..., 3] = 1
     return torch.cat([poses, bottom], -2)

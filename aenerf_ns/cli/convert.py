@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
 from aenerf_ns.cli.operands import Dataset
 from aenerf_ns.cli.termination import ended_by_exception
@@ -19,10 +19,10 @@ from aenerf_ns.events.filters import EventFilters, FilteredEventFile, hot_pixel_
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.progress import tracked
-from aenerf_ns.recording.dataparser import thinned
 from aenerf_ns.recording.images import check_image
-from aenerf_ns.recording.recording import FrameSequence, Recording, ReferenceView, Split
+from aenerf_ns.recording.recording import FrameSequence, Recording
 from aenerf_ns.recording.structure_from_motion import compare_with_truth, estimate_poses
+from aenerf_ns.recording.views import thinned, views_on_trajectory
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
 # Takes exactly four words. As an optional tuple, the option would also take the dataset if it follows.
@@ -187,23 +187,24 @@ def _with_estimated_poses(
     frames: FrameSequence, window: TimeWindow, source: Path, seed: int
 ) -> tuple[Recording, dict[str, Any]]:
     """Return the recording with COLMAP's poses as the estimated poses, and COLMAP's report."""
-    if frames.frame_camera != frames.event_camera:
+    capture = frames.capture
+    if capture.frame_camera != capture.event_camera:
         raise DataError(
             source,
             "its frames are of another camera than its events, and COLMAP finds the poses of the frames only",
             "estimate poses elsewhere, convert them to poses of the event camera, and give them as the trajectory",
         )
-    kept = [(time, file) for time, file in zip(frames.times, frames.files, strict=True) if window.contains(time)]
-    found = estimate_poses([file for _, file in kept], [time for time, _ in kept], frames.frame_camera, source, seed)
-    trajectory, report, given = found.trajectory, found.report(), frames.recording
+    kept = [(time, file) for time, file in frames.images if window.contains(time)]
+    found = estimate_poses([file for _, file in kept], [time for time, _ in kept], capture.frame_camera, source, seed)
+    trajectory, report = found.trajectory, found.report()
     CONSOLE.print(found.summary(), highlight=False, soft_wrap=True)
     CONSOLE.print(
         "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale, because frames of one "
         "camera tell no lengths.",
         soft_wrap=True,
     )
-    if given is not None:
-        truth = given.reference_trajectory
+    if isinstance(capture, Recording):
+        truth = capture.reference_trajectory
         knots = trajectory.times[(trajectory.times >= truth.start) & (trajectory.times <= truth.end)]
         if len(knots) > 1:
             covered = Trajectory(knots, trajectory.interpolate(knots))
@@ -216,16 +217,6 @@ def _with_estimated_poses(
                 soft_wrap=True,
             )
         # The scene box is in the world of the given poses, and the longest gap is about the given poses.
-        return replace(given, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None), report
+        return replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None), report
     placed = [(time, file) for time, file in kept if trajectory.start <= time <= trajectory.end]
-    views = [ReferenceView(file, homogeneous(trajectory.interpolate(time)), time) for time, file in placed]
-    splits: dict[Split, list[ReferenceView]] = {"train": views, "val": views[::2], "test": views[1::2]}
-    return Recording(
-        event_file=frames.event_file,
-        event_camera=frames.event_camera,
-        sensor=frames.sensor,
-        trajectory=trajectory,
-        frame_camera=frames.frame_camera,
-        reference_views=splits,
-        image_encoding=frames.image_encoding,
-    ), report
+    return capture.with_poses(trajectory, views_on_trajectory(placed, trajectory)), report

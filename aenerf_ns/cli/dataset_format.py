@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, cast, get_type_hints
 import tyro
 
 from aenerf_ns.dataparsers.formats import FORMATS, recognise
-from aenerf_ns.recording.dataparser import EventDataParser, EventDataParserConfig
+from aenerf_ns.recording.dataparser import EventDataParser
+from aenerf_ns.recording.options import EventDataParserConfig
 
 
 @dataclass

@@ -15,7 +15,7 @@ from aenerf_ns.events.time_window import TimeWindow
 
 _NEVER = np.iinfo(np.int64).min
 _MAX_MERGED = 255
-# Pairs for each number that a PairsInTime keeps, and that are looked through for each draw.
+# PairsInTime keeps one number for this many pairs, and looks through this many pairs for each draw.
 _BLOCK = 64
 
 _EVERYTHING = TimeWindow()
@@ -58,8 +58,9 @@ class EventPairs:
         return len(self.time)
 
     def predecessors(self, shortest_interval: int = 0) -> NDArray[np.int32] | NDArray[np.int64]:
-        """(N,) indices of the pairs that end where these begin, −1 where there is none: at a pixel's first pair, and
-        behind a gap or an event that gave no pair.
+        """Return for each pair the index (N,) of the pair of its pixel that ends where it begins, −1 if there is none.
+
+        A pixel's first pair has none, and neither has a pair after a gap or after an event that gave no pair.
 
         Args:
             shortest_interval: pairs whose events are fewer nanoseconds apart neither have nor are predecessors.
@@ -75,7 +76,7 @@ class EventPairs:
         return int((self.time - self.previous_time).min())
 
     def summary(self) -> str:
-        """One line that accounts for every event of the stream."""
+        """Return one line that accounts for every event of the stream."""
         return (
             f"{self.num_events:,} events gave {len(self):,} pairs; left out: {self.num_outside:,} outside the time "
             f"window or the poses, {self.num_first:,} first of their pixel, {self.num_within_refractory_period:,} "
@@ -84,11 +85,11 @@ class EventPairs:
 
 
 class PairsInTime:
-    """Finds the pair whose interval surrounds a moment at a pixel, with one number in memory for 64 pairs.
+    """Find the pair whose interval contains a moment at a pixel, with one number in memory for 64 pairs.
 
     Args:
-        pairs: to choose from.
-        usable: (height, width) pixels to choose from, of which one at least has a pair.
+        pairs: the pairs to choose from.
+        usable: (height, width) whether a pixel may be chosen. At least one usable pixel must have a pair.
     """
 
     def __init__(self, pairs: EventPairs, usable: NDArray[np.bool_]) -> None:
@@ -97,9 +98,10 @@ class PairsInTime:
         _add_up(*self._columns, self._ends)
 
     def at(self, places: NDArray[np.float64]) -> NDArray[np.int64]:
-        """(N,) indices of the pairs at (N,) places from 0 to 1 along the intervals of all pairs, laid end to end.
+        """Return the (N,) indices of the pairs at (N,) places along the intervals of all pairs, laid end to end.
 
-        Uniform places are uniform moments at uniform pixels, as far as these have events before and after.
+        Places go from 0 to 1. Uniform places are uniform moments at uniform pixels, among the moments between two
+        events of a pixel.
         """
         found = np.empty(len(places), np.int64)
         _find(*self._columns, self._ends, np.minimum(places * self._ends[-1], np.nextafter(self._ends[-1], 0)), found)
@@ -108,7 +110,7 @@ class PairsInTime:
 
 @numba.njit(cache=True)
 def _add_up(x, y, previous_time, time, usable, ends):
-    """Fills in where along the line of usable intervals each block of pairs ends, in nanoseconds."""
+    """Fill in where each block of pairs ends along the line of usable intervals, in nanoseconds."""
     end = 0.0
     for i in range(time.shape[0]):
         if usable[y[i], x[i]]:
@@ -118,9 +120,9 @@ def _add_up(x, y, previous_time, time, usable, ends):
 
 @numba.njit(cache=True)
 def _find(x, y, previous_time, time, usable, ends, places, found):
-    """Fills in the pairs at places along that line."""
+    """Fill in the pairs at places along the line of usable intervals."""
     for k in range(places.shape[0]):
-        # The first block that ends behind the place, so one that has a usable pair.
+        # The first block that ends behind the place. It has a usable pair.
         block = np.searchsorted(ends, places[k], side="right")
         left = places[k] - (ends[block - 1] if block > 0 else 0.0)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, time.shape[0])):
@@ -133,10 +135,11 @@ def _find(x, y, previous_time, time, usable, ends, places, found):
 
 @numba.njit(cache=True)
 def _pair_chunk(columns, width, refractory_period, last_time, last_record, records, n):
-    """Continues the pairing with one chunk.
+    """Continue the pairing with one chunk.
 
     Returns:
-        The new number of records and the chunk's counts; or −1 and the index of the event that cannot be counted.
+        The new number of records and the chunk's counts of first, merged and refractory events; or −1, and in place of
+        the first count the index of the event that cannot be counted.
     """
     x, y, t, p = columns
     out_x, out_y, out_previous, out_time, out_pos, out_neg = records
@@ -173,7 +176,7 @@ def _pair_chunk(columns, width, refractory_period, last_time, last_record, recor
 
 @numba.njit(cache=True)
 def _link(x, y, previous_time, time, width, height, shortest_interval, indices):
-    """Fills in the index of each pair's predecessor."""
+    """Fill in the index of each pair's predecessor."""
     latest = np.full(width * height, -1, dtype=np.int64)
     for i in range(time.shape[0]):
         pixel = np.int64(y[i]) * width + x[i]
@@ -190,15 +193,15 @@ def pair_events(
     window: TimeWindow = _EVERYTHING,
     expected_events: int | None = None,
 ) -> EventPairs:
-    """Pairs each event with the previous event of its pixel, in one pass over the stream.
+    """Pair each event with the previous event of its pixel, in one pass over the stream.
 
-    Besides the chunk at hand and the pairs themselves (22 bytes each) it holds 16 bytes a pixel.
+    Memory holds one chunk, the pairs (22 bytes each) and 16 bytes for each pixel.
 
     Args:
         chunks: the stream in pieces, in the order of time, all of one sensor.
-        refractory_period: τ in nanoseconds; an event that follows its pixel's previous one by no more gives no pair.
-        window: the events outside it are left out, and no pair spans a gap.
-        expected_events: the number of events, when known, which saves growing the arrays.
+        refractory_period: τ in nanoseconds. An event at most τ after the previous event of its pixel gives no pair.
+        window: events outside the window are left out, and no pair spans a gap.
+        expected_events: the number of events, if known. It saves growing the arrays.
 
     Returns:
         The pairs, with every event of the stream accounted for.
@@ -225,12 +228,12 @@ def pair_events(
                 continue
             outside -= len(chunk)
             if index != piece:
-                # Behind a gap every pixel begins anew.
+                # After a gap every pixel begins anew.
                 piece = index
                 last_time.fill(_NEVER)
             if size + len(chunk) > len(records[0]):
                 capacity = max(size + len(chunk), 3 * len(records[0]) // 2)
-                # One at a time: the old and the new of all would be too much at once.
+                # One column at a time, to hold only one twice in memory.
                 for column, record in enumerate(records):
                     records[column] = np.concatenate([record[:size], np.empty(capacity - size, record.dtype)])
             new_size, chunk_first, chunk_merged, chunk_refractory = _pair_chunk(

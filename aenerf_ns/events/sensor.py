@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 
 BayerPattern = Literal["", "RGGB"]
 
-# What a monochrome sensor sees of linear RGB: Rec. 709 luminance.
+# A monochrome sensor sees the Rec. 709 luminance of linear RGB.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
-# Index of the colour filter (0 red, 1 green, 2 blue) over the 2 x 2 pixels that repeat, [row % 2, column % 2].
+# Colour filter (0 red, 1 green, 2 blue) of the 2 x 2 pixels that repeat: [row % 2, column % 2].
 RGGB = np.array([[0, 1], [1, 2]], dtype=np.uint8)
 
 
 @dataclass(frozen=True)
 class SensorModel:
-    """How a pixel turns log-radiance into events (paper, eq. 5).
+    """The sensor model: how a pixel turns log-radiance into events (paper, eq. 5).
 
     Attributes:
         positive_contrast_threshold: C+, the rise of log-radiance that triggers an event of polarity +1.
         negative_contrast_threshold: C−, the fall of log-radiance (a positive number) that triggers one of polarity −1.
-        refractory_period: τ in nanoseconds, for which a pixel is blind after each of its events.
+        refractory_period: τ in nanoseconds. A pixel is blind for this time after each of its events.
         bayer_pattern: "RGGB" for a colour sensor whose pixel (0, 0) is red, "" for a monochrome one.
 
     Raises:
@@ -51,7 +51,7 @@ class SensorModel:
         return 3 if self.bayer_pattern else 1
 
     def channel(self, x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Radiance channel that each pixel's filter passes.
+        """Return the radiance channel that each pixel's filter passes.
 
         Args:
             x: (N,) raw integer pixel columns, before any undistortion.

@@ -26,7 +26,7 @@ class EventStream:
         p: (N,) int8 polarities, +1 or −1.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
-        source: where the events came from, for messages.
+        source: the file of the events, for messages.
 
     Raises:
         DataError: an array has the wrong type or length, a time decreases, a polarity is not ±1, or a pixel lies
@@ -82,12 +82,12 @@ class EventStream:
         return len(self.t)
 
     def __getitem__(self, index: slice | NDArray) -> EventStream:
-        """The events of a slice, as views, or copies of those that an array of indices or booleans selects."""
+        """Return the events of a slice (as views) or of an array of indices or booleans (as copies)."""
         columns = {name: getattr(self, name)[index] for name in _COLUMNS}
         return EventStream(**columns, width=self.width, height=self.height, source=self.source)
 
     def between(self, start: int, end: int) -> EventStream:
-        """The events with start <= t <= end, in nanoseconds."""
+        """Return the events with start <= t <= end, in nanoseconds."""
         first, last = np.searchsorted(self.t, [start, end + 1])
         return self[first:last]
 
@@ -101,16 +101,16 @@ def _unsorted(source: str | Path, index: int, time: int, previous: int) -> DataE
 
 
 def require_event_file(path: Path) -> None:
-    """Raises a DataError when the file does not exist."""
+    """Raise a DataError if the file does not exist."""
     if not path.is_file():
         raise DataError(path, "there is no such event file", "check the path of the dataset")
 
 
 class EventFile(ABC):
-    """A file of events, opened only when its events are asked for.
+    """A file of events, opened only when its events are needed.
 
-    Readers of a format implement :meth:`read_chunks` and :meth:`time_span`; this class checks that the whole stream
-    is in order.
+    Readers of a format implement :meth:`read_chunks` and :meth:`time_span`. This class checks that the whole stream is
+    in order.
 
     Args:
         path: the file.
@@ -125,7 +125,7 @@ class EventFile(ABC):
 
     @abstractmethod
     def read_chunks(self) -> Iterator[EventStream]:
-        """Yields the events in pieces that fit in memory, each checked in itself.
+        """Yield the events in pieces that fit in memory. Each piece is checked by itself.
 
         Raises:
             DataError: the file is missing or its content cannot be used.
@@ -133,17 +133,17 @@ class EventFile(ABC):
 
     @abstractmethod
     def time_span(self) -> tuple[int, int]:
-        """Times of the first and the last event in nanoseconds, read without reading all events.
+        """Return the times of the first and the last event in nanoseconds, without reading all events.
 
         Raises:
             DataError: the file is missing or empty.
         """
 
     def ordered_time_span(self) -> tuple[int, int]:
-        """Times of the first and the last event, checked to be in order.
+        """Return the times of the first and the last event in nanoseconds, checked to be in order.
 
         Raises:
-            DataError: the last event is before the first; or as :meth:`time_span`.
+            DataError: the file is missing or empty, or the last event is before the first.
         """
         first, last = self.time_span()
         if last < first:
@@ -155,19 +155,19 @@ class EventFile(ABC):
         return first, last
 
     def count(self) -> int | None:
-        """Number of events when the file tells it without being read through, else None."""
+        """Return the number of events, or None if the file must be read through to count them."""
         return None
 
     def require(self) -> None:
-        """Raises a DataError when the file does not exist."""
+        """Raise a DataError if the file does not exist."""
         require_event_file(self.path)
 
     def empty_error(self) -> DataError:
-        """The error for a file without events."""
+        """Return the error for a file without events."""
         return DataError(self.path, "the file holds no events", "record or convert it again")
 
     def chunks(self) -> Iterator[EventStream]:
-        """Yields all events in pieces that fit in memory, in the order of their times.
+        """Yield all events in pieces that fit in memory, in the order of their times.
 
         Raises:
             DataError: the file is missing, empty or out of order, or an event is malformed.

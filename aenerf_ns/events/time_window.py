@@ -26,7 +26,7 @@ class TimeWindow:
     gaps: tuple[tuple[int, int], ...] = ()
 
     def contains(self, times: ArrayLike) -> NDArray[np.bool_]:
-        """Return for (...) times in nanoseconds whether each lies in the window and in no gap."""
+        """Return whether each of (...) times in nanoseconds lies in the window and in no gap."""
         times = np.asarray(times)
         inside = (times >= self.start) & (times <= self.end)
         for first, last in self.gaps:

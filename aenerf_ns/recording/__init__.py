@@ -1,1 +1,1 @@
-"""What a dataset holds, and how Nerfstudio is given it."""
+"""Recordings: the one form that all dataset formats are read into, handed to Nerfstudio, and written."""

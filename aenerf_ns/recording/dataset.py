@@ -1,4 +1,4 @@
-"""Training cameras with pictures, and the events behind them, read when first needed."""
+"""Nerfstudio's dataset of a recording: cameras with pictures, and the pairs of events, read when first needed."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from aenerf_ns.recording.scene import SCENE, Scene
 if TYPE_CHECKING:
     from aenerf_ns.events.pairs import EventPairs
 
-# Events in a picture, as a share of the sensor's pixels: enough to show edges, few enough not to smear them.
+# Events in a picture, as a share of the sensor's pixels: enough to show edges, too few to smear them.
 _PICTURE_DENSITY = 0.25
 
 
 class EventDataset(InputDataset):
-    """A split of a recording: training cameras show an image or their events, the others show images."""
+    """A split of a recording. Training cameras show an image or the events around them, the others show images."""
 
     @property
     def scene(self) -> Scene:
-        """The recording that the split is of, in the frame of the scene."""
+        """The recording in the frame of the scene."""
         return self.metadata[SCENE]
 
     @cached_property
     def pairs(self) -> EventPairs:
-        """All pairs of events in the time window. Reads the whole event file.
+        """All pairs of events in the time window. The first access reads the whole event file.
 
         Raises:
             DataError: the event file is missing or malformed, or no event lies in the time window.
@@ -54,7 +54,7 @@ class EventDataset(InputDataset):
         return pairs
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
-        """Return the image (H, W, 3), or for a camera without an image the events nearest in time, accumulated."""
+        """Return the (H, W, 3) image of a camera, or a picture of the events nearest in time if it has no image."""
         scene = self.scene
         if scene.has_image[image_idx]:
             return super().get_numpy_image(image_idx)

@@ -1,4 +1,4 @@
-"""Reference images, looked at before the framework reads them."""
+"""Checks of reference images, made before Nerfstudio reads them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from aenerf_ns.errors import DataError
 
 
 def check_image(file: Path, camera: EventCamera) -> None:
-    """Raises a DataError for an image that the framework cannot read, or would read wrongly."""
+    """Raise a DataError for an image that Nerfstudio cannot read, or would read wrongly."""
     size, mode = image_size_and_mode(file)
     if size != (camera.width, camera.height):
         raise DataError(
@@ -24,10 +24,10 @@ def check_image(file: Path, camera: EventCamera) -> None:
 
 
 def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:
-    """Width and height in pixels, and PIL's name of what the pixels hold.
+    """Return width and height in pixels, and PIL's name of the pixels' format (such as "RGB").
 
     Raises:
-        DataError: the file is missing or no image.
+        DataError: the file is missing or is not an image.
     """
     try:
         with Image.open(file) as image:

@@ -1,8 +1,8 @@
-"""A recording: what every dataset format gives."""
+"""A recording: the one form that every dataset format is read into."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +15,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 
 Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 
 @dataclass(frozen=True)
@@ -34,35 +35,60 @@ class ReferenceView:
 
 
 @dataclass(frozen=True)
-class Recording:
-    """A recording of an event camera, in the world frame and the units of its poses.
+class Capture:
+    """The cameras and their events, without any poses.
 
     Attributes:
         event_file: the events, not yet read.
         event_camera: the event camera's lens.
         sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
-        trajectory: the estimated trajectory of the event camera, camera-to-world, OpenCV camera axes.
-        frame_camera: the lens of the camera that took the reference views.
-        reference_views: the images of each split.
+        frame_camera: the lens of the camera that took the images.
         image_encoding: whether the images' values are sRGB or linear in radiance.
-        scene_box: (2, 3) smallest and largest corner of a box that holds the whole scene, or None for a scene
-            without bounds.
-        ground_truth: the true trajectory, camera-to-world, OpenCV camera axes, in a world of any position, orientation
-            and scale, or None where it is not known. It serves evaluation only.
-        max_pose_gap: nanoseconds; where poses are further apart, the camera's way between them is not known. None:
-            poses are interpolated however far apart they are.
-        max_views: how many of the views of a split that were taken on the trajectory are used at most, evenly spread
-            over the time window; None: all.
-        image_background: RGB in [0, 1] behind images that have an alpha channel, or None where that is ignored.
     """
 
     event_file: EventFile
     event_camera: EventCamera
     sensor: SensorModel
-    trajectory: Trajectory
     frame_camera: EventCamera
-    reference_views: dict[Split, list[ReferenceView]]
     image_encoding: ImageEncoding
+
+    def with_poses(
+        self,
+        trajectory: Trajectory,
+        reference_views: dict[Split, list[ReferenceView]],
+        ground_truth: Trajectory | None = None,
+        max_views: int | None = None,
+    ) -> Recording:
+        """Return the recording of this capture with poses. The arguments are the attributes of :class:`Recording`."""
+        return Recording(
+            **{field.name: getattr(self, field.name) for field in fields(Capture)},
+            trajectory=trajectory,
+            reference_views=reference_views,
+            ground_truth=ground_truth,
+            max_views=max_views,
+        )
+
+
+@dataclass(frozen=True)
+class Recording(Capture):
+    """A capture with poses, in the world frame and the units of its poses.
+
+    Attributes:
+        trajectory: the estimated trajectory of the event camera, camera-to-world, OpenCV camera axes.
+        reference_views: the images of each split.
+        scene_box: (2, 3) smallest and largest corner of a box that holds the whole scene, or None for a scene
+            without bounds.
+        ground_truth: the true trajectory, camera-to-world, OpenCV camera axes, or None where it is not known. Its
+            world may have any position, orientation and scale. It serves evaluation only.
+        max_pose_gap: nanoseconds. Between poses that are further apart, the camera's way is not known. None: poses
+            are interpolated however far apart they are.
+        max_views: the largest number of timed views of a split that are used, evenly spread over the time window.
+            None: all are used.
+        image_background: RGB in [0, 1] behind images that have an alpha channel. None: the channel is ignored.
+    """
+
+    trajectory: Trajectory
+    reference_views: dict[Split, list[ReferenceView]]
     scene_box: Tensor | None = None
     ground_truth: Trajectory | None = None
     max_pose_gap: int | None = None
@@ -71,30 +97,18 @@ class Recording:
 
     @property
     def reference_trajectory(self) -> Trajectory:
-        """The best there is to compare with: the true trajectory, or where it is not known the estimated one."""
+        """The trajectory to compare with: the true one where it is known, else the estimated one."""
         return self.trajectory if self.ground_truth is None else self.ground_truth
 
 
 @dataclass(frozen=True)
 class FrameSequence:
-    """A recording as it is before it has poses, with the frames that they can be estimated from.
+    """Frames that poses can be estimated from.
 
     Attributes:
-        event_file: the events, not yet read.
-        event_camera: the event camera's lens.
-        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
-        frame_camera: the lens of the camera that took the frames.
-        files: the frames, in the order of time.
-        times: when they were taken, in nanoseconds on the clock of the events.
-        image_encoding: whether the frames' values are sRGB or linear in radiance.
-        recording: the recording with its given poses, or None where it has none.
+        capture: the recording that the frames belong to, or its capture alone where it has no poses.
+        images: times in nanoseconds on the clock of the events, and files, in the order of time.
     """
 
-    event_file: EventFile
-    event_camera: EventCamera
-    sensor: SensorModel
-    frame_camera: EventCamera
-    files: list[Path]
-    times: list[int]
-    image_encoding: ImageEncoding
-    recording: Recording | None
+    capture: Capture
+    images: list[tuple[int, Path]]

@@ -1,4 +1,4 @@
-"""A recording as the model is given it: in the frame and the units of the scene."""
+"""A recording in the frame and the units of the scene, as dataset, sampler and model take it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCENE = "scene"
 
 @dataclass(frozen=True)
 class Scene:
-    """The part of a recording that the dataparser hands to dataset, sampler and model.
+    """The part of a recording that the dataparser hands on.
 
     Attributes:
         trajectory: the estimated trajectory of the event camera, camera-to-world, OpenGL camera axes, scene units.
@@ -28,7 +28,7 @@ class Scene:
         event_camera: the event camera's lens.
         event_file: the events, not yet read.
         sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
-        window: the time that is used: where there are both events and poses, without the gaps of the poses.
+        window: the time that is used: the time that both events and poses cover, without the gaps of the poses.
         camera_times: (N,) times of the training cameras in nanoseconds; none for the other splits.
         has_image: whether each camera of the split has an image.
         image_encoding: whether the images' values are sRGB or linear in radiance.

@@ -25,17 +25,18 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.progress import progress_bar
 
-# Each frame is matched with so many after it, and with those 16, 32, ... 1024 after it,
+# Each frame is matched with this number of frames after it, and with the frames 16, 32, ... 1024 after it.
 _NEIGHBOURS = 10
-# and so many frames, evenly spread, with each other: without them errors add up along the path, and a loop stays open.
+# This number of frames, evenly spread, are matched with each other. Without them errors add up along the path, and a
+# loop stays open.
 _KEY_FRAMES = 100
 
-# COLMAP's own limits are made for photographs of many megapixels. These are for frames of a fraction of one.
+# COLMAP's own limits suit photographs of many megapixels. These suit frames of a fraction of a megapixel.
 _PEAK_THRESHOLD = 0.004
 _MIN_POSE_INLIERS = 15
 _MIN_INITIAL_INLIERS = 50
 
-# A camera that is off by more than this was not estimated badly but put elsewhere.
+# Beyond these errors, a pose is not inaccurate but wrong: COLMAP put the camera elsewhere.
 _FLIP_DEGREES = 90.0
 _MISPLACED_DEGREES = 5.0
 _MISPLACED_EXTENTS = 0.1
@@ -45,7 +46,7 @@ _MAX_GAPS_SHOWN = 10
 
 @dataclass(frozen=True)
 class EstimatedPoses:
-    """What structure from motion makes of a video.
+    """The poses that structure from motion finds in a video.
 
     Attributes:
         frame_times: (N,) times of all frames in nanoseconds.
@@ -68,7 +69,7 @@ class EstimatedPoses:
     seconds: float
 
     def gaps(self) -> list[tuple[int, int, int]]:
-        """First time, last time (nanoseconds) and number of frames of every run of frames without a pose."""
+        """Return first time, last time (nanoseconds) and number of frames of every run of frames without a pose."""
         lost = ~np.isin(self.frame_times, self.trajectory.times.numpy())
         edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
         return [
@@ -77,7 +78,7 @@ class EstimatedPoses:
         ]
 
     def report(self) -> dict[str, Any]:
-        """The figures, for JSON."""
+        """Return the figures as values for JSON."""
         registered, frames = len(self.trajectory), len(self.frame_times)
         return {
             "frames": frames,
@@ -92,7 +93,7 @@ class EstimatedPoses:
         }
 
     def summary(self) -> str:
-        """One line; where frames are lost, a second one that names their times."""
+        """Return a line of figures, and a second line that names the times of frames without a pose, if any."""
         pieces = f" in the largest of {len(self.model_sizes)} models" if len(self.model_sizes) > 1 else ""
         line = (
             f"COLMAP: {len(self.trajectory)} of {len(self.frame_times)} frames registered{pieces}, {self.num_points} "
@@ -116,18 +117,18 @@ def estimate_poses(
     source: str | Path,
     seed: int = 0,
 ) -> EstimatedPoses:
-    """Runs COLMAP's incremental structure from motion on a video, on the CPU.
+    """Run COLMAP's incremental structure from motion on a video, on the CPU.
 
     Intrinsics and distortion stay as given. Every frame is matched with its neighbours, and a hundred frames with each
-    other. On one thread: COLMAP's results depend on the order in which threads end, and so a seed gives the same poses
-    again, to the last bit on one machine with one version of COLMAP.
+    other. COLMAP runs on one thread, because its results depend on the order in which threads end. So a seed gives the
+    same poses again, to the last bit on one machine with one version of COLMAP.
 
     Args:
         frames: (height, width) grey or (height, width, 3) RGB arrays, or files that hold such pictures, in the order of
             time.
         times: (N,) times in nanoseconds, increasing.
         camera: the lens of the frames.
-        source: where they came from, for messages.
+        source: the file or folder of the frames, for messages.
         seed: of COLMAP's random samples.
 
     Raises:
@@ -136,10 +137,10 @@ def estimate_poses(
     """
     times = np.asarray(times, np.int64)
     if len(times) < 2:
-        raise DataError(source, f"{len(times)} frames", "poses can be estimated from two and more")
+        raise DataError(source, f"{len(times)} frames", "poses can be estimated from two frames or more")
     if (np.diff(times) <= 0).any():
         index = int(np.argmax(np.diff(times) <= 0)) + 1
-        raise DataError(source, f"frame {index} is not after the one ahead of it", "sort the frames by time")
+        raise DataError(source, f"frame {index} is not after the frame before it", "sort the frames by time")
     begin = time.perf_counter()
     with TemporaryDirectory() as folder, progress_bar() as progress:
         workspace = _Workspace(Path(folder), len(times), seed, progress)
@@ -151,8 +152,8 @@ def estimate_poses(
     if not models:
         raise DataError(
             source,
-            f"COLMAP places none of {len(times)} frames of {features:.0f} features (median), of which {pairs} pairs "
-            "match",
+            f"COLMAP places none of {len(times)} frames: they have {features:.0f} features (median), and {pairs} pairs "
+            "of frames match",
             "it needs a moving camera and sharp, textured frames: a shorter exposure, a higher frame rate, more pixels",
         )
     model = models[0]
@@ -174,22 +175,22 @@ def estimate_poses(
 
 
 def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory, dict[str, float]]:
-    """Maps estimated poses to the true world by one Sim(3), and tells their errors.
+    """Map estimated poses to the true world by one Sim(3), and measure their errors.
 
-    Only position, orientation and scale of the whole world are taken from the truth. The similarity is that of
-    positions and orientations (:func:`~aenerf_ns.camera.alignment.align`) of the frames that agree with most
-    others, so that a few misplaced ones do not turn the world away from the rest. All are mapped and none is removed.
+    Only position, orientation and scale of the whole world are taken from the truth. The similarity aligns positions
+    and orientations (:func:`~aenerf_ns.camera.alignment.align`) of the frames that agree with most other frames. So a
+    few misplaced frames do not turn the world away from the rest. All frames are mapped, and none is removed.
 
     Args:
         estimated: the estimated poses.
         truth: (N, 3, 4) true poses at the same times, with the same camera axes.
 
     Returns:
-        The mapped trajectory, and its errors in the units of the truth: those of
-        :func:`~aenerf_ns.camera.alignment.pose_errors`, which aligns all frames; and without another alignment the
-        medians and maxima of rotation and translation error, the ``extent`` (root mean square distance of the true
-        positions from their mean), the number of ``misplaced_frames``, off by more than 5 degrees or a tenth of the
-        extent, and of ``flipped_frames`` among them, by more than 90 degrees.
+        The mapped trajectory, and its errors in the units of the truth. The errors of
+        :func:`~aenerf_ns.camera.alignment.pose_errors` follow another alignment, of all frames. The others are those of
+        the mapped trajectory: medians and maxima of rotation and translation error; the number of ``misplaced_frames``
+        (off by more than 5 degrees or a tenth of the extent) and of ``flipped_frames`` (off by more than 90 degrees).
+        ``extent`` is the root mean square distance of the true positions from their mean.
     """
     poses, truth = estimated.camera_to_worlds, truth.double()
     extent = Trajectory(estimated.times, truth).extent
@@ -210,8 +211,8 @@ def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory
 
 
 def _majority(poses: Tensor, truth: Tensor) -> Similarity:
-    """The alignment of those frames that turn the world alike, if they are most."""
-    # Each frame alone tells how the world is turned.
+    """Align the frames that agree on the world's orientation if they are the majority, else all frames."""
+    # Each frame alone gives an orientation of the world.
     turns = truth[..., :3] @ poses[..., :3].mT
     degrees = torch.rad2deg(torch.stack([rotation_angle(turns, turn.expand_as(turns)) for turn in turns]))
     agree = degrees[degrees.median(1).values.argmin()] <= _MISPLACED_DEGREES
@@ -221,7 +222,7 @@ def _majority(poses: Tensor, truth: Tensor) -> Similarity:
 
 
 class _Workspace:
-    """COLMAP's database and images in a folder, and its steps."""
+    """COLMAP's database and images in a folder, and the steps of its work."""
 
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
         self._images, self._database = folder / "images", folder / "database.db"
@@ -233,7 +234,7 @@ class _Workspace:
         self._progress = progress
 
     def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], camera: EventCamera, source: str | Path) -> None:
-        """Writes the frames as COLMAP reads them."""
+        """Write the frames as image files for COLMAP."""
         named = zip(self._names, frames, strict=True)
         for name, frame in self._progress.track(named, total=len(self._names), description="Collecting frames"):
             origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
@@ -281,7 +282,7 @@ class _Workspace:
             pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
 
     def reconstruct(self) -> list[Any]:
-        """The models, the one that places most frames first."""
+        """Return the models, in the order of the number of frames that they place, the largest first."""
         import pycolmap
 
         options = pycolmap.IncrementalPipelineOptions()
@@ -303,7 +304,7 @@ class _Workspace:
         return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
     def num_features(self) -> float:
-        """Median over the frames."""
+        """Return the median number of features in a frame."""
         rows = [rows for (rows,) in self._query("SELECT rows FROM keypoints")]
         return statistics.median(rows) if rows else 0.0
 
@@ -316,7 +317,7 @@ class _Workspace:
 
     @contextlib.contextmanager
     def _step(self, description: str, total: int | None = None) -> Iterator[Any]:
-        """Shows a step of COLMAP's, and keeps its log off the console."""
+        """Show the progress of a step, and keep COLMAP's log off the console."""
         import pycolmap
 
         level = pycolmap.logging.minloglevel
@@ -339,7 +340,7 @@ def _read_image(file: Path) -> Image.Image:
 
 
 def _pairs(num_frames: int) -> list[tuple[int, int]]:
-    """Which frames of a video are matched: the indices, the smaller first."""
+    """Return which frames of a video are matched: pairs of indices, the smaller index first."""
     offsets = [*range(1, _NEIGHBOURS + 1), *(2**power for power in range(4, 11))]
     pairs = {(i, i + offset) for offset in offsets for i in range(num_frames - offset)}
     keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _KEY_FRAMES))})
@@ -348,7 +349,7 @@ def _pairs(num_frames: int) -> list[tuple[int, int]]:
 
 
 def colmap_camera(camera: EventCamera) -> tuple[str, Sequence[float]]:
-    """COLMAP's name of a lens, and its parameters. Its pixels count from the edge of the image, as here."""
+    """Return COLMAP's name of a lens, and its parameters. COLMAP's pixels count from the edge of the image, as ours."""
     pinhole = [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
     distortion = [float(value) for value in camera.distortion]
     if camera.lens_model == "fisheye":

@@ -1,9 +1,10 @@
-"""Reference views of a camera that moves with the event camera, taken at known times."""
+"""Reference views: reading lists of images, placing images on a trajectory, and choosing the views that are used."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -11,24 +12,44 @@ from torch import Tensor
 
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
+from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.files.text import TimeUnit, parse_times, read_rows
 from aenerf_ns.recording.recording import ReferenceView, Split
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 MAX_VIEWS = 20
-"""Images of a split that are used at most: each is rendered to fit the colour correction or to evaluate, and cameras
-take thousands."""
+"""Images of a split that a published format uses at most. Each is rendered to fit the colour correction or to evaluate,
+and cameras take thousands."""
+
+# Training cameras only serve the viewer. The viewer and Nerfstudio's start slow down with their number.
+_MAX_SHOWN = 24
+
+Item = TypeVar("Item")
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The PNG and JPEG images of a folder in the order of their names; none where there is no such folder."""
+    """Return the PNG and JPEG images of a folder in the order of their names; none if the folder does not exist."""
     return sorted(file for file in folder.glob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
 
 
+def image_files_of_poses(folder: Path, num_poses: int) -> list[Path]:
+    """Return the images of a folder in the order of their names: none, or one for each pose.
+
+    Raises:
+        DataError: the folder holds images, but not as many as there are poses.
+    """
+    files = image_files(folder)
+    if files and len(files) != num_poses:
+        raise DataError(folder, f"it holds {len(files)} images for {num_poses} poses", "copy all of them")
+    return files
+
+
 def read_image_list(path: Path) -> list[tuple[int, Path]]:
-    """Times in nanoseconds and files of a list of images: a line for each, with its time in seconds and its file,
-    relative to the list's folder.
+    """Read a list of images: on each line the time in seconds and the file, relative to the list's folder.
+
+    Returns:
+        Times in nanoseconds, and files.
 
     Raises:
         DataError: the list or an image is missing, or a line does not hold the two.
@@ -42,11 +63,18 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
 
 
 def read_image_times(folder: Path, path: Path, unit: TimeUnit) -> list[tuple[int, Path]]:
-    """Times in nanoseconds and files of a folder's images in the order of their names, of which another file lists the
-    times. None where the folder holds no images.
+    """Read the times of a folder's images, which another file lists in the order of the images' names.
+
+    Args:
+        folder: the images.
+        path: the list: a time on each line. It is not read if the folder holds no images.
+        unit: of the times in the list.
+
+    Returns:
+        Times in nanoseconds, and files; none if the folder holds no images.
 
     Raises:
-        DataError: the list is missing, or not as long.
+        DataError: the list is missing, or there are not as many times as images.
     """
     files = image_files(folder)
     if not files:
@@ -65,15 +93,17 @@ def views_on_trajectory(
     event_from_frame: Tensor | None = None,
     max_pose_gap: int | None = None,
 ) -> dict[Split, list[ReferenceView]]:
-    """The images that were taken within the span of the poses, each at the interpolated pose of its time. They
-    alternate between the validation and the test split.
+    """Place images at the interpolated poses of their times. Images taken outside the span of the poses are left out.
 
     Args:
         images: times in nanoseconds, and files.
         trajectory: of the event camera, camera-to-world, OpenCV camera axes.
-        event_from_frame: (4, 4) float64, takes points from the frame camera's to the event camera's coordinates, or
-            None where one sensor takes both.
-        max_pose_gap: nanoseconds between poses beyond which no image there is kept, or None.
+        event_from_frame: (4, 4) float64, takes points from the frame camera's to the event camera's coordinates. None:
+            one sensor takes both.
+        max_pose_gap: nanoseconds. An image between poses that are further apart is left out. None: none is.
+
+    Returns:
+        All views as train views, and the same alternating between the validation and the test split.
     """
     known = trajectory.window(max_pose_gap)
     kept = [(time, file) for time, file in images if known.contains(time)]
@@ -87,3 +117,53 @@ def views_on_trajectory(
         ReferenceView(file, homogeneous(trajectory.interpolate(time)) @ event_from_frame, time) for time, file in kept
     ]
     return {"train": views, "val": views[::2], "test": views[1::2]}
+
+
+def views_within(views: list[ReferenceView], window: TimeWindow) -> list[ReferenceView]:
+    """Return the views that were taken in a time window or at no known time; print how many others there are."""
+    kept = [view for view in views if view.time is None or window.contains(view.time)]
+    if len(kept) < len(views):
+        CONSOLE.print(
+            f"{len(views) - len(kept)} of {len(views)} reference images are left out: they were taken outside the "
+            f"events' {window.start} to {window.end} ns or in a gap of the poses."
+        )
+    return kept
+
+
+def thinned(views: list[ReferenceView], max_views: int | None) -> list[ReferenceView]:
+    """Return at most ``max_views`` of the timed views, evenly spread, and all views without a time.
+
+    Args:
+        views: in any order; the timed ones in the order of time.
+        max_views: None: all views are kept.
+    """
+    timed = [view for view in views if view.time is not None]
+    if max_views is None or len(timed) <= max_views:
+        return views
+    return [*_evenly_spread(timed, max_views), *(view for view in views if view.time is None)]
+
+
+def viewer_cameras(trajectory: Trajectory, views: list[ReferenceView]) -> tuple[Tensor, dict[int, Path]]:
+    """Choose the times at which the viewer shows the camera: at knots and where images were taken, evenly thinned out.
+
+    Returns:
+        (N,) int64 times in nanoseconds, and the images among them by index.
+    """
+    taken = {v.time: v.file for v in views if v.time is not None and trajectory.start <= v.time <= trajectory.end}
+    shown = _evenly_spread(sorted(taken), _MAX_SHOWN)
+    times = sorted({*_evenly_spread(trajectory.times.tolist(), _MAX_SHOWN), *shown})
+    return torch.tensor(times), {times.index(time): taken[time] for time in shown}
+
+
+def seconds_on_trajectory(views: list[ReferenceView], trajectory: Trajectory) -> Tensor:
+    """Return when views were taken: (N, 1) float64 seconds since the trajectory's start, NaN for untimed views."""
+    times = torch.tensor([[trajectory.start if view.time is None else view.time] for view in views])
+    seconds = trajectory.seconds(times.reshape(-1, 1))
+    seconds[[view.time is None for view in views]] = torch.nan
+    return seconds
+
+
+def _evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
+    """Return at most so many of the items, evenly spread from the first to the last."""
+    count = min(len(items), most)
+    return [items[round(i * (len(items) - 1) / max(count - 1, 1))] for i in range(count)]

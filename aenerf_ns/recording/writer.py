@@ -23,28 +23,29 @@ from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.json_object import LENS_MODELS
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
-from aenerf_ns.recording.recording import Split
+from aenerf_ns.recording.recording import SPLITS, Split
 
 
 class NativeDatasetWriter:
-    """Writes a dataset folder, all of it or nothing. Use it as a context manager.
+    """Write a dataset folder, completely or not at all. Use it as a context manager.
 
-    The folder gets its name when the last file is complete; when anything fails, nothing is left behind.
+    The folder gets its name when the last file is complete. If anything fails, nothing is left behind.
 
     Args:
         folder: the dataset folder to create.
         event_camera: the event camera's lens.
         sensor: its contrast thresholds, refractory period and Bayer pattern.
-        image_encoding: of the images to come.
+        image_encoding: whether the images' values are sRGB or linear in radiance.
         scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
-        max_pose_gap: nanoseconds between poses beyond which the way between them is not known, or None.
+        max_pose_gap: nanoseconds. Between poses that are further apart, the camera's way is not known. None: it is
+            known everywhere.
         frame_camera: the lens of the camera that took the images; by default the event camera's.
 
     Raises:
         DataError: the folder exists or cannot be created.
 
     Attributes:
-        events: takes the events, piece by piece in the order of time.
+        events: its method ``append`` takes the events, piece by piece in the order of time.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class NativeDatasetWriter:
                 "bayer_pattern": sensor.bayer_pattern,
             },
             "frames": [],
-            **{f"{split}_filenames": [] for split in ("train", "val", "test")},
+            **{f"{split}_filenames": [] for split in SPLITS},
         }
         if scene_box is not None:
             self._meta["scene_box"] = scene_box.tolist()
@@ -101,8 +102,8 @@ class NativeDatasetWriter:
             if error_type is None and not (self._partial / "trajectory_estimated.txt").exists():
                 raise ValueError("the dataset has no trajectory: call add_trajectories before leaving the block")
             if error_type is None:
-                # A JSON number has all the digits that it is written with, but Python writes none with those of a
-                # nanosecond.
+                # A JSON number may have any number of digits, but Python's json cannot write an exact decimal: times
+                # are stored as strings, and their quotes are removed here.
                 text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(self._meta, indent=2))
                 (self._partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
                 self._partial.rename(self._folder)
@@ -110,13 +111,13 @@ class NativeDatasetWriter:
             shutil.rmtree(self._partial, ignore_errors=True)
 
     def add_trajectories(self, estimated: Trajectory, ground_truth: Trajectory | None = None) -> None:
-        """Writes the estimated and, where it is known, the true trajectory (OpenCV camera axes)."""
+        """Write the estimated and, if it is known, the true trajectory (OpenCV camera axes)."""
         write_tum_trajectory(self._partial / "trajectory_estimated.txt", estimated)
         if ground_truth is not None:
             write_tum_trajectory(self._partial / "trajectory_ground_truth.txt", ground_truth)
 
     def add_poses_report(self, report: dict[str, Any]) -> None:
-        """Writes how the estimated trajectory was made and what is known of its errors. Nothing reads it but people."""
+        """Write how the estimated trajectory was made and what is known of its errors, for people to read."""
         text = json.dumps(report, indent=2)
         (self._partial / "poses_report.json").write_text(text + "\n", encoding="utf-8")
 
@@ -130,16 +131,16 @@ class NativeDatasetWriter:
         linear: NDArray[np.uint16] | None = None,
         depth: NDArray[np.float32] | None = None,
     ) -> None:
-        """Adds a reference image.
+        """Add a reference image.
 
         Args:
-            split: which split it belongs to.
+            split: the split that the image belongs to.
             image: (height, width, 3) display values.
             camera_to_world: (4, 4) pose, OpenCV camera axes.
-            time: in nanoseconds, when the image was taken on the trajectory.
-            linear: (height, width, 3) the same in linear radiance.
-            depth: (height, width) along the optical axis, in the unit of the poses' lengths; not finite where there is
-                none. What is beyond 65.535 cannot be stored and becomes unknown.
+            time: nanoseconds at which the image was taken on the trajectory, or None.
+            linear: (height, width, 3) the same image in linear radiance; 65535 is display white.
+            depth: (height, width) along the optical axis, in the unit of the poses' lengths; not finite where it is
+                unknown. Depth beyond 65.535 cannot be stored and becomes unknown.
         """
         frame = self._add_frame(split, ".png", camera_to_world, time)
         Image.fromarray(image).save(self._partial / frame["file_path"])
@@ -164,15 +165,15 @@ class NativeDatasetWriter:
         time: int | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> None:
-        """Adds a reference image as it is: its file is copied, once when it is added to several splits.
+        """Add a reference image by copying its file. A file that is added to several splits is copied once.
 
         Args:
-            split: which split it belongs to.
+            split: the split that the image belongs to.
             file: the image.
             camera_to_world: (4, 4) pose, OpenCV camera axes; one file has one pose.
-            time: in nanoseconds, when the image was taken on the trajectory.
-            background: RGB in [0, 1], in the image's encoding, that an image with an alpha channel is put on, since the
-                dataset format has no such channel; None: that is ignored.
+            time: nanoseconds at which the image was taken on the trajectory, or None.
+            background: RGB in [0, 1], in the image's encoding. An image with an alpha channel is composed with it,
+                because the dataset format has no such channel. None: the channel is ignored.
         """
         if file in self._files:
             self._meta[f"{split}_filenames"].append(self._files[file]["file_path"])
@@ -206,7 +207,7 @@ class NativeDatasetWriter:
 
 
 def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
-    # OpenCV does not raise.
+    # OpenCV returns false on failure.
     if not cv2.imwrite(str(path), values):
         raise OSError(f"{path} cannot be written")
 

@@ -36,7 +36,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
-from aenerf_ns.recording.dataparser import EventDataParserConfig
+from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.structure_from_motion import EstimatedPoses
 from aenerf_ns.recording.writer import NativeDatasetWriter

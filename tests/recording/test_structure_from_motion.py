@@ -79,7 +79,7 @@ def test_the_estimated_poses_are_in_the_dataset_in_metres(dataset: tuple[Path, s
     # Neither exact, nor in a world or scale of COLMAP's own.
     error = (estimated.camera_to_worlds - true)[..., 3].norm(dim=-1)
     assert 1e-5 < error.mean() < 0.05 * estimated.extent
-    # What comes ahead of the first estimated pose and after the last is not trained on.
+    # Events before the first estimated pose and after the last one are not trained on.
     outputs = NativeDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
     window = outputs.metadata[SCENE].window
     assert estimated.start <= window.start < window.end == estimated.end < truth.end
@@ -87,7 +87,7 @@ def test_the_estimated_poses_are_in_the_dataset_in_metres(dataset: tuple[Path, s
 
 def test_frames_without_texture_are_told() -> None:
     frames = np.full((4, 60, 80), 128, np.uint8)
-    with pytest.raises(DataError, match=r"^flat: COLMAP places none of 4 frames of 0 features .*; .*textured") as told:
+    with pytest.raises(DataError, match=r"^flat: COLMAP places none of 4 frames: they have 0 .*; .*textured") as told:
         estimate_poses(frames, np.arange(4) * FRAME, EventCamera(80, 60, 70.0, 70.0, 40.0, 30.0), "flat")
     assert "\n" not in str(told.value)
 

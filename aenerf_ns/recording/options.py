@@ -1,0 +1,123 @@
+"""The options that dataparsers have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from torch import Tensor
+
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+
+
+@dataclass
+class EventDataParserConfig(DataParserConfig):
+    """The options of every event dataparser."""
+
+    scale_factor: float = 1.0
+    """Factor on the camera positions, after the automatic scale."""
+    auto_scale_poses: bool = True
+    """Scale the estimated poses to fit in a box of +/- 1. Turn it off where the camera moves little compared to the
+    distance of the scene, and choose a scale_factor that brings the scene to a size of about 1 instead."""
+    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
+    """How to turn the world. Not used where the dataset states a scene box."""
+    center_method: Literal["poses", "focus", "none"] = "poses"
+    """Where to put the origin. Not used where the dataset states a scene box."""
+    start_time_ns: int | None = None
+    """Leave out everything before this time on the clock of the events, in nanoseconds. By default the first event or
+    the first pose, whichever is later. A run's saved configuration holds the value that was used."""
+    end_time_ns: int | None = None
+    """Leave out everything after this time. By default the last event or the last pose, whichever is earlier."""
+    max_pose_gap_ns: int | None = None
+    """Leave out everything between consecutive poses that are further apart than this, in nanoseconds. By default the
+    value that the dataset states; where it states none, poses are interpolated however far apart they are."""
+
+    def setup(self, **kwargs: Any) -> Any:
+        """Return the dataparser."""
+        for option in fields(self):
+            path = getattr(self, option.name)
+            if isinstance(path, Path):
+                # A run's saved configuration is also read in other working directories.
+                setattr(self, option.name, path.absolute())
+        return super().setup(**kwargs)
+
+
+@dataclass
+class SensorOptions:
+    """Values of the sensor that take the place of the dataset's."""
+
+    positive_contrast_threshold: float | None = None
+    """C+, in place of the dataset's value or of the one assumed for its sensor. The size of both thresholds only sets
+    the scale of the log-radiance, which colour correction finds."""
+    negative_contrast_threshold: float | None = None
+    """C-, in place of the dataset's value or of the assumed one. Its ratio to C+ matters."""
+    refractory_period_ns: int | None = None
+    """Time for which a pixel is blind after each event, in nanoseconds, in place of the dataset's value."""
+
+    def given_sensor_values(self) -> dict[str, Any]:
+        """Return the values that are given, by their names in :class:`~aenerf_ns.events.sensor.SensorModel`."""
+        values = {
+            "positive_contrast_threshold": self.positive_contrast_threshold,
+            "negative_contrast_threshold": self.negative_contrast_threshold,
+            "refractory_period": self.refractory_period_ns,
+        }
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass
+class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
+    """The options that the formats of other projects have in common."""
+
+    auto_scale_poses: bool = False
+    """Scale the estimated poses to fit in a box of +/- 1. Off by default: poses are in metres, and slow recordings move
+    little compared to the distance of the scene. Choose a scale_factor instead."""
+    trajectory: Path | None = None
+    """Estimated poses of the event camera, as t tx ty tz qx qy qz qw in seconds, camera-to-world, to be used in place
+    of the dataset's. The dataset's poses then only serve to evaluate them."""
+
+    def sensor(self, stated: SensorModel) -> SensorModel:
+        """Return the sensor that the dataset states, with the values that the options give.
+
+        Raises:
+            DataError: a value is impossible.
+        """
+        try:
+            return replace(stated, **self.given_sensor_values())
+        except ValueError as error:
+            raise DataError(str(self.data), str(error), "correct it among the options") from None
+
+    def estimated(self, reference: Trajectory) -> tuple[Trajectory, Trajectory | None]:
+        """Return the estimated and the true trajectory, given the dataset's own.
+
+        The dataset's own is the estimated one, and none is true, unless the options give another estimated one.
+        """
+        return (reference, None) if self.trajectory is None else (read_tum_trajectory(self.trajectory), reference)
+
+
+@dataclass
+class ObjectDataParserConfig(PublishedDataParserConfig):
+    """The options of formats for objects on a uniform background."""
+
+    scene_half_extent: float | None = None
+    """Half the side of a cube around the origin that holds the whole scene, in the units of the poses; 0 for a scene
+    without bounds. By default the value of the dataset's authors."""
+
+    def scene_box(self, stated: float) -> Tensor | None:
+        """Return the (2, 3) float64 corners of the cube, or None for a scene without bounds.
+
+        Args:
+            stated: half the side of the cube, where the options give none; 0 for a scene without bounds.
+
+        Raises:
+            DataError: the length is negative.
+        """
+        half = stated if self.scene_half_extent is None else self.scene_half_extent
+        if half < 0:
+            raise DataError(str(self.data), f"scene_half_extent is {half}", "give a length, or 0 for no bounds")
+        return torch.tensor([[-half] * 3, [half] * 3], dtype=torch.float64) if half else None

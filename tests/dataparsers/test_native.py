@@ -1,0 +1,114 @@
+"""The native dataset format."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from conftest import make_stream
+from dataset_faults import assert_one_clear_line
+from small_datasets import (
+    AS_RECORDED,
+    CAMERA,
+    NATIVE_FAULTS,
+    SENSOR,
+    START,
+    make_trajectory,
+    parse,
+    write_native,
+)
+
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
+from aenerf_ns.files.text import format_seconds
+from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.recording.scene import SCENE
+
+
+def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    outputs = parse(NativeDataParserConfig(data=folder, **AS_RECORDED))
+    metadata = outputs.metadata
+    assert metadata[SCENE].event_camera == CAMERA
+    assert metadata[SCENE].sensor == SENSOR
+    assert metadata[SCENE].image_encoding == "srgb"
+    assert not metadata[SCENE].bounded
+    expected = make_trajectory()
+    assert torch.equal(metadata[SCENE].trajectory.times, expected.times)
+    torch.testing.assert_close(
+        metadata[SCENE].trajectory.camera_to_worlds,
+        (homogeneous(expected.camera_to_worlds) @ OPENCV_TO_OPENGL)[:, :3],
+        rtol=0,
+        atol=1e-11,
+    )
+    for split, values in (("val", [77]), ("test", [78, 79])):
+        dataset = EventDataset(parse(NativeDataParserConfig(data=folder), split))
+        assert [int(dataset.get_numpy_image(i)[0, 0, 0]) for i in range(len(dataset))] == values
+    events = list(metadata[SCENE].event_file.chunks())
+    assert sum(map(len, events)) == metadata[SCENE].event_file.count() == 200
+    assert metadata[SCENE].event_file.time_span() == (events[0].t[0], events[-1].t[-1])
+
+
+def test_a_frame_without_a_pose_gets_that_of_its_time(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    meta = json.loads((folder / "transforms.json").read_text())
+    time = START + 150_000_000
+    for frame in meta["frames"]:
+        if frame["file_path"] == meta["test_filenames"][0]:
+            del frame["transform_matrix"]
+            frame["timestamp"] = "STAMP"
+    shift = np.eye(4)
+    shift[0, 3] = 0.5
+    meta["event_camera"]["T_frame_event"] = shift.tolist()
+    # Every digit of the time counts, beyond what a JSON writer's float holds.
+    (folder / "transforms.json").write_text(json.dumps(meta).replace('"STAMP"', format_seconds(time)))
+    config = NativeDataParserConfig(
+        data=folder, orientation_method="none", center_method="none", auto_scale_poses=False
+    )
+    pose = parse(config, "test").cameras.camera_to_worlds[0]
+    expected = homogeneous(make_trajectory().interpolate(time)) @ torch.linalg.inv(torch.from_numpy(shift))
+    torch.testing.assert_close(pose, (expected @ OPENCV_TO_OPENGL)[:3].float(), rtol=0, atol=1e-6)
+
+
+def test_options_take_the_place_of_the_sensors_values(tmp_path: Path) -> None:
+    folder = write_native(tmp_path / "made")
+    options = {"positive_contrast_threshold": 0.7, "refractory_period_ns": 0}
+    assert parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE].sensor == SensorModel(
+        0.7, 0.2, 0, "RGGB"
+    )
+    with pytest.raises(DataError, match=r"positive_contrast_threshold must be a positive number, not 0\.0; .*options"):
+        parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
+
+
+def test_times_in_other_units_with_an_offset(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        for name, dtype in (("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
+            file[f"events/{name}"] = np.ones(3, dtype)
+        file["events/t"] = np.array([1, 2, 5])
+        # As some writers store a string.
+        file["events"].attrs["time_unit"] = np.array([b"us"])
+        file["events"].attrs["time_offset"] = 1000
+    events = Hdf5EventFile(tmp_path / "events.h5", 2, 2)
+    (chunk,) = events.chunks()
+    assert chunk.t.tolist() == [1_001_000, 1_002_000, 1_005_000]
+    assert events.time_span() == (1_001_000, 1_005_000)
+
+
+def test_events_are_written_in_order_only(tmp_path: Path) -> None:
+    with Hdf5EventWriter(tmp_path / "events.h5") as writer:
+        writer.append(make_stream([(0, 0, 5, 1)]))
+        with pytest.raises(DataError, match="4 ns is before 5 ns"):
+            writer.append(make_stream([(0, 0, 4, 1)]))
+
+
+@pytest.mark.parametrize("fault", NATIVE_FAULTS)
+def test_malformed_native_datasets_are_one_clear_line(fault: str, tmp_path: Path) -> None:
+    change, message = NATIVE_FAULTS[fault]
+    assert_one_clear_line(change, message, NativeDataParserConfig(data=write_native(tmp_path / "made")))

@@ -1,0 +1,156 @@
+"""TUM-VIE as downloaded."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_faults import assert_one_clear_line, edit_json, remove, replace_line
+from numpy.typing import NDArray
+from published_datasets import (
+    EPOCH,
+    assert_same_poses,
+    config_of,
+    convert_to_native,
+    interpolated,
+    recording_of,
+    write_tum_vie,
+)
+from scipy.spatial.transform import Rotation
+from small_datasets import parse
+
+from aenerf_ns.dataparsers.formats import recognise
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.recording.scene import SCENE
+
+
+def test_tum_vie_has_two_calibrations_and_two_sides(tmp_path: Path, tum_vie_calibration: Path) -> None:
+    for sequence, side in (("mocap-desk2", "right"), ("office-maze", "left"), ("office-maze", "right")):
+        folder = tmp_path / f"{sequence}-{side}"
+        truth = write_tum_vie(folder, tum_vie_calibration, sequence, side)
+        recording = recording_of(config_of("tum-vie-data", folder / f"{sequence}-events_{side}.h5"))
+        assert_same_poses(recording.trajectory.camera_to_worlds, truth.poses)
+        assert recording.event_camera.fx == truth.matrix[0, 0]
+        assert recording.event_camera.cx == truth.matrix[0, 2] + 0.5
+        assert recording.sensor == SensorModel(1.458 * 0.25, 0.25, 1375)
+    # The calibration may be one folder up.
+    for file in folder.glob("*.json"):
+        file.rename(tmp_path / file.name)
+    recording_of(config_of("tum-vie-data", folder / "office-maze-events_right.h5"))
+
+
+def test_tum_vie_views_are_those_of_the_frame_camera(tmp_path: Path, tum_vie_calibration: Path) -> None:
+    truth = write_tum_vie(tmp_path / "made", tum_vie_calibration)
+    recording = recording_of(config_of("tum-vie-data", truth.data))
+    cameras = json.loads((tum_vie_calibration / "camera-calibrationA.json").read_text())["value0"]
+
+    def imu_from(index: int) -> NDArray[np.float64]:
+        values, pose = cameras["T_imu_cam"][index], np.eye(4)
+        pose[:3, :3] = Rotation.from_quat([values[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+        pose[:3, 3] = [values[name] for name in ("px", "py", "pz")]
+        return pose
+
+    for view, time in zip(recording.reference_views["train"], (100_000, 333_333, 1_900_000), strict=True):
+        assert view.time == (EPOCH + time) * 1_000
+        expected = interpolated(truth, view.time) @ np.linalg.inv(imu_from(2)) @ imu_from(0)
+        np.testing.assert_allclose(view.camera_to_world.numpy(), expected, rtol=0, atol=1e-9)
+    assert recording.frame_camera.width == recording.frame_camera.height == 1024
+    assert recording.frame_camera.cx == cameras["intrinsics"][0]["intrinsics"]["cx"] + 0.5
+    assert [len(recording.reference_views[split]) for split in ("train", "val", "test")] == [3, 2, 1]
+
+
+def test_events_in_a_gap_of_the_poses_are_left_out_also_after_conversion(
+    tmp_path: Path, tum_vie_calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = write_tum_vie(tmp_path / "made", tum_vie_calibration)
+    path = truth.data / "mocap-desk2-vi_gt_data" / "mocap_data.txt"
+    header, *rows = path.read_text().splitlines(keepends=True)
+    # Poses are 8.3 ms apart: one lost is no gap, a second is.
+    path.write_text("".join([header, *rows[:30], *rows[31:61], *rows[181:]]))
+    config = config_of("tum-vie-data", truth.data)
+    gap = (int(truth.times[60]), int(truth.times[181]))
+    folder = convert_to_native(recording_of(config), tmp_path / "native")
+    capsys.readouterr()
+    for parser in (config, NativeDataParserConfig(data=folder)):
+        outputs = parse(parser)
+        assert (
+            " ".join(capsys.readouterr().out.split()).count("The poses have 1 gap(s) of more than 0.05 s, 1.0 s in")
+            == 1
+        )
+        assert outputs.metadata[SCENE].window.gaps == (gap,)
+        pairs = EventDataset(outputs).pairs
+        times = truth.events["t"] * 1_000
+        assert pairs.num_outside == int(((times > gap[0]) & (times < gap[1])).sum()) > 50
+        assert not ((pairs.time > gap[0]) & (pairs.previous_time < gap[1])).any()
+        assert (pairs.time <= gap[0]).any()
+        assert (pairs.previous_time >= gap[1]).any()
+    # An image in the gap has no pose: here none of the three, so one is moved there.
+    stamps = truth.data / "mocap-desk2-vi_gt_data" / "left_images" / "image_timestamps_left.txt"
+    stamps.write_text(f"{EPOCH + 100_000}\n{EPOCH + 900_000}\n{EPOCH + 1_900_000}\n")
+    views = recording_of(config).reference_views["train"]
+    assert [view.file.name for view in views] == ["00000.jpg", "00002.jpg"]
+    # Another limit may be given.
+    assert parse(replace(config, max_pose_gap_ns=2 * 10**9)).metadata[SCENE].window.gaps == ()
+
+
+def test_several_sequences_in_a_folder_are_told_apart(tmp_path: Path, tum_vie_calibration: Path) -> None:
+    for sequence in ("mocap-desk2", "office-maze"):
+        write_tum_vie(tmp_path / "made", tum_vie_calibration, sequence)
+    with pytest.raises(
+        DataError, match=r"it holds 2 sequences; give the event file of one .*/mocap-desk2-events_left.h5"
+    ):
+        recording_of(config_of("tum-vie-data", tmp_path / "made"))
+    one = tmp_path / "made" / "office-maze-events_left.h5"
+    assert recognise(one) == "tum-vie-data"
+    assert recording_of(config_of("tum-vie-data", one)).event_file.path == one
+
+
+CAMERAS, MOCAP = "camera-calibrationA.json", "mocap-imu-calibrationA.json"
+TRUTH = "mocap-desk2-vi_gt_data"
+FAULTS = {
+    "no events": (remove("*.h5"), "mocap-desk2-events_left.h5: there is no such event file"),
+    "no poses": (remove(f"{TRUTH}/mocap_data.txt"), "mocap_data.txt: there is no such file"),
+    "no calibration": (remove("camera-*"), f"{CAMERAS}: there is no such file; download the dataset's calibration"),
+    "no hand-eye": (remove("mocap-imu*"), f"{MOCAP}: there is no such file"),
+    "pinhole": (
+        edit_json(CAMERAS, lambda m: m["value0"]["intrinsics"][2].update(camera_type="ds")),
+        r"value0.intrinsics\[2\].camera_type is 'ds', not 'kb4'",
+    ),
+    "one camera": (
+        edit_json(CAMERAS, lambda m: m["value0"].update(T_imu_cam=m["value0"]["T_imu_cam"][:1])),
+        "value0.T_imu_cam has 1 entries, not 3",
+    ),
+    "no k4": (
+        edit_json(CAMERAS, lambda m: m["value0"]["intrinsics"][2]["intrinsics"].pop("k4")),
+        r"value0.intrinsics\[2\].intrinsics.k4 is missing",
+    ),
+    "size is a word": (
+        edit_json(CAMERAS, lambda m: m["value0"].update(resolution=["big"] * 4)),
+        r"value0.resolution\[2\] is not a table of numbers|resolution\[2\] must be 2 finite",
+    ),
+    "long quaternion": (
+        edit_json(MOCAP, lambda m: m["value0"]["T_imu_marker"].update(qw=3.0)),
+        f"{MOCAP}: the quaternion of pose 0 has length 3",
+    ),
+    "no marker": (edit_json(MOCAP, lambda m: m["value0"].pop("T_imu_marker")), "value0.T_imu_marker is missing"),
+    "NaN pose": (replace_line(f"{TRUTH}/mocap_data.txt", 3, "1 nan 0 0 0 0 0 1"), "pose 2 holds nan"),
+    "seconds": (
+        replace_line(f"{TRUTH}/mocap_data.txt", 1, "early 0 0 0 0 0 0 1"),
+        "early is not a time in microseconds",
+    ),
+    "lost image": (remove(f"{TRUTH}/left_images/00001.jpg"), "it has 3 times for 2 images"),
+    "no image times": (remove(f"{TRUTH}/left_images/*.txt"), "image_timestamps_left.txt: there is no such file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_malformed_datasets_are_one_clear_line(fault: str, tmp_path: Path, tum_vie_calibration: Path) -> None:
+    change, message = FAULTS[fault]
+    config = config_of("tum-vie-data", write_tum_vie(tmp_path / "made", tum_vie_calibration).data)
+    assert_one_clear_line(change, message, config)
