@@ -1,26 +1,30 @@
-"""What the values of an image mean: linear radiance, or its sRGB encoding for display."""
+"""Convert image values between linear radiance and its sRGB encoding for display (IEC 61966-2-1)."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from aenerf_ns.events.sensor import LUMINANCE
 
 ImageEncoding = Literal["srgb", "linear"]
+_Image = TypeVar("_Image", Tensor, NDArray[np.float64])
 
 
-def decode(image: Tensor, encoding: ImageEncoding) -> Tensor:
-    """Linear radiance in [0, 1] of image values in [0, 1] (sRGB: IEC 61966-2-1)."""
+def decode(image: _Image, encoding: ImageEncoding) -> _Image:
+    """Return linear radiance in [0, 1] of image values in [0, 1], a tensor or an array of any shape."""
     if encoding == "linear":
         return image
-    return torch.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
+    where: Any = torch.where if isinstance(image, Tensor) else np.where
+    return where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
 
 
 def encode(radiance: Tensor, encoding: ImageEncoding) -> Tensor:
-    """Image values in [0, 1] of linear radiance, which is clipped to [0, 1]."""
+    """Return image values in [0, 1] of linear radiance, which is clipped to [0, 1]."""
     radiance = radiance.clamp(0, 1)
     if encoding == "linear":
         return radiance
@@ -30,7 +34,7 @@ def encode(radiance: Tensor, encoding: ImageEncoding) -> Tensor:
 
 
 def to_channels(radiance: Tensor, num_channels: int) -> Tensor:
-    """Linear (..., 3) RGB as a sensor of 1 (luminance) or 3 channels sees it."""
+    """Return linear (..., 3) RGB as a sensor of 1 channel (luminance) or of 3 channels sees it."""
     if num_channels == 3:
         return radiance
     return (radiance * radiance.new_tensor(LUMINANCE)).sum(-1, keepdim=True)

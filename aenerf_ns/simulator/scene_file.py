@@ -17,11 +17,11 @@ from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.free_space import FreeSpace
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
-from aenerf_ns.simulator.rendering.light_baking import AreaLight
-from aenerf_ns.simulator.rendering.mesh_lighting import baked_mesh, light_mesh
-from aenerf_ns.simulator.rendering.mesh_loading import SUFFIXES, Mesh, load_mesh, scaled
+from aenerf_ns.simulator.rendering.lighting import AreaLight, baked_mesh, light_mesh
+from aenerf_ns.simulator.rendering.mesh import Mesh, scaled
+from aenerf_ns.simulator.rendering.mesh_loading import SUFFIXES, load_mesh
 from aenerf_ns.simulator.rendering.mesh_repair import prepared
-from aenerf_ns.simulator.rendering.mesh_scene import MeshScene
+from aenerf_ns.simulator.rendering.renderer import Renderer
 from aenerf_ns.simulator.scene import SimulationScene
 
 Array = NDArray[np.float64]
@@ -236,7 +236,7 @@ def _views(path: Path, value: dict[str, Any], bounds: Array, caster: RayCaster) 
     return views
 
 
-def _exposed(scene: SimulationScene, renderer: MeshScene) -> MeshScene:
+def _exposed(scene: SimulationScene, renderer: Renderer) -> Renderer:
     """The scene with its light scaled so that no surface clips in the pictures, and its surroundings cut off there."""
     width, height = 192, 144
     poses = [scene.path((k + 0.5) / 48) for k in range(48)]
