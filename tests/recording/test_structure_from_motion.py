@@ -130,7 +130,7 @@ def test_colmap_has_the_same_lens(lens: str, distortion: tuple[float, ...]) -> N
 @pytest.mark.parametrize("pattern", ["", "RGGB"])
 def test_a_blurred_frame_is_the_mean_of_sharp_ones_in_linear_light(room: SimulationScene, pattern: str) -> None:
     camera = EventCamera(64, 48, *room.intrinsics(64, 48))
-    simulation = Simulation(room, camera, SensorModel(bayer_pattern=pattern), "hard", 0.5, 0.5, 0.0, 0)
+    simulation = Simulation(room, camera, SensorModel(bayer_pattern=pattern), "hard", 0.5, 0.5, 0)
     time, exposure, steps = 100_000_000, 0.04, 64
     frame = simulation.blurred_frame(time, exposure)
     assert frame.shape == ((48, 64, 3) if pattern else (48, 64))
@@ -150,7 +150,7 @@ def test_a_blurred_frame_is_the_mean_of_sharp_ones_in_linear_light(room: Simulat
 
 def test_frames_are_taken_all_along_the_path(room: SimulationScene) -> None:
     camera = EventCamera(16, 12, *room.intrinsics(16, 12))
-    simulation = Simulation(room, camera, SensorModel(), "easy", 0.41, 2.0, 0.0, 0)
+    simulation = Simulation(room, camera, SensorModel(), "easy", 0.41, 2.0, 0)
     assert simulation.frame_times(25, 0.01).tolist() == [5_000_000 + FRAME * k for k in range(11)]
     assert len(simulation.frame_times(25, 0.0101)) == 10
     for rate, exposure, text in (
