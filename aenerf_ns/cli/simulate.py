@@ -44,8 +44,8 @@ class Simulate:
     pose_rate: float = 250.0
     """Poses a second in the trajectories; with --poses colmap, in the true trajectory."""
     poses: Literal["noise", "colmap"] = "noise"
-    """Source of the estimated poses. noise: the true poses with noise. colmap: COLMAP estimates a pose for each frame of
-    a camera at the event sensor's place, as in a DAVIS, and may lose or misplace frames."""
+    """Source of the estimated poses. noise: the true poses with noise. colmap: COLMAP estimates a pose for each frame
+    of a camera at the event sensor's place, as in a DAVIS, and may lose or misplace frames."""
     frame_rate: float = 25.0
     """Frames a second for COLMAP."""
     exposure: float = 0.003

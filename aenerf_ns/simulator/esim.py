@@ -253,8 +253,8 @@ class EventSimulator:
 
     The sensor sees log(I + log_epsilon), which is linear in time between frames. A pixel fires when this signal differs
     from the pixel's reference by the contrast threshold. Without a refractory period, the reference then moves by
-    exactly the threshold. With a refractory period, the pixel is blind until the period ends and takes the log-intensity
-    of that moment as its new reference, as in Robust e-NeRF.
+    exactly the threshold. With a refractory period, the pixel is blind until the period ends and takes the
+    log-intensity of that moment as its new reference, as in Robust e-NeRF.
 
     Args:
         width: pixel columns.

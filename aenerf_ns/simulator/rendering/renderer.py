@@ -8,9 +8,11 @@ Nerfstudio.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numba
@@ -60,16 +62,17 @@ def mesh_arrays(mesh: Mesh, light_point: NDArray[np.integer]) -> MeshArrays:
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _camera_rays(rotation, centre, intrinsics, offsets, width, height, rays):
-    """Fill ``rays`` (height * width * samples, 6). Directions reach one metre along the optical axis."""
+def _camera_rays(rotation, centre, intrinsics, offsets, window, rays):
+    """Fill the rays (N, 6) of a window of the picture. Directions reach one metre along the optical axis."""
     fx, fy, cx, cy = intrinsics
     samples = len(offsets)
-    for y in numba.prange(height):
-        for x in range(width):
+    left, right, top, bottom = window
+    for y in numba.prange(top, bottom):
+        for x in range(left, right):
             for s in range(samples):
                 u = (x + 0.5 + offsets[s, 0] - cx) / fx
                 v = (y + 0.5 + offsets[s, 1] - cy) / fy
-                ray = rays[(y * width + x) * samples + s]
+                ray = rays[((y - top) * (right - left) + x - left) * samples + s]
                 for axis in range(3):
                     ray[axis] = centre[axis]
                     ray[3 + axis] = rotation[axis, 0] * u + rotation[axis, 1] * v + rotation[axis, 2]
@@ -103,7 +106,21 @@ def _meet(vertices, a, b, c, ox, oy, oz, dx, dy, dz):
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _shade(
-    arrays, textures, light, hits, rotation, centre, intrinsics, offsets, background, sky, limit, radiance, depth, alpha
+    arrays,
+    textures,
+    light,
+    hits,
+    window,
+    rotation,
+    centre,
+    intrinsics,
+    offsets,
+    background,
+    sky,
+    limit,
+    radiance,
+    depth,
+    alpha,
 ):
     """Shade the hits of `_camera_rays` and fill ``radiance``, ``depth`` and ``alpha``.
 
@@ -115,6 +132,7 @@ def _shade(
     samples = len(offsets)
     ox, oy, oz = centre[0], centre[1], centre[2]
     has_sky = len(sky.level) > 0
+    left, right, top, bottom = window
     for y in numba.prange(height):
         for x in range(width):
             red, green, blue, total_depth, found = 0.0, 0.0, 0.0, 0.0, 0
@@ -124,7 +142,9 @@ def _shade(
                 dx = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
                 dy = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
                 dz = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]
-                face = hits[(y * width + x) * samples + s]
+                face = NOTHING
+                if left <= x < right and top <= y < bottom:
+                    face = hits[((y - top) * (right - left) + x - left) * samples + s]
                 if face == NOTHING:
                     if has_sky:
                         per_radian = sky.level[0, 2] / (2.0 * math.pi)
@@ -228,8 +248,10 @@ class Renderer:
         pose = np.asarray(camera_to_world, np.float64)
         rotation, centre = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
         lens, offsets = np.asarray(intrinsics, np.float64), sample_offsets(samples)
-        rays = np.empty((height * width * len(offsets), 6), np.float32)
-        _camera_rays(rotation, centre, lens, offsets, width, height, rays)
+        window = self._window(rotation, centre, lens, offsets, width, height)
+        left, right, top, bottom = window
+        rays = np.empty(((bottom - top) * (right - left) * len(offsets), 6), np.float32)
+        _camera_rays(rotation, centre, lens, offsets, window, rays)
         hits = self.caster.cast(rays)["primitive_ids"]
         radiance = np.empty((height, width, 3), np.float32)
         depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
@@ -238,6 +260,7 @@ class Renderer:
             self.textures,
             self.light,
             hits,
+            window,
             rotation,
             centre,
             lens,
@@ -250,6 +273,26 @@ class Renderer:
             alpha,
         )
         return radiance, depth, alpha
+
+    @cached_property
+    def _corners(self) -> Array:
+        """The corners (8, 3) of the mesh's bounding box."""
+        used = self.arrays.vertices[self.arrays.faces.reshape(-1)]
+        return np.array(list(itertools.product(*np.stack([used.min(axis=0), used.max(axis=0)], axis=1))))
+
+    def _window(
+        self, rotation: Array, centre: Array, lens: Array, offsets: Array, width: int, height: int
+    ) -> tuple[int, int, int, int]:
+        """Return left, right, top and bottom of the part of the picture outside which no ray hits the mesh."""
+        corners = (self._corners - centre) @ rotation
+        if corners[:, 2].min() <= 0:
+            return 0, width, 0, height
+        pixels = lens[:2] * corners[:, :2] / corners[:, 2:] + lens[2:]
+        # One pixel more than the rays' offsets, because the ray caster rounds to float32.
+        reach = np.abs(offsets).max(axis=0) + 1.0
+        left, top = np.floor((pixels.min(axis=0) - reach).clip(0, (width, height))).astype(int).tolist()
+        right, bottom = np.ceil((pixels.max(axis=0) + reach).clip(0, (width, height))).astype(int).tolist()
+        return left, right, top, bottom
 
 
 def surroundings(environment: Environment | None) -> MipMaps:
