@@ -220,7 +220,7 @@ class WalkPath:
         )
 
     def test_views(self, count: int, seed: int, is_free: Callable[[Array, Array], bool]) -> Array:
-        """Return random views (count, 4, 4) around the walk, with random gazes; ``is_free`` as in `validation_views`."""
+        """Return random views (count, 4, 4) around the walk with random gazes; ``is_free`` as in `validation_views`."""
         rng = np.random.default_rng(seed)
         return _stack(
             [

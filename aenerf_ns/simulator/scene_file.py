@@ -150,9 +150,9 @@ def _light(values: JsonObject) -> tuple[Environment, list[AreaLight]] | None:
 
 
 def _lamp(lamp: JsonObject) -> AreaLight:
-    sides = ("centre", "half_u", "half_v")
-    lamp.refuse_keys_except({*sides, "radiance"})
-    return AreaLight(*(_array(lamp, side, (3,)) for side in sides), _radiance(lamp, "radiance", (3,)))
+    lamp.refuse_keys_except({"centre", "half_u", "half_v", "radiance"})
+    centre, half_u, half_v = (_array(lamp, key, (3,)) for key in ("centre", "half_u", "half_v"))
+    return AreaLight(centre, half_u, half_v, _radiance(lamp, "radiance", (3,)))
 
 
 def _background(values: JsonObject, light: tuple[Environment, list[AreaLight]] | None) -> Array | None:
