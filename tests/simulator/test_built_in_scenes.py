@@ -12,6 +12,8 @@ from small_meshes import (
 from aenerf_ns.simulator.open_scene import built_in_scene
 from aenerf_ns.simulator.scene import SimulationScene
 
+pytestmark = pytest.mark.usefixtures("small_work")
+
 
 def test_room_is_closed_and_well_exposed(room: SimulationScene) -> None:
     width, height = 64, 48

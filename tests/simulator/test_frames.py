@@ -19,6 +19,8 @@ from aenerf_ns.simulator.frames import frame_displacement, frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.scene import SimulationScene
 
+pytestmark = pytest.mark.usefixtures("small_work")
+
 
 def test_frame_displacement_of_a_turn_and_of_a_shift() -> None:
     intrinsics, depth = (50.0, 50.0, 16.0, 12.0), np.full((24, 32), 2.0)

@@ -26,6 +26,8 @@ from aenerf_ns.simulator.rendering.lighting import AreaLight, light_points
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
 from aenerf_ns.simulator.rendering.mesh_repair import prepared
 
+pytestmark = pytest.mark.usefixtures("small_work")
+
 
 def test_an_even_sky_lights_a_convex_body_evenly() -> None:
     mesh, _ = prepared(mesh_of(trimesh.creation.icosphere(2)), 1.0)

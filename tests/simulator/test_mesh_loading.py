@@ -21,6 +21,8 @@ from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas, scaled
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
 
+pytestmark = pytest.mark.usefixtures("small_work")
+
 
 def seen(path: Path, up: str) -> np.ndarray:
     scene = baked_mesh(scaled(load_mesh(path, up == "y"), 1.0), BLACK)

@@ -20,6 +20,8 @@ from aenerf_ns.simulator.rendering.mesh import normals_and_areas
 from aenerf_ns.simulator.rendering.mesh_repair import prepared, subdivided
 from aenerf_ns.simulator.rendering.polygons import ear_clipping
 
+pytestmark = pytest.mark.usefixtures("small_work")
+
 
 def test_subdivision_leaves_no_gaps() -> None:
     body = trimesh.creation.box((2.0, 1.0, 0.3))

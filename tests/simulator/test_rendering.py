@@ -30,6 +30,8 @@ from aenerf_ns.simulator.rendering.mesh_repair import prepared
 from aenerf_ns.simulator.rendering.mip_maps import mip_maps
 from aenerf_ns.simulator.rendering.renderer import sample_offsets
 
+pytestmark = pytest.mark.usefixtures("small_work")
+
 
 def test_depth_and_alpha_of_a_tilted_plate() -> None:
     """Depth is that of the plane, alpha that of the square, for a camera that sees it at a slant."""

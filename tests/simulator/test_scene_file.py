@@ -23,6 +23,8 @@ from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.frames import frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene
 
+pytestmark = pytest.mark.usefixtures("small_work")
+
 
 @pytest.mark.parametrize(
     ("values", "told"),

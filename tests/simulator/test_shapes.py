@@ -14,6 +14,8 @@ from aenerf_ns.simulator import shapes
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
 from aenerf_ns.simulator.rendering.mesh_repair import without_degenerate_faces
 
+pytestmark = pytest.mark.usefixtures("small_work")
+
 WHITE = {"white": np.full((8, 8, 3), 0.5, np.float32)}
 ORIGIN = (0, 0, 0)
 SOLIDS = {
