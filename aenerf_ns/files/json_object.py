@@ -160,8 +160,8 @@ def _floats(value: Any) -> Any:
 
 
 def _told(value: Any) -> str:
-    """Return a value as it stands in the file, shortened."""
-    text = json.dumps(value, default=float, ensure_ascii=False)
+    """Return the text of a value for a message, shortened."""
+    text = repr(value) if isinstance(value, str) else json.dumps(value, default=float, ensure_ascii=False)
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 

@@ -244,6 +244,6 @@ def test_pose_noise_and_colmap_exclude_each_other(room: SimulationScene, tmp_pat
     options = Simulate(tmp_path / "scene", poses="colmap", pose_noise_degrees=1.0, width=16, height=12, duration=0.5)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "open_scene", lambda *_: room)
-        with pytest.raises(DataError, match="COLMAP errs by itself"):
+        with pytest.raises(DataError, match="COLMAP makes errors of its own"):
             options.main()
     assert not (tmp_path / "scene").exists()
