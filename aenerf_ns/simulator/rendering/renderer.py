@@ -61,13 +61,14 @@ def mesh_arrays(mesh: Mesh, light_point: NDArray[np.integer]) -> MeshArrays:
     )
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+# Not parallel: starting threads for this little work takes longer than the work, above all on a busy machine.
+@numba.njit(cache=True, error_model="numpy")
 def _camera_rays(rotation, centre, intrinsics, offsets, window, rays):
     """Fill the rays (N, 6) of a window of the picture. Directions reach one metre along the optical axis."""
     fx, fy, cx, cy = intrinsics
     samples = len(offsets)
     left, right, top, bottom = window
-    for y in numba.prange(top, bottom):
+    for y in range(top, bottom):
         for x in range(left, right):
             for s in range(samples):
                 u = (x + 0.5 + offsets[s, 0] - cx) / fx
