@@ -271,12 +271,15 @@ class EventSimulator:
         ValueError: a size, an epsilon or a value of the noise is out of range.
 
     Example:
-        >>> from aenerf_ns.events.sensor import SensorModel
+        One pixel whose radiance doubles in a millisecond: log-radiance rises by 0.69, and by 0.25 twice.
+
         >>> simulator = EventSimulator(1, 1, SensorModel(0.25, 0.25))
-        >>> for time_ns, radiance in ((0, 0.5), (1000, 1.0)):
-        ...     x, y, t, p = simulator([[radiance]], time_ns)
-        >>> t.tolist(), p.tolist()
-        ([361, 722], [1, 1])
+        >>> events = simulator([[0.1]], 0)
+        >>> x, y, t, p = simulator([[0.2]], 1_000_000)
+        >>> p
+        array([1, 1], dtype=int8)
+        >>> t
+        array([363275, 726549])
     """
 
     def __init__(
