@@ -59,7 +59,7 @@ class EstimatedPoses:
 
     def _measure(self, scene: SimulationScene, speed: Literal["easy", "hard"], rate: float) -> dict:
         camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
-        simulation = Simulation(scene, camera, SensorModel(), speed, scene.duration, 0.5, 0.0, self.seed)
+        simulation = Simulation(scene, camera, SensorModel(), speed, scene.duration, 0.5, self.seed)
         begin = time.perf_counter()
         truth = simulation.trajectory(pose_rate=250)
         try:

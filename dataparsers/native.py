@@ -16,7 +16,7 @@ from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneou
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
-from aenerf_ns.files.json_object import Metadata, read_camera, read_image_encoding
+from aenerf_ns.files.json_object import JsonObject, read_camera, read_image_encoding
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig, SensorOptions
@@ -44,7 +44,7 @@ class NativeDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)
-        meta = Metadata.read(folder / "transforms.json")
+        meta = JsonObject.read(folder / "transforms.json")
         block = meta.block("event_camera")
         event_camera = read_camera(block, "width", "height")
         true_poses = folder / "trajectory_ground_truth.txt"
@@ -76,7 +76,7 @@ class NativeDataParser(EventDataParser):
             max_pose_gap=max_pose_gap,
         )
 
-    def _sensor(self, block: Metadata) -> SensorModel:
+    def _sensor(self, block: JsonObject) -> SensorModel:
         """Return the sensor with the values of the options, and the dataset's values where the options give none."""
         values = self.config.given_sensor_values()
         for name in ("positive_contrast_threshold", "negative_contrast_threshold"):
@@ -91,7 +91,7 @@ class NativeDataParser(EventDataParser):
             raise DataError(block.path, f"event_camera: {error}", "correct it there or among the options") from None
 
 
-def _scene_box(meta: Metadata, value: list) -> Tensor:
+def _scene_box(meta: JsonObject, value: list) -> Tensor:
     box = meta.numbers("scene_box", value, (2, 3))
     if (box[0] >= box[1]).any():
         raise meta.error("scene_box", f"has corners {box.tolist()}, the first not below the second")
@@ -99,7 +99,7 @@ def _scene_box(meta: Metadata, value: list) -> Tensor:
 
 
 def _reference_views(
-    meta: Metadata, frames: list, trajectory: Trajectory, has_ground_truth: bool, frame_from_event: Tensor | None
+    meta: JsonObject, frames: list, trajectory: Trajectory, has_ground_truth: bool, frame_from_event: Tensor | None
 ) -> dict[Split, list[ReferenceView]]:
     """Return the images of each split. A frame that has a time but no pose gets the reference trajectory's pose."""
     if frame_from_event is None:
@@ -110,7 +110,7 @@ def _reference_views(
     for index, values in enumerate(frames):
         if not isinstance(values, dict):
             raise meta.error("frames", f"holds {values!r}")
-        frame = Metadata(meta.path, values, f"frames[{index}].")
+        frame = JsonObject(meta.path, values, f"frames[{index}].")
         name = frame.get("file_path", str)
         if name in known:
             raise frame.error("file_path", f"names {name} again")

@@ -18,7 +18,7 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.files.json_object import Metadata, read_camera, read_image_encoding
+from aenerf_ns.files.json_object import JsonObject, read_camera, read_image_encoding
 from aenerf_ns.files.kalibr import read_camchain
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
@@ -182,7 +182,7 @@ def _read_calibration(path: Path, event_camera: str | None, frame_camera: str | 
 
 def _read_json(path: Path) -> _Calibration:
     """Read calibration.json, which has the names of the native dataset's transforms.json."""
-    meta = Metadata.read(path)
+    meta = JsonObject.read(path)
     block = meta.block("event_camera")
     event = read_camera(block, "width", "height")
     frame_from_event = block.rigid_motion("T_frame_event")

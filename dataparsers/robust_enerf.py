@@ -15,7 +15,7 @@ from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import POSITION_TIMESTAMP_POLARITY, NpzEventFile, read_npz_member
-from aenerf_ns.files.json_object import Metadata
+from aenerf_ns.files.json_object import JsonObject
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.images import image_size_and_mode
@@ -153,7 +153,7 @@ def _read_views(folder: Path) -> tuple[EventCamera | None, dict[Split, list[Refe
         views: list[ReferenceView] = []
         path = folder if root is None else root / f"transforms_{split}.json"
         if path.is_file():
-            meta = Metadata.read(path)
+            meta = JsonObject.read(path)
             for index in range(len(meta.get("frames", list))):
                 views.append(_read_view(meta.entry_block("frames", index), path.parent))
         if views:
@@ -165,7 +165,7 @@ def _read_views(folder: Path) -> tuple[EventCamera | None, dict[Split, list[Refe
     return camera, splits  # type: ignore[return-value]
 
 
-def _read_view(frame: Metadata, folder: Path) -> ReferenceView:
+def _read_view(frame: JsonObject, folder: Path) -> ReferenceView:
     name = frame.get("file_path", str)
     # The dataset leaves the suffix out.
     files = [folder / f"{name}{suffix}" for suffix in ("", *IMAGE_SUFFIXES)]
@@ -178,7 +178,7 @@ def _read_view(frame: Metadata, folder: Path) -> ReferenceView:
     return ReferenceView(file, pose @ OPENCV_TO_OPENGL, None)
 
 
-def _view_camera(meta: Metadata, image: Path) -> EventCamera:
+def _view_camera(meta: JsonObject, image: Path) -> EventCamera:
     width, height = image_size_and_mode(image)[0]
     try:
         if "camera_angle_x" in meta:

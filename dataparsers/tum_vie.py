@@ -15,7 +15,7 @@ from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
-from aenerf_ns.files.json_object import Metadata
+from aenerf_ns.files.json_object import JsonObject
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
@@ -117,20 +117,20 @@ def _choose(data: Path) -> tuple[Path, str, str]:
     return files[0], match["sequence"], match["side"]
 
 
-def _read_json(folder: Path, name: str) -> Metadata:
+def _read_json(folder: Path, name: str) -> JsonObject:
     """Read a calibration file, which is beside the sequence or one folder up."""
     place = folder.parent if not (folder / name).is_file() and (folder.parent / name).is_file() else folder
     if not (place / name).is_file():
         raise DataError(place / name, "there is no such file", "download the dataset's calibration to this folder")
-    return Metadata.read(place / name).block("value0")
+    return JsonObject.read(place / name).block("value0")
 
 
-def _pose(meta: Metadata) -> Tensor:
+def _pose(meta: JsonObject) -> Tensor:
     values = np.array([[meta.get(name, float) for name in ("px", "py", "pz", "qx", "qy", "qz", "qw")]])
     return poses_from_quaternions(meta.path, values[:, :3], values[:, 3:])[0]
 
 
-def _camera(meta: Metadata, index: int) -> EventCamera:
+def _camera(meta: JsonObject, index: int) -> EventCamera:
     block = meta.entry_block("intrinsics", index)
     model = block.get("camera_type", str)
     if model != "kb4":

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,6 +14,9 @@ import torch
 
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.events.stream import EventStream
+
+if TYPE_CHECKING:
+    from aenerf_ns.simulator.scene import SimulationScene
 
 # For the package `benchmarks`, which is not installed. At the end, because the repository's own `aenerf_ns` lacks two
 # folders of the installed one.
@@ -64,3 +69,43 @@ def make_stream(rows: list[tuple[int, int, int, int]], width: int = 4, height: i
     return EventStream(
         x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), p.astype(np.int8), width, height, "made"
     )
+
+
+@pytest.fixture(scope="module")
+def small_work() -> Iterator[None]:
+    """Render with one thread, because the pictures are too small to share, and compute light at few points."""
+    import numba
+
+    from aenerf_ns.simulator.rendering import mesh_repair
+
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mesh_repair, "_POINTS", 2000)
+        yield
+    numba.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def room() -> SimulationScene:
+    """The built-in room."""
+    from aenerf_ns.simulator.open_scene import built_in_scene
+
+    return built_in_scene("room")
+
+
+@pytest.fixture(scope="session")
+def toy() -> SimulationScene:
+    """The built-in object."""
+    from aenerf_ns.simulator.open_scene import built_in_scene
+
+    return built_in_scene("object")
+
+
+@pytest.fixture
+def box_file(tmp_path: Path) -> Path:
+    """A mesh file with a textured box of 1.2 x 0.8 x 0.6 m."""
+    from small_meshes import painted_box
+
+    painted_box().export(tmp_path / "box.glb")
+    return tmp_path / "box.glb"

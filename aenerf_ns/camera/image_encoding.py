@@ -1,22 +1,26 @@
-"""Encodings of images: linear radiance, and sRGB for display."""
+"""Convert image values between linear radiance and its sRGB encoding for display (IEC 61966-2-1)."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from aenerf_ns.events.sensor import LUMINANCE
 
 ImageEncoding = Literal["srgb", "linear"]
+_Image = TypeVar("_Image", Tensor, NDArray[np.float64])
 
 
-def decode(image: Tensor, encoding: ImageEncoding) -> Tensor:
-    """Return the linear radiance in [0, 1] of image values in [0, 1] (sRGB: IEC 61966-2-1)."""
+def decode(image: _Image, encoding: ImageEncoding) -> _Image:
+    """Return linear radiance in [0, 1] of image values in [0, 1], a tensor or an array of any shape."""
     if encoding == "linear":
         return image
-    return torch.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
+    where: Any = torch.where if isinstance(image, Tensor) else np.where
+    return where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
 
 
 def encode(radiance: Tensor, encoding: ImageEncoding) -> Tensor:

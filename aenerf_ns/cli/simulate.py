@@ -1,13 +1,14 @@
-"""``aenerf simulate``: a dataset of a built-in scene or of a mesh."""
+"""``aenerf simulate``: make a dataset of a built-in scene or of a mesh."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.lens import EventCamera
@@ -17,6 +18,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.recording.recording import Split
 from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.simulator.esim import SensorNoise
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.simulated_poses import poses_from_frames
 from aenerf_ns.simulator.simulation import Simulation
@@ -29,58 +31,53 @@ class Simulate:
     output: Path
     """Dataset folder to create."""
     scene: str = "room"
-    """room: a furnished room seen from inside; object: one seen from around it; or a file: a mesh (.glb, .obj, .ply)
-    to be seen from around it, or a scene.json with a mesh, its light and the camera's path (docs/simulator.md)."""
+    """room: a furnished room seen from inside. object: a toy locomotive seen from around it. A .glb, .obj or .ply file:
+    a mesh seen from around it. A .json file: a mesh, its light and the camera's path (docs/simulator.md)."""
     speed: Literal["easy", "hard"] = "easy"
-    """Constant speed, or the same path at 8^sin(2 pi t) times that speed."""
+    """easy: constant speed. hard: the same path at 8^sin(2 pi t) times that speed."""
     width: int = 346
     """Pixel columns of the sensor."""
     height: int = 260
     """Pixel rows of the sensor."""
     duration: float | None = None
-    """Seconds that the path takes at constant speed; by default what a scene.json says, else 4."""
+    """Seconds that the path takes at constant speed. Default: the duration in scene.json, or 4."""
     pose_rate: float = 250.0
-    """Poses a second in the trajectories; with --poses colmap, in the true one."""
+    """Poses a second in the trajectories; with --poses colmap, in the true trajectory."""
     poses: Literal["noise", "colmap"] = "noise"
-    """Where the estimated poses come from: the true ones with noise, or COLMAP run on the frames of a camera beside the
-    event sensor, as in a DAVIS. COLMAP gives a pose a frame, and may lose or misplace some."""
+    """Source of the estimated poses. noise: the true poses with noise. colmap: COLMAP estimates a pose for each frame
+    of a camera at the event sensor's place, as in a DAVIS, and may lose or misplace frames."""
     frame_rate: float = 25.0
-    """Frames a second that COLMAP gets."""
+    """Frames a second for COLMAP."""
     exposure: float = 0.003
-    """Seconds for which a frame is exposed, and blurred by motion."""
+    """Seconds for which a frame is exposed. Motion blurs the frame meanwhile."""
     pose_noise_degrees: float = 0.0
     """Error of the estimated rotations: root mean square of its angle, in degrees."""
     pose_noise_translation: float = 0.0
     """Error of the estimated positions: root mean square of its length, in scene units (metres)."""
     pose_noise_correlation_time: float = 0.25
-    """Seconds over which the pose errors are alike."""
+    """Correlation time of the pose errors in seconds."""
     positive_contrast_threshold: float = 0.25
     """C+: rise of log-radiance that triggers an event."""
     negative_contrast_threshold: float = 0.25
     """C-: fall of log-radiance that triggers an event."""
-    contrast_threshold_spread: float = 0.0
-    """Standard deviation of the thresholds over the pixels."""
     refractory_period_ns: int = 0
     """Time for which a pixel is blind after each event, in nanoseconds."""
-    leak_rate: float = 0.0
-    """Positive events a second that every pixel fires without reason, for its reference leaks (real: 0.1 to 1)."""
-    shot_noise_rate: float = 0.0
-    """Events a second that a dark pixel fires at random; a bright one, a quarter of them (real: up to 10)."""
+    noise: tyro.conf.OmitArgPrefixes[SensorNoise] = field(default_factory=SensorNoise)
     bayer_pattern: BayerPattern = ""
     """RGGB for a colour sensor."""
     max_displacement: float = 0.5
-    """Pixels that 99 % of what is seen may move between two rendered frames."""
+    """Pixels that 99 % of the picture may move between two rendered frames."""
     train_images: int = 50
-    """Reference images along the trajectory. They are never trained on."""
+    """Reference images along the trajectory. They are not used for training."""
     validation_views: int = 20
     """Reference views around the trajectory, for colour correction."""
     test_views: int = 20
-    """Reference views from novel places, for evaluation."""
+    """Reference views from other places, for evaluation."""
     seed: int = 0
     """Seed of everything random: the scene, the sensor, the pose noise and the test views."""
 
     def main(self) -> None:
-        """Renders the scene along its path and writes the dataset."""
+        """Render the scene along its path and write the dataset."""
         if self.output.exists():
             raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
         counts = (self.train_images, self.validation_views, self.test_views)
@@ -108,10 +105,8 @@ class Simulate:
                 self.speed,
                 scene.duration if self.duration is None else self.duration,
                 self.max_displacement,
-                self.contrast_threshold_spread,
                 self.seed,
-                self.leak_rate,
-                self.shot_noise_rate,
+                self.noise,
             )
             truth = simulation.trajectory(self.pose_rate)
             estimated, report = self._estimate(simulation, camera, truth)
@@ -128,7 +123,7 @@ class Simulate:
                 writer.events.append(events)
                 num_events += len(events)
             for time in np.linspace(estimated.start, estimated.end, self.train_images, dtype=np.int64).tolist():
-                # The picture shows what is true; the pose beside it is what the user of the dataset is given.
+                # The picture is taken from the true pose. The dataset stores the estimated pose beside it.
                 pose = homogeneous(estimated.interpolate(time))
                 seen = simulation.reference_picture(simulation.pose(time))
                 writer.add_image("train", seen.display, pose, time, linear=seen.linear, depth=seen.depth)
@@ -146,7 +141,7 @@ class Simulate:
     def _estimate(
         self, simulation: Simulation, camera: EventCamera, truth: Trajectory
     ) -> tuple[Trajectory, dict[str, Any] | None]:
-        """The estimated trajectory, and where structure from motion was run, what it says of itself."""
+        """Return the estimated trajectory and, if COLMAP estimated it, COLMAP's report."""
         noise = (self.pose_noise_degrees, self.pose_noise_translation)
         if self.poses == "noise":
             return perturb(truth, *noise, self.pose_noise_correlation_time, self.seed), None
@@ -154,7 +149,7 @@ class Simulate:
             raise DataError(
                 "aenerf simulate",
                 f"pose noise {noise} with --poses colmap",
-                "leave it out: COLMAP errs by itself",
+                "leave the pose noise out, because COLMAP makes errors of its own",
             )
         estimated, report, summary = poses_from_frames(
             simulation, camera, truth, self.frame_rate, self.exposure, self.seed

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.lens import EventCamera, LensModel
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.json_object import Metadata
+from aenerf_ns.files.json_object import JsonObject
 
 _LENS_MODELS: dict[str, LensModel] = {
     "radtan": "radial_tangential",
@@ -41,7 +41,7 @@ def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
     cameras: dict[str, tuple[EventCamera, Tensor]] = {}
     from_first = torch.eye(4, dtype=torch.float64)
     for name in sorted(map(str, chain)):
-        meta = Metadata(path, chain[name], f"{name}.")
+        meta = JsonObject(path, chain[name], f"{name}.")
         step = meta.rigid_motion("T_cn_cnm1")
         if cameras and step is not None:
             from_first = step @ from_first
@@ -49,7 +49,7 @@ def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
     return cameras
 
 
-def _camera(meta: Metadata) -> EventCamera:
+def _camera(meta: JsonObject) -> EventCamera:
     if meta.get("camera_model", str, "pinhole") != "pinhole":
         raise meta.error("camera_model", f"is {meta.get('camera_model', str)!r}, not 'pinhole'")
     model = meta.get("distortion_model", str, "radtan")

@@ -1,12 +1,13 @@
-"""Event-camera simulator: ESIM (Rebecq et al., CoRL 2018) with the corrections of Robust e-NeRF (Low and Lee, 2023).
+"""Simulate an event sensor: ESIM (Rebecq et al., CoRL 2018) with the corrections of Robust e-NeRF (Low and Lee, 2023).
 
-Between two frames the log-intensity of every pixel is linear in time, and every threshold crossing is solved for
-its time, so the number of events of a pixel in a frame interval is not limited by the frame rate.
+Between two frames the log-intensity of every pixel is linear in time. Every threshold crossing is solved for its time,
+so the frame rate does not limit the number of events that a pixel fires between two frames.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -17,12 +18,27 @@ from aenerf_ns.events.sensor import LUMINANCE, RGGB, SensorModel
 MINIMUM_CONTRAST_THRESHOLD = 0.01
 _BRIGHT_REDUCTION = 0.75
 
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """How a sensor differs from an ideal one."""
+
+    contrast_threshold_spread: float = 0.0
+    """Standard deviation of the thresholds over the pixels."""
+    leak_rate: float = 0.0
+    """Positive events a second that every pixel fires in steady light, because its reference leaks (real: 0.1 to 1)."""
+    shot_noise_rate: float = 0.0
+    """Events a second that a dark pixel fires at random. A bright pixel fires a quarter of them (real: up to 10)."""
+
+
+NOISELESS = SensorNoise()
+
 Events = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
 
 
 @numba.njit(cache=True)
 def _filter(image, channel_weights, intensity):
-    """Fill ``intensity`` (H, W) and return how many values of the image are not a radiance."""
+    """Fill ``intensity`` (H, W) and return how many values of the image are negative or not finite."""
     height, width, channels = image.shape
     invalid = 0
     for y in range(height):
@@ -39,7 +55,7 @@ def _filter(image, channel_weights, intensity):
 
 @numba.njit(cache=True)
 def _bits(count):
-    """Bits that hold 0 to count - 1."""
+    """Return the number of bits that hold 0 to count - 1."""
     bits = 0
     while 1 << bits < count:
         bits += 1
@@ -64,10 +80,14 @@ def _pixel_events(
     position,
     write,
 ):
-    """Events of one pixel while its log-intensity is linear: the new reference and the position after the last event.
+    """Fire the events of one pixel while its log-intensity is linear.
 
-    ``reference_time`` lies before ``start_time`` for an armed pixel. Otherwise the reference is still to be taken, at
-    that time: the initial one, or the end of a refractory period, be it in this interval or in a later one.
+    ``reference_time`` lies before ``start_time`` if the pixel already has its reference. Otherwise the pixel takes its
+    reference at that time, in this interval or in a later one: the initial reference, or the one after a refractory
+    period.
+
+    Returns:
+        the new reference, its time, and the position after the last event.
     """
     rise = end_log - start_log
     duration = end_time - start_time
@@ -92,8 +112,8 @@ def _pixel_events(
             keys[position] = (time - frame_time) << time_shift | pixel_key | (polarity > 0)
         position += 1
         if refractory_period > 0:
-            # Counted from the rounded time stamp: the interval [t_prev + refractory period, t] a reader of the
-            # stream forms is then exactly the one over which the log-intensity changed by the threshold.
+            # Counted from the rounded time stamp. The log-intensity then changed by exactly the threshold over the
+            # interval [t_prev + refractory period, t] that a reader of the stream forms.
             reference_time = time + refractory_period
         else:
             reference_log = crossing_log
@@ -119,8 +139,11 @@ def _noisy_pixel_events(
     position,
     write,
 ):
-    """Events of one pixel in one frame interval, which events of noise cut into pieces: after each, as after any other,
-    the pixel is blind for the refractory period or takes the log-intensity of that moment as its reference."""
+    """Fire the events of one pixel in one frame interval, which noise events cut into pieces.
+
+    A noise event acts like any other: the pixel is blind for the refractory period, or takes the log-intensity of that
+    moment as its reference.
+    """
     piece_log, piece_time = start_log, start_time
     for i in range(len(noise_times) + 1):
         time = noise_times[i] if i < len(noise_times) else end_time
@@ -168,8 +191,13 @@ def _frame_events(
     noise_times,
     noise_polarities,
 ):
-    """Two passes, count and fill. Returns keys of time, y, x and polarity, from the highest bits to the lowest: their
-    order is that of the stream. Events of noise come in the order of their pixels, row by row, then of time."""
+    """Fire the events of all pixels in one frame interval: count them in one pass and write them in a second one.
+
+    Noise events are sorted by pixel, row by row, then by time.
+
+    Returns:
+        keys that hold time, y, x and polarity, from the highest bits to the lowest. Sorting the keys orders the stream.
+    """
     height, width = start_log.shape
     x_bits, y_bits = _bits(width), _bits(height)
     keys = np.empty(0, np.int64)
@@ -221,29 +249,26 @@ def _unpack(keys, start_time, height, width):
 
 
 class EventSimulator:
-    """Turns a sequence of linear-radiance frames into events.
+    """Turn a sequence of linear-radiance frames into events.
 
-    The sensor sees log(I + log_epsilon), linear in time between frames. A pixel fires when this differs from its
-    reference by its contrast threshold. Without a refractory period the reference then moves by exactly that
-    threshold; with one, the pixel is blind until the period ends and takes the log-intensity of that moment as its
-    new reference, as Robust e-NeRF models it.
+    The sensor sees log(I + log_epsilon), which is linear in time between frames. A pixel fires when this signal differs
+    from the pixel's reference by the contrast threshold. Without a refractory period, the reference then moves by
+    exactly the threshold. With a refractory period, the pixel is blind until the period ends and takes the
+    log-intensity of that moment as its new reference, as in Robust e-NeRF.
 
     Args:
         width: pixel columns.
         height: pixel rows.
-        sensor: contrast thresholds, refractory period and Bayer pattern. When the period is not zero, the initial
+        sensor: contrast thresholds, refractory period and Bayer pattern. If the period is not zero, the initial
             reference times are random, uniform in [0, refractory period) after the first frame.
-        contrast_threshold_spread: standard deviation of the static per-pixel thresholds, drawn once from
-            N(C, spread) and clipped at 0.01.
+        noise: thresholds of single pixels are drawn once from N(C, contrast_threshold_spread) and clipped at 0.01. The
+            leak makes the log-intensity rise by leak_rate · C+ a second. Shot noise falls with the intensity, to a
+            quarter at 1 and above (v2e, Hu et al. 2021), and moves the reference as any event does.
         log_epsilon: added to the intensity before the logarithm.
-        leak_rate: positive events a second that a pixel of threshold C+ fires in steady light, because its reference
-            leaks: here the log-intensity seems to rise by leak_rate · C+ each second.
-        shot_noise_rate: events of either polarity a second that a dark pixel fires at random; one of intensity 1 and
-            more, a quarter of them (v2e, Hu et al. 2021). Like any event they move the reference.
-        seed: of the thresholds, of the initial reference times, and of the noise.
+        seed: seed of the thresholds, of the initial reference times, and of the noise.
 
     Raises:
-        ValueError: on a size, spread or epsilon outside its range.
+        ValueError: a size, an epsilon or a value of the noise is out of range.
 
     Example:
         One pixel whose radiance doubles in a millisecond: log-radiance rises by 0.69, and by 0.25 twice.
@@ -262,29 +287,25 @@ class EventSimulator:
         width: int,
         height: int,
         sensor: SensorModel,
+        noise: SensorNoise = NOISELESS,
         *,
-        contrast_threshold_spread: float = 0.0,
         log_epsilon: float = 1e-3,
-        leak_rate: float = 0.0,
-        shot_noise_rate: float = 0.0,
         seed: int = 0,
     ) -> None:
         if not (0 < width <= 65536 and 0 < height <= 65536):
             raise ValueError(f"width and height must be in 1..65536, got {width} x {height}")
         if not 0.0 < log_epsilon < math.inf:
             raise ValueError(f"log_epsilon must be positive, got {log_epsilon}")
-        if not 0.0 <= contrast_threshold_spread < math.inf:
-            raise ValueError(f"contrast_threshold_spread must not be negative, got {contrast_threshold_spread}")
-        for name, rate in (("leak_rate", leak_rate), ("shot_noise_rate", shot_noise_rate)):
-            if not 0.0 <= rate < math.inf:
-                raise ValueError(f"{name} must not be negative, got {rate}")
+        for name, value in vars(noise).items():
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} must not be negative, got {value}")
         self.width, self.height = width, height
         self.sensor = sensor
         self.log_epsilon = log_epsilon
-        self.shot_noise_rate = shot_noise_rate
-        self._leak = leak_rate * sensor.positive_contrast_threshold * 1e-9
+        self.shot_noise_rate = noise.shot_noise_rate
+        self._leak = noise.leak_rate * sensor.positive_contrast_threshold * 1e-9
         self._rng = np.random.default_rng(seed)
-        spread = contrast_threshold_spread
+        spread = noise.contrast_threshold_spread
         self.positive_contrast_threshold = self._draw_thresholds(sensor.positive_contrast_threshold, spread)
         self.negative_contrast_threshold = self._draw_thresholds(sensor.negative_contrast_threshold, spread)
         self._log_intensity: NDArray[np.float64] | None = None
@@ -294,16 +315,16 @@ class EventSimulator:
         """Show the sensor the next frame.
 
         Args:
-            image: linear radiance, (H, W) for a monochrome sensor or (H, W, 3) linear RGB. A monochrome sensor takes
-                the Rec. 709 luminance of RGB, a colour sensor needs RGB.
-            time_ns: of the frame, in nanoseconds, later than the previous one.
+            image: linear radiance, (H, W) for a monochrome sensor, or (H, W, 3) linear RGB. A monochrome sensor takes
+                the Rec. 709 luminance of RGB. A colour sensor needs RGB.
+            time_ns: time of the frame in nanoseconds, later than the previous frame's.
 
         Returns:
             x (N,) uint16, y (N,) uint16, t (N,) int64 in nanoseconds, p (N,) int8 of +1 or -1: the events in
-            (previous frame, this frame], ordered by time, then by pixel. None for the first frame.
+            (previous frame, this frame], ordered by time, then by pixel. The first frame gives no events.
 
         Raises:
-            ValueError: on a wrong shape, a negative or non-finite radiance, or a time that does not increase.
+            ValueError: a wrong shape, a negative or non-finite radiance, or a time that does not increase.
         """
         intensity = self._to_intensity(np.asarray(image))
         time_ns = int(time_ns)
@@ -346,7 +367,7 @@ class EventSimulator:
         return np.maximum(thresholds, MINIMUM_CONTRAST_THRESHOLD)
 
     def _shot_noise(self, intensity: NDArray[np.float64], time_ns: int) -> tuple[NDArray[np.int64], ...]:
-        """Pixels, row by row, times within the frame interval and polarities of the events of noise."""
+        """Draw the shot-noise events of a frame interval: pixels, row by row, times and polarities."""
         if self.shot_noise_rate == 0:
             nothing = np.empty(0, np.int64)
             return nothing, nothing, nothing
@@ -372,7 +393,9 @@ class EventSimulator:
             wanted = f"{(*size, 3)}" if self.sensor.bayer_pattern else f"{size} or {(*size, 3)}"
             raise ValueError(f"image must have shape {wanted}, got {image.shape}")
         intensity = np.empty(size)
-        if image.dtype != np.float32:  # what renderers give, and not worth a copy; anything else shares one version
+        if (
+            image.dtype != np.float32
+        ):  # the renderer's float32 is not copied; all other types share one compiled version
             image = image.astype(np.float64)
         image = np.ascontiguousarray(image)
         invalid = _filter(image, np.ascontiguousarray(weights, np.float64), intensity)

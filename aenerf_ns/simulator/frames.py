@@ -1,4 +1,4 @@
-"""Where along a path the frames of a simulation must lie, so that the image moves little between two of them."""
+"""Choose where along a path the frames of a simulation lie, so that the image moves little between two frames."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ from collections.abc import Sequence
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.scene import SimulationScene
-
-Array = NDArray[np.float64]
 
 _PROBE_WIDTH = 24
 _PERCENTILE = 99.0
 _MARGIN = 0.98
-"""Each step is guessed from the one before; aiming a little low saves most second guesses."""
+"""Each step is guessed from the step before. A target a little below the limit saves most second guesses."""
 _LARGEST_STEP = 0.01
 
 
@@ -26,16 +25,16 @@ def frame_displacement(
     intrinsics: Sequence[float],
     sees_infinity: bool = False,
 ) -> float:
-    """99th percentile of how far the pixels of one view lie from where they were in another, in pixels.
+    """Return the 99th percentile of how far pixels move from one view to another, in pixels.
 
     Args:
-        depth: (H, W) of the first view along its optical axis; inf where no surface is.
+        depth: (H, W) of the first view along its optical axis, inf where there is no surface.
         first_camera_to_world, second_camera_to_world: (4, 4), OpenCV axes.
-        intrinsics: (fx, fy, cx, cy) of this depth map, pixel centres at +0.5.
-        sees_infinity: whether there is something to be seen where the depth is inf: then it moves as the camera turns.
+        intrinsics: (fx, fy, cx, cy) of the depth map, pixel centres at +0.5.
+        sees_infinity: whether pixels of depth inf show something, which then moves as the camera turns.
 
     Returns:
-        The percentile, 0 where nothing is seen, inf where the second view has some of it behind the camera.
+        the percentile. It is 0 if nothing is seen, and inf if a point lies behind the second camera.
     """
     depth = np.asarray(depth, np.float64)
     fx, fy, cx, cy = intrinsics
@@ -47,7 +46,7 @@ def frame_displacement(
     first, second = np.asarray(first_camera_to_world, np.float64), np.asarray(second_camera_to_world, np.float64)
     rotation = second[:3, :3].T @ first[:3, :3]
     shift = second[:3, :3].T @ (first[:3, 3] - second[:3, 3])
-    # A point at infinity is a direction, which shifts leave as it is.
+    # A point at infinity is a direction, which a shift does not change.
     near = finite[y, x]
     points = np.stack([u, v, np.ones_like(u)]) * np.where(near, depth[y, x], 1.0)
     px, py, pz = rotation @ points + shift[:, None] * near
@@ -63,14 +62,14 @@ def frame_parameters(
     height: int,
     maximum_displacement: float = 0.5,
 ) -> Array:
-    """Path parameters (N,), 0 to 1, between which 99 % of what is seen moves at most ``maximum_displacement`` pixels.
+    """Return path parameters (N,), 0 to 1, between which 99 % of the picture moves at most ``maximum_displacement``.
 
-    That is the `frame_displacement` of a coarse depth map, in pixels of the full picture, as far apart as it allows. A
-    uniform background does not count, for its motion is not seen; an environment does. The parameters do not depend on
-    the speed at which the path is travelled.
+    The displacement, in pixels of the full picture, is the `frame_displacement` of a coarse depth map. Frames lie as
+    far apart as the limit allows. An environment counts; a uniform background does not, because its motion is
+    invisible. The parameters do not depend on the camera's speed.
 
     Raises:
-        ValueError: on a displacement that is not positive.
+        ValueError: the displacement is not positive.
     """
     if not maximum_displacement > 0:
         raise ValueError(f"maximum_displacement must be positive, got {maximum_displacement}")
@@ -78,7 +77,7 @@ def frame_parameters(
     rows = int(np.ceil(height * shrink))
     probe = tuple(shrink * np.asarray(intrinsics, np.float64))
     target = _MARGIN * maximum_displacement
-    # A probe is too small to share among threads: waiting for each other would take longer.
+    # A probe is too small to share among threads: synchronising them takes longer than rendering.
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
@@ -92,7 +91,7 @@ def frame_parameters(
                 if displacement <= maximum_displacement:
                     break
                 step *= max(target / displacement, 0.1)
-            # The sum may fall one rounding error short of the end.
+            # Rounding may leave the sum just below 1.
             parameters.append(1.0 if step == 1.0 - parameters[-1] else parameters[-1] + step)
             pose = next_pose
             step *= min(target / max(displacement, 1e-12), 4.0)

@@ -1,4 +1,4 @@
-"""Where a camera may be in a mesh."""
+"""Find out where a camera may be in a mesh."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ _STEPS = 2000
 
 
 class FreeSpace:
-    """The space that keeps a clearance, in metres, from every face."""
+    """The space at a clearance, in metres, from every face."""
 
     def __init__(self, caster: RayCaster, clearance: float) -> None:
         self._caster = caster
         self._clearance = clearance
 
     def is_free(self, eye: ArrayLike) -> bool:
-        """Whether a place (3,) keeps the clearance."""
+        """Tell whether a place (3,) keeps the clearance."""
         return bool(self._caster.distance(eye)[0] >= self._clearance)
 
     def is_reached(self, eye: ArrayLike, home: ArrayLike) -> bool:
-        """Whether a place (3,) keeps the clearance, and sees another: so it is on the same side of all walls."""
+        """Tell whether a place (3,) keeps the clearance and sees ``home``: both are on one side of all walls."""
         segment = np.concatenate([np.asarray(home), np.subtract(eye, home)]).astype(np.float32)
         return self.is_free(eye) and not self._caster.blocked(segment[None])[0]
 
     def check_path(self, path: Callable[[float], NDArray[np.float64]]) -> None:
-        """Raises a ValueError where a path breaks through a face or comes too close to one."""
+        """Raise a ValueError if a path passes through a face or comes too close to one."""
         eyes = np.stack([path(s)[:3, 3] for s in np.linspace(0, 1, _STEPS + 1)]).astype(np.float32)
         distance = self._caster.distance(eyes)
         through = self._caster.blocked(np.concatenate([eyes[:-1], np.diff(eyes, axis=0)], axis=1))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from aenerf_ns.simulator import textures as tx
-from aenerf_ns.simulator.rendering.light_baking import AreaLight, bake
-from aenerf_ns.simulator.rendering.raycast import Primitive, PrimitiveScene
-from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, box, pillar, rod, sphere, turned_box
+from aenerf_ns.simulator.arrays import Texture
+from aenerf_ns.simulator.rendering.environment import sky
+from aenerf_ns.simulator.rendering.lighting import AreaLight
+from aenerf_ns.simulator.rendering.renderer import Renderer
+from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, Shape, box, lit, pillar, rod, sphere, turned_box
 
 TEXTURE_SIZE = 256
 BACKGROUND = (0.5, 0.5, 0.5)
@@ -16,24 +18,16 @@ RAIL = 0.3
 HALF = (0.5, 0.5)
 
 
-def locomotive_scene(seed: int = 0) -> PrimitiveScene:
-    """The locomotive, baked, in front of grey. The seed moves the patterns of its textures."""
+def locomotive_scene(seed: int = 0) -> Renderer:
+    """Build and light the locomotive, in front of grey. The seed moves the patterns of the textures."""
     rng = np.random.default_rng(seed)
-    primitives = [*_track(), *_wheels(), *_frame(), *_boiler(), *_cab(), *_tender()]
-    light = AreaLight((2.0, -2.4, 3.6), (-0.42, 0.5, 0.75), (0.85, 0.7, 0.0), (8.4, 7.9, 7.1))
-    return bake(
-        primitives,
-        _textures(rng),
-        [light],
-        spacing=0.03,
-        ambient=0.08,
-        sky=((0.3, 0.28, 0.26), (0.62, 0.66, 0.74)),
-        background=BACKGROUND,
-        seed=seed,
-    )
+    shapes = [*_track(), *_wheels(), *_frame(), *_boiler(), *_cab(), *_tender()]
+    lamp = AreaLight((2.0, -2.4, 3.6), (-0.42, 0.5, 0.75), (0.85, 0.7, 0.0), (8.4, 7.9, 7.1))
+    above = sky((0.3, 0.28, 0.26), (0.62, 0.66, 0.74))
+    return lit(shapes, _textures(rng), above, [lamp], np.array(BACKGROUND), spacing=0.03, ambient=0.08, seed=seed)
 
 
-def _textures(rng: np.random.Generator) -> dict[str, tx.Texture]:
+def _textures(rng: np.random.Generator) -> dict[str, Texture]:
     n = TEXTURE_SIZE
     return {
         "gravel": tx.mottled(n, rng, ["8a7f70", "b0a592", "cfc6b4"], 0.2),
@@ -51,8 +45,8 @@ def _textures(rng: np.random.Generator) -> dict[str, tx.Texture]:
     }
 
 
-def _spokes(size: int, rng: np.random.Generator) -> tx.Texture:
-    """The face of a wheel that fills the tile: rim and spokes on a dark ground."""
+def _spokes(size: int, rng: np.random.Generator) -> Texture:
+    """Paint the face of a wheel that fills the tile: rim and spokes on a dark ground."""
     axis = (np.arange(size) + 0.5) / size - 0.5
     radius, angle = np.hypot(axis[None, :], axis[:, None]), np.arctan2(axis[:, None], axis[None, :])
     light = np.clip((np.abs(np.sin(4 * angle)) * radius - 0.10) * -40 + 0.5, 0, 1)
@@ -64,7 +58,7 @@ def _spokes(size: int, rng: np.random.Generator) -> tx.Texture:
     )
 
 
-def _track() -> list[Primitive]:
+def _track() -> list[Shape]:
     parts = [box((-1.15, -0.55, -0.62), (1.15, 0.55, -0.58), "gravel", 0.5)]
     for k in range(9):
         x = -1.04 + 0.26 * k
@@ -74,7 +68,7 @@ def _track() -> list[Primitive]:
     return parts
 
 
-def _wheels() -> list[Primitive]:
+def _wheels() -> list[Shape]:
     parts = []
     for x, radius in ((-0.88, 0.13), (-0.56, 0.13), (-0.16, 0.2), (0.28, 0.2), (0.68, 0.13)):
         height = -0.47 + radius
@@ -92,7 +86,7 @@ def _wheels() -> list[Primitive]:
     return parts
 
 
-def _frame() -> list[Primitive]:
+def _frame() -> list[Shape]:
     parts = [
         box((-0.36, -0.3, -0.12), (0.98, 0.3, -0.05), "red", 0.4),
         box((0.98, -0.4, -0.24), (1.04, 0.4, -0.03), "stripes", 0.3),
@@ -106,7 +100,7 @@ def _frame() -> list[Primitive]:
     return parts
 
 
-def _boiler() -> list[Primitive]:
+def _boiler() -> list[Shape]:
     parts = [
         rod((0.35, 0, 0.2), 0.26, 1.1, ALONG_X, "green", 0.55),
         rod((0.92, 0, 0.2), 0.235, 0.06, ALONG_X, "steel", 0.3),
@@ -129,7 +123,7 @@ def _boiler() -> list[Primitive]:
     return parts
 
 
-def _cab() -> list[Primitive]:
+def _cab() -> list[Shape]:
     parts = [box((-0.66, -0.38, -0.12), (-0.2, 0.38, -0.04), "red", 0.4)]
     for side in (-1, 1):
         wall, face = side * 0.36, side * 0.375
@@ -153,7 +147,7 @@ def _cab() -> list[Primitive]:
     return parts
 
 
-def _tender() -> list[Primitive]:
+def _tender() -> list[Shape]:
     parts = [
         box((-1.1, -0.36, -0.14), (-0.68, 0.36, -0.05), "red", 0.4),
         box((-1.1, -0.34, -0.049), (-0.72, 0.34, 0.06), "wood", 0.4),

@@ -1,4 +1,4 @@
-"""Opening a scene by its name: a built-in one, a mesh or a scene.json."""
+"""Open a scene by its name: a built-in scene, a mesh or a scene.json."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from aenerf_ns.simulator.scene import SimulationScene
 
 
 def built_in_scene(name: str, seed: int = 0) -> SimulationScene:
-    """Make and light a built-in scene, in a few seconds.
+    """Make and light a built-in scene. It takes a few seconds.
 
     Raises:
-        ValueError: on a name other than "room" and "object".
+        ValueError: the name is neither "room" nor "object".
     """
     if name == "room":
         from aenerf_ns.simulator.room import room_scene
@@ -47,7 +47,7 @@ def built_in_scene(name: str, seed: int = 0) -> SimulationScene:
 
 
 def open_scene(name: str, seed: int = 0) -> SimulationScene:
-    """A built-in scene by its name, or a mesh or scene.json by its file name.
+    """Open a built-in scene by its name, or a mesh or scene.json by its file name.
 
     Raises:
         DataError: there is no such scene, or the file cannot be used.

@@ -1,7 +1,7 @@
-"""Camera paths, and the two speeds at which they are travelled.
+"""Camera paths, and the two speeds at which a camera travels them.
 
-A path maps a parameter s in [0, 1] to a camera-to-world matrix (4, 4) with OpenCV axes (x right, y down, z forward)
-in a world whose z axis points up; lengths are metres.
+A path maps a parameter s in [0, 1] to a camera-to-world matrix (4, 4) with OpenCV axes (x right, y down, z forward).
+The world's z axis points up. Lengths are in metres.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.special import i0, iv
 
 from aenerf_ns.errors import DataError
-
-Array = NDArray[np.float64]
+from aenerf_ns.simulator.arrays import Array
 
 HARD_SPEED_RATIO = 8.0
 HARD_MEAN_SPEED = float(i0(np.log(HARD_SPEED_RATIO)))
@@ -27,8 +26,10 @@ _FINE = np.linspace(0, 1, 2001)
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), roll: float = 0.0) -> Array:
-    """Camera-to-world (4, 4) of a camera at ``eye`` that looks at ``target``, turned by ``roll`` (radians) about its
-    optical axis. ``up`` must not lie along the gaze."""
+    """Return the camera-to-world matrix (4, 4) of a camera at ``eye`` that looks at ``target``.
+
+    The camera is turned by ``roll`` radians about its optical axis. ``up`` must not lie along the gaze.
+    """
     forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, np.asarray(up, np.float64))
@@ -42,12 +43,15 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), 
 
 
 def room_path(s: float) -> Array:
-    """A closed loop around the middle of the room that looks across it, high and low, with a slight roll."""
+    """Return the pose (4, 4) on a closed loop around the middle of the room.
+
+    The camera looks across the room, high and low, with a slight roll.
+    """
     return _room_pose(2 * np.pi * s, 0.0, 0.0, 0.0)
 
 
 def room_validation_views(count: int) -> Array:
-    """Views (count, 4, 4) spread evenly along the room's path, by turns inside, outside, above and below it."""
+    """Return views (count, 4, 4) spread evenly along the room's path, by turns inside, outside, above and below it."""
     return _stack(
         [
             _room_pose(2 * np.pi * (k + 0.5) / count, 0.12 * np.cos(2.4 * k), 0.12 * np.sin(2.4 * k), 0.0)
@@ -57,7 +61,7 @@ def room_validation_views(count: int) -> Array:
 
 
 def room_test_views(count: int, seed: int) -> Array:
-    """Random views (count, 4, 4) in the ring the room's path runs through, with gazes of their own."""
+    """Return random views (count, 4, 4) near the room's path, with random gazes."""
     rng = np.random.default_rng(seed)
     return _stack(
         [
@@ -70,12 +74,12 @@ def room_test_views(count: int, seed: int) -> Array:
 
 
 def _stack(poses: Sequence[Array]) -> Array:
-    """Poses (n, 4, 4), also of none."""
+    """Stack poses to (n, 4, 4); n may be 0."""
     return np.array(poses).reshape(-1, 4, 4)
 
 
 def _room_pose(angle: float, outwards: float, upwards: float, gaze: float) -> Array:
-    """The room path's pose at an angle of its loop, displaced in metres, its gaze turned by ``gaze`` radians."""
+    """Return the pose at an angle of the room's loop, displaced in metres, its gaze turned by ``gaze`` radians."""
     radius = 1.15 + 0.10 * np.sin(2 * angle) + outwards
     height = 1.40 + 0.15 * np.sin(3 * angle + 0.7) + upwards
     opposite = angle + np.pi + 0.35 * np.sin(2 * angle + 0.4) + gaze
@@ -92,19 +96,19 @@ def _anywhere(eye: Array) -> bool:
 
 
 def object_path(s: float, turns: float = 4.0, radius: float = 4.0, centre: ArrayLike = ORIGIN) -> Array:
-    """A spiral from the equator to the pole of a hemisphere around a point, as Robust e-NeRF's scenes have."""
+    """Return the pose (4, 4) on a spiral from the equator to the pole of a hemisphere, as in Robust e-NeRF's scenes."""
     return _hemisphere_pose(2 * np.pi * turns * s, 0.5 * np.pi * s, radius, ORIGIN, centre)
 
 
 def object_validation_views(
     count: int, radius: float = 4.0, centre: ArrayLike = ORIGIN, is_free: Callable[[Array], bool] = _anywhere
 ) -> Array:
-    """Views (count, 4, 4) all over the hemisphere, on a golden-angle spiral.
+    """Return views (count, 4, 4) all over the hemisphere, on a golden-angle spiral.
 
     Args:
         count: number of views.
-        radius, centre: of the hemisphere, in metres.
-        is_free: whether a camera may be at a place (3,). A view is turned about the vertical until it may.
+        radius, centre: radius and centre (3,) of the hemisphere, in metres.
+        is_free: tells whether a camera may be at a place (3,). A view is turned about the vertical until it may.
 
     Raises:
         DataError: a view cannot be placed.
@@ -125,7 +129,7 @@ def object_test_views(
     centre: ArrayLike = ORIGIN,
     is_free: Callable[[Array], bool] = _anywhere,
 ) -> Array:
-    """Random views (count, 4, 4) over the hemisphere, at other distances and off-centre: those that `is_free` accepts.
+    """Return random views (count, 4, 4) over the hemisphere, at other distances and off-centre, where `is_free`.
 
     Raises:
         DataError: a view cannot be placed.
@@ -155,12 +159,12 @@ def _first_free(candidates: Iterator[Array], is_free: Callable[[Array], bool]) -
 class WalkPath:
     """A closed smooth walk through given positions, looking at given targets.
 
-    Both are periodic cubic splines whose parameter is the distance between neighbouring positions, so that the speed
-    hardly varies.
+    Positions and targets are periodic cubic splines. Their parameter is the distance between neighbouring positions, so
+    that the speed hardly varies.
 
     Args:
-        positions: (N, 3) that the camera passes, N at least 4; it returns to the first.
-        targets: (N, 3) that it looks at there.
+        positions: (N, 3) that the camera passes, N at least 4. The camera returns to the first.
+        targets: (N, 3) that the camera looks at from the positions.
 
     Raises:
         ValueError: too few points, neighbours in one place, or a gaze that is vertical or has no direction.
@@ -178,17 +182,17 @@ class WalkPath:
         self._eye = CubicSpline(knots, closed, bc_type="periodic")
         self._target = CubicSpline(knots, np.concatenate([looked_at, looked_at[:1]]), bc_type="periodic")
         self.size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
-        """Root mean square distance of the positions from their middle, in metres."""
+        """Root mean square distance of the positions from their mean, in metres."""
         gaze = self._target(_FINE) - self._eye(_FINE)
         if (np.linalg.norm(gaze[:, :2], axis=1) < 0.02 * np.linalg.norm(gaze, axis=1) + 1e-9).any():
             raise ValueError("the camera looks straight up or down, or at the place it is in; move the targets")
 
     def __call__(self, s: float) -> Array:
-        """Pose (4, 4) at a parameter in [0, 1]."""
+        """Return the pose (4, 4) at a parameter in [0, 1]."""
         return self._pose(s, np.zeros(3), 0.0)
 
     def _pose(self, s: float, shift: ArrayLike, gaze: float) -> Array:
-        """The pose displaced by ``shift`` metres (right, up, forward, level), its gaze turned by ``gaze`` radians."""
+        """Return the pose displaced by ``shift`` metres (right, up, level forward), turned by ``gaze`` radians."""
         eye, target = self._eye(s % 1.0), self._target(s % 1.0)
         forward = (target - eye) * [1.0, 1.0, 0.0]
         forward /= np.linalg.norm(forward)
@@ -200,10 +204,10 @@ class WalkPath:
         return look_at(eye, eye + np.array([cos * x - sin * y, sin * x + cos * y, z]))
 
     def validation_views(self, count: int, is_free: Callable[[Array, Array], bool]) -> Array:
-        """Views (count, 4, 4) spread along the walk, beside, above and below it.
+        """Return views (count, 4, 4) spread along the walk, beside, above and below it.
 
-        ``is_free`` tells whether a camera may be at a place (3,) beside the second place, which is on the path; views
-        move towards the path until it may.
+        ``is_free`` tells whether a camera may be at a place (3,), given the nearest place (3,) on the path. A view
+        moves towards the path until it may.
         """
         return _stack(
             [
@@ -216,7 +220,7 @@ class WalkPath:
         )
 
     def test_views(self, count: int, seed: int, is_free: Callable[[Array, Array], bool]) -> Array:
-        """Random views (count, 4, 4) around the walk, with gazes of their own; ``is_free`` as above."""
+        """Return random views (count, 4, 4) around the walk with random gazes; ``is_free`` as in `validation_views`."""
         rng = np.random.default_rng(seed)
         return _stack(
             [
@@ -229,7 +233,7 @@ class WalkPath:
 
     @property
     def _spread(self) -> float:
-        # That of the built-in room, in proportion.
+        # In proportion to the built-in room's.
         return min(0.13 * self.size, 0.5)
 
     def _place(self, view: tuple[float, Array, float], is_free: Callable[[Array, Array], bool]) -> Array:
@@ -245,7 +249,7 @@ class WalkPath:
 def _hemisphere_pose(
     azimuth: float, elevation: float, radius: float, target: ArrayLike, centre: ArrayLike = ORIGIN
 ) -> Array:
-    """``target`` counts from the centre."""
+    """Return a pose on the hemisphere that looks at ``target``, which is relative to the centre."""
     outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     eye = radius * (np.cos(elevation) * outward + np.sin(elevation) * np.array([0.0, 0.0, 1.0]))
     # The direction of growing elevation is a vertical that stays defined at the pole.
@@ -255,17 +259,17 @@ def _hemisphere_pose(
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """When a camera passes each point of its path.
+    """The times at which a camera passes the points of its path.
 
-    `easy` runs at constant speed. `hard` runs the same path at the easy speed times 8 ** sin(2 pi t), t in seconds,
-    an eighth to eight times as fast (the AE-NeRF paper's two settings).
+    The speed of `easy` is constant. The speed of `hard` is the easy speed times 8 ** sin(2 pi t), t in seconds: between
+    an eighth and eight times as fast. These are the AE-NeRF paper's two settings.
 
     Attributes:
         name: "easy" or "hard".
-        easy_duration: time the whole path takes at the easy speed, in seconds, for both profiles.
+        easy_duration: seconds that the whole path takes at the easy speed, for both profiles.
 
     Raises:
-        ValueError: on another name or a duration that is not positive.
+        ValueError: the name is neither, or the duration is not positive.
     """
 
     name: str
@@ -279,20 +283,20 @@ class SpeedProfile:
 
     @property
     def duration(self) -> float:
-        """Time the whole path takes, in seconds."""
+        """Duration of the whole path in seconds."""
         return float(self.time(1.0))
 
     def parameter(self, time: ArrayLike) -> Array:
-        """Path parameter at times in seconds, any shape."""
+        """Return the path parameters at times in seconds, any shape."""
         time = np.asarray(time, np.float64)
         return (time if self.name == "easy" else _hard_advance(time)) / self.easy_duration
 
     def time(self, parameter: ArrayLike) -> Array:
-        """Time in seconds at which path parameters are passed, any shape: the inverse of `parameter`."""
+        """Return the times in seconds at which the camera passes path parameters, any shape. Inverts `parameter`."""
         advance = np.asarray(parameter, np.float64) * self.easy_duration
         if self.name == "easy":
             return advance
-        # The advance stays within half a second's worth of its mean: interpolate for a start, then Newton.
+        # The advance stays within half a second of its mean. Newton's method starts from an interpolation.
         grid = np.arange(advance.min() / HARD_MEAN_SPEED - 1, advance.max() / HARD_MEAN_SPEED + 1, 1e-3)
         time = np.interp(advance, _hard_advance(grid), grid)
         for _ in range(4):
@@ -301,8 +305,10 @@ class SpeedProfile:
 
 
 def _hard_advance(time: Array) -> Array:
-    """Integral of 8 ** sin(2 pi t) from 0, by the Jacobi-Anger expansion
-    exp(a sin x) = I0(a) + 2 sum_n I_n(a) cos(n (x - pi / 2))."""
+    """Integrate 8 ** sin(2 pi t) from 0, by the Jacobi-Anger expansion.
+
+    exp(a sin x) = I0(a) + 2 sum_n I_n(a) cos(n (x - pi / 2)).
+    """
     order = np.arange(1, 25)
     weight = 2 * iv(order, np.log(HARD_SPEED_RATIO)) / order
     phase = 2 * np.pi * np.asarray(time)[..., None]

@@ -1,4 +1,4 @@
-"""The built-in room: 4 x 4 x 2.5 m, furnished, textured all over and closed, so that every ray hits something."""
+"""The built-in room: 4 x 4 x 2.5 m, furnished, textured everywhere, and closed, so that every ray hits something."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from aenerf_ns.simulator import textures as tx
-from aenerf_ns.simulator.rendering.light_baking import AreaLight, bake
-from aenerf_ns.simulator.rendering.raycast import Primitive, PrimitiveScene
-from aenerf_ns.simulator.shapes import ALONG_X, axes, box, panel, pillar, rod, sphere, turned_box
+from aenerf_ns.simulator.arrays import Texture
+from aenerf_ns.simulator.rendering.environment import sky
+from aenerf_ns.simulator.rendering.lighting import AreaLight
+from aenerf_ns.simulator.rendering.renderer import Renderer
+from aenerf_ns.simulator.shapes import ALONG_X, Shape, axes, box, lit, panel, pillar, rod, sphere, turned_box
 
 TEXTURE_SIZE = 256
 HALF_SIZE = 2.0
@@ -17,10 +19,10 @@ HEIGHT = 2.5
 BOOK_COLOURS = ("b5523b", "d9a441", "4f7a5b", "3f6d8e", "8c4a6b", "e0d3b0", "6b7f3a", "c9772e", "5a5fa0", "a8463f")
 
 
-def room_scene(seed: int = 0) -> PrimitiveScene:
-    """The room, baked. The seed moves the patterns of its textures, and which book stands where."""
+def room_scene(seed: int = 0) -> Renderer:
+    """Furnish and light the room. The seed moves the patterns of the textures, and which book stands where."""
     rng = np.random.default_rng(seed)
-    primitives = [
+    shapes = [
         *_shell(),
         *_window(),
         *_pictures(),
@@ -31,15 +33,16 @@ def room_scene(seed: int = 0) -> PrimitiveScene:
         *_corners(),
     ]
     lights = [
-        AreaLight((0, 0, HEIGHT - 0.09), (0.45, 0, 0), (0, -0.45, 0), (9.3, 8.7, 8.0)),
-        # In front of the curtains and the sill, which would be too bright right beside it.
-        AreaLight((0.2, -1.75, 1.5), (-0.6, 0, 0), (0, 0, 0.4), (4.7, 5.2, 5.8)),
+        AreaLight((0, 0, HEIGHT - 0.09), (0.45, 0, 0), (0, -0.45, 0), (8.8, 8.4, 7.8)),
+        # In front of the curtains and the sill, which would be too bright right beside the lamp.
+        AreaLight((0.2, -1.75, 1.5), (-0.6, 0, 0), (0, 0, 0.4), (4.5, 5.0, 5.7)),
         AreaLight((1.72, 0.95, 0.99), (0.1, 0, 0), (0, -0.1, 0), (1.2, 0.9, 0.6)),
     ]
-    return bake(primitives, _textures(rng), lights, spacing=0.08, ambient=0.09, seed=seed)
+    darkness = sky((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    return lit(shapes, _textures(rng), darkness, lights, np.zeros(3), spacing=0.08, ambient=0.09, seed=seed)
 
 
-def _textures(rng: np.random.Generator) -> dict[str, tx.Texture]:
+def _textures(rng: np.random.Generator) -> dict[str, Texture]:
     n = TEXTURE_SIZE
     return {
         "floor": tx.planks(n, rng, ["a87c50", "b98d5c", "c9a06c"]),
@@ -64,11 +67,11 @@ def _textures(rng: np.random.Generator) -> dict[str, tx.Texture]:
     }
 
 
-# What "right" is to somebody who faces each wall.
+# The direction "right" of a viewer who faces each wall.
 NORTH, EAST, SOUTH, WEST = (1, 0, 0), (0, -1, 0), (-1, 0, 0), (0, 1, 0)
 
 
-def _shell() -> list[Primitive]:
+def _shell() -> list[Shape]:
     h, z = HALF_SIZE, HEIGHT
     walls = [
         (NORTH, (0, h), "leaves", 1.0),
@@ -101,8 +104,8 @@ def _shell() -> list[Primitive]:
 
 def _framed(
     right: ArrayLike, middle: ArrayLike, size: tuple[float, float], picture: str, frame: str, **rest: float
-) -> list[Primitive]:
-    """A picture in its frame, on a wall. ``middle`` lies on the wall."""
+) -> list[Shape]:
+    """Frame a picture on a wall. ``middle`` lies on the wall; ``rest`` goes to the `panel` of the picture."""
     rotation = axes(right, (0, 0, 1))
     width, height = size
     canvas = np.asarray(middle) + 0.02 * rotation[:, 2]
@@ -120,7 +123,7 @@ def _framed(
     return parts
 
 
-def _window() -> list[Primitive]:
+def _window() -> list[Shape]:
     middle, size = np.array([0.2, -HALF_SIZE, 1.5]), (1.3, 1.1)
     parts = _framed(SOUTH, middle, size, "garden", "pale wood", emission=0.45)
     parts.append(box((0.18, -2.0, 1.0), (0.22, -1.965, 2.0), "pale wood", 0.6))
@@ -135,7 +138,7 @@ def _window() -> list[Primitive]:
     return parts
 
 
-def _pictures() -> list[Primitive]:
+def _pictures() -> list[Shape]:
     return [
         *_framed(WEST, (-2.0, 0.25, 1.62), (1.15, 0.75), "landscape", "wood"),
         *_framed(WEST, (-2.0, -1.15, 1.6), (0.55, 0.7), "abstract", "pale wood"),
@@ -145,8 +148,8 @@ def _pictures() -> list[Primitive]:
     ]
 
 
-def _table() -> list[Primitive]:
-    parts = [box((-0.55, -0.4, 0.68), (0.55, 0.4, 0.72), "wood", 0.8)]
+def _table() -> list[Shape]:
+    parts = [box((-0.55, -0.4, 0.68), (0.55, 0.4, 0.72), "wood", 0.8, spacing=0.03)]
     for x in (-0.48, 0.48):
         for y in (-0.33, 0.33):
             parts.append(pillar((x, y, 0.012), 0.035, 0.668, "wood", 0.4))
@@ -166,7 +169,7 @@ def _table() -> list[Primitive]:
     return parts
 
 
-def _bookshelf(rng: np.random.Generator) -> list[Primitive]:
+def _bookshelf(rng: np.random.Generator) -> list[Shape]:
     left, right, front, back, top = -1.55, 0.55, 1.70, 1.999, 1.98
     board = 0.03
     parts = [
@@ -205,7 +208,7 @@ def _bookshelf(rng: np.random.Generator) -> list[Primitive]:
     return parts
 
 
-def _sofa() -> list[Primitive]:
+def _sofa() -> list[Shape]:
     parts = [
         box((-1.9, -0.85, 0.1), (-1.2, 0.95, 0.36), "fabric", 0.5),
         box((-1.97, -0.85, 0.1), (-1.72, 0.95, 0.82), "fabric", 0.5),
@@ -222,11 +225,13 @@ def _sofa() -> list[Primitive]:
     return parts
 
 
-def _cabinet() -> list[Primitive]:
-    """A sideboard with drawers, a lamp and ornaments on it."""
+def _cabinet() -> list[Shape]:
+    """Make a sideboard with drawers, and put a lamp and ornaments on it."""
     parts = [
         box((1.55, -0.75, 0.08), (1.98, 1.15, 0.70), "pale wood", 0.8),
-        box((1.52, -0.78, 0.701), (1.98, 1.18, 0.735), "wood", 0.8),
+        box((1.52, -0.78, 0.701), (1.98, 1.18, 0.735), "wood", 0.8, spacing=0.04),
+        # The gaps between the drawers are dark.
+        panel((1.5495, 0.2, 0.395), (1.84, 0.57), EAST, (0, 0, 1), "wood", 0.8, tint=(0.55, 0.55, 0.55)),
     ]
     for k in range(3):
         y = -0.72 + k * 0.62
@@ -249,8 +254,8 @@ def _cabinet() -> list[Primitive]:
     return parts
 
 
-def _corners() -> list[Primitive]:
-    """A plant, a stool and a chest in the corners."""
+def _corners() -> list[Shape]:
+    """Make a plant, a stool and a chest in the corners."""
     parts = [
         pillar((1.55, 1.6, 0), 0.2, 0.36, "brick", 0.5),
         pillar((1.55, 1.6, 0.36), 0.03, 0.45, "wood", 0.3),

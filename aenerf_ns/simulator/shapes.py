@@ -1,25 +1,119 @@
-"""Shorthand for the primitives scenes are furnished with."""
+"""Make the textured shapes that the built-in scenes consist of."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.simulator.rendering.raycast import BOX, CYLINDER, RECTANGLE, SPHERE, Primitive
+from aenerf_ns.simulator.arrays import Array, Texture
+from aenerf_ns.simulator.rendering.embree import RayCaster
+from aenerf_ns.simulator.rendering.environment import Environment
+from aenerf_ns.simulator.rendering.lighting import AreaLight, light_mesh
+from aenerf_ns.simulator.rendering.mesh import Mesh, scaled
+from aenerf_ns.simulator.rendering.mesh_repair import prepared
+from aenerf_ns.simulator.rendering.renderer import Renderer
 
-Array = NDArray[np.float64]
+_SAGITTA = 5e-4
+"""Largest distance of a triangle from the round surface that it approximates, in metres."""
+_FEWEST_SIDES = 12
+"""The faces of a prism with fewer than 10 sides would meet at creases."""
+
+Surface = tuple[Array, NDArray[np.int64], Array]
+"""Vertices (V, 3) in metres, faces (F, 3), anticlockwise seen from outside, and texture coordinates (V, 2) in tiles."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A textured surface.
+
+    Attributes:
+        surface: returns the surface in local coordinates, given the longest side of its cells in metres. A cell is two
+            triangles.
+        centre: (3,) in metres.
+        rotation: (3, 3) world-from-local.
+        texture: name of the texture.
+        texture_offset: (u, v) in tiles.
+        tint: (3,) factor of the texture's albedo.
+        emission: radiance with which the surface glows at an albedo of 1. It lights nothing: an `AreaLight` does.
+        spacing: longest side of the cells in metres, where that is less than the scene's: the size of its shadows.
+    """
+
+    surface: Callable[[float], Surface]
+    centre: ArrayLike
+    rotation: Array
+    texture: str
+    texture_offset: tuple[float, float] = (0.0, 0.0)
+    tint: ArrayLike = (1.0, 1.0, 1.0)
+    emission: float = 0.0
+    spacing: float = math.inf
+
+
+def mesh_of(shapes: Sequence[Shape], textures: Mapping[str, Texture], spacing: float) -> Mesh:
+    """Join shapes to one mesh of cells with sides of at most ``spacing`` metres.
+
+    Raises:
+        KeyError: the texture of a shape is missing.
+    """
+    index = {name: i for i, name in enumerate(textures)}
+    vertices, faces, uv, colour, count = [], [], [], [], 0
+    for shape in shapes:
+        local, corners, tiles = shape.surface(min(spacing, shape.spacing))
+        # Not a matrix product, which may round equal rows differently: the two sides of a seam must stay in one place.
+        vertices.append((local[:, None, :] * shape.rotation).sum(axis=-1) + np.asarray(shape.centre))
+        faces.append(corners + count)
+        uv.append(tiles + shape.texture_offset)
+        colour.append(np.tile(np.asarray(shape.tint, np.float64), (len(local), 1)))
+        count += len(local)
+    sizes = [len(part) for part in faces]
+    mesh = Mesh(
+        np.concatenate(vertices),
+        np.concatenate(faces),
+        np.concatenate(uv),
+        np.concatenate(colour),
+        np.repeat([index[shape.texture] for shape in shapes], sizes),
+        np.repeat([shape.emission for shape in shapes], sizes).astype(np.float64),
+        tuple(textures.values()),
+    )
+    return scaled(mesh, 1.0)
+
+
+def lit(
+    shapes: Sequence[Shape],
+    textures: Mapping[str, Texture],
+    environment: Environment,
+    lamps: Sequence[AreaLight],
+    background: Array,
+    *,
+    spacing: float,
+    ambient: float,
+    seed: int,
+) -> Renderer:
+    """Join and light shapes.
+
+    Args:
+        shapes, textures: the scene.
+        spacing: largest distance in metres of the points at which light is computed.
+        environment, lamps, background, ambient, seed: see `light_mesh`.
+    """
+    mesh, _ = prepared(mesh_of(shapes, textures, spacing), math.inf)
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    return light_mesh(mesh, caster, environment, lamps, background, ambient=ambient, seed=seed)
 
 
 def axes(right: ArrayLike, up: ArrayLike) -> Array:
-    """World-from-local rotation (3, 3) with these local x and y axes, unit and orthogonal."""
+    """Return the world-from-local rotation (3, 3) with these local x and y axes, which must be orthonormal."""
     x, y = np.asarray(right, float), np.asarray(up, float)
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
 def turned(degrees: float) -> Array:
-    """World-from-local rotation (3, 3) about the vertical."""
+    """Return the world-from-local rotation (3, 3) about the vertical."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
@@ -29,35 +123,44 @@ ALONG_Y = axes((0, 0, 1), (1, 0, 0))
 """Rotations that lay a cylinder along a world axis."""
 
 
-def box(low: ArrayLike, high: ArrayLike, texture: str, scale: float, **rest: Any) -> Primitive:
-    """A box between two corners."""
+def box(low: ArrayLike, high: ArrayLike, texture: str, scale: float, **rest: Any) -> Shape:
+    """Make a box between two corners (3,). For the other arguments see `turned_box`."""
     low_corner, high_corner = np.asarray(low, float), np.asarray(high, float)
-    return Primitive(BOX, (low_corner + high_corner) / 2, (high_corner - low_corner) / 2, texture, scale, **rest)
+    return turned_box((low_corner + high_corner) / 2, high_corner - low_corner, 0.0, texture, scale, **rest)
 
 
-def turned_box(
-    centre: ArrayLike, size: ArrayLike, degrees: float, texture: str, scale: float, **rest: Any
-) -> Primitive:
-    """A box turned about the vertical."""
-    return Primitive(BOX, centre, np.asarray(size) / 2, texture, scale, rotation=turned(degrees), **rest)
+def turned_box(centre: ArrayLike, size: ArrayLike, degrees: float, texture: str, scale: float, **rest: Any) -> Shape:
+    """Make a box turned about the vertical.
+
+    Args:
+        centre: (3,) in metres.
+        size: (3,) sides in metres.
+        degrees: angle of the turn, anticlockwise seen from above.
+        texture: name of the texture. Its origin lies in the middle of each side.
+        scale: side of one tile of the texture, in metres.
+        rest: ``texture_offset``, ``tint``, ``emission`` and ``spacing`` of the `Shape`.
+    """
+    return Shape(partial(_box, np.asarray(size, float), scale), centre, turned(degrees), texture, **rest)
 
 
-def sphere(centre: ArrayLike, radius: float, texture: str, scale: float, **rest: Any) -> Primitive:
-    """A sphere. Its tilted axis keeps the poles of the texture at the sides, away from views from above."""
-    return Primitive(SPHERE, centre, (radius,) * 3, texture, scale, rotation=axes((0, 0.6, 0.8), (1, 0, 0)), **rest)
+def sphere(centre: ArrayLike, radius: float, texture: str, scale: float, **rest: Any) -> Shape:
+    """Make a sphere. A tilted axis keeps the poles of the texture at the sides, away from views from above.
+
+    For the other arguments see `turned_box`.
+    """
+    return Shape(partial(_sphere, radius, scale), centre, axes((0, 0.6, 0.8), (1, 0, 0)), texture, **rest)
 
 
-def pillar(foot: ArrayLike, radius: float, height: float, texture: str, scale: float, **rest: Any) -> Primitive:
-    """An upright cylinder that stands on ``foot``."""
-    centre = np.add(foot, (0.0, 0.0, height / 2))
-    return Primitive(CYLINDER, centre, (radius, radius, height / 2), texture, scale, **rest)
+def pillar(foot: ArrayLike, radius: float, height: float, texture: str, scale: float, **rest: Any) -> Shape:
+    """Make an upright cylinder that stands on ``foot``. For the other arguments see `turned_box`."""
+    return rod(np.add(foot, (0.0, 0.0, height / 2)), radius, height, np.eye(3), texture, scale, **rest)
 
 
 def rod(
     centre: ArrayLike, radius: float, length: float, along: Array, texture: str, scale: float, **rest: Any
-) -> Primitive:
-    """A lying cylinder; ``along`` is ALONG_X or ALONG_Y."""
-    return Primitive(CYLINDER, centre, (radius, radius, length / 2), texture, scale, rotation=along, **rest)
+) -> Shape:
+    """Make a lying cylinder; ``along`` is ALONG_X or ALONG_Y. For the other arguments see `turned_box`."""
+    return Shape(partial(_cylinder, radius, length, scale), centre, along, texture, **rest)
 
 
 def panel(
@@ -68,7 +171,94 @@ def panel(
     texture: str,
     scale: float,
     **rest: Any,
-) -> Primitive:
-    """A rectangle (width, height), visible from the side from which ``right`` and ``up`` look so."""
-    half = (size[0] / 2, size[1] / 2, 0.0)
-    return Primitive(RECTANGLE, centre, half, texture, scale, rotation=axes(right, up), **rest)
+) -> Shape:
+    """Make a rectangle (width, height) that faces a viewer to whom ``right`` and ``up`` look so.
+
+    For the other arguments see `turned_box`.
+    """
+    return Shape(partial(_rectangle, size, scale), centre, axes(right, up), texture, **rest)
+
+
+def _rectangle(size: tuple[float, float], scale: float, spacing: float) -> Surface:
+    across, up = (np.linspace(-side / 2, side / 2, _cells(side, spacing) + 1) for side in size)
+    grid = np.stack(np.meshgrid(across, up), axis=-1)
+    flat = grid.reshape(-1, 2)
+    return np.insert(flat, 2, 0.0, axis=1), _triangles(grid), flat / scale
+
+
+def _box(size: Array, scale: float, spacing: float) -> Surface:
+    sides = []
+    for axis, (u, v) in enumerate(((1, 2), (0, 2), (0, 1))):
+        for sign in (-1, 1):
+            flat, faces, _ = _rectangle((size[u], size[v]), scale, spacing)
+            positions = np.empty_like(flat)
+            positions[:, axis], positions[:, u], positions[:, v] = sign * size[axis] / 2, flat[:, 0], flat[:, 1]
+            # Textures have their grain along u, which follows the longer side.
+            uv = positions[:, [v, u] if size[v] > size[u] else [u, v]] / scale
+            # Together with the outward normal, u and v are right-handed for x and z, and left-handed for y.
+            is_right_handed = (sign > 0) != (axis == 1)
+            sides.append((positions, faces if is_right_handed else faces[:, ::-1], uv))
+    return _joined(sides)
+
+
+def _sphere(radius: float, scale: float, spacing: float) -> Surface:
+    turn, circle = _circle(radius, spacing)
+    latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, len(turn) // 2 + 1)
+    ring = np.cos(latitude)
+    ring[[0, -1]] = 0.0
+    grid = np.empty((len(latitude), len(turn), 3))
+    grid[..., :2] = ring[:, None, None] * circle
+    grid[..., 2] = radius * np.sin(latitude)[:, None]
+    uv = np.empty((len(latitude), len(turn), 2))
+    uv[..., 0], uv[..., 1] = turn, latitude[:, None] * radius / scale
+    # A triangle at a pole has there the mean of its other two corners' u.
+    uv[0, :, 0] += 0.5 / (len(turn) - 1)
+    uv[-1, :, 0] -= 0.5 / (len(turn) - 1)
+    uv[..., 0] *= _tiles_around(radius, scale)
+    return grid.reshape(-1, 3), _triangles(grid), uv.reshape(-1, 2)
+
+
+def _cylinder(radius: float, length: float, scale: float, spacing: float) -> Surface:
+    turn, circle = _circle(radius, spacing)
+    height = np.linspace(-length / 2, length / 2, _cells(length, spacing) + 1)
+    wall = np.empty((len(height), len(turn), 3))
+    wall[..., :2], wall[..., 2] = circle, height[:, None]
+    uv = np.stack(np.meshgrid(turn * _tiles_around(radius, scale), height / scale), axis=-1)
+    parts = [(wall.reshape(-1, 3), _triangles(wall), uv.reshape(-1, 2))]
+    for end in (-1, 1):
+        rings = np.linspace(1, 0, _cells(radius, spacing) + 1)[:, None, None] * circle
+        cap = np.insert(rings.reshape(-1, 2), 2, end * length / 2, axis=1)
+        parts.append((cap, _triangles(rings)[:, ::end], cap[:, :2] / scale))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[Surface]) -> Surface:
+    first = np.cumsum([0, *(len(positions) for positions, _, _ in parts)])
+    positions, faces, uv = zip(*parts, strict=True)
+    moved = [part + start for part, start in zip(faces, first, strict=False)]
+    return np.concatenate(positions), np.concatenate(moved), np.concatenate(uv)
+
+
+def _triangles(grid: Array) -> NDArray[np.int64]:
+    """Return two triangles for each cell of a grid (rows, columns, ...), anticlockwise where rows go up."""
+    vertex = np.arange(grid.shape[0] * grid.shape[1]).reshape(grid.shape[:2])
+    a, b, c, d = (part.reshape(-1) for part in (vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, 1:], vertex[1:, :-1]))
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def _cells(length: float, spacing: float) -> int:
+    return max(1, math.ceil(length / spacing))
+
+
+def _circle(radius: float, spacing: float) -> tuple[Array, Array]:
+    """Return turns (N + 1,) from -0.5 to 0.5 and points (N + 1, 2) of a circle, N even; the last point is the first."""
+    sides = max(_FEWEST_SIDES, math.pi / math.acos(1 - _SAGITTA / radius), _cells(2 * math.pi * radius, spacing))
+    turn = np.linspace(-0.5, 0.5, 2 * math.ceil(sides / 2) + 1)
+    circle = radius * np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], axis=1)
+    circle[-1] = circle[0]
+    return turn, circle
+
+
+def _tiles_around(radius: float, scale: float) -> float:
+    """Return the number of tiles around a circle, which is whole so that no seam shows."""
+    return float(max(1, np.rint(2 * np.pi * radius / scale)))

@@ -1,4 +1,4 @@
-"""Poses as structure from motion estimates them from the frames of a simulated camera, and how wrong they are."""
+"""Estimate poses from the frames of a simulated camera, by structure from motion, and measure their errors."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from aenerf_ns.simulator.simulation import Simulation
 def poses_from_frames(
     simulation: Simulation, camera: EventCamera, truth: Trajectory, frame_rate: float, exposure: float, seed: int
 ) -> tuple[Trajectory, dict[str, Any], str]:
-    """Runs COLMAP on the frames of a camera beside the event sensor, as in a DAVIS.
+    """Run COLMAP on the frames of a camera at the event sensor's place, as in a DAVIS.
 
-    Only what no picture tells is taken from the truth: the world's position, orientation and scale.
+    The truth provides only what pictures cannot: the position, orientation and scale of the world.
 
     Args:
         simulation: the pass of the camera.
-        camera: its lens.
+        camera: the lens.
         truth: the true trajectory.
         frame_rate: frames a second.
-        exposure: seconds for which a frame is exposed, and blurred by motion.
-        seed: of COLMAP.
+        exposure: seconds for which a frame is exposed. Motion blurs the frame meanwhile.
+        seed: seed of COLMAP.
 
     Returns:
-        The estimated trajectory, a report of how it was made and of its errors, and a summary for people.
+        the estimated trajectory, a report of its making and its errors, and a summary in words.
 
     Raises:
         ValueError: frame rate and exposure do not fit each other or the path.

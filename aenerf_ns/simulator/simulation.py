@@ -1,4 +1,4 @@
-"""An event camera moving through a scene."""
+"""Move an event camera through a scene."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.simulator.esim import EventSimulator
+from aenerf_ns.simulator.esim import NOISELESS, EventSimulator, SensorNoise
 from aenerf_ns.simulator.frames import frame_parameters
 from aenerf_ns.simulator.paths import SpeedProfile
 from aenerf_ns.simulator.scene import SimulationScene
 
-# Rays through a pixel: enough that the frames' own aliasing triggers few events, and references without visible noise.
+# Rays per pixel: with 4, aliasing of the frames triggers few events; with 16, references have no visible noise.
 _EVENT_SAMPLES = 4
 _REFERENCE_SAMPLES = 16
 
 
 class ReferencePicture(NamedTuple):
-    """What is seen from a pose, grey for a monochrome sensor.
+    """The picture from a pose, grey for a monochrome sensor.
 
     Attributes:
         display: (height, width, 3) uint8, sRGB.
-        linear: (height, width, 3) uint16, linear radiance; 65535 is 1, what display white shows.
+        linear: (height, width, 3) uint16, linear radiance; 65535 stands for 1, which is display white.
         depth: (height, width) float32 along the optical axis at the pixels' centres, inf where nothing is hit.
     """
 
@@ -44,16 +44,14 @@ class Simulation:
     """One pass of an event camera along a scene's path.
 
     Args:
-        scene: what is seen, and the path.
-        camera: the lens; it must be free of distortion.
+        scene: the scene and the path.
+        camera: the lens, which must be free of distortion.
         sensor: thresholds, refractory period and Bayer pattern.
         speed: "easy" for constant speed, "hard" for 8^sin(2πt) times that speed.
         easy_duration: seconds that the path takes at constant speed.
-        max_displacement: pixels that 99 % of what is seen may move between two rendered frames.
-        contrast_threshold_spread: standard deviation of the thresholds over the pixels.
-        seed: of the sensor's thresholds and noise.
-        leak_rate: see :class:`~aenerf_ns.simulator.esim.EventSimulator`.
-        shot_noise_rate: likewise.
+        max_displacement: pixels that 99 % of the picture may move between two rendered frames.
+        seed: seed of the sensor's thresholds and noise.
+        noise: see :class:`~aenerf_ns.simulator.esim.EventSimulator`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -67,25 +65,15 @@ class Simulation:
         speed: Literal["easy", "hard"],
         easy_duration: float,
         max_displacement: float,
-        contrast_threshold_spread: float,
         seed: int,
-        leak_rate: float = 0.0,
-        shot_noise_rate: float = 0.0,
+        noise: SensorNoise = NOISELESS,
     ) -> None:
         self._scene = scene
         self._camera = camera
         self._sensor = sensor
         self._profile = SpeedProfile(speed, easy_duration)
         width, height = camera.width, camera.height
-        self._simulator = EventSimulator(
-            width,
-            height,
-            sensor,
-            contrast_threshold_spread=contrast_threshold_spread,
-            leak_rate=leak_rate,
-            shot_noise_rate=shot_noise_rate,
-            seed=seed,
-        )
+        self._simulator = EventSimulator(width, height, sensor, noise, seed=seed)
         self._frames = frame_parameters(scene, self._intrinsics, width, height, max_displacement)
         self._times = _nanoseconds(self._profile.time(self._frames))
         if (np.diff(self._times) <= 0).any():
@@ -96,7 +84,7 @@ class Simulation:
         return self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy
 
     def trajectory(self, pose_rate: float) -> Trajectory:
-        """The true trajectory from the start to the end, camera-to-world, OpenCV axes, in metres.
+        """Return the true trajectory from the start to the end, camera-to-world, OpenCV axes, in metres.
 
         Args:
             pose_rate: poses a second.
@@ -111,14 +99,14 @@ class Simulation:
         return Trajectory(_nanoseconds(seconds), self._poses(self._profile.parameter(seconds)))
 
     def pose(self, time: int) -> Tensor:
-        """The true (4, 4) pose at a time in nanoseconds."""
+        """Return the true (4, 4) pose at a time in nanoseconds."""
         return self._poses(np.atleast_1d(self._profile.parameter(time * 1e-9)))[0]
 
     def _poses(self, parameters: NDArray[np.float64]) -> Tensor:
         return torch.from_numpy(np.stack([self._scene.path(float(s)) for s in parameters.clip(0, 1)]))
 
     def events(self) -> Iterator[EventStream]:
-        """Renders the path densely and yields the events from frame to frame, once."""
+        """Render the path densely and yield the events of each frame interval. Call it once."""
         camera = self._camera
         frames = zip(self._frames, self._times, strict=True)
         with progress_bar() as progress:
@@ -127,11 +115,12 @@ class Simulation:
                 yield EventStream(*self._simulator(image, int(time)), camera.width, camera.height, "simulation")
 
     def frame_times(self, frame_rate: float, exposure: float) -> NDArray[np.int64]:
-        """Middles of the exposures of a camera that takes frames all along the path, in nanoseconds.
+        """Return the middles of the exposures of a camera that takes frames along the path, in nanoseconds.
 
         Args:
             frame_rate: frames a second.
-            exposure: in seconds; the first frame's begins with the path, and the last frame's ends within it.
+            exposure: duration of an exposure in seconds. The first exposure begins with the path, and the last one ends
+                within it.
 
         Raises:
             ValueError: a number is not positive, an exposure takes longer than a frame, or the path is too short for
@@ -142,18 +131,21 @@ class Simulation:
         room = self._profile.duration - exposure
         if room < 1 / frame_rate:
             raise ValueError(f"{frame_rate} frames a second are fewer than two in {self._profile.duration:.3f} s")
-        # The last frame of a path of just so many frames must not be lost to rounding.
+        # Rounding must not lose the last frame if the path holds a whole number of frames.
         return _nanoseconds(exposure / 2 + np.arange(int(room * frame_rate * (1 + 1e-12)) + 1) / frame_rate)
 
     def blurred_frame(self, time: int, exposure: float) -> NDArray[np.uint8]:
-        """The sRGB picture (height, width) of a monochrome or (height, width, 3) of a colour sensor with an exposure.
+        """Render the sRGB picture of an exposure.
 
-        Light is summed, so the mean over the exposure is that of linear radiance, by the midpoint rule at steps within
-        which the image moves no more than between two frames of the events.
+        A sensor sums light, so the picture is the mean of linear radiance over the exposure. The mean is taken by the
+        midpoint rule, in steps within which the image moves no more than between two frames of the events.
 
         Args:
-            time: middle of the exposure, in nanoseconds.
-            exposure: in seconds.
+            time: middle of the exposure in nanoseconds.
+            exposure: duration of the exposure in seconds.
+
+        Returns:
+            (height, width) for a monochrome sensor, (height, width, 3) for a colour sensor.
         """
         middle = time * 1e-9
         ends = np.interp(
@@ -167,7 +159,7 @@ class Simulation:
         return _display(seen.squeeze(-1))
 
     def reference_picture(self, camera_to_world: NDArray[np.float64] | Tensor) -> ReferencePicture:
-        """What is seen from a (4, 4) pose, without noise or blur."""
+        """Render the picture from a (4, 4) pose, without noise or blur."""
         pose = np.asarray(camera_to_world)
         seen = to_channels(torch.from_numpy(self._render(pose, _REFERENCE_SAMPLES)), self._sensor.num_channels)
         seen = seen.expand(-1, -1, 3)
@@ -183,7 +175,7 @@ class Simulation:
 
 
 def _display(radiance: Tensor) -> NDArray[np.uint8]:
-    """The 8-bit sRGB picture of linear radiance."""
+    """Return the 8-bit sRGB picture of linear radiance."""
     return (encode(radiance, "srgb") * 255).round().to(torch.uint8).numpy()
 
 

@@ -1,7 +1,7 @@
-"""Procedural textures: seeded, tileable, linear albedo within [0.03, 0.92].
+"""Make procedural textures: seeded, tileable, linear albedo within [0.03, 0.92].
 
-A texture is a float32 array (N, N, 3), N a power of two. Its column is the surface coordinate u, its row the
-surface coordinate v, upwards for pictures. Colours are given as sRGB hexadecimal strings, as one picks them.
+A texture is a float32 array (N, N, 3). Columns run along the surface coordinate u. Rows run along v, which points up in
+pictures. Colours are sRGB hexadecimal strings "rrggbb".
 """
 
 from __future__ import annotations
@@ -9,31 +9,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Texture = NDArray[np.float32]
+from aenerf_ns.camera.image_encoding import decode
+from aenerf_ns.simulator.arrays import Array, Texture
 
 ALBEDO_RANGE = (0.03, 0.92)
 
 
-def linear(encoded: ArrayLike) -> Array:
-    """Linear radiance of sRGB values in [0, 1], any shape (IEC 61966-2-1)."""
-    encoded = np.asarray(encoded, np.float64)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
 def linear_colour(colour: str) -> Array:
-    """Linear RGB (3,) of an sRGB colour "rrggbb"."""
-    return linear(np.array([int(colour[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0)
+    """Return linear RGB (3,) of an sRGB colour "rrggbb"."""
+    return decode(np.array([int(colour[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0, "srgb")
 
 
 def spectral_noise(
     size: int, rng: np.random.Generator, exponent: float = 1.1, stretch: tuple[float, float] = (1.0, 1.0)
 ) -> Array:
-    """Tileable noise (N, N) of zero mean and unit deviation, with amplitude 1 / frequency ** exponent.
+    """Make tileable noise (N, N) of zero mean and unit deviation, with amplitude 1 / frequency ** exponent.
 
-    ``stretch`` elongates its features along u and along v.
+    ``stretch`` elongates the features along u and along v.
     """
     frequency = np.fft.fftfreq(size) * size
     radius = np.hypot(frequency[None, :] * stretch[0], frequency[:, None] * stretch[1])
@@ -44,23 +38,14 @@ def spectral_noise(
     return noise / noise.std()
 
 
-def mip_pyramid(texture: Texture) -> list[Texture]:
-    """The texture and its successive halvings by 2 x 2 means, down to one texel."""
-    levels = [texture]
-    while len(levels[-1]) > 1:
-        top = levels[-1]
-        levels.append(((top[0::2, 0::2] + top[1::2, 0::2] + top[0::2, 1::2] + top[1::2, 1::2]) / 4).astype(np.float32))
-    return levels
-
-
 def mottled(size: int, rng: np.random.Generator, colours: Sequence[str], contrast: float = 0.08) -> Texture:
-    """Clouds that pass through all the colours, under a finer grain: plaster, stone, marble."""
+    """Make clouds that pass through all the colours, under a finer grain: plaster, stone, marble."""
     blend = _blend(colours, 0.5 + 0.24 * spectral_noise(size, rng, 1.5))
     return _albedo(blend, contrast * spectral_noise(size, rng, 0.9))
 
 
 def wood(size: int, rng: np.random.Generator, colours: Sequence[str]) -> Texture:
-    """Grain along u: warped year rings and stretched fibres."""
+    """Make wood with its grain along u: warped year rings and stretched fibres."""
     warp = spectral_noise(size, rng, 1.8, (4.0, 1.0))
     rings = np.sin(2 * np.pi * (5 * _coordinate(size)[:, None] + 0.55 * warp))
     fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
@@ -68,7 +53,7 @@ def wood(size: int, rng: np.random.Generator, colours: Sequence[str]) -> Texture
 
 
 def planks(size: int, rng: np.random.Generator, colours: Sequence[str], rows: int = 8, columns: int = 2) -> Texture:
-    """Floorboards along u, each of its own tone, with staggered joints."""
+    """Make floorboards along u, each of its own tone, with staggered joints."""
     row, column, edge = _bond(size, rows, columns, rng.random(rows))
     tone = rng.random((rows, columns))[row, column]
     fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
@@ -79,7 +64,7 @@ def planks(size: int, rng: np.random.Generator, colours: Sequence[str], rows: in
 def bricks(
     size: int, rng: np.random.Generator, colours: Sequence[str], mortar: str, rows: int = 12, columns: int = 4
 ) -> Texture:
-    """Running bond, each brick of its own tone, with soft mortar joints."""
+    """Make a running bond of bricks, each of its own tone, with soft mortar joints."""
     row, column, edge = _bond(size, rows, columns, 0.5 * (np.arange(rows) % 2) / columns)
     grain = spectral_noise(size, rng, 0.8)
     brick = _blend(colours, rng.random((rows, columns))[row, column] + 0.12 * grain)
@@ -88,7 +73,7 @@ def bricks(
 
 
 def striped_wallpaper(size: int, rng: np.random.Generator, colours: Sequence[str], stripes: int = 6) -> Texture:
-    """Upright stripes that cycle through the colours, with diamonds on every other one."""
+    """Make upright stripes that cycle through the colours, with diamonds on every other stripe."""
     u, v = _coordinate(size)[None, :] * stripes, _coordinate(size)[:, None] * stripes
     palette = np.array([linear_colour(colour) for colour in colours])
     index = np.floor(u).astype(int) % stripes
@@ -103,7 +88,7 @@ def striped_wallpaper(size: int, rng: np.random.Generator, colours: Sequence[str
 def leafy_wallpaper(
     size: int, rng: np.random.Generator, ground: str, colours: Sequence[str], sprigs: int = 110
 ) -> Texture:
-    """Leaves of several colours strewn over a mottled ground."""
+    """Strew leaves of several colours over a mottled ground."""
     paper = _blend([ground, ground], np.zeros((size, size)))
     u, v = _coordinate(size)[None, :], _coordinate(size)[:, None]
     for _ in range(sprigs):
@@ -119,14 +104,14 @@ def leafy_wallpaper(
 
 
 def checker(size: int, rng: np.random.Generator, colours: Sequence[str], cells: int = 4) -> Texture:
-    """Soft-edged squares of two colours."""
+    """Make soft-edged squares of two colours."""
     wave = np.sin(np.pi * cells * _coordinate(size))
     squares = np.clip(6 * wave[None, :] * wave[:, None], -0.5, 0.5)
     return _albedo(_blend(colours, 0.5 + squares), 0.06 * spectral_noise(size, rng, 1.0))
 
 
 def fabric(size: int, rng: np.random.Generator, colours: Sequence[str], threads: int = 24) -> Texture:
-    """A plain weave with uneven threads, and a wide check."""
+    """Make a plain weave with uneven threads and a wide check."""
     coordinate = _coordinate(size)
     wave = np.sin(2 * np.pi * threads * coordinate)
     check = np.sin(2 * np.pi * 2 * coordinate)
@@ -136,7 +121,7 @@ def fabric(size: int, rng: np.random.Generator, colours: Sequence[str], threads:
 
 
 def rug(size: int, rng: np.random.Generator, colours: Sequence[str]) -> Texture:
-    """One woven rug: borders around a field of nested diamonds. Four colours: ground, field, accent, light."""
+    """Make a rug: borders around a field of nested diamonds. The colours are ground, field, accent and light."""
     ground, field, accent, light = (linear_colour(colour) for colour in colours)
     u, v = np.abs(_coordinate(size) - 0.5)[None, :], np.abs(_coordinate(size) - 0.5)[:, None]
     reach = np.maximum(u, v)
@@ -151,7 +136,7 @@ def rug(size: int, rng: np.random.Generator, colours: Sequence[str]) -> Texture:
 
 
 def book_spine(size: int, rng: np.random.Generator) -> Texture:
-    """A pale spine, to be tinted: bands across it, and marks where a title stands."""
+    """Make a pale book spine to be tinted, with bands across it and marks in place of a title."""
     v, u = _coordinate(size)[:, None], _coordinate(size)[None, :]
     tone = np.full((size, size), 0.62)
     for height, width in ((0.08, 0.012), (0.12, 0.006), (0.86, 0.012), (0.90, 0.006)):
@@ -163,7 +148,7 @@ def book_spine(size: int, rng: np.random.Generator) -> Texture:
 
 
 def landscape(size: int, rng: np.random.Generator, sky: Sequence[str], hills: Sequence[str]) -> Texture:
-    """A picture of ridges, one before the other, under a clouded sky."""
+    """Paint ridges, one before the other, under a clouded sky."""
     v = _coordinate(size)[:, None]
     picture = _blend(sky, 1.5 * v - 0.45 + 0.10 * spectral_noise(size, rng, 1.5, (2.5, 1.0)))
     for depth, colour in enumerate(hills):
@@ -176,7 +161,7 @@ def landscape(size: int, rng: np.random.Generator, sky: Sequence[str], hills: Se
 
 
 def abstract(size: int, rng: np.random.Generator, ground: str, colours: Sequence[str], shapes: int = 16) -> Texture:
-    """A picture of overlapping discs and bars."""
+    """Paint overlapping discs and bars."""
     u, v = _coordinate(size)[None, :], _coordinate(size)[:, None]
     picture = _blend([ground, ground], np.zeros((size, size)))
     for shape in range(shapes):
@@ -200,14 +185,14 @@ def _smooth_step(value: Array, low: float, high: float) -> Array:
 
 
 def _blend(colours: Sequence[str], position: Array) -> Array:
-    """Colours at position 0 to 1 along the sequence, interpolated."""
+    """Interpolate the sequence of colours at positions from 0 to 1."""
     palette = np.array([linear_colour(colour) for colour in colours])
     knots = np.linspace(0, 1, len(palette))
     return np.stack([np.interp(position, knots, channel) for channel in palette.T], axis=-1)
 
 
 def _bond(size: int, rows: int, columns: int, shift: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Of each texel: the row and column of its brick, and its distance to the brick's edge in tiles."""
+    """Return for each texel the row and column of its brick and the distance, in tiles, from the brick's edge."""
     v = np.repeat(_coordinate(size)[:, None], size, axis=1)
     row = np.floor(v * rows).astype(np.int64)
     u = (_coordinate(size)[None, :] + shift[row]) % 1

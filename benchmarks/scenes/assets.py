@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
+from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import textures
 
@@ -223,4 +224,4 @@ def _photograph(name: str, path: Path) -> Material:
     with Image.open(path) as picture:
         sides = [int(min(_PICTURE_SIZE, 2 ** round(np.log2(side)))) for side in picture.size]
         pixels = np.asarray(picture.convert("RGB").resize(sides, Image.Resampling.LANCZOS))
-    return Material(name, srgb_picture(np.clip(textures.linear(pixels / 255), *textures.ALBEDO_RANGE)))
+    return Material(name, srgb_picture(np.clip(decode(pixels / 255, "srgb"), *textures.ALBEDO_RANGE)))

@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
+from aenerf_ns.simulator.arrays import Texture
 from aenerf_ns.simulator.rendering.embree import RayCaster
-from aenerf_ns.simulator.textures import ALBEDO_RANGE, Texture, linear
+from aenerf_ns.simulator.textures import ALBEDO_RANGE
 
 Array = NDArray[np.float64]
 
@@ -137,7 +139,7 @@ def coloured_copy(material: Material, colour: ArrayLike) -> Material:
     """The material with its linear albedo times an RGB factor."""
     factor = np.asarray(colour, np.float64)
     name = f"{material.name} * {factor.round(4).tolist()}"
-    return Material(name, srgb_picture(np.clip(linear(material.picture / 255) * factor, *ALBEDO_RANGE)))
+    return Material(name, srgb_picture(np.clip(decode(material.picture / 255, "srgb") * factor, *ALBEDO_RANGE)))
 
 
 def srgb_picture(value: ArrayLike) -> NDArray[np.uint8]:

@@ -131,7 +131,7 @@ def test_colmap_has_the_same_lens(lens: str, distortion: tuple[float, ...]) -> N
 @pytest.mark.parametrize("pattern", ["", "RGGB"])
 def test_a_blurred_frame_is_the_mean_of_sharp_ones_in_linear_light(room: SimulationScene, pattern: str) -> None:
     camera = EventCamera(64, 48, *room.intrinsics(64, 48))
-    simulation = Simulation(room, camera, SensorModel(bayer_pattern=pattern), "hard", 0.5, 0.5, 0.0, 0)
+    simulation = Simulation(room, camera, SensorModel(bayer_pattern=pattern), "hard", 0.5, 0.5, 0)
     time, exposure, steps = 100_000_000, 0.04, 64
     frame = simulation.blurred_frame(time, exposure)
     assert frame.shape == ((48, 64, 3) if pattern else (48, 64))
@@ -151,7 +151,7 @@ def test_a_blurred_frame_is_the_mean_of_sharp_ones_in_linear_light(room: Simulat
 
 def test_frames_are_taken_all_along_the_path(room: SimulationScene) -> None:
     camera = EventCamera(16, 12, *room.intrinsics(16, 12))
-    simulation = Simulation(room, camera, SensorModel(), "easy", 0.41, 2.0, 0.0, 0)
+    simulation = Simulation(room, camera, SensorModel(), "easy", 0.41, 2.0, 0)
     assert simulation.frame_times(25, 0.01).tolist() == [5_000_000 + FRAME * k for k in range(11)]
     assert len(simulation.frame_times(25, 0.0101)) == 10
     for rate, exposure, text in (
@@ -245,6 +245,6 @@ def test_pose_noise_and_colmap_exclude_each_other(room: SimulationScene, tmp_pat
     options = Simulate(tmp_path / "scene", poses="colmap", pose_noise_degrees=1.0, width=16, height=12, duration=0.5)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "open_scene", lambda *_: room)
-        with pytest.raises(DataError, match="COLMAP errs by itself"):
+        with pytest.raises(DataError, match="COLMAP makes errors of its own"):
             options.main()
     assert not (tmp_path / "scene").exists()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
-from aenerf_ns.simulator.esim import EventSimulator
+from aenerf_ns.simulator.esim import EventSimulator, SensorNoise
 
 WIDTH, HEIGHT = 7, 6
 LOG_EPSILON = 1e-3
@@ -22,10 +22,12 @@ def make_simulator(
     negative_contrast_threshold: float,
     refractory_period: int = 0,
     bayer_pattern: BayerPattern = "",
-    **rest: float,
+    log_epsilon: float = LOG_EPSILON,
+    seed: int = 0,
+    **noise: float,
 ) -> EventSimulator:
     sensor = SensorModel(positive_contrast_threshold, negative_contrast_threshold, refractory_period, bayer_pattern)
-    return EventSimulator(width, height, sensor, **rest)  # type: ignore[arg-type]
+    return EventSimulator(width, height, sensor, SensorNoise(**noise), log_epsilon=log_epsilon, seed=seed)
 
 
 def simulate(simulator: EventSimulator, images: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -1,4 +1,4 @@
-"""Rays against triangles by Embree, through Open3D."""
+"""Intersect rays with triangles by Embree, through Open3D."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 from aenerf_ns.errors import DataError
 
 NOTHING = np.uint32(0xFFFFFFFF)
-"""The triangle a ray hits that hits none."""
+"""Stands for the triangle where a ray hits none."""
 
 
 class RayCaster:
-    """Triangles (F, 3) of vertices (V, 3), which are rounded to float32.
+    """Cast rays against triangles.
 
-    Rays are float32 (N, 6): origin and direction. Their answers do not depend on the number of threads, which is
-    numba's: the tree is built by one.
+    Rays are float32 (N, 6): origin and direction. Queries use as many threads as numba. Answers do not depend on that
+    number, because one thread builds the tree.
+
+    Args:
+        vertices: (V, 3), rounded to float32.
+        faces: (F, 3).
 
     Raises:
         DataError: Open3D cannot be loaded.
@@ -35,36 +39,41 @@ class RayCaster:
         )
 
     def cast(self, rays: NDArray[np.float32]) -> dict[str, NDArray]:
-        """First hits: ``primitive_ids`` (N,) uint32, `NOTHING` where there is none; ``t_hit`` (N,) in lengths of the
-        direction, inf there; ``primitive_uvs`` (N, 2), barycentric coordinates of the second and third corner."""
+        """Return the first hit of each ray.
+
+        Returns:
+            ``primitive_ids`` (N,) uint32, `NOTHING` where the ray hits no triangle; ``t_hit`` (N,), the distance in
+            lengths of the direction, inf where the ray hits none; ``primitive_uvs`` (N, 2), barycentric coordinates of
+            the second and third corner.
+        """
         hits = self._scene.cast_rays(self._tensor(rays), nthreads=numba.get_num_threads())
         return {name: hits[name].numpy() for name in ("primitive_ids", "t_hit", "primitive_uvs")}
 
     def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Whether anything lies on the segments (N,) from the origins to origin + direction."""
+        """Tell for each ray (N,) whether a triangle lies between its origin and origin + direction."""
         return self._scene.test_occlusions(
             self._tensor(rays), tnear=0.0, tfar=1.0, nthreads=numba.get_num_threads()
         ).numpy()
 
     def all_hits(self, rays: NDArray[np.float32]) -> dict[str, NDArray]:
-        """Every intersection (M,) of every ray: ``ray_ids``, ``primitive_ids`` and ``t_hit``."""
+        """Return every intersection (M,) of every ray: ``ray_ids``, ``primitive_ids`` and ``t_hit``."""
         hits = self._scene.list_intersections(self._tensor(rays), nthreads=numba.get_num_threads())
         return {name: hits[name].numpy() for name in ("ray_ids", "primitive_ids", "t_hit")}
 
     def distance(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Distance (N,) of points (N, 3) from the nearest triangle."""
+        """Return the distance (N,) of points (N, 3) from the nearest triangle."""
         query = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
         return self._scene.compute_distance(self._tensor(query), nthreads=numba.get_num_threads()).numpy()
 
 
 def _open3d():
-    """The module, whose import takes seconds.
+    """Import Open3D lazily, because its import takes seconds.
 
     Raises:
-        DataError: a library of the system that it needs is missing.
+        DataError: a system library that Open3D needs is missing.
     """
     if sys.platform == "linux":
-        # Open3D's wheels link libusb, for depth cameras, without bringing it along.
+        # Open3D's wheels link libusb, for depth cameras, but do not contain it.
         try:
             ctypes.CDLL("libusb-1.0.so.0")
         except OSError:
@@ -74,6 +83,8 @@ def _open3d():
     try:
         import open3d
     except (ImportError, OSError) as error:
-        remedy = "install what it misses, on Debian and Ubuntu: apt-get install libgl1 libx11-6 libgomp1 libusb-1.0-0"
+        remedy = (
+            "install the missing libraries, on Debian and Ubuntu: apt-get install libgl1 libx11-6 libgomp1 libusb-1.0-0"
+        )
         raise DataError("Open3D", f"cannot be loaded ({error})", remedy) from error
     return open3d

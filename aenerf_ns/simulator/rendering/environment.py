@@ -9,21 +9,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.errors import DataError
-
-Array = NDArray[np.float64]
+from aenerf_ns.simulator.arrays import Array
 
 _COARSE_ROWS = 32
 _SKY_ROWS = 512
 _BRIGHT = 4.0
-"""What exceeds this multiple of the mean radiance is sampled by itself: the sun, lamps, windows."""
+"""Radiance above this multiple of the mean (the sun, lamps, windows) is sampled separately."""
 
 
 @dataclass(frozen=True)
 class Environment:
     """Radiance from every direction, as an equirectangular picture.
 
-    The first row is straight up. The middle column lies along +x and columns go on clockwise seen from above: a
-    quarter of the width to the left of it is +y.
+    The first row is straight up. The middle column lies along +x. Columns run clockwise seen from above, so +y lies a
+    quarter of the width to the left of the middle.
 
     Attributes:
         radiance: (rows, columns, 3) linear RGB, float32.
@@ -32,10 +31,13 @@ class Environment:
     radiance: NDArray[np.float32]
 
     def split(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The even part, coarse (at most 32 rows), and the rest, which is small and bright, at full resolution.
+        """Split the environment into an even part and a bright part that add up to the whole.
 
-        The two add up to the whole: a light that covers a few texels is noise where one samples it like the sky, and
-        the sky would need many samples where one samples it like the sun.
+        Sampling a light of a few texels like the sky gives noise, and sampling the sky like the sun takes many samples,
+        so each part is sampled in its own way.
+
+        Returns:
+            the even part, at most 32 rows high, and the small bright part at full resolution.
         """
         solid_angle = _row_weights(len(self.radiance))[:, None]
         luminance = self.radiance.mean(axis=-1)
@@ -50,27 +52,27 @@ class Environment:
 
 
 def _row_weights(rows: int) -> Array:
-    """Solid angle (rows,) of each row, up to a factor."""
+    """Return the solid angle (rows,) of each row, up to a factor."""
     return -np.diff(np.cos(np.pi * np.arange(rows + 1) / rows))
 
 
 def sky(nadir: ArrayLike, zenith: ArrayLike) -> Environment:
-    """A sky that is linear in the cosine between radiances (3,) from straight below and from straight above."""
+    """Make a sky whose radiance is linear in the direction's height, from ``nadir`` (3,) to ``zenith`` (3,)."""
     up = 0.5 + 0.5 * np.cos(np.pi * (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS)[:, None]
     column = (1 - up) * np.asarray(nadir, np.float64) + up * np.asarray(zenith, np.float64)
     return Environment(np.repeat(column[:, None].astype(np.float32), 2, axis=1))
 
 
 def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -> Environment:
-    """A Radiance .hdr panorama.
+    """Read a Radiance .hdr panorama.
 
     Args:
         path: the file.
-        turn_degrees: by which it is turned about the vertical, anticlockwise seen from above.
-        gain: factor of its radiance.
+        turn_degrees: rotation about the vertical, anticlockwise seen from above.
+        gain: factor of the radiance.
 
     Raises:
-        DataError: the file is missing or no panorama.
+        DataError: the file is missing or is not a panorama.
     """
     import cv2
 
@@ -86,7 +88,7 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
     if not np.isfinite(picture).all() or picture.min() < 0 or not 0 < picture.max() * gain < 1e12:
         raise DataError(path, "radiance that is negative, infinite, or nowhere positive", "give another picture")
     radiance = gain * picture[..., 2::-1]
-    # Turning it anticlockwise moves what was at +x towards +y: to the left.
+    # An anticlockwise turn moves the content at +x towards +y, which is to the left.
     shift = turn_degrees / 360.0 * columns
     whole, part = int(np.floor(shift)), shift - np.floor(shift)
     radiance = (1 - part) * np.roll(radiance, -whole, axis=1) + part * np.roll(radiance, -whole - 1, axis=1)

@@ -1,10 +1,9 @@
-"""Triangle meshes with colours and textures, from .glb, .obj and .ply files."""
+"""Read meshes with colours and textures from .glb, .obj and .ply files."""
 
 from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -12,52 +11,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
+from aenerf_ns.simulator.arrays import Array, Texture
+from aenerf_ns.simulator.rendering.mesh import Mesh
 from aenerf_ns.simulator.rendering.polygons import triangulated_obj
-from aenerf_ns.simulator.textures import linear
-
-Array = NDArray[np.float64]
 
 SUFFIXES = (".glb", ".obj", ".ply")
 UNCOLOURED = 0.5
-"""Albedo of a surface whose file gives it no colour."""
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles in the world, z up, in metres once it is `scaled`.
-
-    The colour of a surface point is its texture's times that interpolated between the vertices.
-
-    Attributes:
-        vertices: (V, 3). Not shared between surfaces of different materials or across seams of a texture.
-        faces: (F, 3) vertices, anticlockwise seen from the front.
-        uv: (V, 2) texture coordinates in widths and heights of the texture, from its lower left corner.
-        colour: (V, 3) linear RGB.
-        texture: (F,) index into ``textures``, -1 for none.
-        textures: of linear RGB, float32 (rows, columns, 3), the lowest row first. They repeat.
-    """
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    uv: Array
-    colour: Array
-    texture: NDArray[np.int64]
-    textures: tuple[NDArray[np.float32], ...]
+"""Albedo of a surface that has no colour in its file."""
 
 
 def load_mesh(path: Path, y_up: bool) -> Mesh:
     """Read a mesh with all the parts and transforms of its scene.
 
-    Materials are Lambertian and opaque: base colour (a factor, a texture, and colours of vertices or faces), and
-    nothing else. A .ply's and an .obj's vertex colours are sRGB; factors and a .glb's vertex colours are linear.
+    Of a material, only the base colour is read: a factor, a texture, and colours of vertices or faces. Vertex colours
+    of .ply and .obj files are sRGB. Factors and the vertex colours of .glb files are linear.
 
     Args:
-        path: .glb, .obj (with its .mtl) or .ply.
-        y_up: whether the file's y axis points up, in place of z. It is turned by (x, y, z) -> (x, -z, y).
+        path: a .glb, .obj (with its .mtl) or .ply file.
+        y_up: whether the file's y axis points up, in place of z. Vertices are then turned by (x, y, z) -> (x, -z, y).
 
     Raises:
-        DataError: the file or one it refers to is missing or cannot be read, or there is no surface in it.
+        DataError: the file, or a file that it refers to, is missing or cannot be read, or it has no surface.
     """
     import trimesh
 
@@ -81,18 +57,18 @@ def load_mesh(path: Path, y_up: bool) -> Mesh:
             process=False,
         )
         nodes = list(scene.graph.nodes_geometry)
-        # Its reader of .obj files makes a part of each material, the last one first.
+        # trimesh makes a part of each material of an .obj file, in reversed order.
         placed = [scene.graph[name] for name in (reversed(nodes) if suffix == ".obj" else nodes)]
         meshes = [
             (scene.geometry[name], np.asarray(transform, np.float64))
             for transform, name in placed
             if len(getattr(scene.geometry[name], "faces", ()))
         ]
-    except Exception as error:  # whatever a malformed file makes of the reader
+    except Exception as error:  # a malformed file raises exceptions of any kind in trimesh
         raise DataError(path, f"cannot be read ({error})", "export the mesh again") from error
     if not meshes:
         raise DataError(path, "there is no surface in it", "give a mesh of triangles, not points or lines")
-    textures: dict[int, tuple[int, NDArray[np.float32]]] = {}
+    textures: dict[int, tuple[int, Texture]] = {}
     parts = [_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in meshes]
     vertices, faces, uv, colour, texture = zip(*parts, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
@@ -108,26 +84,22 @@ def load_mesh(path: Path, y_up: bool) -> Mesh:
         np.concatenate(uv),
         np.concatenate(colour),
         np.concatenate(texture),
+        np.zeros(len(joined)),
         tuple(image for _, image in textures.values()),
     )
 
 
-def scaled(mesh: Mesh, scale: float) -> Mesh:
-    """The mesh with ``scale`` metres per unit, its vertices rounded as the ray caster will round them."""
-    return replace(mesh, vertices=(scale * mesh.vertices).astype(np.float32).astype(np.float64))
-
-
 def _part(
-    path: Path, mesh: Any, transform: Array, is_gltf: bool, textures: dict[int, tuple[int, NDArray[np.float32]]]
+    path: Path, mesh: Any, transform: Array, is_gltf: bool, textures: dict[int, tuple[int, Texture]]
 ) -> tuple[Array, NDArray[np.int64], Array, Array, NDArray[np.int64]]:
-    """Vertices, faces, texture coordinates, colours, and the texture of each face; new textures are added."""
+    """Return vertices, faces, texture coordinates, colours, and the texture of each face. Add new textures."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if faces.max() >= len(vertices) or faces.min() < 0:
         raise DataError(path, "a face has a vertex that does not exist", "export the mesh again")
     visual = mesh.visual
     uv, index = np.zeros((len(vertices), 2)), -1
     if visual.kind == "face":
-        # Each face with vertices of its own.
+        # Face colours need separate vertices for each face.
         vertices, uv = vertices[faces].reshape(-1, 3), np.zeros((3 * len(faces), 2))
         colour = np.repeat(_colours(visual.face_colors, is_gltf), 3, axis=0)
         faces = np.arange(3 * len(faces)).reshape(-1, 3)
@@ -149,7 +121,7 @@ def _part(
                     pixels = np.asarray(image.convert("RGB"))[::-1]
                 except OSError as error:
                     raise DataError(path, f"a texture cannot be read ({error})", "export the mesh again") from error
-                table = linear(np.arange(256) / 255).astype(np.float32)
+                table = decode(np.arange(256) / 255, "srgb").astype(np.float32)
                 textures[id(image)] = (len(textures), table[pixels])
             index = textures[id(image)][0]
     else:
@@ -161,11 +133,11 @@ def _part(
 
 
 def _material(material: Any) -> tuple[Array, Any]:
-    """Linear colour factor (3,) and picture or None of a material."""
+    """Return the linear colour factor (3,) and the picture, or None, of a material."""
     if hasattr(material, "baseColorTexture"):
         factor = material.baseColorFactor
         return (np.ones(3) if factor is None else np.asarray(factor)[:3] / 255.0), material.baseColorTexture
-    # The reader rounds what it calls diffuse to 8 bits, and keeps what the file says.
+    # trimesh rounds `diffuse` to 8 bits, but keeps the file's own value in `kwargs`.
     image, factor = material.image, (material.kwargs or {}).get("kd")
     if factor is not None and np.size(factor) == 3:
         return np.asarray(factor, np.float64), image
@@ -173,16 +145,16 @@ def _material(material: Any) -> tuple[Array, Any]:
 
 
 def _colours(values: Any, is_linear: bool) -> Array:
-    """Linear RGB (N, 3) of colours as integers of any width or decimals."""
+    """Return linear RGB (N, 3) of colours that are integers of any width, or decimals."""
     colours = np.asarray(values)[:, :3]
     if colours.dtype.kind in "iu":
         colours = colours / float(np.iinfo(colours.dtype).max)
     colours = np.asarray(colours, np.float64).clip(0, None)
-    return colours if is_linear else linear(colours)
+    return decode(colours, "linear" if is_linear else "srgb")
 
 
 def _check_glb(path: Path, content: bytes) -> None:
-    """What the reader would pass over in silence."""
+    """Refuse content that trimesh would ignore without a word."""
     try:
         magic, _, _, length, kind = struct.unpack_from("<4sIII4s", content)
         header = json.loads(content[20 : 20 + length])
@@ -203,7 +175,7 @@ def _check_glb(path: Path, content: bytes) -> None:
 
 
 def _check_obj(path: Path, text: str) -> None:
-    """Every file that an .obj refers to must be there: the reader would leave surfaces grey."""
+    """Refuse an .obj that refers to a missing file, because trimesh would leave its surfaces grey."""
     from PIL import Image
 
     libraries = [line.split(None, 1)[1].strip() for line in text.splitlines() if line.startswith("mtllib ")]

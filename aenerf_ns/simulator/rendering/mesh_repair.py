@@ -1,4 +1,4 @@
-"""Meshes made fit to be rendered: without degenerate and coincident faces, and cut small enough to carry light."""
+"""Prepare a mesh for rendering: no degenerate or coincident faces, and faces small enough to carry light."""
 
 from __future__ import annotations
 
@@ -9,27 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.simulator.rendering.embree import RayCaster
-from aenerf_ns.simulator.rendering.mesh_loading import Array, Mesh
+from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position_ids
 
 _RESOLUTION = 4e-6
-"""Distance, in parts of the largest coordinate, below which the ray caster's float32 cannot order two surfaces."""
+"""Distance below which the ray caster's float32 cannot order two surfaces, as a fraction of the largest coordinate."""
 _SEPARATION = 8.0
-"""How far coincident surfaces are moved apart, in the same distances."""
-
-
+"""How far coincident surfaces are moved apart, in units of that distance."""
 _POINTS = 60_000
-"""About how many corners large faces are cut into."""
+"""Approximate number of corners that large faces are subdivided into."""
 
 
 def prepared(mesh: Mesh, spacing: float | None = None) -> tuple[Mesh, int]:
-    """A mesh without degenerate, coincident or large faces.
+    """Remove degenerate faces, separate coincident faces and subdivide large faces.
 
     Args:
-        mesh: as it was read.
-        spacing: longest edge in metres; by default, one that makes some ten thousands of corners of large faces.
+        mesh: a mesh as it was read.
+        spacing: longest edge in metres. The default subdivides large faces into some ten thousand corners.
 
     Returns:
-        the mesh, and how many of its faces lay in others.
+        the mesh, and the number of its faces that coincided with others.
 
     Raises:
         ValueError: no face has an area.
@@ -38,53 +36,36 @@ def prepared(mesh: Mesh, spacing: float | None = None) -> tuple[Mesh, int]:
     if len(mesh.faces) == 0:
         raise ValueError("no face has an area")
     if spacing is None:
-        # Halved edges have about 0.7 of that length, and a corner has two equilateral triangles of them.
+        # Halving leaves edges of about 0.7 of that length; an equilateral mesh has two triangles per corner.
         spacing = math.sqrt(2.3 * float(normals_and_areas(mesh)[1].sum()) / _POINTS)
     small, source = subdivided(mesh, spacing)
     apart, moved = with_coincident_faces_apart(small, source)
     return apart, dropped + len(np.unique(source[moved]))
 
 
-def normals_and_areas(mesh: Mesh) -> tuple[Array, Array]:
-    """Unit normals (F, 3), zero where a face is degenerate, and areas (F,)."""
-    a, b, c = mesh.vertices[mesh.faces.T]
-    cross = np.cross(b - a, c - a)
-    norm = np.linalg.norm(cross, axis=1)
-    return cross / np.maximum(norm, 1e-300)[:, None], norm / 2
-
-
 def without_degenerate_faces(mesh: Mesh) -> Mesh:
-    """Drops faces without area: those whose height is lost in float32."""
+    """Drop the faces whose height is lost in float32."""
     a, b, c = mesh.vertices[mesh.faces.T]
     longest = np.sqrt(np.maximum.reduce([((p - q) ** 2).sum(1) for p, q in ((a, b), (b, c), (c, a))]))
     area = normals_and_areas(mesh)[1]
     keep = 2 * area > np.abs(mesh.vertices).max() * 1e-7 * longest
-    return replace(mesh, faces=mesh.faces[keep], texture=mesh.texture[keep])
-
-
-def position_ids(vertices: Array) -> NDArray[np.int64]:
-    """Number (V,) of each vertex's position: the same for vertices in one place."""
-    keys = np.ascontiguousarray(vertices.astype(np.float32) + np.float32(0))  # -0 is 0
-    words = keys.view(np.uint32).astype(np.uint64)
-    order = np.lexsort(words.T)
-    new = np.append(False, (words[order][1:] != words[order][:-1]).any(axis=1))
-    ids = np.empty(len(vertices), np.int64)
-    ids[order] = np.cumsum(new)
-    return ids
+    return mesh.with_faces_kept(keep)
 
 
 def without_duplicate_faces(mesh: Mesh) -> tuple[Mesh, int]:
-    """Of faces with the same corners, in any order, keeps the first; and how many were dropped."""
+    """Keep the first of the faces that share all corners, in any order. Return also how many were dropped."""
     corners = np.sort(position_ids(mesh.vertices)[mesh.faces], axis=1)
     first = np.sort(np.unique(corners, axis=0, return_index=True)[1])
-    kept = replace(mesh, faces=mesh.faces[first], texture=mesh.texture[first])
-    return kept, len(mesh.faces) - len(first)
+    return mesh.with_faces_kept(first), len(mesh.faces) - len(first)
 
 
 def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
-    """Halves edges longer than ``spacing``, the longest of a face first (Rivara, 1984); and each face's old number.
+    """Halve edges longer than ``spacing``, the longest of a face first (Rivara, 1984).
 
     An edge is halved in all its faces or in none, so that no gaps open.
+
+    Returns:
+        the mesh, and the index (F,) of the original face that each face is part of.
     """
     vertices, uv, colour, faces = mesh.vertices, mesh.uv, mesh.colour, mesh.faces
     source = np.arange(len(faces))
@@ -94,15 +75,23 @@ def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
         longest = square.argmax(axis=1)
         split = np.flatnonzero(square[np.arange(len(faces)), longest] > spacing * spacing)
         if len(split) == 0:
-            kept = replace(mesh, vertices=vertices, uv=uv, colour=colour, faces=faces, texture=mesh.texture[source])
-            return kept, source
+            parts = replace(
+                mesh,
+                vertices=vertices,
+                uv=uv,
+                colour=colour,
+                faces=faces,
+                texture=mesh.texture[source],
+                emission=mesh.emission[source],
+            )
+            return parts, source
         turn = (longest[split, None] + np.arange(3)) % 3
         a, b, c = np.take_along_axis(faces[split], turn, axis=1).T
         low, high = np.minimum(a, b), np.maximum(a, b)
         _, representative, middle = np.unique(low * len(vertices) + high, return_index=True, return_inverse=True)
         i, j = low[representative], high[representative]
         middle = len(vertices) + middle.reshape(-1)
-        # Rounded as the ray caster rounds.
+        # Rounded to float32, as the ray caster does.
         midpoints = (0.5 * (vertices[i] + vertices[j])).astype(np.float32).astype(np.float64)
         vertices = np.concatenate([vertices, midpoints])
         uv = np.concatenate([uv, 0.5 * (uv[i] + uv[j])])
@@ -114,15 +103,16 @@ def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
 
 
 def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:
-    """Moves faces that lie in others, overlapping them, a hair behind the ones that come first.
+    """Separate coincident faces: move each a hair behind the one that comes first.
 
-    Which of the two a ray hits would be rounding's choice, another one in each frame.
+    Rounding would otherwise decide which of the two faces a ray hits, differently in each frame.
 
     Args:
-        order: (F,) the lower comes first.
+        mesh: a mesh of small faces.
+        order: (F,) rank of each face. Of two coincident faces, the one with the lower rank stays.
 
     Returns:
-        the mesh, and the faces that were moved.
+        the mesh, and the indices of the moved faces.
     """
     resolution = _RESOLUTION * float(np.abs(mesh.vertices).max())
     a, b, c = mesh.vertices[mesh.faces.T]
@@ -134,7 +124,7 @@ def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[M
     # The middle, and points near the corners.
     for weights in ((1 / 3, 1 / 3, 1 / 3), (0.8, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.1, 0.8)):
         points = weights[0] * a + weights[1] * b + weights[2] * c
-        # Directions that end just behind the face: farther hits are of no interest, but are listed.
+        # The rays end just behind the face. Hits beyond that are listed too, and ignored.
         rays = np.concatenate([points + above * normal, -above * normal], axis=1).astype(np.float32)
         for start in range(0, len(rays), 1 << 18):
             hits = caster.all_hits(rays[start : start + (1 << 18)])

@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 
 
 class MipMaps(NamedTuple):
-    """Pictures with their successive halvings, L of them in all, one after the other."""
+    """Pictures and their successive halvings, L levels in all, stored one after the other."""
 
     texels: NDArray  # (M, 3) uint16 or float32
-    level: NDArray[np.int64]  # (L, 3): first texel, rows and columns
+    level: NDArray[np.int64]  # (L, 3) first texel, rows and columns
     first_level: NDArray[np.int64]  # (pictures + 1,)
 
 
 def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
-    """Mip maps of pictures (rows, columns, 3), whose mean every level keeps.
+    """Build mip maps of pictures (rows, columns, 3). Every level keeps the mean of its picture.
 
     Args:
-        bits16: values in [0, 1] as 16-bit integers, for half the memory.
+        pictures: the pictures.
+        bits16: store values as 16-bit integers, clipped to [0, 1], which halves the memory.
     """
     texels, level, first_level, start = [], [], [0], 0
     for picture in pictures:
@@ -45,7 +46,7 @@ def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
 
 
 def _halved(picture: NDArray[np.floating], axis: int) -> NDArray[np.floating]:
-    """Means over two texels each; over two and a bit where their number is odd."""
+    """Average pairs of texels along an axis; if their number is odd, average a little more than two."""
     picture = np.moveaxis(picture, axis, 0)
     size = len(picture)
     half = max(1, size // 2)
@@ -64,10 +65,10 @@ def _halved(picture: NDArray[np.floating], axis: int) -> NDArray[np.floating]:
 
 @numba.njit(cache=True, error_model="numpy")
 def lookup(maps, picture, u, v, footprint, repeats):
-    """Trilinear value of a picture at (u, v) in its widths and heights.
+    """Interpolate a picture at (u, v), in widths and heights of the picture, trilinearly.
 
-    ``footprint`` is the side of the region to average, in texels of the finest level. Rows go on beyond their ends from
-    the other side with ``repeats``, and else with the last row; columns always go on.
+    ``footprint`` is the side of the region to average, in texels of the finest level. Columns always repeat.
+    Rows repeat if ``repeats`` is true; otherwise the first and the last row extend to infinity.
     """
     first, last = maps.first_level[picture], maps.first_level[picture + 1] - 1
     detail = min(math.log2(max(footprint, 1.0)), float(last - first))
@@ -105,7 +106,7 @@ def lookup(maps, picture, u, v, footprint, repeats):
 
 @numba.njit(cache=True, error_model="numpy")
 def panorama(maps, dx, dy, dz, footprint):
-    """Value of an equirectangular picture (see `Environment`) in a direction of any length."""
+    """Interpolate an equirectangular picture (see `Environment`) in a direction of any length."""
     turn = math.atan2(dy, dx) / (2.0 * math.pi)
     down = math.acos(max(-1.0, min(1.0, dz / math.sqrt(dx * dx + dy * dy + dz * dz)))) / math.pi
     return lookup(maps, 0, 0.5 - turn, down, footprint, False)

@@ -1,17 +1,16 @@
-"""Triangles of polygons that are not convex, which a fan from one corner would fill wrongly."""
+"""Triangulate polygons that are not convex; a fan from one corner would fill them wrongly."""
 
 from __future__ import annotations
 
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from aenerf_ns.simulator.arrays import Array
 
 
 def ear_clipping(corners: Array) -> list[tuple[int, int, int]]:
-    """Triangles (as indices) of a simple polygon with corners (N, 3), in its orientation (Meisters, 1975)."""
+    """Cut a simple polygon with corners (N, 3) into triangles of indices, in its orientation (Meisters, 1975)."""
     normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)  # Newell's
     axis = int(np.argmax(np.abs(normal)))
     flat = corners[:, [(axis + 1) % 3, (axis + 2) % 3]] * [1.0, np.sign(normal[axis]) or 1.0]
@@ -24,21 +23,21 @@ def ear_clipping(corners: Array) -> list[tuple[int, int, int]]:
     while len(left) > 3:
         for i, b in enumerate(left):
             a, c = left[i - 1], left[(i + 1) % len(left)]
-            # The corners where a hole is joined to the outline occur twice, and must not be in their own way.
+            # Corners where a hole joins the outline occur twice. A corner must not block its own copy.
             others = [p for p in left if not any((flat[p] == flat[q]).all() for q in (a, b, c))]
             if turn(a, b, c) > 0 and not any(
                 turn(a, b, p) >= 0 and turn(b, c, p) >= 0 and turn(c, a, p) >= 0 for p in others
             ):
                 break
         else:
-            i = 1  # it crosses or touches itself: no way is right
+            i = 1  # the polygon crosses or touches itself, so no triangulation is right
         triangles.append((left[i - 1], left[i], left[(i + 1) % len(left)]))
         del left[i]
     return [*triangles, (left[0], left[1], left[2])]
 
 
 def triangulated_obj(text: str) -> str:
-    """The text of an .obj file with its concave polygons cut into triangles."""
+    """Return the text of an .obj file with its concave polygons cut into triangles."""
     if not re.search(r"^f(?:[ \t]+\S+){4}", text, re.MULTILINE):
         return text
     lines = text.replace("\\\n", " ").split("\n")

@@ -1,50 +1,314 @@
-"""What the simulator asks of a scene: pictures through a pinhole camera."""
+"""Pictures of a lit mesh: Embree casts the primary rays, compiled code shades the hits.
+
+Every surface is Lambertian, so the light that a surface receives does not depend on the view. `lighting` computes that
+light once; rendering casts primary rays only. Radiance is linear RGB, lengths are metres, and the world's z axis points
+up. A camera has OpenCV axes (x right, y down, z forward). The centre of pixel (x, y) lies at (x + 0.5, y + 0.5), as in
+Nerfstudio.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
-from typing import Protocol
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from aenerf_ns.simulator.arrays import Array
+from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
+from aenerf_ns.simulator.rendering.environment import Environment
+from aenerf_ns.simulator.rendering.mesh import Mesh
+from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps, panorama
+
 POINT_SPREAD = 0.5
 """Standard deviation of a pixel's Gaussian point-spread function, in pixels."""
+_FOOTPRINT = 0.5
+"""Side of the texture region that a sample averages, in pixels: about the distance between the samples of a pixel."""
 
 
-class Renderer(Protocol):
-    """A lit scene."""
+class MeshArrays(NamedTuple):
+    """The arrays of a mesh that the compiled functions read: V vertices, F faces, G light points."""
+
+    vertices: Array  # (V, 3)
+    faces: NDArray[np.int32]  # (F, 3)
+    uv: Array  # (V, 2)
+    colour: NDArray[np.float32]  # (V, 3)
+    texture: NDArray[np.int32]  # (F,) -1 for none
+    density: NDArray[np.float32]  # (F,) texels per metre
+    light_point: NDArray[np.int32]  # (F, 3) light point of each corner
+
+
+def mesh_arrays(mesh: Mesh, light_point: NDArray[np.integer]) -> MeshArrays:
+    """Return the arrays of a mesh, given the light points (F, 3) of its faces' corners."""
+    a, b, c = mesh.vertices[mesh.faces.T]
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    p, q, r = mesh.uv[mesh.faces.T]
+    in_texture = np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
+    texels = np.array([*(len(image) * image.shape[1] for image in mesh.textures), 0.0])
+    return MeshArrays(
+        mesh.vertices,
+        mesh.faces.astype(np.int32),
+        mesh.uv,
+        mesh.colour.astype(np.float32),
+        mesh.texture.astype(np.int32),
+        np.sqrt(in_texture * texels[mesh.texture] / np.maximum(area, 1e-300)).astype(np.float32),
+        light_point.astype(np.int32),
+    )
+
+
+# Not parallel: starting threads for this little work takes longer than the work, above all on a busy machine.
+@numba.njit(cache=True, error_model="numpy")
+def _camera_rays(rotation, centre, intrinsics, offsets, window, rays):
+    """Fill the rays (N, 6) of a window of the picture. Directions reach one metre along the optical axis."""
+    fx, fy, cx, cy = intrinsics
+    samples = len(offsets)
+    left, right, top, bottom = window
+    for y in range(top, bottom):
+        for x in range(left, right):
+            for s in range(samples):
+                u = (x + 0.5 + offsets[s, 0] - cx) / fx
+                v = (y + 0.5 + offsets[s, 1] - cy) / fy
+                ray = rays[((y - top) * (right - left) + x - left) * samples + s]
+                for axis in range(3):
+                    ray[axis] = centre[axis]
+                    ray[3 + axis] = rotation[axis, 0] * u + rotation[axis, 1] * v + rotation[axis, 2]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _meet(vertices, a, b, c, ox, oy, oz, dx, dy, dz):
+    """Intersect a ray with a triangle's plane (Möller and Trumbore, 1997).
+
+    Returns:
+        the second and third barycentric coordinates, clamped to the triangle, and the normal, whose length is twice the
+        area.
+    """
+    ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+    ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+    vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    sx, sy, sz = ox - ax, oy - ay, oz - az
+    determinant = -(nx * dx + ny * dy + nz * dz)
+    qx, qy, qz = sy * dz - sz * dy, sz * dx - sx * dz, sx * dy - sy * dx
+    second = (vx * qx + vy * qy + vz * qz) / determinant
+    third = -(ux * qx + uy * qy + uz * qz) / determinant
+    # A ray nearly parallel to the plane may meet it anywhere or nowhere.
+    second = second if 0.0 <= second < 1e9 else 0.0
+    third = third if 0.0 <= third < 1e9 else 0.0
+    total = second + third
+    if total > 1.0:
+        second, third = second / total, third / total
+    return second, third, nx, ny, nz
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _shade(
+    arrays,
+    textures,
+    light,
+    hits,
+    window,
+    rotation,
+    centre,
+    intrinsics,
+    offsets,
+    background,
+    sky,
+    limit,
+    radiance,
+    depth,
+    alpha,
+):
+    """Shade the hits of `_camera_rays` and fill ``radiance``, ``depth`` and ``alpha``.
+
+    A ray that hits nothing sees the panorama ``sky``, or ``background`` if ``sky`` is empty.
+    """
+    vertices, faces, uv, colour, texture, density, light_point = arrays
+    height, width = depth.shape
+    fx, fy, cx, cy = intrinsics
+    samples = len(offsets)
+    ox, oy, oz = centre[0], centre[1], centre[2]
+    has_sky = len(sky.level) > 0
+    left, right, top, bottom = window
+    for y in numba.prange(height):
+        for x in range(width):
+            red, green, blue, total_depth, found = 0.0, 0.0, 0.0, 0.0, 0
+            for s in range(samples):
+                u = (x + 0.5 + offsets[s, 0] - cx) / fx
+                v = (y + 0.5 + offsets[s, 1] - cy) / fy
+                dx = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
+                dy = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
+                dz = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]
+                face = NOTHING
+                if left <= x < right and top <= y < bottom:
+                    face = hits[((y - top) * (right - left) + x - left) * samples + s]
+                if face == NOTHING:
+                    if has_sky:
+                        per_radian = sky.level[0, 2] / (2.0 * math.pi)
+                        r, g, b = panorama(sky, dx, dy, dz, _FOOTPRINT / fx * per_radian)
+                        red += min(r, limit)
+                        green += min(g, limit)
+                        blue += min(b, limit)
+                    else:
+                        red += background[0]
+                        green += background[1]
+                        blue += background[2]
+                    continue
+                i, j, k = faces[face, 0], faces[face, 1], faces[face, 2]
+                wj, wk, nx, ny, nz = _meet(vertices, i, j, k, ox, oy, oz, dx, dy, dz)
+                wi = 1.0 - wj - wk
+                px = wi * vertices[i, 0] + wj * vertices[j, 0] + wk * vertices[k, 0] - ox
+                py = wi * vertices[i, 1] + wj * vertices[j, 1] + wk * vertices[k, 1] - oy
+                pz = wi * vertices[i, 2] + wj * vertices[j, 2] + wk * vertices[k, 2] - oz
+                distance = rotation[0, 2] * px + rotation[1, 2] * py + rotation[2, 2] * pz
+                facing = nx * dx + ny * dy + nz * dz
+                side = 0 if facing < 0.0 else 1
+                li, lj, lk = light_point[face, 0], light_point[face, 1], light_point[face, 2]
+                r = wi * light[side, li, 0] + wj * light[side, lj, 0] + wk * light[side, lk, 0]
+                g = wi * light[side, li, 1] + wj * light[side, lj, 1] + wk * light[side, lk, 1]
+                b = wi * light[side, li, 2] + wj * light[side, lj, 2] + wk * light[side, lk, 2]
+                r *= wi * colour[i, 0] + wj * colour[j, 0] + wk * colour[k, 0]
+                g *= wi * colour[i, 1] + wj * colour[j, 1] + wk * colour[k, 1]
+                b *= wi * colour[i, 2] + wj * colour[j, 2] + wk * colour[k, 2]
+                if texture[face] >= 0:
+                    # A pixel covers depth / focal length, stretched where the surface is seen at a slant; the geometric
+                    # mean of its two sides keeps textures crisp there without aliasing.
+                    lengths = math.sqrt((nx * nx + ny * ny + nz * nz) * (dx * dx + dy * dy + dz * dz))
+                    slant = max(abs(facing) / lengths, 0.02)
+                    tr, tg, tb = lookup(
+                        textures,
+                        texture[face],
+                        wi * uv[i, 0] + wj * uv[j, 0] + wk * uv[k, 0],
+                        wi * uv[i, 1] + wj * uv[j, 1] + wk * uv[k, 1],
+                        _FOOTPRINT * distance / (fx * math.sqrt(slant)) * density[face],
+                        True,
+                    )
+                    r, g, b = r * tr / 65535.0, g * tg / 65535.0, b * tb / 65535.0
+                red += r
+                green += g
+                blue += b
+                total_depth += distance
+                found += 1
+            radiance[y, x, 0] = red / samples
+            radiance[y, x, 1] = green / samples
+            radiance[y, x, 2] = blue / samples
+            depth[y, x] = total_depth / found if found > 0 else math.inf
+            alpha[y, x] = found / samples
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """Render a lit mesh.
+
+    Attributes:
+        arrays: the mesh.
+        textures: textures of the mesh.
+        caster: casts rays against the mesh.
+        light: (2, G, 3) irradiance / pi at the light points, in front of the faces and behind them.
+        background: (3,) radiance where a ray hits nothing and ``surroundings`` is empty.
+        surroundings: panorama that is seen where a ray hits nothing, or empty.
+        limit: the radiance of the surroundings is clipped to this value.
+    """
+
+    arrays: MeshArrays
+    textures: MipMaps
+    caster: RayCaster
+    light: NDArray[np.float32]
+    background: Array
+    surroundings: MipMaps
+    limit: float
 
     def render(
-        self, camera_to_world: ArrayLike, intrinsics: Sequence[float], width: int, height: int, samples: int
+        self,
+        camera_to_world: ArrayLike,
+        intrinsics: Sequence[float],
+        width: int,
+        height: int,
+        samples: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Picture through a pinhole camera.
+        """Render a picture through a pinhole camera.
 
         Args:
             camera_to_world: (4, 4) or (3, 4), OpenCV axes.
             intrinsics: (fx, fy, cx, cy) in pixels, pixel centres at +0.5.
-            width, height: of the picture, in pixels.
-            samples: rays per pixel, the same pattern of a Gaussian point-spread in every pixel and every frame: 1, or 3
-                and more; one ray goes through the pixel's centre.
+            width, height: size of the picture in pixels.
+            samples: rays per pixel, 1 or at least 3. Every pixel of every frame has the same pattern of rays, which
+                samples a Gaussian point-spread function. A single ray goes through the pixel's centre.
 
         Returns:
-            radiance (H, W, 3) linear RGB; depth (H, W) along the optical axis, mean over the rays that hit, inf where
-            none does; alpha (H, W), the fraction of rays that hit. All float32.
+            radiance (H, W, 3), linear RGB; depth (H, W) along the optical axis, the mean over the rays that hit, inf
+            where none does; alpha (H, W), the fraction of rays that hit. All are float32.
 
         Raises:
-            ValueError: on a number of samples that `sample_offsets` has no pattern for.
+            ValueError: `sample_offsets` has no pattern with this number of samples.
         """
-        ...
+        pose = np.asarray(camera_to_world, np.float64)
+        rotation, centre = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
+        lens, offsets = np.asarray(intrinsics, np.float64), sample_offsets(samples)
+        window = self._window(rotation, centre, lens, offsets, width, height)
+        left, right, top, bottom = window
+        rays = np.empty(((bottom - top) * (right - left) * len(offsets), 6), np.float32)
+        _camera_rays(rotation, centre, lens, offsets, window, rays)
+        hits = self.caster.cast(rays)["primitive_ids"]
+        radiance = np.empty((height, width, 3), np.float32)
+        depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+        _shade(
+            self.arrays,
+            self.textures,
+            self.light,
+            hits,
+            window,
+            rotation,
+            centre,
+            lens,
+            offsets,
+            self.background,
+            self.surroundings,
+            self.limit,
+            radiance,
+            depth,
+            alpha,
+        )
+        return radiance, depth, alpha
+
+    @cached_property
+    def _corners(self) -> Array:
+        """The corners (8, 3) of the mesh's bounding box."""
+        used = self.arrays.vertices[self.arrays.faces.reshape(-1)]
+        return np.array(list(itertools.product(*np.stack([used.min(axis=0), used.max(axis=0)], axis=1))))
+
+    def _window(
+        self, rotation: Array, centre: Array, lens: Array, offsets: Array, width: int, height: int
+    ) -> tuple[int, int, int, int]:
+        """Return left, right, top and bottom of the part of the picture outside which no ray hits the mesh."""
+        corners = (self._corners - centre) @ rotation
+        if corners[:, 2].min() <= 0:
+            return 0, width, 0, height
+        pixels = lens[:2] * corners[:, :2] / corners[:, 2:] + lens[2:]
+        # One pixel more than the rays' offsets, because the ray caster rounds to float32.
+        reach = np.abs(offsets).max(axis=0) + 1.0
+        left, top = np.floor((pixels.min(axis=0) - reach).clip(0, (width, height))).astype(int).tolist()
+        right, bottom = np.ceil((pixels.max(axis=0) + reach).clip(0, (width, height))).astype(int).tolist()
+        return left, right, top, bottom
+
+
+def surroundings(environment: Environment | None) -> MipMaps:
+    """Return the panorama behind a mesh, empty where there is no environment to be seen."""
+    return mip_maps([] if environment is None else [environment.radiance], bits16=False)
 
 
 def sample_offsets(samples: int) -> NDArray[np.float64]:
-    """Offsets (N, 2) in pixels of equally weighted rays that stand for the point-spread function.
+    """Return offsets (N, 2) in pixels of equally weighted rays that sample the point-spread function.
 
-    A spiral of golden angles with its radii at the quantiles of the Gaussian, then brought to exactly the Gaussian's
-    mean and covariance. One ray goes through the centre.
+    The offsets lie on a spiral of golden angles, with radii at the quantiles of the Gaussian. A linear map then gives
+    them exactly the Gaussian's mean and covariance. A single ray goes through the centre.
 
     Raises:
-        ValueError: on fewer than one ray, or on two, which cannot spread both ways.
+        ValueError: fewer than one ray, or two, because two rays cannot spread in both directions.
     """
     if samples == 1:
         return np.zeros((1, 2))

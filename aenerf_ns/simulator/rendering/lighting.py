@@ -1,31 +1,31 @@
-"""The light that a mesh receives on both its sides, computed once.
+"""Compute the light that a mesh receives, once, on both sides of its faces.
 
-Direct light of lamps and of the sun with soft shadows, light of the sky, and diffuse bounces, at the corners of the
-faces, which are small enough for it to be linear between them. Rays are cast once: where those that gather light end is
-kept, and the bounces follow the same links again and again.
+The light consists of direct light of lamps and of the sun with soft shadows, light of the sky, and diffuse bounces. It
+is computed at the corners of the faces; faces are small enough for light to be linear between their corners. Rays are
+cast once: the points where gathering rays end are kept as links, and every bounce follows the same links.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.progress import progress_bar
+from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment
-from aenerf_ns.simulator.rendering.light_baking import AreaLight, plane_sequence
-from aenerf_ns.simulator.rendering.mesh_loading import Array, Mesh
-from aenerf_ns.simulator.rendering.mesh_repair import normals_and_areas, position_ids
-from aenerf_ns.simulator.rendering.mesh_scene import MeshArrays, MeshScene, mesh_arrays, surroundings
+from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position_ids
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps, panorama
+from aenerf_ns.simulator.rendering.renderer import MeshArrays, Renderer, mesh_arrays, surroundings
 
 _CREASE = math.cos(math.radians(40.0))
-"""Faces that meet at less than this angle are parts of one smooth surface."""
+"""Cosine of the angle below which adjacent faces belong to one smooth surface."""
 _DIRECTIONS = 64
 _STRATA = 4
 _SUN_SAMPLES = 32
@@ -34,17 +34,36 @@ _SMOOTHING = 4
 _CHUNK = 1 << 14
 
 
-class LightPoints(NamedTuple):
-    """Where light is computed: the corners that faces of one smooth surface share."""
+@dataclass(frozen=True)
+class AreaLight:
+    """An invisible rectangle that shines to one side, that of half_u x half_v.
 
-    corner: NDArray[np.int64]  # (F, 3) of the faces' corners
+    Attributes:
+        centre: (3,) in metres.
+        half_u, half_v: (3,) from the centre to the middle of a side, in metres.
+        radiance: (3,) linear RGB, uniform.
+    """
+
+    centre: ArrayLike
+    half_u: ArrayLike
+    half_v: ArrayLike
+    radiance: ArrayLike
+
+
+class LightPoints(NamedTuple):
+    """The points at which light is computed. Faces of one smooth surface share them at their corners."""
+
+    corner: NDArray[np.int64]  # (F, 3) light point of each corner of the faces
     position: Array  # (G, 3)
     normal: Array  # (G, 3) unit
-    size: Array  # (G,) length of the edges there, in metres
+    size: Array  # (G,) mean length of the edges at the point, in metres
 
 
 def light_points(mesh: Mesh) -> LightPoints:
-    """The light points of a mesh. Where a surface ends they lie inside it a little, off others that begin there."""
+    """Place the light points of a mesh.
+
+    At the boundary of a surface, points lie a little inside it, away from other surfaces that begin there.
+    """
     a, b, c = mesh.vertices[mesh.faces.T]
     normals, _ = normals_and_areas(mesh)
     place = position_ids(mesh.vertices)[mesh.faces].reshape(-1)
@@ -65,8 +84,8 @@ def light_points(mesh: Mesh) -> LightPoints:
     faces_at = np.bincount(corner, minlength=count)[:, None]
     normal = total(angle[:, None] * np.repeat(normals, 3, axis=0))
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    # A surface ends at a corner to whose neighbour an edge leads once. There the point goes onto the face that leads
-    # inside best; elsewhere it stays, for beside a corner of a curved surface the way along it is not in the surface.
+    # An edge that belongs to one face only marks the boundary of a surface. A point on the boundary moves onto the face
+    # that leads furthest inside. Other points stay, because a step along a face of a curved surface leaves the surface.
     neighbours = np.concatenate([np.roll(place.reshape(-1, 3), turn, axis=1).reshape(-1) for turn in (1, 2)])
     edges = np.concatenate([corner, corner]) * (place.max() + 1) + neighbours
     edge, uses = np.unique(edges, return_counts=True)
@@ -83,7 +102,7 @@ def light_points(mesh: Mesh) -> LightPoints:
 
 @numba.njit(cache=True, error_model="numpy")
 def _smooth_parts(start, order, normals, part):
-    """Numbers the parts, free of creases, of the corners at each position: ``order[start[i]:start[i + 1]]``."""
+    """Number the crease-free groups of the corners at each position, ``order[start[i]:start[i + 1]]``."""
     count = 0
     for place in range(len(start) - 1):
         corners = order[start[place] : start[place + 1]]
@@ -93,7 +112,7 @@ def _smooth_parts(start, order, normals, part):
             if part[corners[first]] >= 0:
                 continue
             part[corners[first]] = count
-            # Grow it from face to face.
+            # Grow the group from face to face.
             grown = True
             while grown:
                 grown = False
@@ -119,32 +138,38 @@ def light_mesh(
     background: Array,
     *,
     show_environment: bool = False,
+    ambient: float = 0.0,
     seed: int = 0,
-) -> MeshScene:
-    """Light a mesh once and for all.
+) -> Renderer:
+    """Light a mesh on both sides of its faces.
 
     Args:
-        mesh: what is lit, on both sides of its faces. Light is computed at their corners and is linear between them.
-        caster: its rays.
+        mesh: the mesh. Light is computed at the corners of its faces and is linear between them.
+        caster: casts rays against the mesh.
         environment: light from far away.
-        lamps: invisible rectangles that shine.
-        background: (3,) radiance where a ray of the camera hits nothing, unless the environment is shown there.
-        show_environment: whether it is.
-        seed: of the sampling.
+        lamps: invisible lamps.
+        background: (3,) radiance where a camera's ray hits nothing, unless the environment is shown there.
+        show_environment: whether the camera sees the environment where its ray hits nothing.
+        ambient: radiance that reaches every surface from all sides, occluded or not. It keeps crevices from going
+            black, where small differences would become large contrasts of log-radiance.
+        seed: seed of the sampling.
     """
     points = light_points(mesh)
     arrays = mesh_arrays(mesh, points.corner)
     textures = mip_maps(mesh.textures, bits16=True)
-    light = _light(arrays, textures, caster, points, environment, lamps, seed)
+    light = _light(arrays, textures, caster, points, environment, lamps, ambient, seed)
+    glow = np.zeros(len(points.position), np.float32)
+    np.maximum.at(glow, points.corner, mesh.emission[:, None].astype(np.float32))
+    light += glow[:, None]
     shown = surroundings(environment if show_environment else None)
-    return MeshScene(arrays, textures, caster, light, background, shown, math.inf)
+    return Renderer(arrays, textures, caster, light, background, shown, math.inf)
 
 
-def baked_mesh(mesh: Mesh, caster: RayCaster, background: Array) -> MeshScene:
-    """A mesh whose colours are the radiance that is seen, in front of a uniform background (3,)."""
+def baked_mesh(mesh: Mesh, caster: RayCaster, background: Array) -> Renderer:
+    """Return a renderer of a mesh whose colours are radiance, in front of a uniform background (3,)."""
     arrays = mesh_arrays(mesh, np.zeros_like(mesh.faces))
     light, textures = np.ones((2, 1, 3), np.float32), mip_maps(mesh.textures, bits16=True)
-    return MeshScene(arrays, textures, caster, light, background, surroundings(None), math.inf)
+    return Renderer(arrays, textures, caster, light, background, surroundings(None), math.inf)
 
 
 def _light(
@@ -154,9 +179,10 @@ def _light(
     points: LightPoints,
     environment: Environment,
     lamps: Sequence[AreaLight],
+    ambient: float,
     seed: int,
 ) -> NDArray[np.float32]:
-    """Irradiance / pi (2, G, 3) in front of and behind the light points."""
+    """Compute irradiance / pi (2, G, 3) in front of the light points and behind them."""
     count = len(points.position)
     extent = float(np.abs(arrays.vertices).max())
     offset = max(1e-4, 2e-5 * extent)
@@ -168,7 +194,7 @@ def _light(
     sky = mip_maps([even], bits16=False)
     sun = _Sun(bright) if bright.max() > 0 else None
     emitters = np.array([[a.centre, a.half_u, a.half_v, a.radiance] for a in lamps], np.float64).reshape(-1, 4, 3)
-    directions = plane_sequence(_DIRECTIONS)
+    directions = _plane_sequence(_DIRECTIONS)
 
     sharp = np.zeros((2 * count, 3), np.float32)
     soft = np.zeros((2 * count, 3), np.float32)
@@ -206,7 +232,7 @@ def _light(
                 buried[part],
             )
     albedo = _albedo(arrays, textures, count)
-    direct = sharp + soft
+    direct = sharp + soft + np.float32(ambient)
     light = direct
     for _ in range(_BOUNCES):
         reflected = np.empty_like(light)
@@ -223,7 +249,7 @@ def _light(
         soft = _means(neighbours, soft, ~buried)
     light = sharp + soft
     for _ in range(2):
-        # What is inside or beneath another thing has no light of its own; its edge goes on with what is beside it.
+        # A point inside or beneath another object has no light of its own. It takes the mean of its neighbours' light.
         known = ~buried
         filled = _means(neighbours[buried[neighbours[:, 0]]], light, known)
         found = np.zeros(2 * count, np.bool_)
@@ -233,8 +259,17 @@ def _light(
     return np.ascontiguousarray(light.reshape(2, count, 3), np.float32)
 
 
+def _plane_sequence(count: int) -> Array:
+    """Return the first points (count, 2) of the R2 low-discrepancy sequence in the unit square (Roberts, 2018)."""
+    plastic = 1.32471795724474602596
+    return (np.arange(1, count + 1)[:, None] * np.array([1 / plastic, 1 / plastic**2])) % 1.0
+
+
 def _means(neighbours: NDArray[np.int64], values: NDArray, known: NDArray[np.bool_]) -> NDArray:
-    """Means (N, C) over the known ones of each point and its neighbours (M, 2); its own value where there is none."""
+    """Return the mean (N, C) over each point and its neighbours, of those that are known; the point's value if none is.
+
+    ``neighbours`` (M, 2) are pairs of points.
+    """
     to, of = neighbours[known[neighbours[:, 1]]].T
     weight = known + np.bincount(to, minlength=len(values))
     total = values * known[:, None]
@@ -243,7 +278,7 @@ def _means(neighbours: NDArray[np.int64], values: NDArray, known: NDArray[np.boo
 
 
 def _albedo(arrays: MeshArrays, textures: MipMaps, count: int) -> NDArray[np.float32]:
-    """Mean colour (G, 3) of the faces at each light point."""
+    """Return the mean colour (G, 3) of the faces at each light point."""
     colour = np.empty((len(arrays.faces), 3), np.float32)
     _face_colours(arrays, textures, colour)
     corner = arrays.light_point.reshape(-1)
@@ -254,7 +289,7 @@ def _albedo(arrays: MeshArrays, textures: MipMaps, count: int) -> NDArray[np.flo
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _face_colours(arrays, textures, colours):
-    """Mean colour of each face, as far as the level of the texture with about three texels on it tells."""
+    """Fill the mean colour of each face, from the mip level that has about two texels on the face."""
     for face in numba.prange(len(arrays.faces)):
         i, j, k = arrays.faces[face]
         for c in range(3):
@@ -280,7 +315,7 @@ def _face_colours(arrays, textures, colours):
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _lamp_rays(points, normals, jitter, lamp, offset, rays, weights):
-    """Segments to a lamp (4, 3), and the irradiance / pi, of unit radiance, that each would bring by itself."""
+    """Fill segments to a lamp (4, 3), and the irradiance / pi that each alone would bring from unit radiance."""
     centre, half_u, half_v = lamp[0], lamp[1], lamp[2]
     nx = half_u[1] * half_v[2] - half_u[2] * half_v[1]
     ny = half_u[2] * half_v[0] - half_u[0] * half_v[2]
@@ -306,13 +341,13 @@ def _lamp_rays(points, normals, jitter, lamp, offset, rays, weights):
 
 
 def _clear_blocked(caster: RayCaster, rays: NDArray[np.float32], weights: NDArray[np.float32]) -> None:
-    """Sets the weights of blocked segments to zero."""
+    """Set the weights of blocked segments to zero."""
     active = np.flatnonzero(weights)
     weights[active[caster.blocked(rays[active])]] = 0
 
 
 class _Sun:
-    """Samples of the small and bright part of an environment, in proportion to its luminance."""
+    """Sample the small and bright part of an environment in proportion to its luminance."""
 
     def __init__(self, radiance: NDArray[np.float32]) -> None:
         rows, columns = radiance.shape[:2]
@@ -323,22 +358,22 @@ class _Sun:
         self._texel = texel
         self._cumulative = np.cumsum(power[texel]) / power[texel].sum()
         per_power = radiance.reshape(-1, 3)[texel] / radiance.reshape(-1, 3)[texel].mean(axis=-1, keepdims=True)
-        # Radiance over probability density of a direction.
+        # Radiance divided by the probability density of the direction.
         self._colour = (per_power * power.sum()).astype(np.float32)
 
     def rays(
         self, points: Array, normals: Array, jitter: Array, reach: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Segments (N * samples, 6) of a length, and weights and colours whose products' means are irradiance / pi."""
+        """Return segments (N * samples, 6), weights and colours. The mean of weight times colour is irradiance / pi."""
         rows, columns = self._shape
         rank = np.arange(_SUN_SAMPLES)
         index = np.searchsorted(self._cumulative, ((rank + jitter[:, :1]) / _SUN_SAMPLES).reshape(-1))
         index = np.minimum(index, len(self._texel) - 1)
         texel = self._texel[index]
-        # Where in the texel: an additive recurrence, which fills it evenly whatever its rank.
+        # An additive recurrence spreads the samples evenly over each texel.
         u = ((rank * 0.7548776662466927 + jitter[:, 1:]) % 1).reshape(-1)
         v = ((rank * 0.5698402909980532 + jitter[:, :1]) % 1).reshape(-1)
-        # Even in solid angle: between the heights of the texel's edges.
+        # Uniform in solid angle: the height is uniform between the texel's edges.
         row = texel // columns
         top, bottom = np.cos(np.pi * row / rows), np.cos(np.pi * (row + 1) / rows)
         height = top + v * (bottom - top)
@@ -352,7 +387,7 @@ class _Sun:
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _gathering_rays(points, normals, jitter, directions, rays):
-    """Rays in cosine-weighted directions, of ``directions`` (K, 2) in the unit square, turned by the jitter."""
+    """Fill rays in cosine-weighted directions: ``directions`` (K, 2) in the unit square, shifted by the jitter."""
     for n in numba.prange(len(points)):
         nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
         # Tangent frame without a branch per axis: Duff et al., JCGT 2017.
@@ -374,8 +409,11 @@ def _gathering_rays(points, normals, jitter, directions, rays):
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _gather(arrays, half, rays, hits, distance, coordinates, size, sky, links, received, buried):
-    """Of each point: the light points its rays end at (behind a surface: ``half`` farther), -1 for the sky; the light
-    of the sky; and whether it is inside of something or right beneath it."""
+    """Fill, for each point, where its rays end, the light of the sky, and whether the point is buried.
+
+    A link is the light point nearest to the hit, plus ``half`` for the back of a surface, or -1 for the sky. A point is
+    buried if it lies inside an object or right beneath one.
+    """
     count = links.shape[1]
     for n in numba.prange(len(links)):
         red, green, blue, behind, near = 0.0, 0.0, 0.0, 0, 0
@@ -410,7 +448,7 @@ def _gather(arrays, half, rays, hits, distance, coordinates, size, sky, links, r
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _follow_links(links, albedo, light, reflected):
-    """Light (2 G, 3) that each point receives from what its rays end at."""
+    """Fill the light (2 G, 3) that each point receives from the points at the ends of its rays."""
     half, count = len(albedo), links.shape[1]
     for n in numba.prange(len(links)):
         red, green, blue = 0.0, 0.0, 0.0

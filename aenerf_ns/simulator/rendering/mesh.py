@@ -1,0 +1,64 @@
+"""Triangle meshes with colours and textures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.simulator.arrays import Array, Texture
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the world, z up, in metres once the mesh is `scaled`.
+
+    The albedo of a surface point is its texture's value times the colour interpolated between the vertices.
+
+    Attributes:
+        vertices: (V, 3). Surfaces of different materials share no vertices, nor do the two sides of a texture's seam.
+        faces: (F, 3) vertices, anticlockwise seen from the front.
+        uv: (V, 2) texture coordinates in widths and heights of the texture, from its lower left corner.
+        colour: (V, 3) linear RGB.
+        texture: (F,) index into ``textures``, -1 for none.
+        emission: (F,) irradiance / pi that a face seems to receive in addition. It makes the face glow and lights
+            nothing else.
+        textures: linear RGB, float32 (rows, columns, 3), the lowest row first. They repeat.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    uv: Array
+    colour: Array
+    texture: NDArray[np.int64]
+    emission: Array
+    textures: tuple[Texture, ...]
+
+    def with_faces_kept(self, kept: NDArray) -> Mesh:
+        """Return the mesh with the faces that an index or a mask (F,) selects."""
+        return replace(self, faces=self.faces[kept], texture=self.texture[kept], emission=self.emission[kept])
+
+
+def scaled(mesh: Mesh, scale: float) -> Mesh:
+    """Scale a mesh by ``scale`` metres per unit. Round its vertices to float32, as the ray caster does."""
+    return replace(mesh, vertices=(scale * mesh.vertices).astype(np.float32).astype(np.float64))
+
+
+def normals_and_areas(mesh: Mesh) -> tuple[Array, Array]:
+    """Return unit normals (F, 3), zero where a face is degenerate, and areas (F,)."""
+    a, b, c = mesh.vertices[mesh.faces.T]
+    cross = np.cross(b - a, c - a)
+    norm = np.linalg.norm(cross, axis=1)
+    return cross / np.maximum(norm, 1e-300)[:, None], norm / 2
+
+
+def position_ids(vertices: Array) -> NDArray[np.int64]:
+    """Number (V,) the positions of vertices: two vertices in one place have the same number."""
+    keys = np.ascontiguousarray(vertices.astype(np.float32) + np.float32(0))  # -0 is 0
+    words = keys.view(np.uint32).astype(np.uint64)
+    order = np.lexsort(words.T)
+    new = np.append(False, (words[order][1:] != words[order][:-1]).any(axis=1))
+    ids = np.empty(len(vertices), np.int64)
+    ids[order] = np.cumsum(new)
+    return ids

@@ -1,0 +1,127 @@
+"""Meshes from files, and errors in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from small_meshes import (
+    BLACK,
+    OVERHEAD,
+    baked_mesh,
+    painted_box,
+)
+
+from aenerf_ns.camera.image_encoding import decode
+from aenerf_ns.errors import DataError
+from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.rendering.mesh import normals_and_areas, scaled
+from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
+
+pytestmark = pytest.mark.usefixtures("small_work")
+
+
+def seen(path: Path, up: str) -> np.ndarray:
+    scene = baked_mesh(scaled(load_mesh(path, up == "y"), 1.0), BLACK)
+    pose = paths.look_at((2.0, -1.5, 1.3), (0, 0, 0))
+    return scene.render(pose, (60, 60, 32, 24), 64, 48, 1)[0]
+
+
+def test_the_same_picture_from_glb_and_obj(tmp_path: Path) -> None:
+    z_up = painted_box()
+    # What a program with y up would write: (x, y, z) of ours is its (x, z, -y).
+    y_up = z_up.copy()
+    y_up.apply_transform(np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]))
+    scene = trimesh.Scene()
+    turn = trimesh.transformations.rotation_matrix(0.4, (1, 2, 3), (0.3, 0, 0))
+    moved = y_up.copy().apply_transform(np.linalg.inv(turn))
+    scene.add_geometry(moved, transform=turn)
+    scene.export(tmp_path / "box.glb")
+    z_up.visual.material = z_up.visual.material.to_simple()
+    z_up.visual.material.kwargs = {"kd": [0.8, 1.0, 0.6]}
+    z_up.export(tmp_path / "box.obj", mtl_name="box.mtl")
+    text = (tmp_path / "box.mtl").read_text()
+    assert "Kd" in text
+    (tmp_path / "box.mtl").write_text(
+        "\n".join("Kd 0.8 1.0 0.6" if line.startswith("Kd") else line for line in text.splitlines())
+    )
+    glb, obj = seen(tmp_path / "box.glb", "y"), seen(tmp_path / "box.obj", "z")
+    assert (glb > 0).any(-1).mean() > 0.15
+    np.testing.assert_allclose(glb, obj, atol=2e-3)
+    # At a point of the top, the picture has the texture's value.
+    overhead = baked_mesh(scaled(load_mesh(tmp_path / "box.glb", True), 1.0), BLACK).render(
+        OVERHEAD, (100.0, 100.0, 0.5, 0.5), 1, 1, 1
+    )[0][0, 0]
+    rng = np.random.default_rng(0)
+    picture = decode(rng.integers(40, 220, (12, 16, 3)).astype(np.uint8) / 255, "srgb")[::-1]
+    # u = 0 + 0.2, v = 0 + 0.2 there
+    column, row = 0.2 * 16 - 0.5, 0.2 * 12 - 0.5
+    i, j = int(column), int(row)
+    fx, fy = column - i, row - j
+    value = (1 - fy) * ((1 - fx) * picture[j, i] + fx * picture[j, i + 1]) + fy * (
+        (1 - fx) * picture[j + 1, i] + fx * picture[j + 1, i + 1]
+    )
+    np.testing.assert_allclose(overhead, value * [0.8, 1.0, 0.6], atol=1e-3)
+
+
+def test_colours_of_a_ply_are_srgb(tmp_path: Path) -> None:
+    body = trimesh.creation.box()
+    for kind in ("vertex_colors", "face_colors"):
+        coloured = trimesh.Trimesh(
+            body.vertices,
+            body.faces,
+            process=False,
+            **{kind: np.array([[200, 100, 50, 255]] * (8 if kind[0] == "v" else 12), np.uint8)},
+        )
+        coloured.export(tmp_path / "box.ply")
+        mesh = load_mesh(tmp_path / "box.ply", False)
+        np.testing.assert_allclose(
+            mesh.colour[mesh.faces], np.broadcast_to(decode(np.array([200, 100, 50]) / 255, "srgb"), (12, 3, 3))
+        )
+
+
+def test_an_obj_with_a_concave_polygon_and_two_materials(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 0.7 0.1 0.1\nnewmtl green\nKd 0.1 0.6 0.1\n")
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 1 1 0\nv 0 2 0\nv 0.4 1 0\nusemtl red\nf 1 2 3 4\n"
+        "v 2 0 0\nv 3 0 0\nv 3 1 0\nusemtl green\nf -3 -2 -1\n"
+    )
+    mesh = scaled(load_mesh(tmp_path / "a.obj", False), 2.0)
+    # The notch is not filled; the scale is applied; the first material comes first.
+    np.testing.assert_allclose(normals_and_areas(mesh)[1].sum(), 4 * (0.6 + 0.5), rtol=1e-6)
+    np.testing.assert_allclose(mesh.colour[mesh.faces[0]], [[0.7, 0.1, 0.1]] * 3)
+    np.testing.assert_allclose(mesh.colour[mesh.faces[-1]], [[0.1, 0.6, 0.1]] * 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("a.json", "{", "not valid JSON"),
+        ("a.json", "[]", "not a JSON object; see docs/simulator.md"),
+        ("a.json", "{}", "mesh is missing; see docs/simulator.md"),
+        ("a.stl", "", "an unknown scene"),
+        ("a.glb", "glTF", "not a binary glTF file"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "a.ply"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7\n", "a.obj"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "there is no surface in it"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no face has an area"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "not finite"),
+        ("a.obj", "mtllib b.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "b.mtl: the materials do not exist"),
+        ("a.obj", "mtllib c.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "c.png: the texture does not exist"),
+        ("a.obj", "mtllib d.mtl\nusemtl c\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no material 'c'"),
+        ("a.obj", "mtllib e.mtl\nusemtl e\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "e.png: not a picture"),
+    ],
+)  # fmt: skip
+def test_bad_meshes_end_in_one_line(tmp_path: Path, name: str, content: str, told: str) -> None:
+    (tmp_path / "c.mtl").write_text("newmtl c\nmap_Kd c.png\n")
+    (tmp_path / "d.mtl").write_text("newmtl d\nKd 1 1 1\n")
+    (tmp_path / "e.mtl").write_text("newmtl e\nmap_Kd e.png\n")
+    (tmp_path / "e.png").write_text("no")
+    (tmp_path / name).write_text(content)
+    with pytest.raises(DataError) as raised:
+        open_scene(str(tmp_path / name))
+    assert told in str(raised.value)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,69 @@
+"""Subdivision, coincident and degenerate faces, and concave polygons."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from small_meshes import (
+    BLACK,
+    baked_mesh,
+    joined,
+    mesh_of,
+    plate,
+)
+
+from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.rendering.mesh import normals_and_areas
+from aenerf_ns.simulator.rendering.mesh_repair import prepared, subdivided
+from aenerf_ns.simulator.rendering.polygons import ear_clipping
+
+pytestmark = pytest.mark.usefixtures("small_work")
+
+
+def test_subdivision_leaves_no_gaps() -> None:
+    body = trimesh.creation.box((2.0, 1.0, 0.3))
+    small, source = subdivided(mesh_of(body), 0.17)
+    corners = small.vertices[small.faces]
+    assert np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1).max() <= 0.17
+    assert trimesh.Trimesh(small.vertices, small.faces, process=True).is_watertight
+    np.testing.assert_allclose(normals_and_areas(small)[1].sum(), body.area, rtol=1e-5)
+    old, new = normals_and_areas(mesh_of(body))[0][source], normals_and_areas(small)[0]
+    np.testing.assert_allclose((old * new).sum(1), 1, atol=1e-5)
+
+
+def test_coincident_faces_show_the_first_from_everywhere() -> None:
+    red, green = (mesh_of(trimesh.creation.box((1, 1, 0.2)), colour) for colour in ((0.8, 0, 0), (0, 0.8, 0)))
+    smaller = mesh_of(trimesh.creation.box((0.6, 0.6, 0.2)), (0, 0, 0.8))
+    for second, count in ((green, 12), (smaller, 4)):
+        both, coincident = prepared(joined(red, second))
+        assert coincident == count
+        scene = baked_mesh(both, BLACK)
+        rng = np.random.default_rng(0)
+        for _ in range(20):
+            pose = paths.look_at((*rng.uniform(-2, 2, 2), rng.uniform(1, 3)), (0, 0, 0))
+            radiance, _, alpha = scene.render(pose, (80, 80, 20, 15), 40, 30, 1)
+            np.testing.assert_allclose(radiance[alpha > 0], np.tile([0.8, 0, 0], (int(alpha.sum()), 1)), rtol=1e-6)
+
+
+def test_degenerate_faces_are_dropped() -> None:
+    square = plate(1.0)
+    faces = np.concatenate([square.faces, [[0, 0, 1], [0, 2, 2]]])
+    rest = {"texture": np.full(4, -1), "emission": np.zeros(4)}
+    mesh, _ = prepared(dataclasses.replace(square, faces=faces, **rest), 10.0)
+    assert len(mesh.faces) == 2
+    with pytest.raises(ValueError, match="no face has an area"):
+        prepared(dataclasses.replace(square, faces=faces[2:]), 10.0)
+
+
+def test_concave_polygons() -> None:
+    arrow = np.array([[0, 0], [2, 1], [0, 2], [0.7, 1.0]], np.float64) @ np.array([[1, 0, 0.2], [0, 1, -0.4]])
+    for shift in range(4):
+        corners = np.roll(arrow, shift, axis=0)[:: 1 if shift % 2 else -1]
+        triangles = np.array([corners[list(t)] for t in ear_clipping(corners)])
+        cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        newell = np.cross(corners, np.roll(corners, -1, axis=0)).sum(0)
+        assert (cross @ newell > 0).all()
+        np.testing.assert_allclose(cross.sum(0), newell, atol=1e-12)

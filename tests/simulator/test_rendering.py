@@ -1,0 +1,157 @@
+"""Pictures of meshes against closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import numba
+import numpy as np
+import pytest
+import trimesh
+from scipy.stats import norm
+from small_meshes import (
+    BLACK,
+    OVERHEAD,
+    baked_mesh,
+    joined,
+    light_mesh,
+    mesh_of,
+    plate,
+    ray_directions,
+)
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.rendering.embree import RayCaster
+from aenerf_ns.simulator.rendering.environment import Environment, sky
+from aenerf_ns.simulator.rendering.lighting import AreaLight
+from aenerf_ns.simulator.rendering.mesh_repair import prepared
+from aenerf_ns.simulator.rendering.mip_maps import mip_maps
+from aenerf_ns.simulator.rendering.renderer import sample_offsets
+
+pytestmark = pytest.mark.usefixtures("small_work")
+
+
+def test_depth_and_alpha_of_a_tilted_plate() -> None:
+    """Depth is that of the plane, alpha that of the square, for a camera that sees it at a slant."""
+    scene = baked_mesh(plate(1.0), np.array([0.2, 0.3, 0.4]))
+    pose = paths.look_at((1.5, -2.0, 1.2), (0.1, 0.2, 0.0), roll=0.3)
+    intrinsics, width, height = (40.0, 44.0, 24.2, 17.7), 48, 36
+    radiance, depth, alpha = scene.render(pose, intrinsics, width, height, 1)
+    directions = ray_directions(intrinsics, width, height) @ pose[:3, :3].T
+    expected = -pose[2, 3] / directions[..., 2]
+    points = pose[:3, 3] + expected[..., None] * directions
+    inside = (expected > 0) & (abs(points[..., 0]) < 1) & (abs(points[..., 1]) < 1)
+    assert 200 < inside.sum() < width * height - 200
+    np.testing.assert_array_equal(alpha, inside.astype(np.float32))
+    np.testing.assert_allclose(depth[inside], expected[inside], rtol=3e-7)
+    assert np.isinf(depth[~inside]).all()
+    np.testing.assert_allclose(radiance[inside], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(
+        radiance[~inside], np.broadcast_to([0.2, 0.3, 0.4], (int((~inside).sum()), 3)), rtol=1e-6
+    )
+
+
+def test_texture_coordinates_and_wrapping() -> None:
+    """A picture with two different ramps, repeated: bilinear between the centres of its texels, and round its edges."""
+    rng = np.random.default_rng(0)
+    picture = rng.uniform(0.1, 0.9, (6, 10, 3)).astype(np.float32)
+    scene = baked_mesh(plate(1.0, picture, tiles=1.5), BLACK)
+    intrinsics, width, height = (60.0, 60.0, 16.0, 12.0), 32, 24
+    radiance = scene.render(OVERHEAD, intrinsics, width, height, 1)[0]
+    x, y = ray_directions(intrinsics, width, height)[..., :2].transpose(2, 0, 1) * [[[3.0]], [[-3.0]]]
+    column, row = (0.5 + 0.5 * x) * 1.5 * 10 - 0.5, (0.5 + 0.5 * y) * 1.5 * 6 - 0.5
+    i, j = np.floor(column).astype(int), np.floor(row).astype(int)
+    fx, fy = (column - i)[..., None], (row - j)[..., None]
+
+    def texel(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        return picture[rows % 6, columns % 10]
+
+    low = (1 - fx) * texel(j, i) + fx * texel(j, i + 1)
+    high = (1 - fx) * texel(j + 1, i) + fx * texel(j + 1, i + 1)
+    np.testing.assert_allclose(radiance, (1 - fy) * low + fy * high, atol=2e-5)
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (33, 50), (7, 1)])
+def test_minified_textures_keep_their_mean(shape: tuple[int, int]) -> None:
+    picture = np.random.default_rng(0).uniform(0.1, 0.9, (*shape, 3)).astype(np.float32)
+    maps = mip_maps([picture], bits16=False)
+    for start, rows, columns in maps.level:
+        mean = maps.texels[start : start + rows * columns].mean(axis=0)
+        np.testing.assert_allclose(mean, picture.mean((0, 1)), rtol=1e-5)
+    scene = baked_mesh(plate(50.0, picture, tiles=2000.0), BLACK)
+    radiance = scene.render(OVERHEAD, (10.0, 10.0, 4.0, 4.0), 8, 8, 1)[0]
+    np.testing.assert_allclose(radiance, np.broadcast_to(picture.mean((0, 1)), (8, 8, 3)), rtol=1e-4)
+
+
+def test_surroundings_are_seen_in_their_directions() -> None:
+    """A ramp in height, and one around: the middle column is +x, and +y is a quarter to its left."""
+    rows, columns = 90, 180
+    down, across = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+    picture = np.stack([down, 0.5 - 0.4 * np.cos(2 * np.pi * across), 0.5 - 0.4 * np.sin(2 * np.pi * across)], axis=-1)
+    scene = light_mesh(plate(0.01), Environment(picture.astype(np.float32)), [], BLACK, show_environment=True)
+    for azimuth in (0.0, 0.5 * np.pi, -2.0):
+        pose = paths.look_at((5, 5, 5), (5 + np.cos(azimuth), 5 + np.sin(azimuth), 5.5))
+        radiance, _, alpha = scene.render(pose, (20.0, 20.0, 4.0, 3.0), 8, 6, 1)
+        assert not alpha.any()
+        direction = ray_directions((20.0, 20.0, 4.0, 3.0), 8, 6) @ pose[:3, :3].T
+        angle = np.arctan2(direction[..., 1], direction[..., 0])
+        height = direction[..., 2] / np.linalg.norm(direction, axis=-1)
+        np.testing.assert_allclose(radiance[..., 0], np.arccos(height) / np.pi, atol=1e-4)
+        np.testing.assert_allclose(radiance[..., 1], 0.5 + 0.4 * np.cos(angle), atol=5e-4)
+        np.testing.assert_allclose(radiance[..., 2], 0.5 - 0.4 * np.sin(angle), atol=5e-4)
+
+
+@pytest.mark.parametrize("samples", [4, 16])
+def test_sample_offsets_are_the_point_spread(samples: int) -> None:
+    offsets = sample_offsets(samples)
+    np.testing.assert_allclose(offsets.mean(0), 0, atol=1e-12)
+    np.testing.assert_allclose(offsets.T @ offsets / samples, 0.25 * np.eye(2), atol=1e-12)
+    np.testing.assert_array_equal(sample_offsets(1), [[0, 0]])
+    for bad in (0, 2):
+        with pytest.raises(ValueError, match=f"got {bad}"):
+            sample_offsets(bad)
+
+
+def test_edge_is_blurred_by_the_point_spread() -> None:
+    square = plate(2.0)
+    scene = baked_mesh(dataclasses.replace(square, vertices=square.vertices + np.array([2.0, 0, 0])), BLACK)
+    # The edge x = 0 crosses the pixels at cx; moving cx moves it through the pixel.
+    shifts = np.linspace(-1.5, 1.5, 21)
+    alpha = np.array([scene.render(OVERHEAD, (50.0, 50.0, 2.5 - d, 2.5), 5, 5, 300)[2][2, 2] for d in shifts])
+    np.testing.assert_allclose(alpha, norm.cdf(shifts, scale=0.5), atol=0.02)
+
+
+def test_pictures_do_not_depend_on_the_run_or_the_threads() -> None:
+    mesh, _ = prepared(mesh_of(trimesh.creation.icosphere(3)), 0.2)
+    lamp = AreaLight((0.5, 0, 2.0), (0.3, 0, 0), (0, -0.3, 0), (1.0, 2.0, 3.0))
+    pose = paths.look_at((3, 1, 1), (0, 0, 0))
+    pictures = []
+    for threads in (1, numba.config.NUMBA_NUM_THREADS):
+        numba.set_num_threads(threads)
+        scene = light_mesh(mesh, sky((0.1,) * 3, (1.0,) * 3), [lamp], BLACK)
+        pictures.append(b"".join(part.tobytes() for part in scene.render(pose, (50, 50, 20, 15), 40, 30, 4)))
+    numba.set_num_threads(1)
+    assert pictures[0] == pictures[1]
+
+
+def test_open3d_that_cannot_be_loaded_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(DataError, match=r"Open3D: cannot be loaded \(.*\); install the missing libraries"):
+        RayCaster(np.eye(3), np.array([[0, 1, 2]]))
+
+
+def test_a_mesh_at_the_edge_of_the_picture_or_outside_is_seen_as_in_a_larger_picture() -> None:
+    """No ray is cast outside the mesh's bounding box in the picture; the rays that are left are the same."""
+    mesh = mesh_of(trimesh.creation.icosphere(3), (0.2, 0.4, 0.8))
+    scene = baked_mesh(mesh, np.array([0.1, 0.2, 0.3]))
+    pose = paths.look_at((4, 0, 0.2), (0, 0, 0), roll=0.2)
+    # A second mesh behind the camera makes the bounding box surround it, so that all rays are cast.
+    behind = dataclasses.replace(mesh, vertices=0.01 * mesh.vertices + np.array([9.0, 0, 0]))
+    whole = baked_mesh(joined(mesh, behind), np.array([0.1, 0.2, 0.3])).render(pose, (60, 60, 60, 45), 120, 90, 4)
+    for left, top in ((0, 0), (30, 20), (70, 0), (0, 60), (119, 89)):
+        window = scene.render(pose, (60, 60, 60 - left, 45 - top), 120 - left, 90 - top, 4)
+        for ours, theirs in zip(window, whole, strict=True):
+            np.testing.assert_allclose(ours, theirs[top:, left:], rtol=2e-5)
+    assert 0.05 < whole[2].mean() < 0.9

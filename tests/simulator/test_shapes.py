@@ -1,0 +1,110 @@
+"""The shapes of the built-in scenes against closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from small_meshes import BLACK, OVERHEAD, baked_mesh, ray_directions
+
+from aenerf_ns.simulator import shapes
+from aenerf_ns.simulator.rendering.mesh import normals_and_areas
+from aenerf_ns.simulator.rendering.mesh_repair import without_degenerate_faces
+
+pytestmark = pytest.mark.usefixtures("small_work")
+
+WHITE = {"white": np.full((8, 8, 3), 0.5, np.float32)}
+ORIGIN = (0, 0, 0)
+SOLIDS = {
+    "panel": shapes.panel(ORIGIN, (1.6, 1.2), (1, 0, 0), (0, 1, 0), "white", 0.3),
+    "box": shapes.box((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3), "white", 0.3),
+    "sphere": shapes.sphere(ORIGIN, 0.7, "white", 0.3),
+    "cylinder": shapes.pillar((0, 0, -0.4), 0.6, 0.8, "white", 0.3),
+}
+
+
+@pytest.mark.parametrize("kind", SOLIDS)
+def test_depth_and_silhouette_match_the_solid(kind: str) -> None:
+    """Every hit lies on the surface of the turned solid; a march along the ray finds a solid where it is hit only."""
+    rng = np.random.default_rng(len(kind))
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0] if kind != "panel" else np.eye(3)
+    rotation *= np.sign(np.linalg.det(rotation))
+    centre = np.array([0.1, -0.2, 0.3])
+    shape = dataclasses.replace(SOLIDS[kind], centre=centre, rotation=rotation)
+    scene = baked_mesh(shapes.mesh_of([shape], WHITE, 0.1), BLACK)
+    width, height, intrinsics = 24, 20, (20.0, 22.0, 12.3, 9.1)
+    _, depth, alpha = scene.render(OVERHEAD, intrinsics, width, height, 1)
+    directions = ray_directions(intrinsics, width, height) @ OVERHEAD[:3, :3].T
+
+    def inside(points: np.ndarray, slack: float) -> np.ndarray:
+        p = (points - centre) @ rotation
+        if kind == "sphere":
+            return np.linalg.norm(p, axis=-1) <= 0.7 + slack
+        if kind == "cylinder":
+            return (np.hypot(p[..., 0], p[..., 1]) <= 0.6 + slack) & (abs(p[..., 2]) <= 0.4 + slack)
+        half = (0.8, 0.6, 0.0) if kind == "panel" else (0.5, 0.4, 0.3)
+        return (abs(p) <= np.array(half) + slack).all(-1)
+
+    hit = np.isfinite(depth)
+    np.testing.assert_array_equal(alpha, hit.astype(np.float32))
+    assert 20 < hit.sum() < width * height - 20
+    points = OVERHEAD[:3, 3] + directions * np.where(hit, depth, 0)[..., None].astype(np.float64)
+    assert inside(points, 1e-5)[hit].all()
+    # Nothing before the hit, and nothing at all along a miss, is deeper inside than triangles are below round surfaces.
+    steps = np.linspace(0, 1, 400)[:, None, None] * np.where(hit, depth - 1e-4, 5.0)
+    marched = OVERHEAD[:3, 3] + directions * steps[..., None]
+    assert not inside(marched, -1.2e-3 if kind != "panel" else 1e-5).any()
+
+
+@pytest.mark.parametrize(
+    ("kind", "volume", "area"),
+    [
+        ("box", 0.48, 2 * (0.8 + 0.6 + 0.48)),
+        ("sphere", 4 / 3 * math.pi * 0.343, 4 * math.pi * 0.49),
+        ("cylinder", math.pi * 0.36 * 0.8, 2 * math.pi * 0.6 * 1.4),
+    ],
+)
+def test_solids_are_closed_and_face_outwards(kind: str, volume: float, area: float) -> None:
+    mesh = without_degenerate_faces(shapes.mesh_of([SOLIDS[kind]], WHITE, 0.07))
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
+    assert solid.volume == pytest.approx(volume, rel=3e-3)
+    assert normals_and_areas(mesh)[1].sum() == pytest.approx(area, rel=3e-3)
+    edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
+    assert np.linalg.norm(edges, axis=-1).max() <= math.sqrt(2) * 0.07 + 1e-6
+
+
+def test_texture_coordinates() -> None:
+    """A linear ramp along u, seen head-on: the value at each pixel's centre, half texels and all."""
+    ramp = np.repeat(np.repeat(np.linspace(0.1, 0.8, 64)[None, :, None], 64, axis=0), 3, axis=2).astype(np.float32)
+    plate = shapes.panel(ORIGIN, (2, 2), (1, 0, 0), (0, 1, 0), "ramp", 2.0, texture_offset=(0.5, 0.5), tint=(1, 0.5, 0))
+    scene = baked_mesh(shapes.mesh_of([plate], {"ramp": ramp}, 0.3), BLACK)
+    radiance, depth, _ = scene.render(OVERHEAD, (30.0, 30.0, 8.0, 6.0), 16, 12, 1)
+    np.testing.assert_allclose(depth, 3.0, rtol=1e-6)
+    x = (np.arange(16) + 0.5 - 8.0) / 30.0 * 3.0
+    texel = (x / 2 + 0.5) * 64 - 0.5
+    expected = np.broadcast_to(0.1 + 0.7 * texel / 63, (12, 16))
+    np.testing.assert_allclose(radiance[..., 0], expected, atol=2e-5)
+    np.testing.assert_allclose(radiance, expected[..., None] * [1, 0.5, 0], atol=2e-5)
+
+
+@pytest.mark.parametrize(("kind", "radius"), [("cylinder", 0.6), ("sphere", 0.7)])
+def test_a_texture_has_no_seam_around_a_solid(kind: str, radius: float) -> None:
+    """The texture goes round a whole number of times, so vertices in one place have one place in the tile."""
+    positions, _, uv = SOLIDS[kind].surface(0.1)
+    flat_caps = abs(positions[:, 2]) > 0.4 - 1e-9 if kind == "cylinder" else np.hypot(*positions.T[:2]) < 1e-9
+    wall = np.flatnonzero(~flat_caps)
+    order = wall[np.lexsort(positions[wall].T)]
+    same = (positions[order][1:] == positions[order][:-1]).all(axis=1)
+    assert same.sum() > 5
+    turns = np.abs(np.diff(uv[order], axis=0)[same])
+    np.testing.assert_allclose(turns, np.tile([round(2 * math.pi * radius / 0.3), 0.0], (len(turns), 1)), atol=1e-9)
+
+
+def test_a_missing_texture_is_an_error() -> None:
+    with pytest.raises(KeyError, match="white"):
+        shapes.mesh_of([SOLIDS["box"]], {}, 0.1)

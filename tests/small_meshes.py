@@ -1,0 +1,95 @@
+"""Small meshes for the tests of the simulator."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from aenerf_ns.simulator.rendering import lighting
+from aenerf_ns.simulator.rendering.embree import RayCaster
+from aenerf_ns.simulator.rendering.environment import sky
+from aenerf_ns.simulator.rendering.mesh import Mesh, scaled
+from aenerf_ns.simulator.rendering.renderer import Renderer
+
+OVERHEAD = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])
+"""A camera 3 m above the origin that looks down, its x axis along the world's."""
+BLACK = np.zeros(3)
+NIGHT = sky(BLACK, BLACK)
+WALK = {
+    "kind": "walk",
+    "positions": [[1.5, 0, 0.3], [0, 1.4, 0.5], [-1.6, 0, 0.2], [0, -1.3, 0.4]],
+    "targets": [[0, 0, 0], [0.1, 0, 0], [0, 0, 0.1], [0, 0.1, 0]],
+}
+
+
+def baked_mesh(mesh: Mesh, background: np.ndarray) -> Renderer:
+    return lighting.baked_mesh(mesh, RayCaster(mesh.vertices, mesh.faces), background)
+
+
+def light_mesh(mesh: Mesh, *rest: object, **options: float) -> Renderer:
+    return lighting.light_mesh(mesh, RayCaster(mesh.vertices, mesh.faces), *rest, **options)
+
+
+def mesh_of(shape: trimesh.Trimesh, colour: object = (0.5, 0.5, 0.5)) -> Mesh:
+    colours = np.tile(np.asarray(colour, np.float64), (len(shape.vertices), 1))
+    uv, texture = np.zeros((len(shape.vertices), 2)), np.full(len(shape.faces), -1)
+    glow = np.zeros(len(shape.faces))
+    return scaled(Mesh(np.array(shape.vertices), np.array(shape.faces), uv, colours, texture, glow, ()), 1.0)
+
+
+def plate(half: float, picture: np.ndarray | None = None, tiles: float = 1.0) -> Mesh:
+    """A square in the plane z = 0 with its front up, and a picture on it."""
+    corners = half * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    uv = tiles * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    textures = () if picture is None else (np.asarray(picture, np.float32),)
+    colour = np.full((4, 3), 0.5 if picture is None else 1.0)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return scaled(Mesh(corners, faces, uv, colour, np.full(2, len(textures) - 1), np.zeros(2), textures), 1.0)
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)]),
+        np.concatenate([mesh.uv for mesh in meshes]),
+        np.concatenate([mesh.colour for mesh in meshes]),
+        np.concatenate([mesh.texture for mesh in meshes]),
+        np.concatenate([mesh.emission for mesh in meshes]),
+        (),
+    )
+
+
+def ray_directions(intrinsics: tuple[float, ...], width: int, height: int) -> np.ndarray:
+    fx, fy, cx, cy = intrinsics
+    y, x = np.mgrid[:height, :width]
+    return np.stack([(x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, np.ones((height, width))], axis=-1)
+
+
+def painted_box() -> trimesh.Trimesh:
+    """A box of 1.2 x 0.8 x 0.6 m, each side with vertices of its own and a picture of its own part of a texture."""
+    body = trimesh.creation.box((1.2, 0.8, 0.6))
+    body.unmerge_vertices()
+    normal = np.repeat(body.face_normals, 3, axis=0)
+    axis = np.abs(normal).argmax(axis=1)
+    rows = np.arange(len(body.vertices))
+    uv = (
+        np.stack([body.vertices[rows, (axis + 1) % 3], body.vertices[rows, (axis + 2) % 3]], axis=1)
+        + 0.1 * axis[:, None]
+    )
+    picture = np.random.default_rng(0).integers(40, 220, (12, 16, 3)).astype(np.uint8)
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(picture), baseColorFactor=[0.8, 1.0, 0.6, 1.0]
+    )
+    body.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return body
+
+
+def scene_file(beside: Path, **values: object) -> str:
+    path = beside.with_name("scene.json")
+    path.write_text(json.dumps({"mesh": beside.name, "light": "baked", "up": "z", **values}))
+    return str(path)
