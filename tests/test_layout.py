@@ -22,7 +22,7 @@ MAY_USE = {
     "method": {"camera", "recording", "supervision"},
     "training": {"errors", "progress", "camera", "recording", "supervision", "method"},
     "checking": {"progress", "events", "camera", "recording"},
-    "simulator": {"errors", "progress", "events", "camera", "recording"},
+    "simulator": {"errors", "progress", "events", "camera", "files", "recording"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},
     "cli": {
