@@ -1,4 +1,4 @@
-"""The packages that the benchmark scenes are made of: fetched by their registries' clients, verified, and opened."""
+"""Fetch, verify and open the packages that the benchmark scenes are made of."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from meshes import Material, Model, paint, read_obj, srgb_picture
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import binary_dilation
@@ -23,13 +22,15 @@ from scipy.ndimage import binary_dilation
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import textures
+from benchmarks.scenes.meshes import Material, Model, paint, srgb_picture
+from benchmarks.scenes.obj import read_obj
 
-# OpenCV reads OpenEXR files only where this is set before it is imported.
+# OpenCV reads OpenEXR files only if this is set before its import.
 os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"
 import cv2
 
 _PICTURE_SIZE = 512
-_DETAILS = {"plain": (textures.mottled, 0.08), "wood": (textures.wood,), "cloth": (textures.fabric,)}
+_DETAILS = {"plain": textures.mottled, "wood": textures.wood, "cloth": textures.fabric}
 _LICENCE = "CC0 1.0"
 
 
@@ -38,9 +39,9 @@ class Package:
     """A file of a package registry.
 
     Attributes:
-        file: its name, as the client saves it.
-        sha256: of the file.
-        command: what fetches it into the current folder.
+        file: name under which the registry's client saves the file.
+        sha256: pinned hash of the file.
+        command: fetches the file into the current folder.
     """
 
     file: str
@@ -63,10 +64,10 @@ _CATALOGUE = "PluginFurnitureCatalog.properties"
 
 
 def fetch(package: Package, folder: Path) -> Path:
-    """The package's file in the folder, fetched if it is not there yet.
+    """Return the path of a package's file in a folder; fetch the file if it is not there.
 
     Raises:
-        DataError: if it cannot be fetched or is not the pinned version.
+        DataError: if the file cannot be fetched or is not the pinned version.
     """
     file = folder / package.file
     by_hand = f"run `{' '.join(package.command)}` where it works and put {package.file} into {folder}"
@@ -80,7 +81,7 @@ def fetch(package: Package, folder: Path) -> Path:
             reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
             raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
         if not file.is_file():
-            raise DataError(file, f"{package.command[0]} saved it under another name", by_hand)
+            raise DataError(file, f"missing, because {package.command[0]} saved it under another name", by_hand)
     found = hashlib.sha256(file.read_bytes()).hexdigest()
     if found != package.sha256:
         raise DataError(file, f"sha256 {found}, not the pinned {package.sha256}", f"remove it, then {by_hand}")
@@ -88,19 +89,20 @@ def fetch(package: Package, folder: Path) -> Path:
 
 
 class Library:
-    """The models and environments of the packages in a folder, which are fetched and unpacked when first needed.
+    """Hold the models and environments of the packages. Fetch and unpack a package at its first use.
 
     Attributes:
-        credits: what was taken from the library, as the "credits" of a scene file.
+        folder: keeps the packages.
+        credits: entries of a scene file's "credits", by asset, for all assets that were used.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.credits: dict[str, dict[str, str]] = {}
 
-    @cache  # noqa: B019 one library lives as long as the command
+    @cache  # noqa: B019 a library lives as long as the command
     def _furniture(self) -> Path:
-        """Folder of the CC0 furniture, unpacked."""
+        """Unpack the CC0 furniture and return its folder."""
         package = fetch(FURNITURE, self.folder)
         target = self.folder / package.stem
         if not (target / _CATALOGUE).is_file():
@@ -119,7 +121,7 @@ class Library:
 
     @cache  # noqa: B019
     def _catalogue(self) -> dict[str, dict[str, str]]:
-        """Entries of the furniture's catalogue by model name."""
+        """Read the entries of the furniture's catalogue, by model name."""
         entries: dict[str, dict[str, str]] = {}
         for line in (self._furniture() / _CATALOGUE).read_text(encoding="latin-1").splitlines():
             key, _, value = line.partition("=")
@@ -131,16 +133,17 @@ class Library:
     def model(
         self, name: str, detail: str | Mapping[str, str] = "plain", dress: Mapping[str, Material | None] | None = None
     ) -> Model:
-        """A piece of furniture at its true size, standing on z = 0 above the origin, its front towards -y.
+        """Return a piece of furniture at its true size. It stands on z = 0 above the origin, its front towards -y.
 
         Args:
             name: folder of the model in its package.
-            detail: pattern of the materials without a picture, "plain", "wood" or "cloth", or one for each by name.
-            dress: other materials by the name of those they replace; None leaves the faces out.
+            detail: pattern of the materials without a picture: "plain", "wood" or "cloth", or a pattern for each
+                material by name.
+            dress: replacements of materials, by the replaced name. None leaves the faces out.
 
         Raises:
-            DataError: on a model that the package lacks, or whose own licence is not the package's: a few models
-                of its CC0 file are CC BY.
+            DataError: if the package lacks the model, or if the model's own licence is not CC0: a few models of the
+                package's CC0 file are CC BY.
         """
         entry = self._catalogue().get(name)
         if entry is None:
@@ -170,10 +173,10 @@ class Library:
         return model.standing()
 
     def environment(self, name: str) -> NDArray[np.float32]:
-        """An environment: linear radiance (256, 512, 3) RGB, equirectangular, its first row straight up.
+        """Return the linear RGB radiance (256, 512, 3) of an equirectangular environment, its first row straight up.
 
         Raises:
-            DataError: on one that the package lacks.
+            DataError: if the package lacks the environment.
         """
         package = fetch(ENVIRONMENTS, self.folder)
         with tarfile.open(package) as archive:
@@ -195,9 +198,9 @@ class Library:
 
 
 def with_whole_sun(panorama: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A panorama (H, W, 3) whose sun has all its colours.
+    """Return a panorama (H, W, 3) whose sun has all its colours.
 
-    The package's compression has lost the red and the green of some suns, and left ringing in their blue: they get the
+    The package's compression lost the red and the green of some suns, and left ringing in their blue. Such suns get the
     colour of the sky around them.
     """
     lost = (panorama[..., 0] < 1e-3) & (np.abs(panorama[..., 2]) > 1)
@@ -211,16 +214,15 @@ def with_whole_sun(panorama: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def coloured(name: str, colour: tuple[float, float, float], pattern: str = "plain") -> Material:
-    """A material around an sRGB colour (each 0 to 1), neither black nor glaring, with a faint pattern."""
+    """Make a material with a faint pattern around an sRGB colour (0 to 1), neither black nor glaring."""
     tones = [np.clip(np.array(colour) * factor, 0.2, 0.95) for factor in (0.85, 1.0, 1.15)]
-    generator, *options = _DETAILS[pattern]
     hexadecimal = ["".join(f"{round(255 * value):02x}" for value in tone) for tone in tones]
-    return paint(name, generator, hexadecimal, *options, size=128)
+    return paint(name, _DETAILS[pattern], hexadecimal, size=128)
 
 
 @cache
 def _photograph(name: str, path: Path) -> Material:
-    """A material of a picture file, its sides powers of two, its albedo within the range of the other textures."""
+    """Make a material of a picture file: sides are powers of two, albedo is in the range of the other textures."""
     with Image.open(path) as picture:
         sides = [int(min(_PICTURE_SIZE, 2 ** round(np.log2(side)))) for side in picture.size]
         pixels = np.asarray(picture.convert("RGB").resize(sides, Image.Resampling.LANCZOS))

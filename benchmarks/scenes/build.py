@@ -1,9 +1,9 @@
-"""Builds the benchmark's scenes from assets of package registries.
+"""Build the benchmark's scenes from assets of package registries.
 
-    python benchmarks/scenes/build.py --output FOLDER [--scenes NAME ...] [--assets FOLDER]
+    python -m benchmarks.scenes.build --output FOLDER [--scenes NAME ...] [--assets FOLDER]
 
-Each becomes FOLDER/NAME/scene.json with its mesh and environment, for `aenerf simulate`. The same assets and libraries
-give the same bytes. See CREDITS.md for who made the assets.
+Each scene becomes FOLDER/NAME/scene.json with its mesh and environment, for `aenerf simulate`. The same assets and
+libraries give the same bytes. CREDITS.md names the makers of the assets.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from assets import Library, cv2
-from catalogue import SCENES
-from meshes import write_glb
 
 from aenerf_ns.errors import DataError
+from benchmarks.scenes.assets import Library, cv2
+from benchmarks.scenes.catalogue import SCENES
+from benchmarks.scenes.glb import write_glb
 
 _BRIGHTEST = 300.0
-"""Radiance that an environment is cut off at: a sun of a few texels would leave hard shadows, and all else dark."""
+"""Upper limit of an environment's radiance: a sun of a few texels would make hard shadows and leave the rest dark."""
 
 
 @dataclass
@@ -29,14 +29,14 @@ class Build:
     """Build benchmark scenes."""
 
     output: Path
-    """Folder to create a folder for each scene in."""
+    """Folder in which each scene gets a folder of its own."""
     scenes: tuple[str, ...] = tuple(SCENES)
-    """Names of the scenes."""
+    """Names of the scenes to build."""
     assets: Path = field(default_factory=lambda: Path.home() / ".cache" / "aenerf-ns" / "scene-assets")
-    """Folder that keeps the packages that the scenes are made of."""
+    """Folder that keeps the fetched packages."""
 
     def main(self) -> None:
-        """Fetches what is missing and writes the scenes."""
+        """Fetch missing packages and write the scenes."""
         for name in self.scenes:
             if name not in SCENES:
                 raise DataError("--scenes", f"no scene is called {name!r}", f"choose among {', '.join(SCENES)}")
@@ -48,7 +48,7 @@ def build_scene(name: str, library: Library, folder: Path) -> None:
     """Write a scene's mesh, environment and scene.json into a folder.
 
     Raises:
-        DataError: if an asset cannot be had.
+        DataError: if an asset is missing and cannot be fetched.
     """
     scene = SCENES[name]
     panorama = np.clip(library.environment(scene.environment), 0, _BRIGHTEST)

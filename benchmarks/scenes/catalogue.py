@@ -1,4 +1,4 @@
-"""The benchmark scenes: what is in them, their light, and the camera's path."""
+"""The benchmark scenes: their content, their light, and the camera's path."""
 
 from __future__ import annotations
 
@@ -6,29 +6,30 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import object_scenes
-import place_scenes
-from assets import Library
-from meshes import Model, without_coincident_faces
+
+from benchmarks.scenes import object_scenes, place_scenes
+from benchmarks.scenes.assets import Library
+from benchmarks.scenes.cleaning import without_coincident_faces
+from benchmarks.scenes.meshes import Model
 
 _HALF_EXTENT, _RADIUS, _DISTANCE = 1.2, 1.35, 4.0
-"""Of an object: half its longest side, the ball that holds it, and where the camera is, in metres."""
+"""Half of an object's longest side, radius of the ball that holds it, and the camera's distance, in metres."""
 _GREY = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
 class BenchmarkScene:
-    """A scene to be built.
+    """A scene to build.
 
     Attributes:
-        compose: makes its mesh from a library.
-        environment: name of the environment that lights it.
+        compose: makes the mesh from a library.
+        environment: name of the environment that lights the scene.
         gain: factor of the environment's radiance.
-        turn_degrees: by which the environment is turned.
+        turn_degrees: turn of the environment.
         lamps: further lights, as in a scene file.
-        walk: positions and targets of a walk; None: the camera goes around it.
+        walk: positions and targets of a walk. None if the camera goes around the scene.
         duration: seconds that the path takes at constant speed.
-        show_environment: whether the environment is seen where there is nothing else; else it is grey.
+        show_environment: whether the environment is the background. Otherwise the background is grey.
     """
 
     compose: Callable[[Library], Model]
@@ -41,14 +42,14 @@ class BenchmarkScene:
     show_environment: bool = False
 
     def model(self, library: Library) -> Model:
-        """The finished mesh: an object brought to its size and place, no faces in one another."""
+        """Make the finished mesh: an object gets its size and place, and no faces lie in one another."""
         model = self.compose(library)
         if self.walk is None:
             model = model.fitted(_HALF_EXTENT, _RADIUS)
         return without_coincident_faces(model, 5e-4)
 
     def description(self, mesh: str, environment: str, credits: Sequence[dict[str, str]]) -> dict[str, object]:
-        """The scene file's content, with the names of its mesh and its environment."""
+        """Return the content of the scene file, given the file names of its mesh and its environment."""
         path: dict[str, object] = {"kind": "around", "centre": [0, 0, 0], "radius": _DISTANCE, "turns": 4}
         if self.walk is not None:
             path = {"kind": "walk", "positions": self.walk[0], "targets": self.walk[1]}
@@ -72,13 +73,14 @@ class BenchmarkScene:
 def loop(
     half_length: float, half_width: float, height: float, reach: float, look_height: float, count: int = 16
 ) -> tuple[list[list[float]], list[list[float]]]:
-    """Positions and targets of an oval walk around the origin, up and down a little, that looks across the middle.
+    """Return positions and targets of an oval walk around the origin. The camera bobs and looks across the middle.
 
     Args:
-        half_length, half_width: of the oval, along x and y.
-        height: mean height of the camera.
-        reach: how far beyond the middle the targets lie, in parts of the oval.
-        look_height: mean height of the targets.
+        half_length: half axis of the oval along x, in metres.
+        half_width: half axis of the oval along y, in metres.
+        height: mean height of the camera, in metres.
+        reach: distance of the targets beyond the middle, as a fraction of the oval's half axes.
+        look_height: mean height of the targets, in metres.
         count: number of positions.
     """
     turn = 2 * np.pi * np.arange(count) / count

@@ -1,13 +1,14 @@
-"""What the scenes share: surfaces, and furniture made of boxes. Fronts face -y."""
+"""Surfaces that several scenes share, and furniture made of boxes. Fronts face -y."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from meshes import Material, Model, box, coloured_copy, disc, join, paint, rectangle, revolved
 
 from aenerf_ns.simulator import textures as tx
+from benchmarks.scenes.meshes import Material, Model, coloured_copy, join, paint
+from benchmarks.scenes.shapes import box, disc, rectangle, revolved
 
 _BOOK_COLOURS = ("8c3b32", "35608c", "4a7a4f", "b98a3a", "6f4a7a", "a8a090", "396b73", "a35f3a")
 
@@ -29,19 +30,20 @@ def steel() -> Material:
 
 
 def podium(radius: float, height: float, top: Material, side: Material, tile: float = 0.8) -> Model:
-    """A round platform whose top is at z = 0."""
+    """Make a round platform whose top is at z = 0."""
     return disc(radius, 0, top, tile) + revolved([(0, -height), (radius, -height), (radius, 0)], side, tile)
 
 
 def books(width: float, depth: float, height: float, seed: int, fill: float = 1.0) -> Model:
-    """A row of books that stands on z = 0, from x = 0 to at most ``fill`` of the width, its spines at y = 0."""
+    """Make a row of books that stands on z = 0, its spines at y = 0, from x = 0 to at most ``fill`` of the width."""
     rng = np.random.default_rng(seed)
     spine, cover = (
         paint("book spine", tx.book_spine, size=128),
         paint("book cover", tx.mottled, ["9a968c", "b0aca2"], size=64),
     )
     pages = paint("pages", tx.mottled, ["cbbf9f", "d8cfb4"], 0.1, size=64)
-    row, x = [], 0.0
+    row: list[Model] = []
+    x = 0.0
     while True:
         thick, tall = rng.uniform(0.018, 0.05), height * rng.uniform(0.68, 0.92)
         deep, set_back = depth * rng.uniform(0.7, 0.9), rng.uniform(0, 0.02)
@@ -58,7 +60,7 @@ def books(width: float, depth: float, height: float, seed: int, fill: float = 1.
 def bookcase(
     width: float, depth: float, levels: Sequence[float], wood: Material, seed: int, fill: float = 1.0, columns: int = 1
 ) -> Model:
-    """A case with boards at heights above z = 0, the last of them its top, and books between them."""
+    """Make a bookcase with books. ``levels`` are the heights of its boards above z = 0; the last board is its top."""
     thick, top = 0.025, levels[-1]
     sides = np.linspace(-width / 2, width / 2 - thick, columns + 1)
     parts = [box((x, -depth / 2, 0), (x + thick, depth / 2, top), wood) for x in sides]
@@ -76,7 +78,7 @@ def bookcase(
 
 
 def framed_picture(width: float, height: float, canvas: Material, frame: Material, border: float = 0.05) -> Model:
-    """A picture whose back lies in the plane y = 0, its middle at the origin."""
+    """Make a picture whose back lies in the plane y = 0, its middle at the origin."""
     x, z, b = width / 2, height / 2, border
     return join(
         (
@@ -97,13 +99,16 @@ def wall(
     openings: Sequence[tuple[float, float, float, float]] = (),
     reveal: Material | None = None,
 ) -> Model:
-    """A wall in the plane y = 0 from x = 0, z = 0, with openings (x, x, z, z) side by side, 0.15 m deep."""
+    """Make a wall in the plane y = 0 from x = 0, z = 0, with openings (x, x, z, z) side by side, 0.15 m deep.
+
+    With ``reveal`` the openings get inner sides of that material.
+    """
     parts = []
 
     def piece(x0: float, x1: float, z0: float, z1: float) -> None:
         if x1 - x0 > 1e-9 and z1 - z0 > 1e-9:
             part = rectangle((x0, 0, z0), (x1 - x0, 0, 0), (0, 0, z1 - z0), material, tile)
-            # One texture over the whole wall.
+            # The texture runs on over the whole wall.
             parts.append(part.with_texture_shifted((x0 / tile, z0 / tile)))
 
     end = 0.0
@@ -119,7 +124,7 @@ def wall(
 
 
 def window(width: float, height: float, material: Material, columns: int = 2, rows: int = 2) -> Model:
-    """The bars of a window around y = 0, from x = 0, z = 0."""
+    """Make the bars of a window around y = 0, from x = 0, z = 0."""
     bar = 0.05
     uprights = [
         box((x, -bar / 2, 0), (x + bar, bar / 2, height), material) for x in np.linspace(0, width - bar, columns + 1)
@@ -139,7 +144,10 @@ def room(
     floor: Model,
     ceiling: Model,
 ) -> Model:
-    """Walls as `wall` makes them, in the order far (+y), right (+x), near (-y), left (-x); floor and ceiling from 0."""
+    """Put walls from `wall`, a floor and a ceiling in their places.
+
+    The order of the walls is far (+y), right (+x), near (-y), left (-x). The floor and the ceiling begin at the origin.
+    """
     (x0, y0), (x1, y1) = low, high
     far, right, near, left = walls
     return join(
@@ -155,7 +163,7 @@ def room(
 
 
 def skirting(low: tuple[float, float], high: tuple[float, float], material: Material, height: float = 0.1) -> Model:
-    """Boards along the foot of the walls of a room."""
+    """Make boards along the foot of the walls of a room."""
     (x0, y0), (x1, y1) = low, high
     t = 0.02
     return join(
@@ -169,7 +177,7 @@ def skirting(low: tuple[float, float], high: tuple[float, float], material: Mate
 
 
 def lamp(x: float, y: float, z: float, half_size: float, radiance: Sequence[float]) -> dict[str, list[float]]:
-    """A square lamp that shines downwards, for a scene file."""
+    """Describe a square lamp that shines downwards, for a scene file."""
     return {
         "centre": [x, y, z],
         "half_u": [half_size, 0, 0],

@@ -1,16 +1,16 @@
-"""Things to be looked at from around them, each on a platform of its own. Sizes are those of the real things."""
+"""Scenes that the camera goes around: true-sized things on a platform."""
 
 from __future__ import annotations
 
-from assets import Library
-from furnishings import bookcase, framed_picture, oak, podium, steel, walnut
-from meshes import Model, box, disc, paint, revolved, top
-
 from aenerf_ns.simulator import textures as tx
+from benchmarks.scenes.assets import Library
+from benchmarks.scenes.furnishings import bookcase, framed_picture, oak, podium, steel, walnut
+from benchmarks.scenes.meshes import Model, paint
+from benchmarks.scenes.shapes import box, disc, revolved, top
 
 
 def piano(library: Library) -> Model:
-    """A grand piano of mahogany, its bench with a bear on it, a guitar and an orchid."""
+    """Build a mahogany grand piano, its bench with a bear on it, a guitar and an orchid."""
     mahogany = paint("mahogany", tx.wood, ["6e3a24", "8f4f30", "b06b45"])
     cloth = paint("red cloth", tx.fabric, ["8a3b35", "a5544a", "b9695c"])
     boards = paint("parquet", tx.planks, ["8f6a45", "a98258", "c09a6e"], rows=6)
@@ -27,7 +27,7 @@ def piano(library: Library) -> Model:
 
 
 def bookshelf(library: Library) -> Model:
-    """A bookcase with knick-knacks, a rocking horse and a stool before it."""
+    """Build a bookcase with knick-knacks; a rocking horse and a stool stand before it."""
     boards = paint("pale boards", tx.planks, ["a58d6c", "b9a27f", "cbb793"], rows=6)
     scene = podium(1.15, 0.1, boards, walnut())
     case = bookcase(1.5, 0.34, (0.12, 0.52, 0.9, 1.26, 1.6), oak(), 7, fill=0.72)
@@ -55,7 +55,7 @@ def bookshelf(library: Library) -> Model:
 
 
 def plants(library: Library) -> Model:
-    """Potted plants around a table, and on it."""
+    """Build a table with potted plants on it and around it."""
     tiles = paint("terracotta tiles", tx.checker, ["b0795a", "c69a7a"], cells=6)
     scene = podium(1.1, 0.1, tiles, paint("stone", tx.mottled, ["8f8a80", "a39e92", "b5b0a4"], 0.08), 1.0)
     scene += library.model("oakTable").moved((0, 0, 0), scale=0.8)
@@ -79,7 +79,7 @@ def plants(library: Library) -> Model:
 
 
 def playground(library: Library) -> Model:
-    """A climbing hut with a slide, a see-saw and a rocking motorbike on grass."""
+    """Build a climbing hut with a slide, a see-saw and a rocking motorbike on grass."""
     grass = paint("grass", tx.mottled, ["5f7a3a", "74914a", "8ba55f"], 0.12)
     scene = box((-2.9, -3.0, -0.2), (2.9, 3.0, 0), grass, 1.2)
     scene += library.model("childHut", "wood").moved((-0.4, 0.2, 0))
@@ -90,7 +90,7 @@ def playground(library: Library) -> Model:
 
 
 def breakfast(library: Library) -> Model:
-    """A tray of breakfast, larger than life."""
+    """Build a tray of breakfast."""
     cloth = paint("checked cloth", tx.fabric, ["5c7fa8", "a9bccf", "d5dbdd"])
     china = paint("china", tx.mottled, ["d8d6cf", "e2e0da", "e9e7e1"], 0.03)
     scene = box((-0.46, -0.36, -0.04), (0.46, 0.36, 0), walnut(), 0.3)
@@ -118,7 +118,7 @@ def breakfast(library: Library) -> Model:
 
 
 def lounge(library: Library) -> Model:
-    """Leather sofa and an armchair on a rug, with a lamp, a plant and a side table."""
+    """Build a leather sofa and an armchair on a rug, with a lamp, a plant and a side table."""
     leather = paint("leather", tx.mottled, ["7d3b2a", "965040", "ab6852"], 0.07)
     rug = paint("rug", tx.rug, ["7a3b35", "4f6480", "c9a66b", "d9cfb8"], size=512)
     boards = paint("dark boards", tx.planks, ["7a5a3c", "8f6c4a", "a5825e"], rows=6)
@@ -137,7 +137,7 @@ def lounge(library: Library) -> Model:
 
 
 def forklift(library: Library) -> Model:
-    """A fork-lift truck with a loaded pallet, barrels and crates on concrete."""
+    """Build a fork-lift truck with a loaded pallet, barrels and crates on concrete."""
     concrete = paint("concrete", tx.mottled, ["85827c", "96938c", "a8a59d"], 0.1)
     hazard = paint("hazard stripes", tx.striped_wallpaper, ["d9b03f", "5a5a5c"])
     scene = box((-2.6, -1.7, -0.15), (2.6, 1.7, 0), concrete, 1.5, without="xXyY")
@@ -155,7 +155,7 @@ def forklift(library: Library) -> Model:
 
 
 def games(library: Library) -> Model:
-    """A football table, stools and balls."""
+    """Build a football table with stools and balls."""
     tiles = paint("lino", tx.checker, ["7f97a3", "b5bfc2"], cells=4)
     scene = box((-1.3, -1.3, -0.1), (1.3, 1.3, 0), tiles, 1.0, without="xXyY")
     scene += box((-1.3, -1.3, -0.1), (1.3, 1.3, 0), steel(), 0.5, without="zZ")

@@ -1,10 +1,12 @@
-"""Places to walk through. Metres, z up."""
+"""Scenes that the camera walks through. Lengths are in metres, z points up."""
 
 from __future__ import annotations
 
 import numpy as np
-from assets import Library
-from furnishings import (
+
+from aenerf_ns.simulator import textures as tx
+from benchmarks.scenes.assets import Library
+from benchmarks.scenes.furnishings import (
     bookcase,
     framed_picture,
     lamp,
@@ -17,23 +19,22 @@ from furnishings import (
     white_paint,
     window,
 )
-from meshes import Material, Model, box, disc, paint, rectangle, revolved, top
-
-from aenerf_ns.simulator import textures as tx
+from benchmarks.scenes.meshes import Material, Model, paint
+from benchmarks.scenes.shapes import box, disc, rectangle, revolved, top
 
 Placing = tuple[str, float, float, float]
-"""Model, x, y and turn in degrees of something that is put down."""
+"""Name of a model, the x and y where it is put down, and its turn in degrees."""
 
 
 def _with_all(scene: Model, library: Library, placings: list[Placing], below: float) -> Model:
-    """With furniture put down on the highest surfaces below a height: that of a ceiling, or of an umbrella."""
+    """Put furniture down on the highest surfaces lower than ``below``, so not on a ceiling or an umbrella."""
     for name, x, y, turn in placings:
         scene = scene.with_dropped(library.model(name), x, y, turn, below)
     return scene
 
 
 def _canvas(number: int) -> Material:
-    """A painting, each number another one."""
+    """Make a painting, a different one for each number."""
     name = f"painting {number}"
     warm, cool = ["c9b58f", "b5623f", "7a3b35"], ["9fb0b8", "4f6f8f", "35506b"]
     if number % 3 == 0:
@@ -49,7 +50,7 @@ _LIVING_LOW, _LIVING_HIGH, _LIVING_HEIGHT = (-3.4, -2.7), (3.4, 2.7), 2.7
 
 
 def living_room(library: Library) -> Model:
-    """Sofas around a low table, bookcases, a piano, plants and pictures; a wide window to the right."""
+    """Build sofas around a low table, bookcases, a piano, plants and pictures, with a wide window to the right."""
     low, high, z = _LIVING_LOW, _LIVING_HIGH, _LIVING_HEIGHT
     wide, deep = high[0] - low[0], high[1] - low[1]
     sage = paint("sage wallpaper", tx.striped_wallpaper, ["b3b99f", "a5ad92", "bcc1a9"])
@@ -121,7 +122,7 @@ LIVING_ROOM_LAMPS = tuple(lamp(x, y, 2.45, 0.35, (10, 9.2, 8)) for x in (-1.7, 1
 
 
 def terrace(library: Library) -> Model:
-    """A paved terrace before a house, with table and umbrella, flowers, rocks, a hut and a hedge of pot plants."""
+    """Build a paved terrace before a house, with table and umbrella, flowers, rocks, a hut and a row of pot plants."""
     grass = paint("lawn", tx.mottled, ["66803f", "76904c", "87a05c"], 0.1, size=512)
     paving = paint("paving", tx.bricks, ["a39a8a", "aea594", "b9b1a2"], "928a7c", rows=6, columns=3)
     stone = paint("garden wall", tx.bricks, ["9f917c", "ab9d88", "b8ab97"], "9a8f80")
@@ -129,7 +130,7 @@ def terrace(library: Library) -> Model:
     roof = paint("roof tiles", tx.bricks, ["96543f", "a5654e", "b17560"], "7f4a3a", rows=10, columns=8)
     scene = disc(24, -0.03, grass, 2.2, sides=64)
     scene += box((-5, -4.5, -0.2), (5, 4.5, 0), paving, 1.6, without="z")
-    # The house to the back.
+    # The house, at the back.
     scene += wall(
         12, 3.2, facade, 2.5, [(1.2, 2.8, 0.9, 2.2), (5.2, 6.8, 0.02, 2.2), (9.2, 10.8, 0.9, 2.2)], white_paint()
     ).moved((-6, 5.6, -0.03))
@@ -142,7 +143,7 @@ def terrace(library: Library) -> Model:
         scene += side.moved((x, 5.6, -0.03), 90) if x > 0 else side.inside_out().moved((x, 5.6, -0.03), 90)
     scene += rectangle((-6.4, 5.2, 3.05), (12.8, 0, 0), (0, 2.6, 1.5), roof, 1.6)
     scene += rectangle((-6.4, 5.2, 2.98), (12.8, 0, 0), (0, 0, 0.07), walnut(), 0.5)
-    # Low walls to the sides.
+    # Low walls at the sides.
     for low, high in (((-6.3, -5.5, -0.05), (-6.0, 5.6, 0.75)), ((6.0, -5.5, -0.05), (6.3, 5.6, 0.75))):
         scene += box(low, high, stone, 1.2, without="z")
         scene += box((low[0] - 0.04, low[1] - 0.04, 0.75), (high[0] + 0.04, high[1] + 0.04, 0.81), paving, 1.6)
@@ -210,7 +211,7 @@ _GALLERY_LOW, _GALLERY_HIGH, _GALLERY_HEIGHT = (-7.0, -3.2), (7.0, 3.2), 4.0
 
 
 def gallery(library: Library) -> Model:
-    """A long hall with paintings on its walls, columns, and exhibits on plinths along its middle."""
+    """Build a long hall with paintings on its walls, columns, and exhibits on plinths along its middle."""
     low, high, z = _GALLERY_LOW, _GALLERY_HIGH, _GALLERY_HEIGHT
     wide, deep = high[0] - low[0], high[1] - low[1]
     plaster = paint("gallery plaster", tx.mottled, ["c4b7a3", "ccc1af", "d3cabb"], 0.05)
@@ -280,7 +281,7 @@ _WORKSHOP_LOW, _WORKSHOP_HIGH, _WORKSHOP_HEIGHT = (-5.5, -4.5), (5.5, 4.5), 4.2
 
 
 def workshop(library: Library) -> Model:
-    """A store and workshop: a fork-lift truck, crates, barrels, shelves, lockers and a stair, under high windows."""
+    """Build a workshop with a fork-lift truck, crates, barrels, shelves, lockers and a stair, under high windows."""
     low, high, z = _WORKSHOP_LOW, _WORKSHOP_HIGH, _WORKSHOP_HEIGHT
     wide, deep = high[0] - low[0], high[1] - low[1]
     brick = paint("workshop bricks", tx.bricks, ["a06a55", "ab7863", "b58875"], "b0a596")

@@ -1,21 +1,17 @@
 """The benchmark's scenes: geometry against truth, what they are composed of, and what a missing asset says."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from aenerf_ns.errors import DataError
-
-FOLDER = Path(__file__).parents[2] / "benchmarks" / "scenes"
-sys.path.insert(0, str(FOLDER))
-import assets  # noqa: E402
-import catalogue  # noqa: E402
-import furnishings  # noqa: E402
-import meshes  # noqa: E402
-import object_scenes  # noqa: E402
-import place_scenes  # noqa: E402
+from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
+from benchmarks.scenes import assets, catalogue, furnishings, meshes, object_scenes, place_scenes, shapes
+from benchmarks.scenes.cleaning import without_coincident_faces
+from benchmarks.scenes.glb import write_glb
+from benchmarks.scenes.obj import read_obj, triangulate
 
 PLAIN = meshes.Material("plain", np.full((2, 2, 3), 128, np.uint8))
 
@@ -28,7 +24,7 @@ class StandIns:
 
     def model(self, name, detail="plain", dress=None):
         self.names.add(name)
-        return meshes.box((-0.1, -0.1, 0), (0.1, 0.1, 0.2), PLAIN)
+        return shapes.box((-0.1, -0.1, 0), (0.1, 0.1, 0.2), PLAIN)
 
 
 def area(triangles):
@@ -53,7 +49,7 @@ def test_polygons_are_filled_once_and_keep_their_sense(outline, expected, turned
     basis = np.linalg.qr(np.array([[1.0, 2, 3], [3, -1, 1], [2, 2, -1]]))[0]
     basis *= np.sign(np.linalg.det(basis))
     polygon = corners @ basis[:2]
-    triangles = polygon[meshes.triangulate(polygon)]
+    triangles = polygon[triangulate(polygon)]
     assert len(triangles) == len(outline) - 2
     # Without overlap, areas add up to the polygon's only if none lies outside.
     assert area(triangles).sum() == pytest.approx(expected)
@@ -62,9 +58,9 @@ def test_polygons_are_filled_once_and_keep_their_sense(outline, expected, turned
 
 
 def test_dropped_models_stand_on_what_is_below():
-    table = meshes.box((-1, -1, 0.7), (1, 1, 0.75), PLAIN)
-    ceiling = meshes.rectangle((-2, -2, 2.5), (4, 0, 0), (0, 4, 0), PLAIN)
-    cup = meshes.box((3, 3, 5), (3.1, 3.1, 5.2), PLAIN)
+    table = shapes.box((-1, -1, 0.7), (1, 1, 0.75), PLAIN)
+    ceiling = shapes.rectangle((-2, -2, 2.5), (4, 0, 0), (0, 4, 0), PLAIN)
+    cup = shapes.box((3, 3, 5), (3.1, 3.1, 5.2), PLAIN)
     scene = table + ceiling
     assert scene.with_dropped(cup, 0.5, 0.5).bounds[1, 2] == pytest.approx(2.7)
     stood = scene.with_dropped(cup, 0.5, 0.5, 30, below=2.0).parts[-6:]
@@ -75,7 +71,7 @@ def test_dropped_models_stand_on_what_is_below():
 
 
 def test_fitted_models_keep_to_both_limits():
-    model = meshes.box((3, 0, 0), (5, 4, 1), PLAIN)
+    model = shapes.box((3, 0, 0), (5, 4, 1), PLAIN)
     fitted = model.fitted(1.2, 1.25)
     reach = np.linalg.norm(fitted.triangles, axis=2).max()
     assert reach == pytest.approx(1.25)
@@ -84,11 +80,11 @@ def test_fitted_models_keep_to_both_limits():
 
 
 def test_coincident_faces_are_dropped_or_moved_apart():
-    table = meshes.rectangle((-1, -1, 0), (2, 0, 0), (0, 2, 0), PLAIN)
-    label = meshes.rectangle((0.1, 0.2, 0), (0.3, 0, 0), (0, 0.3, 0), PLAIN)
-    sticker = meshes.rectangle((0.15, 0.25, 0), (0.1, 0, 0), (0, 0.1, 0), PLAIN)
-    above = meshes.rectangle((-1, -1, 0.4), (2, 0, 0), (0, 2, 0), PLAIN)
-    scene = meshes.without_coincident_faces(table + label + sticker + above + above.inside_out(), 1e-3)
+    table = shapes.rectangle((-1, -1, 0), (2, 0, 0), (0, 2, 0), PLAIN)
+    label = shapes.rectangle((0.1, 0.2, 0), (0.3, 0, 0), (0, 0.3, 0), PLAIN)
+    sticker = shapes.rectangle((0.15, 0.25, 0), (0.1, 0, 0), (0, 0.1, 0), PLAIN)
+    above = shapes.rectangle((-1, -1, 0.4), (2, 0, 0), (0, 2, 0), PLAIN)
+    scene = without_coincident_faces(table + label + sticker + above + above.inside_out(), 1e-3)
     heights = [part.points[..., 2] for part in scene.parts]
     assert [len(height) for height in heights] == [2, 2, 2, 2, 0]
     np.testing.assert_allclose(heights[0], 0)
@@ -100,12 +96,12 @@ def test_coincident_faces_are_dropped_or_moved_apart():
 
 
 def test_boxes_face_outwards():
-    box = meshes.box((1, 2, 3), (2, 4, 6), PLAIN).triangles
+    box = shapes.box((1, 2, 3), (2, 4, 6), PLAIN).triangles
     outward = box.mean(axis=1) - [1.5, 3, 4.5]
     normals = np.cross(box[:, 1] - box[:, 0], box[:, 2] - box[:, 0])
     assert ((normals * outward).sum(axis=1) > 0).all()
     assert area(box).sum() == pytest.approx(2 * (2 + 3 + 6))
-    volume = np.linalg.det(meshes.revolved([(0, 0), (1, 0), (1, 2), (0, 2)], PLAIN, sides=256).triangles).sum() / 6
+    volume = np.linalg.det(shapes.revolved([(0, 0), (1, 0), (1, 2), (0, 2)], PLAIN, sides=256).triangles).sum() / 6
     assert volume == pytest.approx(2 * np.pi, rel=1e-3)
 
 
@@ -121,34 +117,35 @@ def test_obj_files_are_read_with_their_materials(tmp_path):
         asked[name] = (colour, picture)
         return None if name == "paper" else PLAIN
 
-    model = meshes.read_obj(tmp_path / "a.obj", surface, size=(2.0, 0.4, 1.0))
+    model = read_obj(tmp_path / "a.obj", surface, size=(2.0, 0.4, 1.0))
     assert asked == {"wood": ((0.5, 0.25, 0), None), "paper": ((1, 1, 1), None)}
     np.testing.assert_allclose(model.triangles, [[[0, 0, 0], [2, 0, 0], [2, 0, 1]]])
     (tmp_path / "b.obj").write_text("v 0 0\nf 1 2 x\n")
     with pytest.raises(DataError, match=r"b\.obj"):
-        meshes.read_obj(tmp_path / "b.obj", surface)
+        read_obj(tmp_path / "b.obj", surface)
 
 
 def test_glb_files_hold_the_model(tmp_path):
-    import trimesh
-
     picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-    model = meshes.box((0, 0, 0), (1, 2, 3), PLAIN) + meshes.rectangle(
+    model = shapes.box((0, 0, 0), (1, 2, 3), PLAIN) + shapes.rectangle(
         (5, 0, 0), (1, 0, 0), (0, 0, 1), meshes.Material("picture", picture)
     )
     for name in ("a.glb", "b.glb"):
-        meshes.write_glb(tmp_path / name, model)
+        write_glb(tmp_path / name, model)
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
     read = trimesh.load_scene(tmp_path / "a.glb", process=False)
     # y is up in the file: (x, y, z) there is (x, -z, y) here.
     np.testing.assert_allclose(read.bounds, [[0, 0, -2], [6, 3, 0]], atol=1e-6)
-    last = list(read.geometry.values())[-1]
+    last = read.geometry[read.graph["picture"][1]]
     np.testing.assert_array_equal(np.asarray(last.visual.material.baseColorTexture), picture)
     upper = last.vertices[:, 1] > 0.5
     np.testing.assert_allclose(last.visual.uv[upper, 1], 1)  # the reader turns v upwards
+    # The order of the triangles is the model's: which of two faces hides the other depends on it.
+    corners = load_mesh(tmp_path / "a.glb", y_up=True)
+    np.testing.assert_allclose(corners.vertices[corners.faces], model.triangles, atol=1e-6)
     with pytest.raises(ValueError, match="picture"):
-        meshes.write_glb(
-            tmp_path / "c.glb", model + meshes.box((0, 0, 0), (1, 1, 1), meshes.Material("picture", picture[::-1]))
+        write_glb(
+            tmp_path / "c.glb", model + shapes.box((0, 0, 0), (1, 1, 1), meshes.Material("picture", picture[::-1]))
         )
 
 
@@ -156,7 +153,7 @@ def test_credits_name_every_asset_of_every_scene(monkeypatch):
     # Patterns take seconds, and do not matter here.
     for module in (furnishings, object_scenes, place_scenes):
         monkeypatch.setattr(module, "paint", lambda name, *rest, **options: meshes.Material(name, PLAIN.picture))
-    credits = (FOLDER / "CREDITS.md").read_text()
+    credits = Path(catalogue.__file__).with_name("CREDITS.md").read_text()
     rows = {line.split("|")[1].strip(): line for line in credits.splitlines() if line.startswith("| ")}
     for name, scene in catalogue.SCENES.items():
         library = StandIns()

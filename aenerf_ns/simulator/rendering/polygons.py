@@ -4,36 +4,25 @@ from __future__ import annotations
 
 import re
 
+import mapbox_earcut
 import numpy as np
+from numpy.typing import NDArray
 
 from aenerf_ns.simulator.arrays import Array
 
 
-def ear_clipping(corners: Array) -> list[tuple[int, int, int]]:
-    """Cut a simple polygon with corners (N, 3) into triangles of indices, in its orientation (Meisters, 1975)."""
+def ear_clipping(corners: Array) -> NDArray[np.int64]:
+    """Cut a simple polygon with corners (N, 3) into triangles that keep its orientation.
+
+    Returns:
+        Corner numbers (T, 3). T is at most N - 2: earcut may leave out corners that repeat a neighbour or lie on a line
+        with both, and parts of polygons that cross themselves.
+    """
     normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)  # Newell's
     axis = int(np.argmax(np.abs(normal)))
     flat = corners[:, [(axis + 1) % 3, (axis + 2) % 3]] * [1.0, np.sign(normal[axis]) or 1.0]
-
-    def turn(a: int, b: int, c: int) -> float:
-        (ux, uy), (vx, vy) = flat[b] - flat[a], flat[c] - flat[b]
-        return float(ux * vy - uy * vx)
-
-    left, triangles = list(range(len(corners))), []
-    while len(left) > 3:
-        for i, b in enumerate(left):
-            a, c = left[i - 1], left[(i + 1) % len(left)]
-            # Corners where a hole joins the outline occur twice. A corner must not block its own copy.
-            others = [p for p in left if not any((flat[p] == flat[q]).all() for q in (a, b, c))]
-            if turn(a, b, c) > 0 and not any(
-                turn(a, b, p) >= 0 and turn(b, c, p) >= 0 and turn(c, a, p) >= 0 for p in others
-            ):
-                break
-        else:
-            i = 1  # the polygon crosses or touches itself, so no triangulation is right
-        triangles.append((left[i - 1], left[i], left[(i + 1) % len(left)]))
-        del left[i]
-    return [*triangles, (left[0], left[1], left[2])]
+    triangles = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], np.uint32))
+    return triangles.reshape(-1, 3).astype(np.int64)
 
 
 def triangulated_obj(text: str) -> str:
