@@ -67,3 +67,24 @@ def test_concave_polygons() -> None:
         newell = np.cross(corners, np.roll(corners, -1, axis=0)).sum(0)
         assert (cross @ newell > 0).all()
         np.testing.assert_allclose(cross.sum(0), newell, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "outline",
+    [
+        # A hole that a bridge joins to the outline.
+        [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)],
+        # Corners on the line between others, before and after a notch.
+        [(0, 0), (1, 0), (2, 0), (4, 0), (4, 4), (2, 1), (0, 4), (0, 2)],
+        # A corner given twice.
+        [(0, 0), (4, 0), (4, 0), (4, 4), (2, 1), (0, 4)],
+    ],
+)
+def test_holes_and_needless_corners_of_polygons(outline: list[tuple[float, float]]) -> None:
+    corners = np.column_stack([outline, 1e-6 * np.random.default_rng(0).normal(size=len(outline))])
+    a, b, c = np.moveaxis(corners[ear_clipping(corners)], 1, 0)
+    cross = np.cross(b - a, c - a)
+    assert (cross[:, 2] >= 0).all()
+    np.testing.assert_allclose(
+        cross.sum(0), np.cross(corners, np.roll(corners, -1, axis=0)).sum(0), rtol=1e-9, atol=1e-5
+    )
