@@ -17,6 +17,10 @@ from aenerf_ns.events.stream import EventStream
 # folders of the installed one.
 sys.path.append(str(Path(__file__).parents[1]))
 
+if not torch.cuda.is_available():
+    # Before anything imports Triton: it then interprets its kernels on the CPU.
+    os.environ["TRITON_INTERPRET"] = "1"
+
 # Examples of each test that feeds readers with damaged and random input; many more when they are set to.
 FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 
