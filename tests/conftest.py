@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 # folders of the installed one.
 sys.path.append(str(Path(__file__).parents[1]))
 
+if not torch.cuda.is_available():
+    # Before anything imports Triton: it then interprets its kernels on the CPU.
+    os.environ["TRITON_INTERPRET"] = "1"
+
 # Examples of each test that feeds readers with damaged and random input; many more when they are set to.
 FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 

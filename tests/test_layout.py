@@ -19,7 +19,7 @@ MAY_USE = {
     "files": {"errors", "events", "camera"},
     "recording": {"errors", "progress", "events", "camera", "files"},
     "supervision": {"errors", "events", "camera", "recording"},
-    "method": {"camera", "recording", "supervision"},
+    "method": {"errors", "camera", "recording", "supervision"},
     "training": {"errors", "progress", "camera", "recording", "supervision", "method"},
     "checking": {"progress", "events", "camera", "recording"},
     "simulator": {"errors", "progress", "events", "camera", "files", "recording"},

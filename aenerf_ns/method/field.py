@@ -18,7 +18,7 @@ from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor, nn
 
-from aenerf_ns.method.encoding.hash_grid import HashEncoding
+from aenerf_ns.method.encoding.hash_grid import HashEncoding, Implementation
 
 # The framework's trunc_exp cuts gradients at the same value, but it overflows, and it is a custom function without
 # forward-mode derivatives.
@@ -172,13 +172,22 @@ class ProposalNetwork(HashMLPDensityField):
         num_levels: levels of the hash grid.
         max_res: cells along an axis on the finest level.
         log2_hashmap_size: binary logarithm of the entries of a level.
+        grid_implementation: how the hash grid is computed, see :class:`.encoding.hash_grid.HashEncoding`.
         options: the other options of the framework's network.
     """
 
-    def __init__(self, aabb: Tensor, num_levels: int, max_res: int, log2_hashmap_size: int, **options: Any) -> None:
+    def __init__(
+        self,
+        aabb: Tensor,
+        num_levels: int,
+        max_res: int,
+        log2_hashmap_size: int,
+        grid_implementation: Implementation,
+        **options: Any,
+    ) -> None:
         grid = {"num_levels": num_levels, "max_res": max_res, "log2_hashmap_size": log2_hashmap_size}
         super().__init__(aabb, implementation="torch", **grid, **options)
-        self.encoding = self.mlp_base[0] = HashEncoding(**grid)
+        self.encoding = self.mlp_base[0] = HashEncoding(grid_implementation, **grid)
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, None]:
         """Return density (..., 1), and no feature."""

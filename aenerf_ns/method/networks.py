@@ -10,7 +10,7 @@ from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import Field
 from torch import Tensor
 
-from aenerf_ns.method.encoding.hash_grid import HashEncoding
+from aenerf_ns.method.encoding.hash_grid import HashEncoding, Implementation
 from aenerf_ns.method.field import DensityField, DensityShape, EventRadianceField, ProposalNetwork, RadianceShape
 
 Backbone = Literal["hash", "mlp"]
@@ -30,6 +30,9 @@ class FieldConfig:
     """hash: cells along an axis on the finest level."""
     log2_hashmap_size: int = 19
     """hash: binary logarithm of the entries of a level."""
+    grid_implementation: Implementation = "auto"
+    """hash: how the grids of field and proposal networks are computed. "numba": on the CPU. "triton": on NVIDIA GPUs.
+    "torch": anywhere, more slowly. "auto": by numba or Triton where they are installed, else by torch."""
     num_frequencies: int = 10
     """mlp: frequencies of the position's encoding, in octaves from one period across the box or contracted space."""
     num_hidden_layers: int = 1
@@ -81,55 +84,36 @@ def make_networks(
         num_channels: radiance channels of the sensor, 1 or 3.
         average_init_density: density before training.
     """
-    make = {"hash": _hash_networks, "mlp": _mlp_networks}[backbone]
-    return make(field, proposal, aabb, spatial_distortion, num_channels, average_init_density)
-
-
-def _hash_networks(
-    field: FieldConfig,
-    proposal: ProposalConfig,
-    aabb: Tensor,
-    spatial_distortion: SpatialDistortion | None,
-    num_channels: int,
-    average_init_density: float,
-) -> tuple[EventRadianceField, list[Field]]:
-    radiance_field = EventRadianceField(
-        aabb,
-        spatial_distortion,
-        HashEncoding(
-            num_levels=field.num_levels,
-            min_res=field.base_resolution,
-            max_res=field.max_resolution,
-            log2_hashmap_size=field.log2_hashmap_size,
-        ),
-        DensityShape(
-            field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "exp", average_init_density
-        ),
-        RadianceShape(num_channels, num_hidden_layers=2, hidden_dim=field.hidden_dim),
-    )
-    return radiance_field, [
-        ProposalNetwork(
+    if backbone == "hash":
+        radiance_field = EventRadianceField(
             aabb,
-            spatial_distortion=spatial_distortion,
-            num_levels=proposal.num_levels,
-            max_res=resolution,
-            log2_hashmap_size=proposal.log2_hashmap_size,
-            num_layers=proposal.num_hidden_layers + 1,
-            hidden_dim=proposal.hidden_dim,
-            average_init_density=average_init_density,
+            spatial_distortion,
+            HashEncoding(
+                num_levels=field.num_levels,
+                min_res=field.base_resolution,
+                max_res=field.max_resolution,
+                log2_hashmap_size=field.log2_hashmap_size,
+                implementation=field.grid_implementation,
+            ),
+            DensityShape(
+                field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "exp", average_init_density
+            ),
+            RadianceShape(num_channels, num_hidden_layers=2, hidden_dim=field.hidden_dim),
         )
-        for resolution in proposal.max_resolutions
-    ]
-
-
-def _mlp_networks(
-    field: FieldConfig,
-    proposal: ProposalConfig,
-    aabb: Tensor,
-    spatial_distortion: SpatialDistortion | None,
-    num_channels: int,
-    average_init_density: float,
-) -> tuple[EventRadianceField, list[Field]]:
+        return radiance_field, [
+            ProposalNetwork(
+                aabb,
+                spatial_distortion=spatial_distortion,
+                num_levels=proposal.num_levels,
+                max_res=resolution,
+                log2_hashmap_size=proposal.log2_hashmap_size,
+                grid_implementation=field.grid_implementation,
+                num_layers=proposal.num_hidden_layers + 1,
+                hidden_dim=proposal.hidden_dim,
+                average_init_density=average_init_density,
+            )
+            for resolution in proposal.max_resolutions
+        ]
     # On a position in [0, 1], which the framework's encoding multiplies by 2π: NeRF's frequencies on [-1, 1].
     encoding = NeRFEncoding(
         in_dim=3,
