@@ -45,7 +45,7 @@ class ExportTrajectory:
         estimated = correction.trajectory
         trajectory = estimated
         if self.poses == "ground-truth":
-            trajectory = pipeline.datamanager.train_dataset.metadata["ground_truth"]
+            trajectory = pipeline.datamanager.train_dataset.scene.ground_truth
             if trajectory is None:
                 raise DataError(
                     pipeline.datamanager.get_datapath(), "it has no true poses", "export corrected or estimated ones"
