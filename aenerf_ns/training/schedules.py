@@ -92,7 +92,7 @@ class RelativeCosineSchedulerConfig(SchedulerConfig):
     delay: int = 100
     """Steps in which the rate is zero."""
     warm_up: int = 100
-    """Steps after these in which the rate rises."""
+    """Steps after the delay in which the rate rises."""
     final_factor: float = 0.01
     """Factor at the end of the run."""
     max_steps: tyro.conf.Suppress[int] = 0
