@@ -18,6 +18,7 @@ import torch
 import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
+from aenerf_ns.supervision.pairs import PairSampler
 from aenerf_ns.training.pipeline import AENeRFPipeline
 from benchmarks.common import write_result
 
@@ -65,7 +66,7 @@ class RealRecording:
                 # A rendering without any structure has no correlation.
                 correlations[name] = torch.corrcoef(stacked)[0, 1].nan_to_num().item()
         sampler = pipeline.datamanager.train_pixel_sampler
-        assert sampler is not None
+        assert isinstance(sampler, PairSampler)
         sampler.max_events_per_pair, sampler.share_to_moments = 1, 0.0
         torch.manual_seed(1)
         losses = []

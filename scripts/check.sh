@@ -13,4 +13,4 @@ for entry in aenerf_ns/* dataparsers method_configs; do
   ln -s "$PWD/$entry" "$layout/aenerf_ns/$(basename "$entry")"
 done
 ln -s "$PWD/benchmarks" "$layout/benchmarks"
-(cd "$layout" && mypy --config-file "$OLDPWD/pyproject.toml" --cache-dir "$OLDPWD/.mypy_cache" -p aenerf_ns -p benchmarks.paper)
+(cd "$layout" && mypy --config-file "$OLDPWD/pyproject.toml" --cache-dir "$OLDPWD/.mypy_cache" -p aenerf_ns -p benchmarks)

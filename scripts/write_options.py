@@ -41,8 +41,8 @@ INTRODUCTION = """\
 # Options
 
 This page lists this project's options of `ns-train` and of the dataset formats, with their defaults. `ns-train METHOD
---help` also lists Nerfstudio's own options; [some of them have no effect](nerfstudio.md#flags-without-effect). [The method](method.md) explains the terms.
-Give `True` or `False` after an option whose default is one of them.
+--help` also lists Nerfstudio's own options; [some of them have no effect](nerfstudio.md#flags-without-effect). [The
+method](method.md) explains the terms. Give `True` or `False` after an option whose default is one of them.
 
 `python scripts/write_options.py` writes this page from the configurations: do not edit it by hand.
 """

@@ -106,7 +106,7 @@ def test_the_version_is_stated_alike(wheel: zipfile.ZipFile) -> None:
     version = aenerf_ns.__version__
     assert _metadata(wheel)["Version"] == version
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert f"\n## [{version}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"\n## {version} " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def test_the_dataparsers_are_registered() -> None:

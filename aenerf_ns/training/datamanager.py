@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -48,10 +50,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         test_mode: Literal["test", "val", "inference"] = "val",
         **kwargs: Any,
     ) -> None:
-        try:
+        with _errors_as_one_line():
             super().__init__(config, device=device, test_mode=test_mode, **kwargs)
-        except DataError as error:
-            raise SystemExit(f"Error: {error}") from None
         # A run is opened with the options that the dataparser resolved, such as the format it recognised.
         config.dataparser = self.dataparser.config
         config.data = config.dataparser.data
@@ -84,15 +84,13 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         Raises:
             SystemExit: with one clear line, when events, sampler and supervision do not fit each other.
         """
-        try:
+        with _errors_as_one_line():
             self.train_pixel_sampler = self.config.sampler.setup(
                 dataset=self.train_dataset, supervision=supervision, device=self.device
             )
             if self.test_mode == "val":
                 self.train_pixel_sampler.prepare()
                 supervision.prepare(self.train_dataset)
-        except DataError as error:
-            raise SystemExit(f"Error: {error}") from None
 
     def setup_eval(self) -> None:
         """Make the loaders of whole reference views. No pixels are sampled from them."""
@@ -114,8 +112,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """Draw a batch to train on; see :meth:`Sampler.sample`."""
         self.train_count += 1
-        assert self.train_pixel_sampler is not None
-        return self.train_pixel_sampler.sample(self.config.train_num_rays_per_batch)
+        # An exporter asks a trained run for batches too: its events are read only then.
+        return self._sample(self.config.train_num_rays_per_batch, training=self.test_mode == "val")
 
     def get_train_rays_per_batch(self) -> int:
         """Return the most rays of a training batch."""
@@ -124,8 +122,21 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """Draw a batch to log the loss on."""
         self.eval_count += 1
+        return self._sample(self.config.eval_num_rays_per_batch, training=False)
+
+    def _sample(self, num_rays: int, training: bool) -> tuple[RayBundle, dict[str, Any]]:
         assert self.train_pixel_sampler is not None
-        return self.train_pixel_sampler.sample(self.config.eval_num_rays_per_batch, training=False)
+        with _errors_as_one_line():
+            return self.train_pixel_sampler.sample(num_rays, training)
+
+
+@contextmanager
+def _errors_as_one_line() -> Iterator[None]:
+    """Turn a :class:`DataError` into a :class:`SystemExit` with one clear line."""
+    try:
+        yield
+    except DataError as error:
+        raise SystemExit(f"Error: {error}") from None
 
 
 def _place(dataset: EventDataset, poses: Tensor) -> None:

@@ -110,14 +110,14 @@ class HashEncoding(FrameworkHashEncoding):
             and forward_ad.unpack_dual(self.hash_table).tangent is None
         )
         if self._implementation == "auto":
-            return _kernels_or_a_line(by_device) if by_device is not None and fits else None
+            return _kernels_or_a_line(by_device, positions.device) if by_device is not None and fits else None
         source = f"hash grid implementation {self._implementation}"
         if self._implementation != by_device or not fits:
             problem = f"cannot compute with these {positions.dtype} tensors on {positions.device}"
             raise DataError(source, problem, "choose auto")
         try:
-            return _kernels(self._implementation)
-        except ImportError as error:
+            return _working_kernels(self._implementation, positions.device)
+        except (ImportError, RuntimeError) as error:
             raise DataError(source, str(error), "install it or choose auto") from error
 
     def _plain(self, positions: Tensor) -> Tensor:
@@ -175,16 +175,27 @@ def _is_float_in_memory(tensor: Tensor) -> bool:
 
 
 @lru_cache
-def _kernels_or_a_line(name: str) -> Kernels | None:
-    """Return an implementation. Where it is not installed, say so the first time and return None."""
+def _kernels_or_a_line(name: str, device: torch.device) -> Kernels | None:
+    """Return an implementation. Where it does not work, say so the first time and return None."""
     try:
-        return _kernels(name)
-    except ImportError as error:
+        return _working_kernels(name, device)
+    except (ImportError, RuntimeError) as error:
         line = f"[yellow]Hash grids are computed by plain torch, which is slower than {name}: {error}."
         CONSOLE.print(line, soft_wrap=True)
         return None
 
 
-def _kernels(name: str) -> Kernels:
+@lru_cache
+def _working_kernels(name: str, device: torch.device) -> Kernels:
+    """Return an implementation that has computed a point on a device.
+
+    Raises:
+        ImportError: it is not installed.
+        RuntimeError: it cannot compile, such as Triton without a C compiler.
+    """
     # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-    return cast(Kernels, import_module(f"{__package__}.hash_grid_{name}"))
+    kernels = cast(Kernels, import_module(f"{__package__}.hash_grid_{name}"))
+    kernels.features(
+        torch.zeros(1, 3, device=device), None, torch.zeros(1, 2, device=device), torch.ones(1, device=device)
+    )
+    return kernels

@@ -9,6 +9,7 @@ threads enter them at once, as the viewer and the training do.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -29,7 +30,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"c
 def features(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor) -> tuple[Tensor, Tensor | None]:
     """Return features (N, 2 levels), and their rates where the positions move. See :class:`.hash_grid.Kernels`."""
     num_points, num_levels = len(positions), len(scales)
-    out = torch.empty(num_points, 2 * num_levels)
+    out = positions.new_empty(num_points, 2 * num_levels)
     rates = None if tangents is None else torch.empty_like(out)
     arrays = _array(positions), _array(tangents), _levels(table, num_levels), _array(scales), _array(out), _array(rates)
     num_blocks = -(-num_points // _BLOCK)
@@ -52,8 +53,8 @@ def gradients(
     num_levels = len(scales)
     to_table = torch.zeros_like(table)
     # A part for each level, because the levels are summed at the same time.
-    parts = torch.empty(num_levels, *positions.shape) if of_positions else None
-    tangent_parts = torch.empty(num_levels, *positions.shape) if of_positions and tangents is not None else None
+    parts = positions.new_empty(num_levels, *positions.shape) if of_positions else None
+    tangent_parts = positions.new_empty(num_levels, *positions.shape) if of_positions and tangents is not None else None
     arrays = (
         _array(positions), _array(tangents), _levels(table, num_levels), _array(scales), _array(grad),
         _array(grad_rates), _levels(to_table, num_levels), _array(parts), _array(tangent_parts),
@@ -92,6 +93,11 @@ def _run(function: Callable[[int], None], pieces: Iterable[int]) -> None:
 @lru_cache
 def _pool(num_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_threads, "hash-grid")
+
+
+# A forked process inherits the pool, but not its threads. There is no fork on Windows.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 @_compiled
