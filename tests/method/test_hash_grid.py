@@ -318,18 +318,40 @@ def test_torch_func_takes_the_plain_implementation() -> None:
         torch.testing.assert_close(transform(fast), transform(plain), rtol=0, atol=0)
 
 
-def test_a_missing_package_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    monkeypatch.setitem(sys.modules, NUMBA, None)
-    hash_grid._kernels_or_a_line.cache_clear()
+@pytest.fixture
+def nothing_known() -> Iterator[None]:
+    """Which implementations work is not known before the test, and not afterwards."""
+    caches = hash_grid._kernels_or_a_line, hash_grid._working_kernels
+    for cache in caches:
+        cache.cache_clear()
+    yield
+    for cache in caches:
+        cache.cache_clear()
+
+
+@pytest.mark.parametrize("installed", [False, True])
+def test_kernels_that_do_not_work_are_said_once(
+    installed: bool, nothing_known: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    if installed:
+
+        def features(*_: Any) -> None:
+            raise RuntimeError("Failed to find C compiler")
+
+        monkeypatch.setattr(f"{NUMBA}.features", features)
+    else:
+        monkeypatch.setitem(sys.modules, NUMBA, None)
     for _ in range(2):
         encoding = HashEncoding(**OPTIONS)
         assert not is_fast(encoding(make_points(20)[0]))
-    hash_grid._kernels_or_a_line.cache_clear()
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith("Hash grids are computed by plain torch, which is slower than numba: ")
+    assert ("C compiler" in line) == installed
 
 
-def test_an_implementation_asked_for_by_name_is_never_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_implementation_asked_for_by_name_is_never_replaced(
+    nothing_known: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     positions = make_points(20)[0]
     with pytest.raises(DataError, match=r"^hash grid implementation triton: cannot .* torch.float32 .* on cpu; choose"):
         HashEncoding("triton", **OPTIONS)(positions)
