@@ -25,13 +25,13 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     folder = tmp_path_factory.mktemp("wheel")
-    # Built by the backend itself, in a process of its own: no network, and no build folder in the source tree.
-    build = (
-        "import sys, setuptools.build_meta as backend;"
-        "sys.argv = ['build'];"
-        f"backend.build_wheel({str(folder)!r}, {{'--build-option': ['--bdist-dir', {str(folder / 'files')!r}]}})"
-    )
-    subprocess.run([sys.executable, "-c", build], cwd=ROOT, check=True, capture_output=True)
+    # Built by the backend itself, in a process of its own, because there may be no network. The build folder is not in
+    # the source tree: the modules that an earlier build left there would be in the wheel too.
+    options = folder / "options.cfg"
+    options.write_text(f"[build]\nbuild_base = {folder / 'build'}\n", encoding="utf-8")
+    build = f"import setuptools.build_meta as backend; backend.build_wheel({str(folder)!r})"
+    environment = {**os.environ, "DIST_EXTRA_CONFIG": str(options)}
+    subprocess.run([sys.executable, "-c", build], cwd=ROOT, env=environment, check=True, capture_output=True)
     return zipfile.ZipFile(next(folder.glob("*.whl")))
 
 
