@@ -1,4 +1,4 @@
-"""What the benchmarks share: running commands, measuring in a process of its own, and writing results."""
+"""Run commands, measure in a separate process and write results, for all benchmarks."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class ReadmePicture:
     data: Path
     """Dataset folder that aenerf simulate wrote."""
     uncorrected: Path
-    """What ns-eval --render-output-path wrote for the run without pose correction."""
+    """Folder that ns-eval --render-output-path wrote for the run without pose correction."""
     corrected: Path
     """The same for the run with pose correction."""
     output: Path

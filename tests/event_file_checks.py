@@ -63,7 +63,7 @@ def assert_rejected(path: Path, content: bytes, message: str) -> None:
     assert message in str(caught.value)
 
 
-# What is done to a file, at places given as fractions of its length.
+# Ways to damage a file, at places given as fractions of its length.
 EDITS = st.lists(
     st.tuples(
         st.sampled_from(["set", "flip", "cut", "insert", "repeat", "number"]),

@@ -72,7 +72,7 @@ class AENeRFModelConfig(ModelConfig):
     """Weights of the losses (paper, eq. 14: alpha, beta, gamma, eta). A weight of 0 turns a loss off. The paper's beta
     is 0.001. On hash grids the temporal loss has not been seen to help."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=PairSupervisionConfig)
-    """What renderings are compared with. The datamanager's sampler draws the batches for it."""
+    """How renderings are compared with the sensor's record. The datamanager's sampler draws the batches."""
     camera_optimizer: PoseCorrectionConfig = dataclasses.field(default_factory=PoseCorrectionConfig)
     """Correction of the estimated poses."""
     color_correction: ColorCorrectionProtocol = "affine"

@@ -24,7 +24,7 @@ from aenerf_ns.recording.dataset import EventDataset
 
 @dataclass
 class SupervisionConfig(InstantiateConfig):
-    """What renderings are compared with."""
+    """How renderings are compared with the sensor's record."""
 
     _target: type = field(default_factory=lambda: Supervision)
 

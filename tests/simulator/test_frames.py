@@ -78,7 +78,7 @@ def test_frames_follow_what_moves_behind_a_mesh(box_file: Path) -> None:
         poses = [scene.path(s) for s in frame_parameters(scene, intrinsics, 24, 18, 0.5)]
         behind = np.isinf(scene.renderer.render(poses[0], intrinsics, 24, 18, 1)[1].T.ravel())
         assert 0.5 < behind.mean() < 0.95
-        # What is infinitely far is warped by the rotation alone.
+        # The rotation alone warps points that are infinitely far.
         moved = []
         for first, second in itertools.pairwise(poses[:-1]):
             warp = lens @ second[:3, :3].T @ first[:3, :3] @ np.linalg.inv(lens)

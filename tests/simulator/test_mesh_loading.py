@@ -32,7 +32,7 @@ def seen(path: Path, up: str) -> np.ndarray:
 
 def test_the_same_picture_from_glb_and_obj(tmp_path: Path) -> None:
     z_up = painted_box()
-    # What a program with y up would write: (x, y, z) of ours is its (x, z, -y).
+    # As a program with y up would write it: our (x, y, z) is its (x, z, -y).
     y_up = z_up.copy()
     y_up.apply_transform(np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]))
     scene = trimesh.Scene()
