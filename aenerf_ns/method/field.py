@@ -16,8 +16,9 @@ from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
-from torch import Tensor, nn
+from torch import Tensor
 
+from aenerf_ns.method.activation import SharpSoftplus
 from aenerf_ns.method.encoding.hash_grid import HashEncoding, Implementation
 
 # The framework's trunc_exp cuts gradients at the same value, but it overflows, and it is a custom function without
@@ -66,8 +67,8 @@ class RadianceShape:
 class DensityField(Field):
     """Density of space: an encoding of the position (γ_x of the paper, eq. 1) and a network.
 
-    It can be differentiated as often as the encoding can: hidden units are softplus with β = 100, which is smooth but
-    as sharp as a rectifier. Weights start as PyTorch's own linear layers do.
+    It can be differentiated as often as the encoding and the activation can. Weights start as those of PyTorch's own
+    linear layers do.
 
     Args:
         aabb: (2, 3) scene box, which bounds the scene where there is no spatial distortion.
@@ -93,7 +94,7 @@ class DensityField(Field):
             layer_width=shape.hidden_dim,
             out_dim=1 + shape.feature_dim,
             skip_connections=(_SKIP_LAYER,) if shape.num_hidden_layers > _SKIP_LAYER else None,
-            activation=nn.Softplus(beta=100),
+            activation=SharpSoftplus(),
             implementation="torch",
         )
 
@@ -101,7 +102,8 @@ class DensityField(Field):
         """Return density (..., 1), zero outside the box of a bounded scene, and the feature (..., feature_dim)."""
         positions, inside = _unit_positions(self, ray_samples)
         raw = self.density_network(self.encoding(positions.flatten(0, -2))).unflatten(0, positions.shape[:-1])
-        raw_density, feature = raw[..., :1].to(positions.dtype), raw[..., 1:]
+        raw_density, feature = raw.split([1, raw.shape[-1] - 1], dim=-1)
+        raw_density = raw_density.to(positions.dtype)
         if self.density_activation == "exp":
             density = _exponential_density(raw_density, self.average_init_density)
         else:
@@ -145,7 +147,7 @@ class EventRadianceField(DensityField):
             num_layers=radiance.num_hidden_layers + 1,
             layer_width=radiance.hidden_dim,
             out_dim=radiance.num_channels,
-            activation=nn.Softplus(beta=100),
+            activation=SharpSoftplus(),
             implementation="torch",
         )
 
@@ -154,11 +156,13 @@ class EventRadianceField(DensityField):
     ) -> dict[FieldHeadNames, Tensor]:
         """Return radiance (rays, samples, num_channels), positive and unbounded, by the framework's name for colour."""
         assert density_embedding is not None
-        # All samples of a ray have its direction.
+        # All samples of a ray have its direction, so the first layer's part for it is computed once a ray.
         directions = self.direction_encoding(ray_samples.frustums.directions[..., :1, :])
-        raw = self.radiance_network(
-            torch.cat([directions.expand(*density_embedding.shape[:-1], -1), density_embedding], -1)
-        )
+        first, *others = self.radiance_network.layers
+        of_direction, of_feature = first.weight.split([directions.shape[-1], density_embedding.shape[-1]], dim=1)
+        raw = F.linear(density_embedding, of_feature) + F.linear(directions, of_direction, first.bias)
+        for layer in others:
+            raw = layer(self.radiance_network.activation(raw))
         return {FieldHeadNames.RGB: F.softplus(raw.to(directions.dtype))}
 
 

@@ -18,6 +18,7 @@ from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.method import compiled
 from aenerf_ns.method.encoding import hash_grid
 from aenerf_ns.method.encoding.hash_grid import HashEncoding
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
@@ -321,7 +322,7 @@ def test_torch_func_takes_the_plain_implementation() -> None:
 @pytest.fixture
 def nothing_known() -> Iterator[None]:
     """Which implementations work is not known before the test, and not afterwards."""
-    caches = hash_grid._kernels_or_a_line, hash_grid._working_kernels
+    caches = compiled.kernels_or_none, compiled.kernels, compiled._say
     for cache in caches:
         cache.cache_clear()
     yield
@@ -345,7 +346,7 @@ def test_kernels_that_do_not_work_are_said_once(
         encoding = HashEncoding(**OPTIONS)
         assert not is_fast(encoding(make_points(20)[0]))
     (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith("Hash grids are computed by plain torch, which is slower than numba: ")
+    assert line.startswith("Plain torch computes what compiled kernels compute faster: ")
     assert ("C compiler" in line) == installed
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-from importlib import import_module
 from typing import Any, Literal, Protocol, cast
 
 import torch
 import torch.autograd.forward_ad as forward_ad
 from nerfstudio.field_components.encodings import HashEncoding as FrameworkHashEncoding
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.method.compiled import is_float_in_memory, kernels, kernels_or_none
 
 # https://arxiv.org/abs/2201.05989, eq. 4; the second is 2654435761 in 32 bits, where products wrap as they should.
 _PRIMES = (1, 2654435761 - 2**32, 805459861)
@@ -90,12 +88,12 @@ class HashEncoding(FrameworkHashEncoding):
 
     def pytorch_fwd(self, in_tensor: Tensor) -> Tensor:
         """Return features (N, 2 levels) of positions (N, 3) in [0, 1]."""
-        kernels = self._choose(in_tensor)
-        if kernels is None:
+        chosen = self._choose(in_tensor)
+        if chosen is None:
             return self._plain(in_tensor)
         # Outside forward mode, too: there the tangent is None.
         positions, tangents = forward_ad.unpack_dual(in_tensor)
-        features, rates = _HashGrid.apply(positions, tangents, self.hash_table, self._scales.flatten(), kernels)
+        features, rates = _HashGrid.apply(positions, tangents, self.hash_table, self._scales.flatten(), chosen)
         return features if tangents is None else forward_ad.make_dual(features, rates)
 
     def _choose(self, positions: Tensor) -> Kernels | None:
@@ -105,18 +103,18 @@ class HashEncoding(FrameworkHashEncoding):
             return None
         by_device = _BY_DEVICE.get(positions.device.type)
         fits = (
-            _is_float_in_memory(positions)
-            and _is_float_in_memory(self.hash_table)
+            is_float_in_memory(positions)
+            and is_float_in_memory(self.hash_table)
             and forward_ad.unpack_dual(self.hash_table).tangent is None
         )
         if self._implementation == "auto":
-            return _kernels_or_a_line(by_device, positions.device) if by_device is not None and fits else None
+            return kernels_or_none(_module(by_device), positions.device) if by_device is not None and fits else None
         source = f"hash grid implementation {self._implementation}"
         if self._implementation != by_device or not fits:
             problem = f"cannot compute with these {positions.dtype} tensors on {positions.device}"
             raise DataError(source, problem, "choose auto")
         try:
-            return _working_kernels(self._implementation, positions.device)
+            return cast(Kernels, kernels(_module(self._implementation), positions.device))
         except (ImportError, RuntimeError) as error:
             raise DataError(source, str(error), "install it or choose auto") from error
 
@@ -135,6 +133,10 @@ class HashEncoding(FrameworkHashEncoding):
             near, far = features.unbind(0)
             features = torch.lerp(near, far, weight)
         return features.transpose(0, 1).flatten(1)
+
+
+def _module(implementation: str) -> str:
+    return f"{__package__}.hash_grid_{implementation}"
 
 
 class _HashGrid(torch.autograd.Function):
@@ -164,38 +166,3 @@ class _HashGrid(torch.autograd.Function):
             positions, tangents, table, scales, grad.contiguous(), grad_rates, of_positions
         )
         return to_positions, to_tangents, to_table, None, None
-
-
-def _is_float_in_memory(tensor: Tensor) -> bool:
-    """Whether a tensor is float32 and has values of its own, unlike the tensors in torch.func and FakeTensorMode."""
-    try:
-        return tensor.dtype == torch.float32 and tensor.data_ptr() != 0
-    except RuntimeError:
-        return False
-
-
-@lru_cache
-def _kernels_or_a_line(name: str, device: torch.device) -> Kernels | None:
-    """Return an implementation. Where it does not work, say so the first time and return None."""
-    try:
-        return _working_kernels(name, device)
-    except (ImportError, RuntimeError) as error:
-        line = f"[yellow]Hash grids are computed by plain torch, which is slower than {name}: {error}."
-        CONSOLE.print(line, soft_wrap=True)
-        return None
-
-
-@lru_cache
-def _working_kernels(name: str, device: torch.device) -> Kernels:
-    """Return an implementation that has computed a point on a device.
-
-    Raises:
-        ImportError: it is not installed.
-        RuntimeError: it cannot compile, such as Triton without a C compiler.
-    """
-    # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-    kernels = cast(Kernels, import_module(f"{__package__}.hash_grid_{name}"))
-    kernels.features(
-        torch.zeros(1, 3, device=device), None, torch.zeros(1, 2, device=device), torch.ones(1, device=device)
-    )
-    return kernels

@@ -2,29 +2,20 @@
 
 The results are the same bytes for every number of threads: blocks of points are the same for every number of threads,
 and a single thread sums a level's gradients.
-
-The kernels release Python's lock and run on a pool of this module's own. Numba's own threads die when two Python
-threads enter them at once, as the viewer and the training do.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
+from aenerf_ns.method.cpu_kernels import as_array, compiled, run, run_ranges
+
 # A block of points is encoded level by level: its outputs and the level's table then stay in the cache.
 _BLOCK = 256
-
-# Contraction is the only freedom from IEEE arithmetic: values that are not finite must stay so.
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 def features(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -32,11 +23,15 @@ def features(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: 
     num_points, num_levels = len(positions), len(scales)
     out = positions.new_empty(num_points, 2 * num_levels)
     rates = None if tangents is None else torch.empty_like(out)
-    arrays = _array(positions), _array(tangents), _levels(table, num_levels), _array(scales), _array(out), _array(rates)
-    num_blocks = -(-num_points // _BLOCK)
-    num_pieces = min(torch.get_num_threads(), num_blocks)
-    ends = [num_blocks * piece // num_pieces * _BLOCK for piece in range(num_pieces + 1)]
-    _run(lambda i: _fill_features(ends[i], min(ends[i + 1], num_points), *arrays), range(num_pieces))
+    arrays = (
+        as_array(positions),
+        as_array(tangents),
+        _levels(table, num_levels),
+        as_array(scales),
+        as_array(out),
+        as_array(rates),
+    )
+    run_ranges(lambda first, last: _fill_features(first, last, *arrays), num_points, _BLOCK)
     return out, rates
 
 
@@ -56,22 +51,17 @@ def gradients(
     parts = positions.new_empty(num_levels, *positions.shape) if of_positions else None
     tangent_parts = positions.new_empty(num_levels, *positions.shape) if of_positions and tangents is not None else None
     arrays = (
-        _array(positions), _array(tangents), _levels(table, num_levels), _array(scales), _array(grad),
-        _array(grad_rates), _levels(to_table, num_levels), _array(parts), _array(tangent_parts),
+        as_array(positions), as_array(tangents), _levels(table, num_levels), as_array(scales), as_array(grad),
+        as_array(grad_rates), _levels(to_table, num_levels), as_array(parts), as_array(tangent_parts),
     )  # fmt: skip
     # The finest level first: its table is the furthest apart in memory, so it takes longest.
-    _run(lambda level: _add_gradients(level, *arrays), reversed(range(num_levels)))
+    run(lambda level: _add_gradients(level, *arrays), reversed(range(num_levels)))
     return to_table, _sum_of_levels(parts), _sum_of_levels(tangent_parts)
-
-
-def _array(tensor: Tensor | None) -> Any:
-    """Return the tensor's values as an array. Numba compiles a kernel of its own for None."""
-    return None if tensor is None else tensor.detach().numpy()
 
 
 def _levels(table: Tensor, num_levels: int) -> Any:
     """Return the table as an array (levels, size, 2)."""
-    return _array(table).reshape(num_levels, -1, 2)
+    return as_array(table).reshape(num_levels, -1, 2)
 
 
 def _sum_of_levels(parts: Tensor | None) -> Tensor | None:
@@ -79,28 +69,12 @@ def _sum_of_levels(parts: Tensor | None) -> Tensor | None:
     return None if parts is None else torch.from_numpy(parts.numpy().sum(0))
 
 
-def _run(function: Callable[[int], None], pieces: Iterable[int]) -> None:
-    """Call the function for each piece, on as many threads as torch uses."""
-    num_threads = torch.get_num_threads()
-    if num_threads == 1:
-        for piece in pieces:
-            function(piece)
-    else:
-        # A list, because only reading the results raises what a thread has raised.
-        list(_pool(num_threads).map(function, pieces))
+def probe(device: torch.device) -> None:
+    """Encode one point."""
+    features(torch.zeros(1, 3, device=device), None, torch.zeros(1, 2, device=device), torch.ones(1, device=device))
 
 
-@lru_cache
-def _pool(num_threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(num_threads, "hash-grid")
-
-
-# A forked process inherits the pool, but not its threads. There is no fork on Windows.
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-@_compiled
+@compiled
 def _cell(positions, i, scale, mask):
     """Return a point's distances from the lower corner of its cell, and the places of the 8 corners in the table.
 
@@ -120,7 +94,7 @@ def _cell(positions, i, scale, mask):
     return (x - low_x, y - low_y, z - low_z), near + far
 
 
-@_compiled
+@compiled
 def _corner_values(rows, places, feature):
     a, b, c, d, e, f, g, h = places
     return (
@@ -129,7 +103,7 @@ def _corner_values(rows, places, feature):
     )  # fmt: skip
 
 
-@_compiled
+@compiled
 def _corner_products(rows, places, first, second):
     """Return the dot products of the corners' features with a gradient."""
     a, b, c, d, e, f, g, h = places
@@ -141,7 +115,7 @@ def _corner_products(rows, places, first, second):
     )  # fmt: skip
 
 
-@_compiled
+@compiled
 def _weights(offsets):
     """Return the trilinear weights of the corners."""
     one = np.float32(1)
@@ -151,7 +125,7 @@ def _weights(offsets):
     return a * w, b * w, c * w, d * w, a * z, b * z, c * z, d * z
 
 
-@_compiled
+@compiled
 def _weight_rates(offsets, rates):
     """Return the derivatives of the corners' weights while the offsets move."""
     one = np.float32(1)
@@ -164,14 +138,14 @@ def _weight_rates(offsets, rates):
     return ta * w - a, tb * w - b, tc * w - c, td * w - d, ta * z + a, tb * z + b, tc * z + c, td * z + d
 
 
-@_compiled
+@compiled
 def _value(weights, values):
     a, b, c, d, e, f, g, h = weights
     k, l, m, n, o, p, q, r = values  # noqa: E741
     return (a * k + b * l + c * m + d * n) + (e * o + f * p + g * q + h * r)
 
 
-@_compiled
+@compiled
 def _slopes(offsets, values):
     """Return the derivatives of the interpolated value along the axes."""
     one = np.float32(1)
@@ -185,7 +159,7 @@ def _slopes(offsets, values):
     )
 
 
-@_compiled
+@compiled
 def _mixed_slopes(offsets, values):
     """Return the second derivatives along two axes: first and second, first and third, second and third."""
     one = np.float32(1)
@@ -199,13 +173,13 @@ def _mixed_slopes(offsets, values):
     )
 
 
-@_compiled
+@compiled
 def _add(rows, place, first, second):
     rows[place, 0] += first
     rows[place, 1] += second
 
 
-@_compiled
+@compiled
 def _add_to_corners(rows, places, weights, first, second):
     a, b, c, d, e, f, g, h = places
     k, l, m, n, o, p, q, r = weights  # noqa: E741
@@ -219,7 +193,7 @@ def _add_to_corners(rows, places, weights, first, second):
     _add(rows, h, r * first, r * second)
 
 
-@_compiled
+@compiled
 def _fill_features(first, last, positions, tangents, table, scales, out, rates):
     """Fill in the features of a range of points, and their rates where there are tangents."""
     mask = np.uint32(table.shape[1] - 1)
@@ -238,7 +212,7 @@ def _fill_features(first, last, positions, tangents, table, scales, out, rates):
                         rates[i, 2 * level + feature] = scale * along
 
 
-@_compiled
+@compiled
 def _add_gradients(
     level, positions, tangents, table, scales, grad, grad_rates, to_table, to_positions, to_tangents
 ):  # fmt: skip

@@ -56,6 +56,11 @@ def gradients(
     return to_table, None if parts is None else parts.sum(0), None if tangent_parts is None else tangent_parts.sum(0)
 
 
+def probe(device: torch.device) -> None:
+    """Encode one point."""
+    features(torch.zeros(1, 3, device=device), None, torch.zeros(1, 2, device=device), torch.ones(1, device=device))
+
+
 def _by_point(values: Tensor) -> Tensor:
     return values.transpose(0, 1).flatten(1)
 

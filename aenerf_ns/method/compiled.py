@@ -1,0 +1,49 @@
+"""Modules of compiled kernels: which tensors they can compute with, and whether they work on this machine."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib import import_module
+from types import ModuleType
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+
+def is_float_in_memory(tensor: Tensor) -> bool:
+    """Return whether a tensor is float32 and has values of its own, unlike those in torch.func and FakeTensorMode."""
+    try:
+        return tensor.dtype == torch.float32 and tensor.data_ptr() != 0
+    except RuntimeError:
+        return False
+
+
+@lru_cache
+def kernels(module: str, device: torch.device) -> ModuleType:
+    """Return a module whose function ``probe`` has computed something on a device.
+
+    Raises:
+        ImportError: the library that compiles the module is not installed.
+        RuntimeError: the module cannot be compiled, such as Triton's without a C compiler.
+    """
+    # Imported lazily: every ns-* command imports the model, and numba is slow to import.
+    loaded = import_module(module)
+    loaded.probe(device)
+    return loaded
+
+
+@lru_cache
+def kernels_or_none(module: str, device: torch.device) -> ModuleType | None:
+    """Return a module as `kernels` does. If it does not work, say why and return None."""
+    try:
+        return kernels(module, device)
+    except (ImportError, RuntimeError) as error:
+        _say(f"[yellow]Plain torch computes what compiled kernels compute faster: {error}.")
+        return None
+
+
+# Modules that need the same library fail for the same reason, which is said once.
+@lru_cache
+def _say(line: str) -> None:
+    CONSOLE.print(line, soft_wrap=True)
