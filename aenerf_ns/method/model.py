@@ -16,7 +16,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
-from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
+from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
@@ -33,6 +33,7 @@ from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method.networks import Backbone, FieldConfig, ProposalConfig, make_networks
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.method.ray_losses import distortion_loss
 from aenerf_ns.method.temporal import log_radiance_rate
 from aenerf_ns.recording.scene import SCENE, Scene
 from aenerf_ns.supervision.base import Supervision, SupervisionConfig
@@ -206,10 +207,10 @@ class AENeRFModel(Model):
         """Render rays.
 
         Returns:
-            ``rgb`` (N, 3) colour-corrected display values, ``log_radiance`` (N, channels) the raw log L̂,
-            ``accumulation`` (N, 1), ``depth`` (N, 1) median distance along the ray in scene units; and, while
-            training, the samples and weights of both stages, and the ``log_radiance_rate`` (rate rays, channels) of the
-            rays at the end of the batch that the supervision needs rates of.
+            ``log_radiance`` (N, channels), the raw log L̂. While training, also the samples and weights of both stages,
+            and the ``log_radiance_rate`` (rate rays, channels) of the rays at the end of the batch that the supervision
+            needs rates of. Otherwise also ``rgb`` (N, 3) colour-corrected display values, ``accumulation`` (N, 1) and
+            ``depth`` (N, 1), the median distance along the ray in scene units.
         """
         samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
         outputs: dict[str, Any] = {}
@@ -231,14 +232,14 @@ class AENeRFModel(Model):
             log_radiance, weights = self._composite(samples)
         weights_list.append(weights)
         samples_list.append(samples)
-        outputs["rgb"] = self.display(log_radiance.detach())
         outputs["log_radiance"] = log_radiance
-        outputs["accumulation"] = self.renderer_accumulation(weights)
-        with torch.no_grad():
-            outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
         if self.training:
             outputs["weights_list"] = weights_list
             outputs["ray_samples_list"] = samples_list
+        else:
+            outputs["rgb"] = self.display(log_radiance.detach())
+            outputs["accumulation"] = self.renderer_accumulation(weights)
+            outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
         return outputs
 
     def _composite(self, samples: RaySamples) -> tuple[Tensor, Tensor]:
@@ -259,7 +260,7 @@ class AENeRFModel(Model):
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             losses["interlevel_loss"] = interlevel_loss(weights, samples) / self.supervision.unit(outputs) ** 2
-            losses["distortion_loss"] = distortion_loss(weights, samples)
+            losses["distortion_loss"] = distortion_loss(weights[-1], samples[-1])
             self.camera_optimizer.get_loss_dict(losses)
         return scale_dict(losses, self.config.loss_coefficients)
 

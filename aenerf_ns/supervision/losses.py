@@ -1,4 +1,4 @@
-"""The losses on rendered log-radiance. The losses on ray weights are the framework's."""
+"""The losses on rendered log-radiance. The losses on ray weights stand with the model."""
 
 from __future__ import annotations
 
