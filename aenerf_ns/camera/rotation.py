@@ -5,15 +5,131 @@ The exponential maps of roma and Nerfstudio are not smooth to second order at ze
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+import math
 
-# Below this squared angle the series of sin and cos are exact to the last bit of float64.
-_SMALL = 1e-4
+import torch
+from torch import Tensor, nn
+
+# Below this squared angle the series below are exact to the last bit of float64. Above it the closed forms are.
+_SMALL = 1.0
+_NUM_TERMS = 9
+
+
+class TwistExponential(nn.Module):
+    """The exponential of se(3), and its rate while the twist moves, in few operations.
+
+    A twist of translation part ρ and rotation part ω is the matrix X = [[ω]ₓ, ρ; 0, 0]. With the angle θ = |ω|,
+    exp(X) = I + X + c₂ X² + c₃ X³, where c₂ = (1 − cos θ) / θ² and c₃ = (θ − sin θ) / θ³. The derivatives of c₂ and c₃
+    by θ² are c₄ − c₃ / 2 and (3 c₅ − c₄) / 2, where c₄ = (1/2 − c₂) / θ² and c₅ = (1/6 − c₃) / θ². All of them are
+    series in θ²: c_k = Σ (−θ²)ʲ / (k + 2j)!, Stumpff's functions.
+
+    All derivatives are finite at zero, too. It is a module so that the constants move to a device once.
+    """
+
+    _generators: Tensor
+    _moving_generators: Tensor
+    _powers: Tensor
+    _first_terms: Tensor
+    _further_terms: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        generators = torch.zeros(6, 4, 4, dtype=torch.float64)
+        generators[:3, :3, 3] = torch.eye(3)
+        generators[3:, :3, :3] = cross_matrix(torch.eye(3, dtype=torch.float64))
+        # X with its rate, as [X, Ẋ; 0, X]. From the left, [B, Ḃ] becomes [B X, B Ẋ + Ḃ X]: a product with its rate.
+        moving = torch.zeros(12, 8, 8, dtype=torch.float64)
+        moving[:6, :4, :4] = moving[:6, 4:, 4:] = moving[6:, :4, 4:] = generators
+        terms = torch.tensor(
+            [[(-1) ** j / math.factorial(k + 2 * j) for k in range(2, 6)] for j in range(_NUM_TERMS)],
+            dtype=torch.float64,
+        )
+        for name, value in (
+            ("_generators", generators.flatten(1)),
+            ("_moving_generators", moving.flatten(1)),
+            ("_powers", torch.arange(1.0, _NUM_TERMS, dtype=torch.float64)),
+            ("_first_terms", terms[0]),
+            ("_further_terms", terms[1:]),
+        ):
+            self.register_buffer(name, value, persistent=False)
+
+    def forward(self, base: Tensor, twist: Tensor) -> Tensor:
+        """Return base · exp(X).
+
+        Args:
+            base: (N, rows, 4) matrices.
+            twist: (N, 6) translation part, then rotation part in radians, of the dtype of ``base``.
+
+        Returns:
+            (N, rows, 4) matrices.
+        """
+        once, twice, thrice = _powers_of(base, (twist @ self._generators).unflatten(-1, (4, 4)))
+        c2, c3 = self._coefficients(_squared_angle(twist), 2)
+        return base + once + c2 * twice + c3 * thrice
+
+    def with_rate(self, base: Tensor, base_rate: Tensor, twist: Tensor, twist_rate: Tensor) -> tuple[Tensor, Tensor]:
+        """Return base · exp(X) and its rate.
+
+        Args:
+            base: (N, rows, 4) matrices.
+            base_rate: (N, rows, 4) their rates.
+            twist: (N, 6) see :meth:`forward`.
+            twist_rate: (N, 6) its rate.
+
+        Returns:
+            Two times (N, rows, 4).
+        """
+        moving = (torch.cat([twist, twist_rate], -1) @ self._moving_generators).unflatten(-1, (8, 8))
+        start = torch.cat([base, base_rate], -1)
+        once, twice, thrice = _powers_of(start, moving)
+        c2, c3, c4, c5 = self._coefficients(_squared_angle(twist), 4)
+        value, rate = (start + once + c2 * twice + c3 * thrice).chunk(2, -1)
+        # Half of the rate of θ².
+        half = (twist[:, 3:] * twist_rate[:, 3:]).sum(-1)[:, None, None]
+        rate_of_c2, rate_of_c3 = (2 * c4 - c3) * half, (3 * c5 - c4) * half
+        return value, rate + rate_of_c2 * twice[..., :4] + rate_of_c3 * thrice[..., :4]
+
+    def _coefficients(self, squared: Tensor, count: int) -> tuple[Tensor, ...]:
+        """Return c₂ and c₃, and with a ``count`` of 4 also c₄ and c₅, each (N, 1, 1), of (N, 1) squared angles."""
+        near = torch.addmm(self._first_terms[:count], squared**self._powers, self._further_terms[:, :count])
+        small = squared < _SMALL
+        # The unused branch of torch.where must stay finite too, or its gradient is NaN.
+        safe = torch.where(small, _SMALL, squared)
+        angle = safe.sqrt()
+        far = torch.cat([1 - torch.cos(angle), 1 - torch.sin(angle) / angle], -1) / safe
+        if count == 4:
+            far = torch.cat([far, (self._first_terms[:2] - far) / safe], -1)
+        return torch.where(small, near, far)[..., None, None].unbind(1)
+
+
+def _squared_angle(twist: Tensor) -> Tensor:
+    """Return the (N, 1) squared angles of twists (N, 6)."""
+    return twist[:, 3:].square().sum(-1, keepdim=True)
+
+
+def _powers_of(start: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return start · matrix, start · matrix² and start · matrix³."""
+    once = start @ matrix
+    twice = once @ matrix
+    return once, twice, twice @ matrix
+
+
+def motion_from_twist(twist: Tensor) -> Tensor:
+    """Return the exponential of se(3).
+
+    Args:
+        twist: (..., 6) translation part ρ, then rotation part ω in radians.
+
+    Returns:
+        (..., 4, 4) rigid motions [exp(ω), V(ω) ρ; 0, 1]. Both the value and all derivatives are finite at zero.
+    """
+    flat = twist.reshape(-1, 6)
+    identity = torch.eye(4, dtype=twist.dtype, device=twist.device).expand(len(flat), 4, 4)
+    return TwistExponential().to(twist)(identity, flat).reshape(*twist.shape[:-1], 4, 4)
 
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
-    """Return the exponential of so(3) (Rodrigues' formula).
+    """Return the exponential of so(3).
 
     Args:
         vector: (..., 3) axis times angle in radians.
@@ -21,31 +137,7 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
     Returns:
         (..., 3, 3) rotation matrices. Both the value and all derivatives are finite at zero.
     """
-    a, b, _ = _exponential_coefficients(vector)
-    cross = cross_matrix(vector)
-    return torch.eye(3, dtype=vector.dtype, device=vector.device) + a * cross + b * (cross @ cross)
-
-
-def _exponential_coefficients(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³, each (..., 1, 1).
-
-    θ is the angle of ``vector`` (..., 3).
-    """
-    squared = (vector * vector).sum(-1)[..., None, None]
-    small = squared < _SMALL
-    # The unused branch of torch.where must stay finite too, or its gradient is NaN.
-    safe = torch.where(small, torch.ones_like(squared), squared)
-    angle = safe.sqrt()
-    a = torch.where(small, 1 - squared / 6 * (1 - squared / 20 * (1 - squared / 42)), torch.sin(angle) / angle)
-    b = torch.where(
-        small, (1 - squared / 12 * (1 - squared / 30 * (1 - squared / 56))) / 2, (1 - torch.cos(angle)) / safe
-    )
-    c = torch.where(
-        small,
-        (1 - squared / 20 * (1 - squared / 42 * (1 - squared / 72))) / 6,
-        (angle - torch.sin(angle)) / (safe * angle),
-    )
-    return a, b, c
+    return motion_from_twist(nn.functional.pad(vector, (3, 0)))[..., :3, :3]
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
@@ -104,21 +196,3 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
     quaternion = torch.take_along_dim(candidates, best[..., None, None], -2).squeeze(-2)
     quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
     return torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
-
-
-def motion_from_twist(twist: Tensor) -> Tensor:
-    """Return the exponential of se(3).
-
-    Args:
-        twist: (..., 6) translation part ρ, then rotation part ω in radians.
-
-    Returns:
-        (..., 4, 4) rigid motions [exp(ω), V(ω) ρ; 0, 1]. Both the value and all derivatives are finite at zero.
-    """
-    translation, vector = twist[..., :3, None], twist[..., 3:]
-    _, b, c = _exponential_coefficients(vector)
-    cross = cross_matrix(vector)
-    moved = translation + b * (cross @ translation) + c * (cross @ (cross @ translation))
-    bottom = torch.zeros_like(twist[..., None, :4])
-    bottom[..., 3] = 1
-    return torch.cat([torch.cat([rotation_from_vector(vector), moved], -1), bottom], -2)

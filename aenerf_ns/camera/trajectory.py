@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from aenerf_ns.camera.rotation import (
     cross_matrix,
     quaternion_from_rotation,
-    rotation_from_vector,
     vector_from_quaternion,
 )
 from aenerf_ns.errors import DataError
@@ -56,8 +55,9 @@ class Trajectory(nn.Module):
 
     times: Tensor
     camera_to_worlds: Tensor
-    _rotation_steps: Tensor
-    _translation_steps: Tensor
+    _knots: Tensor
+    _segments: Tensor
+    _motions: Tensor
 
     def __init__(self, times: ArrayLike | Tensor, camera_to_worlds: Tensor, source: str | Path = "trajectory") -> None:
         super().__init__()
@@ -81,11 +81,24 @@ class Trajectory(nn.Module):
         require_rigid(poses, source)
         rotations = poses[:, :, :3]
         relative = rotations[:-1].mT @ rotations[1:]
+        steps = vector_from_quaternion(quaternion_from_rotation(relative))
+        angles = steps.norm(dim=-1, keepdim=True)
+        # Along a segment the camera turns about one axis, at one speed: by Rodrigues' formula its pose is a sum of four
+        # matrices, with the factors 1, sin α, 1 − cos α and the share w of the segment that has passed, α = w angle.
+        axes = cross_matrix(steps / angles.clamp_min(torch.finfo(torch.float64).tiny))
+        motions = torch.zeros(len(steps), 4, 3, 4, dtype=torch.float64, device=poses.device)
+        motions[:, 0] = poses[:-1]
+        motions[:, 1, :, :3] = rotations[:-1] @ axes
+        motions[:, 2, :, :3] = rotations[:-1] @ axes @ axes
+        motions[:, 3, :, 3] = poses[1:, :, 3] - poses[:-1, :, 3]
+        seconds = (times - times[0]).to(torch.float64) * 1e-9
         for name, value in (
             ("times", times),
             ("camera_to_worlds", poses),
-            ("_rotation_steps", vector_from_quaternion(quaternion_from_rotation(relative))),
-            ("_translation_steps", poses[1:, :, 3] - poses[:-1, :, 3]),
+            ("_knots", seconds),
+            # Start and duration in seconds, and angle in radians.
+            ("_segments", torch.stack([seconds[:-1], seconds.diff(), angles[:, 0]], -1)),
+            ("_motions", motions.flatten(2)),
         ):
             self.register_buffer(name, value, persistent=False)
 
@@ -124,11 +137,9 @@ class Trajectory(nn.Module):
         Returns:
             (..., 3, 4) float64 camera-to-world poses.
         """
-        segment, _, weight = self._segment(seconds)
-        pose = self.camera_to_worlds[segment]
-        rotation = pose[..., :3] @ rotation_from_vector(weight * self._rotation_steps[segment])
-        translation = pose[..., 3] + weight * self._translation_steps[segment]
-        return torch.cat([rotation, translation[..., None]], -1)
+        segment, _, _, weight, turned = self._place(seconds)
+        factors = torch.stack([torch.ones_like(weight), torch.sin(turned), 1 - torch.cos(turned), weight], -1)
+        return (factors[..., None, :] @ self._motions[segment]).unflatten(-1, (3, 4)).squeeze(-3)
 
     def pose_and_rate(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of :meth:`pose` and their derivatives with respect to time.
@@ -142,20 +153,25 @@ class Trajectory(nn.Module):
         Returns:
             (..., 3, 4) float64 poses and (..., 3, 4) float64 rates per second.
         """
-        segment, duration, _ = self._segment(seconds)
-        pose = self.pose(seconds)
-        # Along a segment the camera turns about one axis at one speed: its angular velocity is the same in every frame.
-        spin = pose[..., :3] @ cross_matrix(self._rotation_steps[segment])
-        rate = torch.cat([spin, self._translation_steps[segment][..., None]], -1)
-        return pose, rate / duration[..., None, None]
+        segment, duration, angle, weight, turned = self._place(seconds)
+        sine, cosine, one = torch.sin(turned), torch.cos(turned), torch.ones_like(weight)
+        speed = angle / duration
+        factors = torch.stack(
+            [one, sine, 1 - cosine, weight, torch.zeros_like(one), speed * cosine, speed * sine, one / duration], -1
+        )
+        pose, rate = (factors.unflatten(-1, (2, 4)) @ self._motions[segment]).unflatten(-1, (3, 4)).unbind(-3)
+        return pose, rate
 
-    def _segment(self, seconds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the segments that times lie in: (...) indices of the first knot, (...) durations in seconds, and the
-        (..., 1) share of the duration that has passed."""
-        knots = self.seconds(self.times)
-        segment = (torch.searchsorted(knots, seconds.detach(), right=True) - 1).clamp(0, len(knots) - 2)
-        duration = knots[segment + 1] - knots[segment]
-        return segment, duration, ((seconds - knots[segment]) / duration)[..., None]
+    def _place(self, seconds: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return the segments that times (...) lie in, and the place in the segment, each (...).
+
+        They are the index of the segment, its duration in seconds and its angle in radians, the share of the duration
+        that has passed, and the angle that the camera has turned by.
+        """
+        segment = (torch.searchsorted(self._knots, seconds.detach(), right=True) - 1).clamp(0, len(self) - 2)
+        start, duration, angle = self._segments[segment].unbind(-1)
+        weight = (seconds - start) / duration
+        return segment, duration, angle, weight, weight * angle
 
     def interpolate(self, times: ArrayLike | Tensor) -> Tensor:
         """Return the poses at given times.

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from aenerf_ns.camera.alignment import Similarity, align
 from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS, REFERENCE_SECONDS, TRAJECTORY_SECONDS
-from aenerf_ns.camera.rotation import motion_from_twist
+from aenerf_ns.camera.rotation import TwistExponential
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 
 # Poses at which trajectories are compared: enough for any metric, few enough to be logged quickly.
@@ -70,6 +70,9 @@ class PoseCorrection(CameraOptimizer):
     _compared_seconds: Tensor
     _reference_poses: Tensor
     _twist_units: Tensor
+    _sampled_seconds: Tensor
+    _sampled_poses: Tensor
+    _penalties: Tensor
 
     def __init__(
         self,
@@ -94,10 +97,19 @@ class PoseCorrection(CameraOptimizer):
         self._duration = (trajectory.end - trajectory.start) * 1e-9
         # A camera that only turns gives translations no unit. The unit of the scene serves instead.
         extent = trajectory.extent if trajectory.extent > _SMALLEST_EXTENT else 1.0
-        units = torch.tensor([extent] * 3 + [1.0] * 3)
-        self.register_buffer("_twist_units", units, persistent=False)
+        # Times in every interval of the spline, at which the size of the corrections is taken.
+        count = max(64, math.ceil(self._duration / config.knot_interval))
+        sampled = torch.linspace(0, self._duration, count, dtype=torch.float64)
+        for name, value in (
+            ("_twist_units", torch.tensor([extent] * 3 + [1.0] * 3, dtype=torch.float64)),
+            ("_sampled_seconds", sampled),
+            ("_sampled_poses", trajectory.pose(sampled)),
+            ("_penalties", torch.tensor([config.trans_l2_penalty] * 3 + [config.rot_l2_penalty] * 3).double()),
+        ):
+            self.register_buffer(name, value, persistent=False)
+        self._exponential = TwistExponential()
         self.training_cameras_are_corrected = False
-        self.twists: nn.Module | None = None
+        self.twists: TwistNetwork | TwistSpline | None = None
         if config.mode == "network":
             self.twists = TwistNetwork(trajectory, config.num_frequencies)
         elif config.mode == "spline":
@@ -105,13 +117,18 @@ class PoseCorrection(CameraOptimizer):
 
     def pose(self, seconds: Tensor) -> Tensor:
         """Return corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
-        return self._corrected(seconds, self.trajectory.pose(seconds))
-
-    def _corrected(self, seconds: Tensor, base: Tensor) -> Tensor:
-        """Return corrected poses (N, 3, 4) for the estimated poses ``base`` (N, 3, 4)."""
+        base = self.trajectory.pose(seconds)
         if self.twists is None:
             return base
-        return base @ motion_from_twist((self._twist_units * self.twists(seconds, base)).double())
+        return self._exponential(base, self._twist_units * self.twists(seconds, base))
+
+    def pose_and_rate(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the poses of :meth:`pose` and their derivatives with respect to time, per second."""
+        base, base_rate = self.trajectory.pose_and_rate(seconds)
+        if self.twists is None:
+            return base, base_rate
+        twist, rate = self.twists.with_rate(seconds, base, base_rate)
+        return self._exponential.with_rate(base, base_rate, self._twist_units * twist, self._twist_units * rate)
 
     def forward(self, indices: Tensor) -> Tensor:
         """Return (N, 3, 4) motions that the framework multiplies the training cameras' poses with.
@@ -174,14 +191,7 @@ class PoseCorrection(CameraOptimizer):
     def ray_rates(self, raybundle: RayBundle) -> tuple[Tensor, Tensor]:
         """Return the derivatives of the corrected rays' origins and directions (N, 3) by time, per second."""
         assert raybundle.times is not None
-        seconds = raybundle.times[:, 0]
-        pose, rate = self.trajectory.pose_and_rate(seconds)
-        if self.twists is not None:
-            with forward_ad.dual_level():
-                moving = self._corrected(
-                    forward_ad.make_dual(seconds, torch.ones_like(seconds)), forward_ad.make_dual(pose, rate)
-                )
-                rate = forward_ad.unpack_dual(moving).tangent
+        _, rate = self.pose_and_rate(raybundle.times[:, 0])
         # Rays are linear in the pose.
         origin_rates, direction_rates = world_rays(rate, raybundle.metadata[CAMERA_DIRECTIONS])
         return origin_rates.to(raybundle.origins), direction_rates.to(raybundle.origins)
@@ -190,11 +200,8 @@ class PoseCorrection(CameraOptimizer):
         """Add the mean squared size of the corrections over the recording, so that good poses stay as they are."""
         if self.twists is None:
             return
-        twist = self._sampled_twists()
-        loss_dict["pose_correction_penalty"] = (
-            self.config.trans_l2_penalty * twist[:, :3].square().sum(-1).mean()
-            + self.config.rot_l2_penalty * twist[:, 3:].square().sum(-1).mean()
-        )
+        penalty = (self._penalties * self._sampled_twists().square().mean(0)).sum()
+        loss_dict["pose_correction_penalty"] = penalty.float()
 
     def get_metrics_dict(self, metrics_dict: dict[str, Any]) -> None:
         """Add the root mean square size of the corrections: scene units and degrees."""
@@ -208,9 +215,7 @@ class PoseCorrection(CameraOptimizer):
     def _sampled_twists(self) -> Tensor:
         """Return twists, in units of the trajectory's extent, at times in every interval of the spline."""
         assert self.twists is not None
-        count = max(64, math.ceil(self._duration / self.config.knot_interval))
-        seconds = torch.linspace(0, self._duration, count, dtype=torch.float64, device=self._camera_seconds.device)
-        return self.twists(seconds, self.trajectory.pose(seconds))
+        return self.twists(self._sampled_seconds, self._sampled_poses)
 
     def get_param_groups(self, param_groups: dict[str, list[nn.Parameter]]) -> None:
         """Add the parameters as the group ``camera_opt``, where there are any."""
@@ -274,14 +279,23 @@ class TwistNetwork(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
-        """Return twists (N, 6) at (N,) seconds, for estimated poses (N, 3, 4)."""
+        """Return float64 twists (N, 6) at (N,) seconds, for estimated poses (N, 3, 4)."""
         dtype = self.output.weight.dtype
         time = (2 * seconds / self._duration - 1).to(dtype)[:, None]
         # Half precision cannot tell the two ends of an interval apart.
         with torch.autocast(time.device.type, enabled=False):
             pose = self.pose_embedding(base.flatten(1).to(dtype))
             embedded = F.softplus(pose) + F.softplus(self.time_embedding(time))
-            return _NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))
+            return (_NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))).double()
+
+    def with_rate(self, seconds: Tensor, base: Tensor, base_rate: Tensor) -> tuple[Tensor, Tensor]:
+        """Return float64 twists and their rates per second (N, 6), for estimated poses and their rates (N, 3, 4)."""
+        with forward_ad.dual_level():
+            moving = self(
+                forward_ad.make_dual(seconds, torch.ones_like(seconds)), forward_ad.make_dual(base, base_rate)
+            )
+            twist, rate = forward_ad.unpack_dual(moving)
+        return twist, rate
 
 
 class TwistSpline(nn.Module):
@@ -292,23 +306,44 @@ class TwistSpline(nn.Module):
         knot_interval: seconds between knots.
     """
 
+    _exponents: Tensor
+    _basis: Tensor
+    _near: Tensor
+
     def __init__(self, duration: float, knot_interval: float) -> None:
         super().__init__()
         self._segments = max(math.ceil(duration / knot_interval), 1)
         self._interval = duration / self._segments
         self.control_twists = nn.Parameter(torch.zeros(self._segments + 3, 6))
+        # https://en.wikipedia.org/wiki/B-spline, the uniform cubic basis: row k has the factors of uᵏ.
+        basis = torch.tensor(
+            [[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]],
+            dtype=torch.float64,
+        )
+        basis /= 6
+        rate = torch.zeros(4, 4, dtype=torch.float64)
+        rate[:3] = basis[1:] * torch.tensor([[1.0], [2.0], [3.0]]) / self._interval
+        for name, value in (
+            ("_exponents", torch.arange(4, dtype=torch.float64)),
+            ("_basis", torch.cat([basis, rate], -1)),
+            ("_near", torch.arange(4)),
+        ):
+            self.register_buffer(name, value, persistent=False)
 
     def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
-        """Return twists (N, 6) at (N,) seconds. The poses play no part."""
+        """Return float64 twists (N, 6) at (N,) seconds. The poses play no part."""
+        return self._evaluate(seconds, self._basis[:, :4])[:, 0]
+
+    def with_rate(self, seconds: Tensor, base: Tensor, base_rate: Tensor) -> tuple[Tensor, Tensor]:
+        """Return float64 twists and their rates per second (N, 6). The poses play no part."""
+        twist, rate = self._evaluate(seconds, self._basis).unbind(1)
+        return twist, rate
+
+    def _evaluate(self, seconds: Tensor, basis: Tensor) -> Tensor:
+        """Return sums (N, count, 6) of control twists by the functions (4, 4 count) of ``basis``."""
         position = seconds / self._interval
-        segment = position.detach().floor().long().clamp(0, self._segments - 1)
-        u = (position - segment)[:, None]
-        # https://en.wikipedia.org/wiki/B-spline, the uniform cubic basis.
-        basis = (
-            torch.cat([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], dim=-1).to(
-                self.control_twists.dtype
-            )
-            / 6
-        )
-        near = segment[:, None] + torch.arange(4, device=segment.device)
-        return (basis[..., None] * self.control_twists[near]).sum(1)
+        segment = position.detach().long().clamp(0, self._segments - 1)
+        functions = ((position - segment)[:, None] ** self._exponents) @ basis
+        # In float64, because autocast would round the products of float32.
+        near = self.control_twists[segment[:, None] + self._near].double()
+        return functions.unflatten(-1, (-1, 4)) @ near

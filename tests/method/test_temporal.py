@@ -11,7 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 
-from aenerf_ns.camera.rotation import cross_matrix, motion_from_twist, rotation_from_vector
+from aenerf_ns.camera.rotation import TwistExponential, cross_matrix, motion_from_twist, rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.model import AENeRFModel
@@ -236,3 +236,34 @@ def test_motion_from_twist_is_the_matrix_exponential() -> None:
         generator_matrix[:3, 3] = twist[:3]
         torch.testing.assert_close(motion_from_twist(twist), torch.matrix_exp(generator_matrix), rtol=0, atol=1e-13)
         assert torch.autograd.gradcheck(motion_from_twist, twist.requires_grad_(), atol=1e-7)
+
+
+# The angles lie on both sides of the one where closed forms take over from series.
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.1, 0.999, 1.001, 3.0, 8.0])
+def test_the_rate_of_a_moving_exponential_is_exact_and_smooth(size: float, random_poses: torch.Tensor) -> None:
+    exponential = TwistExponential()
+    generator = torch.Generator().manual_seed(0)
+    twist, twist_rate = torch.randn(2, len(random_poses), 6, generator=generator, dtype=torch.float64)
+    twist[:, 3:] *= size / twist[:, 3:].norm(dim=-1, keepdim=True)
+    base_rate = torch.randn(random_poses.shape, generator=generator, dtype=torch.float64)
+    arguments = (random_poses, base_rate, twist, twist_rate)
+    value, rate = exponential.with_rate(*arguments)
+    expected = torch.func.jvp(exponential, (random_poses, twist), (base_rate, twist_rate))
+    torch.testing.assert_close(value, expected[0], rtol=0, atol=1e-13)
+    torch.testing.assert_close(rate, expected[1], rtol=0, atol=1e-12)
+    few = [argument[:2].clone().requires_grad_() for argument in arguments]
+    assert torch.autograd.gradcheck(exponential.with_rate, few, atol=1e-6)
+    assert torch.autograd.gradgradcheck(exponential.with_rate, few, atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["off", "network", "spline"])
+def test_the_rate_of_the_corrected_pose_is_its_derivative(mode: str) -> None:
+    correction = make_correction(mode)
+    for parameter in correction.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    # Neither at the ends, nor on a knot.
+    seconds = torch.linspace(0.013, 1.987, 40, dtype=torch.float64)
+    pose, rate = correction.pose_and_rate(seconds)
+    torch.testing.assert_close(pose, correction.pose(seconds), rtol=0, atol=1e-7)
+    _, expected = torch.func.jvp(correction.pose, (seconds,), (torch.ones_like(seconds),))
+    torch.testing.assert_close(rate, expected, rtol=0, atol=1e-4 if mode == "network" else 1e-12)
