@@ -12,6 +12,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils import comms
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -79,6 +80,8 @@ class AENeRFPipeline(VanillaPipeline):
             self.datamanager.supervise(self.model.supervision)
         # Chosen once: otherwise every fit would read the images again.
         self._pixels_of_split: dict[str, _Pixels] = {}
+        self._unchecked_losses: dict[str, Tensor] = {}
+        self._steps_per_log = 1
         self._warn_of_test_views()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
@@ -99,18 +102,21 @@ class AENeRFPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
         """Return outputs, weighted losses and metrics of a training batch.
 
-        Every hundredth step the errors of the corrected poses are among the metrics.
-
-        Raises:
-            SystemExit: a loss is not finite.
+        There are metrics at the steps that the trainer logs. At every hundredth step the errors of the corrected poses
+        are among them. Whether the losses are finite is looked at after the backward pass, with the gradients.
         """
-        outputs, losses, metrics = super().get_train_loss_dict(step)
-        # With mixed precision too: otherwise the scaler would silently skip every step from now on.
-        _require_finite(losses, "loss", step)
-        if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
-            errors = self.pose_errors()
-            if errors is not None:
-                metrics |= errors["corrected"]
+        rays, batch = self.datamanager.next_train(step)
+        # In several processes it is wrapped in DistributedDataParallel.
+        outputs = self._model(rays)
+        metrics = {}
+        if step_check(step, self._steps_per_log, run_at_zero=True):
+            metrics = self.model.get_metrics_dict(outputs, batch)
+            if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
+                errors = self.pose_errors()
+                if errors is not None:
+                    metrics |= errors["corrected"]
+        losses = self.model.get_loss_dict(outputs, batch, metrics)
+        self._unchecked_losses = losses
         return outputs, losses, metrics
 
     def get_training_callbacks(
@@ -126,19 +132,39 @@ class AENeRFPipeline(VanillaPipeline):
         last_step = trainer._start_step + trainer.config.max_num_iterations - 1
 
         def fit(step: int) -> None:
+            # The main process writes the checkpoints, and DistributedDataParallel copies its buffers to the others.
+            if not comms.is_main_process():
+                return
             if step == last_step or step_check(step, trainer.config.steps_per_save):
                 self.fit_color_correction()
             elif step_check(step, _ROUGH_FIT_INTERVAL, run_at_zero=True):
                 self.fit_color_correction(_ROUGH_FIT_SHARE)
 
-        for optimizer in trainer.optimizers.optimizers.values():
-            # Mixed precision's scaler calls it only when it has found the gradients finite.
-            optimizer.register_step_pre_hook(
-                lambda optimizer, *_: self._require_finite_gradients(optimizer, trainer.step)
-            )
+        def check_losses(step: int) -> None:
+            # Only mixed precision's scaler leaves losses unchecked: it skips the optimizers' steps where gradients are
+            # not finite. If the losses are not, it would silently skip every step from now on.
+            if self._unchecked_losses:
+                self._require_finite([], step)
+
+        self._steps_per_log = trainer.config.logging.steps_per_log
+        optimizers = list(trainer.optimizers.optimizers.values())
+
+        def check(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+            if trainer.grad_scaler.is_enabled():
+                # The gradients of the others are still scaled, and may rightly be infinite.
+                self._require_finite([optimizer], trainer.step)
+            elif self._unchecked_losses:
+                # The first optimizer of a step looks at everything.
+                self._require_finite(optimizers, trainer.step)
+
+        for optimizer in optimizers:
+            optimizer.register_step_pre_hook(check)
         # After every step, because the trainer saves its last checkpoint before it calls the callbacks for the end.
-        callback = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], fit, update_every_num_iters=1)
-        return [*super().get_training_callbacks(training_callback_attributes), callback]
+        callbacks = [
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], function, update_every_num_iters=1)
+            for function in (check_losses, fit)
+        ]
+        return [*super().get_training_callbacks(training_callback_attributes), *callbacks]
 
     def replace_color_correction(self, protocol: ColorCorrectionProtocol) -> None:
         """Replace the run's colour correction by another protocol, fitted anew on the run's data."""
@@ -146,13 +172,31 @@ class AENeRFPipeline(VanillaPipeline):
         self._warn_of_test_views()
         self.fit_color_correction()
 
-    def _require_finite_gradients(self, optimizer: torch.optim.Optimizer, step: int) -> None:
-        """Raise SystemExit if the gradients would make the weights of an optimizer not finite."""
-        names = {parameter: name for name, parameter in self.model.named_parameters()}
-        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    def _require_finite(self, optimizers: list[torch.optim.Optimizer], step: int) -> None:
+        """Raise SystemExit unless the step's losses and the gradients of optimizers are finite.
+
+        The CPU waits for the GPU once a call, however many values there are. That is the price of stopping before the
+        first weight is lost.
+        """
+        losses, self._unchecked_losses = self._unchecked_losses, {}
+        groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+        parameters = [p for group in groups for p in group["params"] if p.grad is not None]
         # Adam squares gradients: it cannot use a gradient whose norm overflows.
-        norms = {names[p]: p.grad.norm() for p in parameters if p.grad is not None}
-        _require_finite(norms, "gradient", step)
+        norms = torch._foreach_norm([parameter.grad for parameter in parameters]) if parameters else ()
+        values = torch.stack([*(loss.detach() for loss in losses.values()), *norms]).tolist()
+        if all(map(math.isfinite, values)):
+            return
+        name_of = {parameter: name for name, parameter in self.model.named_parameters()}
+        names = [*losses, *(name_of[parameter] for parameter in parameters)]
+        bad = [f"{name} {value:g}" for name, value in zip(names, values, strict=True) if not math.isfinite(value)]
+        # A loss that is not finite is the cause of gradients that are not.
+        bad_losses = [line for line in bad if line.split()[0] in losses]
+        what, bad = ("loss", bad_losses) if bad_losses else ("gradient", bad)
+        raise SystemExit(
+            f"Error: step {step}: {what} not finite ({', '.join(bad)}), training stopped before this reached the "
+            "weights; go on from the last checkpoint or start again, with lower learning rates, without "
+            "--mixed-precision if on, and with poses of sensible scale"
+        )
 
     @torch.no_grad()
     def fit_color_correction(self, share: float = 1.0) -> None:
@@ -293,20 +337,3 @@ class AENeRFPipeline(VanillaPipeline):
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent
         return metrics
-
-
-def _require_finite(values: Mapping[str, Tensor], what: str, step: int) -> None:
-    """Raise SystemExit unless all scalar ``values`` are finite.
-
-    The CPU waits for the GPU once a call, however many values there are. That is the price of stopping before the first
-    weight is lost.
-    """
-    finite = torch.stack([value.detach() for value in values.values()]).isfinite().tolist()
-    if all(finite):
-        return
-    bad = ", ".join(f"{name} {value:g}" for (name, value), ok in zip(values.items(), finite, strict=True) if not ok)
-    raise SystemExit(
-        f"Error: step {step}: {what} not finite ({bad}), training stopped before this reached the weights; "
-        "go on from the last checkpoint or start again, with lower learning rates, without --mixed-precision if on"
-        ", and with poses of sensible scale"
-    )

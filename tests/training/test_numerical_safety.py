@@ -231,8 +231,8 @@ def test_training_in_mixed_precision_reaches_the_loss_of_full_precision(
     assert train(precision) == pytest.approx(full, abs=0.1)
 
 
-def make_pipeline(model: AENeRFModel, rays: RayBundle) -> tuple[AENeRFPipeline, Any]:
-    """A pipeline whose every batch is the same, and its only optimizer."""
+def make_pipeline(model: AENeRFModel, rays: RayBundle, mixed: bool = False) -> tuple[AENeRFPipeline, Any, Any]:
+    """A pipeline whose every batch is the same, its only optimizer, and its scaler of gradients."""
     pipeline = AENeRFPipeline.__new__(AENeRFPipeline)
     nn.Module.__init__(pipeline)
     pipeline._model = model
@@ -241,36 +241,59 @@ def make_pipeline(model: AENeRFModel, rays: RayBundle) -> tuple[AENeRFPipeline, 
     )
     pipeline.__dict__["datamanager"] = batches
     optimizer = torch.optim.Adam(model.parameters())
+    config = SimpleNamespace(max_num_iterations=10, logging=SimpleNamespace(steps_per_log=2))
     trainer = SimpleNamespace(
-        local_rank=1, _start_step=0, step=7, config=SimpleNamespace(max_num_iterations=10),
+        local_rank=1, _start_step=0, step=7, config=config, grad_scaler=torch.amp.GradScaler("cpu", enabled=mixed),
         optimizers=SimpleNamespace(optimizers={"all": optimizer}),
     )  # fmt: skip
-    pipeline.get_training_callbacks(SimpleNamespace(trainer=trainer))
-    return pipeline, optimizer
+    callbacks = pipeline.get_training_callbacks(SimpleNamespace(trainer=trainer))
+    (pipeline.check_losses,) = [c.func for c in callbacks if c.func.__name__ == "check_losses"]
+    return pipeline, optimizer, trainer.grad_scaler
 
 
-def test_a_loss_that_is_not_finite_ends_training_with_its_name() -> None:
+def backward(losses: dict[str, Tensor]) -> None:
+    torch.stack(list(losses.values())).sum().backward()
+
+
+def test_metrics_are_computed_at_the_steps_that_are_logged() -> None:
+    pipeline, _, _ = make_pipeline(make_model(), make_rays(10, with_times=True))
+    assert [bool(pipeline.get_train_loss_dict(step)[2]) for step in range(4)] == [True, False, True, False]
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_loss_that_is_not_finite_ends_training_with_its_name(mixed: bool) -> None:
     model = make_model()
-    pipeline, _ = make_pipeline(model, make_rays(10, with_times=True))
-    _, losses, _ = pipeline.get_train_loss_dict(6)
-    assert all(torch.isfinite(loss) for loss in losses.values())
+    pipeline, optimizer, scaler = make_pipeline(model, make_rays(10, with_times=True), mixed)
+
+    def step() -> None:
+        losses = pipeline.get_train_loss_dict(7)[1]
+        scaler.scale(torch.stack(list(losses.values())).sum()).backward()
+        scaler.step(optimizer)
+        scaler.update()
+        pipeline.check_losses(7)
+
+    step()
     with torch.no_grad():
         model.field.radiance_network.layers[-1].bias.fill_(float("nan"))
+    before = [parameter.clone() for parameter in model.parameters()]
     with pytest.raises(SystemExit) as stop:
-        pipeline.get_train_loss_dict(7)
+        step()
     message = str(stop.value)
     assert message.startswith("Error: step 7: loss not finite (reconstruction_loss nan), ")
     assert "\n" not in message
+    for weights, parameter in zip(before, model.parameters(), strict=True):
+        torch.testing.assert_close(parameter, weights, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
 def test_a_gradient_that_is_not_finite_does_not_reach_the_weights(value: float) -> None:
     model = make_model()
-    pipeline, optimizer = make_pipeline(model, make_rays(10, with_times=True))
-    losses = pipeline.get_train_loss_dict(0)[1]
-    torch.stack(list(losses.values())).sum().backward()
+    pipeline, optimizer, _ = make_pipeline(model, make_rays(10, with_times=True))
+    backward(pipeline.get_train_loss_dict(0)[1])
     optimizer.step()
     before = [parameter.clone() for parameter in model.parameters()]
+    optimizer.zero_grad()
+    backward(pipeline.get_train_loss_dict(1)[1])
     # Of 1e30 the square, which Adam takes, overflows.
     model.field.encoding.hash_table.grad[3, 1] = value
     with pytest.raises(SystemExit, match=r"^Error: step 7: gradient not finite \(field.encoding.hash_table "):
