@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from nerfstudio.configs.base_config import ViewerConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.dataparsers.formats import AutomaticDataParserConfig
@@ -13,6 +12,7 @@ from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipelineConfig
 from aenerf_ns.training.schedules import (
     AENeRFTrainerConfig,
+    FusedAdamOptimizerConfig,
     RelativeCosineSchedulerConfig,
     RelativeMultiStepSchedulerConfig,
 )
@@ -30,19 +30,19 @@ aenerf = MethodSpecification(
         ),
         optimizers={
             "encodings": {
-                "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15),
+                "optimizer": FusedAdamOptimizerConfig(lr=1e-2, eps=1e-15),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
             "networks": {
-                "optimizer": AdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
+                "optimizer": FusedAdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
             "sensor": {
-                "optimizer": AdamOptimizerConfig(lr=0.05),
+                "optimizer": FusedAdamOptimizerConfig(lr=0.05),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
             "camera_opt": {
-                "optimizer": AdamOptimizerConfig(lr=2e-3, eps=1e-15),
+                "optimizer": FusedAdamOptimizerConfig(lr=2e-3, eps=1e-15),
                 "scheduler": RelativeCosineSchedulerConfig(),
             },
         },

@@ -5,13 +5,13 @@ from __future__ import annotations
 from copy import deepcopy
 from dataclasses import replace
 
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.supervision.pairs import PairSamplerConfig
+from aenerf_ns.training.schedules import FusedAdamOptimizerConfig
 
 _base = deepcopy(aenerf.config)
 
@@ -47,11 +47,11 @@ aenerf_mlp = MethodSpecification(
             "networks": {
                 # PyTorch's defaults but for rate and decay, as in the paper. The paper's rate of 0.01 collapses these
                 # networks. This rate is that of NerfAcc's MLP example.
-                "optimizer": AdamOptimizerConfig(lr=5e-4, weight_decay=1e-6),
+                "optimizer": FusedAdamOptimizerConfig(lr=5e-4, weight_decay=1e-6),
                 "scheduler": _base.optimizers["networks"]["scheduler"],
             },
             "camera_opt": {
-                "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
+                "optimizer": FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15),
                 "scheduler": _base.optimizers["camera_opt"]["scheduler"],
             },
         },

@@ -17,7 +17,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import interlevel_loss
-from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler, UniformSampler
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
@@ -31,6 +31,7 @@ from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
 from aenerf_ns.method.box_collider import BoxCollider
 from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
 from aenerf_ns.method.image_metrics import ImageMetrics
+from aenerf_ns.method.initial_samplers import EvenSampler, EvenThenDisparitySampler
 from aenerf_ns.method.networks import Backbone, FieldConfig, ProposalConfig, make_networks
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
 from aenerf_ns.method.ray_losses import distortion_loss
@@ -130,8 +131,7 @@ class AENeRFModel(Model):
             num_proposal_samples_per_ray=config.proposal.num_samples_per_ray,
             num_proposal_network_iterations=len(self.density_fns),
             single_jitter=True,
-            # In a bounded scene samples are spread evenly. Else the framework's default: evenly, then in disparity.
-            initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
+            initial_sampler=(EvenSampler if distortion is None else EvenThenDisparitySampler)(single_jitter=True),
         )
         background = config.background if config.background != "auto" else ("learned" if scene.bounded else "none")
         # softplus(0.54) = 1: of the size of the radiance before training.

@@ -35,7 +35,8 @@ def log_radiance_rate(
     """
     with torch.autocast(rays[0].device.type, enabled=False), forward_ad.dual_level():
         origins, directions = (
-            forward_ad.make_dual(value.contiguous(), rate)[:, None].expand_as(samples.frustums.origins)
+            # Cloned, because the tangent of a part of a tensor would get memory for the whole.
+            forward_ad.make_dual(value.clone(), rate)[:, None].expand_as(samples.frustums.origins)
             for value, rate in zip(rays, ray_rates, strict=True)
         )
         moving = replace(samples, frustums=replace(samples.frustums, origins=origins, directions=directions))

@@ -141,20 +141,17 @@ class AENeRFPipeline(VanillaPipeline):
                 self.fit_color_correction(_ROUGH_FIT_SHARE)
 
         def check_losses(step: int) -> None:
-            # Only mixed precision's scaler leaves losses unchecked: it skips the optimizers' steps where gradients are
-            # not finite. If the losses are not, it would silently skip every step from now on.
+            # With mixed precision only the losses are left to check. The scaler drops gradients that are not finite. If
+            # the losses are not, it would silently drop every step's from now on.
             if self._unchecked_losses:
                 self._require_finite([], step)
 
         self._steps_per_log = trainer.config.logging.steps_per_log
         optimizers = list(trainer.optimizers.optimizers.values())
 
-        def check(optimizer: torch.optim.Optimizer, *_: Any) -> None:
-            if trainer.grad_scaler.is_enabled():
-                # The gradients of the others are still scaled, and may rightly be infinite.
-                self._require_finite([optimizer], trainer.step)
-            elif self._unchecked_losses:
-                # The first optimizer of a step looks at everything.
+        def check(*_: Any) -> None:
+            # The first optimizer of a step looks at all gradients. Mixed precision's are still scaled here.
+            if self._unchecked_losses and not trainer.grad_scaler.is_enabled():
                 self._require_finite(optimizers, trainer.step)
 
         for optimizer in optimizers:

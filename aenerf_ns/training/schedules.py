@@ -1,4 +1,4 @@
-"""The training schedules, for runs of any length."""
+"""The optimizer, and the training schedules for runs of any length."""
 
 from __future__ import annotations
 
@@ -6,10 +6,21 @@ import math
 from dataclasses import dataclass, field
 
 import tyro
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
-from torch.optim import Optimizer
+from torch.nn import Parameter
+from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
+
+
+@dataclass
+class FusedAdamOptimizerConfig(AdamOptimizerConfig):
+    """Adam that updates all parameters in one operation, on CPU and GPU faster than one by one."""
+
+    def setup(self, params: list[Parameter]) -> Adam:
+        """Return the optimizer of parameters."""
+        return Adam(params, lr=self.lr, eps=self.eps, weight_decay=self.weight_decay, fused=True)
 
 
 class _StepsFactor:

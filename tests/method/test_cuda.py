@@ -1,60 +1,45 @@
-"""Training on a GPU: where there is one, for real; anywhere, that the model mixes no tensors of two devices."""
+"""Training on a GPU: where there is one, for real; anywhere, on a simulated one, with the cost of a step."""
 
 from __future__ import annotations
 
 import json
+from collections import defaultdict
+from copy import deepcopy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+import torch.utils.backend_registration
 from commands import run, simulate
-from nerfstudio.cameras.rays import RayBundle
-from small_models import make_batch, make_model, make_rays
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.engine.trainer import Trainer
+from simulated_cuda import Counts, SimulatedCuda, device, to_device
+from small_models import ALL_LOSSES, make_batch, make_model, make_rays
+from small_pipelines import make_pipeline_config
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.method.encoding.hash_grid import HashEncoding
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.supervision.pairs import PairSupervisionConfig
 
-GPU = torch.device("cuda:0")
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+NEEDS_SIMULATION = pytest.mark.skipif(
+    not hasattr(torch.utils.backend_registration, "_setup_privateuseone_for_python_backend"),
+    reason="this version of torch has no devices that are written in Python",
+)
 
 
-def on_gpu(tensor: Tensor, mode: FakeTensorMode) -> Tensor:
-    """A tensor without values that takes itself to be on a GPU, and refuses operations with one that does not."""
-    with mode:
-        return torch.empty_strided(tensor.shape, tensor.stride(), dtype=tensor.dtype, device=GPU)
-
-
-def move_to_gpu(model: torch.nn.Module, mode: FakeTensorMode) -> None:
-    for module in model.modules():
-        for name, parameter in module._parameters.items():
-            if parameter is not None:
-                module._parameters[name] = torch.nn.Parameter(on_gpu(parameter, mode))
-        for name, buffer in module._buffers.items():
-            if buffer is not None:
-                module._buffers[name] = on_gpu(buffer, mode)
-
-
-def rays_on_gpu(count: int, mode: FakeTensorMode) -> RayBundle:
-    rays = make_rays(count, with_times=True)
-    for name in ("origins", "directions", "pixel_area", "camera_indices", "times"):
-        setattr(rays, name, on_gpu(getattr(rays, name), mode))
-    rays.metadata = {name: on_gpu(value, mode) for name, value in rays.metadata.items()}
-    return rays
-
-
-# Without the temporal loss and the gradients: such tensors cannot be differentiated.
+@NEEDS_SIMULATION
 @pytest.mark.parametrize("learned", [False, True])
 @pytest.mark.parametrize("correction", ["off", "network", "spline"])
 @pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("backbone", ["hash", "mlp"])
-def test_whatever_the_model_computes_with_is_on_its_device(
-    backbone: str, bounded: bool, correction: str, learned: bool
-) -> None:
-    mode = FakeTensorMode(allow_non_fake_inputs=True)
+def test_a_step_computes_on_the_device_alone(backbone: str, bounded: bool, correction: str, learned: bool) -> None:
     options: dict[str, Any] = {"proposal": {"num_samples_per_ray": (16, 8)}} if backbone == "mlp" else {}
     model = make_model(
         SensorModel(bayer_pattern="RGGB"),
@@ -62,23 +47,146 @@ def test_whatever_the_model_computes_with_is_on_its_device(
         backbone=backbone,
         camera_optimizer=PoseCorrectionConfig(mode=correction),
         supervision=PairSupervisionConfig(learn_contrast_threshold_ratio=learned, learn_refractory_period=learned),
+        loss_coefficients=ALL_LOSSES,
         **options,
     )
-    move_to_gpu(model, mode)
-    rays = rays_on_gpu(10, mode)
-    batch = {name: on_gpu(value, mode) for name, value in make_batch(5).items()}
-    with mode:
+    with SimulatedCuda() as gpu:
+        to_device(model)
+        rays, batch = to_device(make_rays(15, with_times=True)), to_device(make_batch(5))
         losses = model.get_loss_dict(model(rays), batch)
-    assert {loss.device for loss in losses.values()} == {GPU}
+        torch.stack(list(losses.values())).sum().backward()
+    assert {loss.device for loss in losses.values()} == {device()}
+    assert sum(gpu.counts.launches.values()) > 100
+    assert gpu.counts.uploads == gpu.counts.downloads == gpu.counts.waits == 0
 
 
+@NEEDS_SIMULATION
 def test_a_tensor_left_on_the_cpu_would_be_noticed() -> None:
-    mode = FakeTensorMode(allow_non_fake_inputs=True)
     model = make_model(camera_optimizer=PoseCorrectionConfig(mode="spline"))
-    move_to_gpu(model, mode)
-    model.camera_optimizer._twist_units = torch.ones(6)
-    with pytest.raises(RuntimeError, match="same device"), mode:
-        model(rays_on_gpu(10, mode))
+    with SimulatedCuda():
+        to_device(model)
+        model.camera_optimizer._twist_units = torch.ones(6)
+        with pytest.raises(RuntimeError, match="same device"):
+            model(to_device(make_rays(10, with_times=True)))
+
+
+@NEEDS_SIMULATION
+def test_transfers_and_waits_would_be_noticed() -> None:
+    with SimulatedCuda() as gpu:
+        values = torch.arange(3.0).to(device())
+        torch.zeros(3, device=device()).copy_(torch.ones(3))
+        assert values.tolist() == [0.0, 1.0, 2.0]
+        values.cpu()
+        values.sum().item()
+        values[values > 0]
+    assert (gpu.counts.uploads, gpu.counts.downloads, gpu.counts.waits) == (2, 3, 1)
+    assert gpu.counts.launches == {"zeros": 1, "sum": 1, "gt": 1, "index": 1}
+
+
+def make_trainer(folder: Path, narrow: bool, temporal: bool) -> Trainer:
+    """A trainer of the method aenerf, without what belongs to files and logs.
+
+    Every batch is the same, and on the device.
+    """
+    config = deepcopy(aenerf.config)
+    config.pipeline.datamanager.dataparser = make_pipeline_config(folder).datamanager.dataparser
+    model = config.pipeline.model
+    model.loss_coefficients = {**model.loss_coefficients, "temporal_loss": 1e-3 * temporal}
+    if narrow:
+        config.pipeline.datamanager.train_num_rays_per_batch = 60
+        model.field.log2_hashmap_size, model.field.num_samples_per_ray = 10, 6
+        model.proposal.log2_hashmap_size, model.proposal.num_samples_per_ray = 8, (16, 8)
+    trainer = Trainer.__new__(Trainer)
+    trainer.config, trainer.device, trainer.mixed_precision = config, device().type, False
+    trainer.local_rank, trainer._start_step = 1, 0
+    trainer.gradient_accumulation_steps = defaultdict(lambda: 1, config.gradient_accumulation_steps)
+    trainer.grad_scaler = torch.amp.GradScaler("cpu", enabled=False)
+    trainer.pipeline = config.pipeline.setup(device="cpu", test_mode="val")
+    batch = trainer.pipeline.datamanager.next_train(0)
+    trainer.pipeline.datamanager.next_train = lambda step: tuple(map(to_device, batch))
+    return trainer
+
+
+def move_to_device(trainer: Trainer) -> None:
+    """Moves the model of a trainer, and makes its optimizers."""
+    pipeline = trainer.pipeline
+    to_device(pipeline.model)
+    trainer.optimizers = Optimizers(trainer.config.optimizers, pipeline.get_param_groups())
+    pipeline.get_training_callbacks(SimpleNamespace(trainer=trainer))
+    pipeline.train()
+
+
+def train(trainer: Trainer, gpu: SimulatedCuda, step: int) -> Counts:
+    trainer.step = step
+    trainer.pipeline.model.proposal_sampler.step_cb(step)
+    gpu.counts = Counts()
+    trainer.train_iteration(step)
+    return gpu.counts
+
+
+class CountedKernel:
+    """Stands for a Triton kernel of the hash grid, and counts it."""
+
+    def __init__(self, gpu: SimulatedCuda, bytes_per_point: int) -> None:
+        self.gpu = gpu
+        self.bytes_per_point = bytes_per_point
+
+    def __getitem__(self, grid: tuple[int, int]) -> Any:
+        def launch(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor, *_: Any, **__: Any):
+            num_bytes = len(positions) * len(scales) * self.bytes_per_point * (1 if tangents is None else 2)
+            self.gpu.counts.kernel("hash grid", num_bytes)
+
+        return launch
+
+
+@NEEDS_SIMULATION
+@pytest.mark.parametrize("temporal", [False, True])
+def test_a_step_waits_once_and_copies_nothing_else(temporal: bool, tmp_path: Path) -> None:
+    trainer = make_trainer(tmp_path / "data", narrow=True, temporal=temporal)
+    with SimulatedCuda() as gpu:
+        move_to_device(trainer)
+        parameters = list(trainer.pipeline.model.field.parameters())
+        before = [parameter.on_cpu.clone() for parameter in parameters]
+        # At step 23 the pose correction is stepped, too.
+        counts = [train(trainer, gpu, step) for step in range(16, 24) if step != 20]
+    assert not any(torch.equal(parameter.on_cpu, value) for parameter, value in zip(parameters, before, strict=True))
+    # Losses and gradients, all together.
+    assert [count.downloads for count in counts] == [1] * len(counts)
+    assert [count.uploads for count in counts] == [0] * len(counts)
+    assert [count.waits for count in counts] == [0] * len(counts)
+
+
+# Bounds on the means over a step with gradients of the proposal networks, in which the pose correction is stepped, and
+# a step without. They are what was counted, rounded. The bytes of the Triton kernels are by formula: positions,
+# features and their gradients come from memory, the tables from the cache.
+@NEEDS_SIMULATION
+@pytest.mark.parametrize(
+    ("grid", "temporal", "launches", "gigabytes"),
+    [
+        ("torch", False, 862, 48.6),
+        ("torch", True, 1668, 59.9),
+        ("triton", False, 767, 14.0),
+        ("triton", True, 1473, 20.1),
+    ],
+)
+def test_what_a_step_of_the_full_method_costs(
+    grid: str, temporal: bool, launches: int, gigabytes: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = make_trainer(tmp_path / "data", narrow=False, temporal=temporal)
+    with FakeTensorMode(allow_non_fake_inputs=True), SimulatedCuda() as gpu:
+        if grid == "triton":
+            pytest.importorskip("triton")
+            from aenerf_ns.method.encoding import hash_grid_triton
+
+            monkeypatch.setattr(hash_grid_triton, "_fill_features", CountedKernel(gpu, 20))
+            monkeypatch.setattr(hash_grid_triton, "_add_gradients", CountedKernel(gpu, 32))
+            monkeypatch.setattr(HashEncoding, "_choose", lambda self, positions: hash_grid_triton)
+        move_to_device(trainer)
+        # The optimizers make their states in the first step, and at step 7 all of them step.
+        train(trainer, gpu, 7)
+        counts = [train(trainer, gpu, step) for step in (22, 23)]
+    assert sum(sum(count.launches.values()) for count in counts) / 2 <= launches
+    assert sum(count.bytes for count in counts) / 2 <= (gigabytes + 0.05) * 1e9
 
 
 @NEEDS_GPU
