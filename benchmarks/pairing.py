@@ -1,28 +1,40 @@
-"""Measure throughput and peak memory of pairing events, beside sorting them with NumPy.
+"""Measure pairing events, in memory and in a file, beside sorting them with NumPy, and drawing batches of pairs.
 
     python -m benchmarks.pairing --output benchmarks/results/NAME.json
 
 Each measurement has a process of its own, and so its own peak memory. The events come in chunks, as from a file. The
-time of making them is measured alone and subtracted.
+time of making them is measured alone and subtracted. Figures of a batch are of one thread of the CPU.
 """
 
 from __future__ import annotations
 
+import os
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
+import torch
 import tyro
 
-from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.events.pair_table import PIXEL_SHIFT, EventPairs
+from aenerf_ns.events.pairs import EVENTS_IN_MEMORY, pair_events
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.recording.scene import Scene
+from aenerf_ns.supervision.pairs import PairSampler, PairSamplerConfig, PairSupervisionConfig
 from benchmarks.common import in_own_process, peak_mib, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
 _CHUNK = 1 << 22
+_BATCHES, _PAIRS = 100, 4096
 
 
 def stream(num_events: int) -> Iterator[EventStream]:
@@ -53,19 +65,120 @@ def with_numpy(num_events: int) -> int:
     return len(time)
 
 
-def measure(what: Literal["stream", "pair_events", "numpy"], num_events: int) -> dict[str, float]:
-    """Return seconds, peak memory of this process and the number of pairs."""
-    # Compile before the measurement.
+def sampler(pairs: EventPairs) -> PairSampler:
+    """Return the sampler of ``aenerf`` for these pairs, with a camera that stands still."""
+    sensor = SensorModel()
+    end = 200 * pairs.num_events
+    scene = Scene(
+        trajectory=Trajectory([0, end], torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)),
+        ground_truth=None,
+        event_camera=EventCamera(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2),
+        event_file=SimpleNamespace(),  # type: ignore[arg-type]
+        sensor=sensor,
+        window=TimeWindow(),
+        camera_times=torch.zeros(0, dtype=torch.int64),
+        has_image=[],
+        image_encoding="srgb",
+        bounded=False,
+    )
+    return PairSamplerConfig().setup(
+        dataset=SimpleNamespace(scene=scene, pairs=pairs),
+        supervision=PairSupervisionConfig().setup(sensor=sensor, loss_coefficients={}),
+        device="cpu",
+    )
+
+
+def sample(pairs: EventPairs) -> dict[str, float]:
+    """Return figures of batches of 4096 pairs, one thread."""
+    torch.set_num_threads(1)
+    source = sampler(pairs)
+    source.prepare()
+    wall, cpu = [], []
+    for _ in range(_BATCHES):
+        begin, begin_cpu = time.perf_counter(), time.thread_time()
+        source.sample(2 * _PAIRS)
+        wall.append(time.perf_counter() - begin)
+        cpu.append(time.thread_time() - begin_cpu)
+    # Where uniform pairs end: the share of them in each tenth of the recording and of the pixels.
+    rows = torch.cat([source._table.draw(0, _PAIRS, 1)[:, 0] for _ in range(_BATCHES)])
+    times = rows[:, 0].double() / rows[:, 0].max()
+    places = (rows[:, 1] >> PIXEL_SHIFT).double() / (_WIDTH * _HEIGHT)
+    shares = torch.stack([torch.histc(parts, 10, 0, 1) for parts in (times, places)]) / len(rows)
+    return {
+        "batch_ms": 1e3 * float(np.median(wall)),
+        "batch_cpu_ms": 1e3 * float(np.median(cpu)),
+        "batch_ms_of_the_fastest_tenth": 1e3 * float(np.quantile(wall, 0.1)),
+        "smallest_share_of_a_tenth_of_the_time": float(shares[0].min()),
+        "largest_share_of_a_tenth_of_the_time": float(shares[0].max()),
+        "smallest_share_of_a_tenth_of_the_pixels": float(shares[1].min()),
+        "largest_share_of_a_tenth_of_the_pixels": float(shares[1].max()),
+    }
+
+
+def resident_gib() -> dict[str, float]:
+    """Return the resident memory of this process: its own, and of mapped files, which the system can take back."""
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text("utf8").splitlines())
+    return {
+        "own_gib": int(lines["RssAnon"].split()[0]) / 2**20,
+        "mapped_gib": int(lines["RssFile"].split()[0]) / 2**20,
+    }
+
+
+def in_file(num_events: int, folder: Path) -> dict[str, Any]:
+    """Pair events into a file and draw batches from it, first with nothing of it in memory."""
+    pair_events(stream(10))
+    opened: list[BinaryIO] = []
+
+    def open_file() -> tuple[BinaryIO, Path]:
+        opened.append((folder / "rows").open("w+b"))
+        return opened[0], folder
+
+    begin = time.perf_counter()
+    pairs = pair_events(
+        stream(num_events),
+        expected_events=num_events,
+        open_file=open_file,
+        # A recording that would stay in memory is cut into eight parts, too.
+        events_in_memory=EVENTS_IN_MEMORY if num_events > EVENTS_IN_MEMORY else num_events // 8,
+    )
+    seconds = time.perf_counter() - begin
+    peak = peak_mib() / 2**10
+    with opened[0] as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+    cold = sample(pairs)
+    memory = resident_gib()
+    size = (folder / "rows").stat().st_size
+    (folder / "rows").unlink()
+    return {
+        "seconds": seconds,
+        "peak_gib": peak,
+        "bytes_per_event": size / num_events,
+        "sampling_from_disk": cold,
+        "sampling_again": sample(pairs),
+        "memory_after_sampling": memory,
+    }
+
+
+def in_memory(num_events: int) -> dict[str, Any]:
+    """Pair events in memory and draw batches."""
     pair_events(stream(10))
     begin = time.perf_counter()
-    if what == "stream":
-        pairs = sum(len(chunk) for chunk in stream(num_events))
-    elif what == "numpy":
-        pairs = with_numpy(num_events)
-    else:
-        pairs = len(pair_events(stream(num_events), expected_events=num_events))
+    pairs = pair_events(stream(num_events), expected_events=num_events)
     seconds = time.perf_counter() - begin
-    return {"seconds": seconds, "peak_gib": peak_mib() / 2**10, "pairs": pairs}
+    peak = peak_mib() / 2**10
+    return {"seconds": seconds, "peak_gib": peak, "pairs": len(pairs), "sampling": sample(pairs)}
+
+
+def measure(what: Literal["stream", "numpy"], num_events: int) -> dict[str, float]:
+    """Return seconds and peak memory of this process."""
+    begin = time.perf_counter()
+    if what == "stream":
+        for _ in stream(num_events):
+            pass
+    else:
+        with_numpy(num_events)
+    return {"seconds": time.perf_counter() - begin, "peak_gib": peak_mib() / 2**10}
 
 
 @dataclass
@@ -75,28 +188,30 @@ class Pairing:
     output: Path
     """JSON file to write."""
     sizes: tuple[int, ...] = (10_000_000, 100_000_000)
-    """Numbers of events."""
+    """Numbers of events. Beyond 134 million only the file is measured."""
+    folder: Path | None = None
+    """Folder for the file of pairs, which takes 32 bytes an event. By default the system's for temporary files."""
 
     def main(self) -> None:
         """Measure and write the figures."""
         rows = []
         for size in self.sizes:
-            results = {what: in_own_process(measure, what, size) for what in ("stream", "pair_events", "numpy")}
-            idle = results["stream"]["seconds"]
-            own, numpy = (results[what]["seconds"] - idle for what in ("pair_events", "numpy"))
+            idle = in_own_process(measure, "stream", size)
+            with tempfile.TemporaryDirectory(dir=self.folder) as folder:
+                file = in_own_process(in_file, size, Path(folder))
             row = {
                 "events": size,
-                "pairs": results["pair_events"]["pairs"],
-                "million_events_per_second": size / own / 1e6,
-                "numpy_million_events_per_second": size / numpy / 1e6,
-                "times_faster_than_numpy": numpy / own,
-                "peak_gib": results["pair_events"]["peak_gib"],
-                "numpy_peak_gib": results["numpy"]["peak_gib"],
-                "peak_gib_of_the_process_without_pairs": results["stream"]["peak_gib"],
-                "seconds_making_the_stream": idle,
+                "seconds_making_the_stream": idle["seconds"],
+                "peak_gib_of_the_process_without_pairs": idle["peak_gib"],
+                "in_file": file | {"million_events_per_second": size / (file["seconds"] - idle["seconds"]) / 1e6},
             }
+            if size <= EVENTS_IN_MEMORY:
+                own, numpy = in_own_process(in_memory, size), in_own_process(measure, "numpy", size)
+                rates = [size / (result["seconds"] - idle["seconds"]) / 1e6 for result in (own, numpy)]
+                row["in_memory"] = own | {"million_events_per_second": rates[0]}
+                row["numpy"] = numpy | {"million_events_per_second": rates[1]}
             rows.append(row)
-        write_result(self.output, {"sensor": [_WIDTH, _HEIGHT], "rows": rows})
+        write_result(self.output, {"sensor": [_WIDTH, _HEIGHT], "pairs_in_a_batch": _PAIRS, "rows": rows})
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ from nerfstudio.data.scene_box import SceneBox
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.events.pairs import EventPairs, pair_events
+from aenerf_ns.events.pair_table import EventPairs
+from aenerf_ns.events.pairs import pair_events
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.events.time_window import TimeWindow
@@ -81,7 +82,8 @@ def make_sampler(
 ) -> PairSampler:
     rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
     stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
-    pairs = pair_events([stream], refractory_period=sensor.refractory_period)
+    _, usable = camera.pixel_directions()
+    pairs = pair_events([stream], refractory_period=sensor.refractory_period, usable=usable)
     trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
     return PairSamplerConfig(max_events_per_pair=max_events_per_pair, share_to_moments=share).setup(
         dataset=FivePairs(make_scene(sensor, trajectory, camera), pairs),

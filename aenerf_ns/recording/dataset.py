@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -11,12 +11,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.picture import polarity_picture
+from aenerf_ns.events.pair_table import EventPairs
+from aenerf_ns.events.picture import PolaritySums, polarity_picture
 from aenerf_ns.progress import tracked
+from aenerf_ns.recording.pair_file import PairFile
 from aenerf_ns.recording.scene import SCENE, Scene
-
-if TYPE_CHECKING:
-    from aenerf_ns.events.pairs import EventPairs
 
 # Events in a picture, as a share of the sensor's pixels: enough to show edges, too few to smear them.
 _PICTURE_DENSITY = 0.25
@@ -30,28 +29,67 @@ class EventDataset(InputDataset):
         """The recording in the frame of the scene."""
         return self.metadata[SCENE]
 
-    @cached_property
+    @property
     def pairs(self) -> EventPairs:
-        """All pairs of events in the time window. The first access reads the whole event file.
+        """All pairs of events in the time window. The first access reads the whole event file, or finds its pairs.
 
         Raises:
             DataError: the event file is missing or malformed, or no event lies in the time window.
         """
-        # Imported lazily: every ns-* command imports this module, and numba is slow to import.
+        return self._pairs_and_pictures[0]
+
+    @cached_property
+    def _pairs_and_pictures(self) -> tuple[EventPairs, NDArray[np.int16]]:
+        """The pairs, and for each camera the (height, width) sum of polarities around its time."""
+        scene = self.scene
+        events, camera = scene.event_file, scene.event_camera
+        events.require()
+        _, usable = camera.pixel_directions()
+        made_from = {
+            "refractory_period": scene.sensor.refractory_period,
+            "window": [scene.window.start, scene.window.end, scene.window.gaps],
+            "usable": zlib.crc32(usable.data),
+            "camera_times": scene.camera_times.tolist(),
+        }
+        file = PairFile(events, made_from)
+        found = file.find()
+        if found is None:
+            # Imported lazily: every ns-* command imports this module, and numba is slow to import.
+            from aenerf_ns.events.pairs import EVENTS_IN_MEMORY
+
+            count = events.count()
+            # Several processes read a short recording side by side.
+            with file.making(alone=count is None or count > EVENTS_IN_MEMORY):
+                # Another process may have made the file meanwhile.
+                found = file.find() or self._read_events(file, usable, count)
+        else:
+            CONSOLE.print(f"{file.path.name}: {found[0].summary()}.")
+        return found
+
+    def _read_events(
+        self, file: PairFile, usable: NDArray[np.bool_], count: int | None
+    ) -> tuple[EventPairs, NDArray[np.int16]]:
+        """Make pairs and pictures, and keep them if they are in a file."""
         from aenerf_ns.events.pairs import pair_events
 
         scene = self.scene
-        count = scene.event_file.count()
+        events = scene.event_file
+        half = max(int(_PICTURE_DENSITY * usable.size) // 2, 1)
+        pictures = PolaritySums(scene.camera_times.tolist(), half)
         pairs = pair_events(
-            tracked(scene.event_file.chunks(), f"Reading {scene.event_file.path.name}", count),
+            pictures.passed(tracked(events.chunks(), f"Reading {events.path.name}", count)),
             refractory_period=scene.sensor.refractory_period,
             window=scene.window,
+            usable=usable,
             expected_events=count,
+            open_file=file.open,
         )
-        CONSOLE.print(f"{scene.event_file.path.name}: {pairs.summary()}.")
+        CONSOLE.print(f"{events.path.name}: {pairs.summary()}.")
         if len(pairs) == 0:
-            raise DataError(scene.event_file.path, "no pixel has two events", "record longer, or widen the time window")
-        return pairs
+            raise DataError(events.path, "no pixel has two events", "record longer, or widen the time window")
+        sums = pictures.sums(*usable.shape)
+        file.keep(pairs, sums)
+        return pairs, sums
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Return the (H, W, 3) image of a camera, or a picture of the events nearest in time if it has no image."""
@@ -59,13 +97,8 @@ class EventDataset(InputDataset):
         if scene.has_image[image_idx]:
             return super().get_numpy_image(image_idx)
         width, height = scene.event_camera.width, scene.event_camera.height
-        if not scene.event_file.path.exists():
-            # A trained run may be opened where its events are not.
-            nothing = np.zeros(0, dtype=np.int64)
-            return polarity_picture(nothing, nothing, nothing, width, height)
-        pairs = self.pairs
-        half = max(int(_PICTURE_DENSITY * width * height) // 2, 1)
-        middle = int(np.searchsorted(pairs.time, int(scene.camera_times[image_idx])))
-        shown = slice(max(middle - half, 0), middle + half)
-        polarity = pairs.num_positive[shown].astype(np.int64) - pairs.num_negative[shown]
-        return polarity_picture(pairs.x[shown], pairs.y[shown], polarity, width, height)
+        # A trained run may be opened where its events are not.
+        has_events = scene.event_file.path.exists()
+        net = self._pairs_and_pictures[1][image_idx] if has_events else np.zeros((height, width), np.int16)
+        rows, columns = np.nonzero(net)
+        return polarity_picture(columns, rows, net[rows, columns], width, height)

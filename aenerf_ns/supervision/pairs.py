@@ -2,36 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
 from aenerf_ns.errors import DataError
+from aenerf_ns.events.pair_table import (
+    BLOCK,
+    COUNT_MASK,
+    MAX_REACH,
+    NEGATIVE_SHIFT,
+    NUMBER_MASK,
+    PIXEL_SHIFT,
+    REACH_MASK,
+    REACH_SHIFT,
+    EventPairs,
+)
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision, SupervisionConfig
 from aenerf_ns.supervision.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
 from aenerf_ns.supervision.sensor_parameters import SensorParameters
 
-if TYPE_CHECKING:
-    from aenerf_ns.events.pairs import EventPairs, PairsInTime
-
-# A pair spans an event only where the intervals on both sides of it are so many refractory periods long. At a steady
-# rate, at most a twentieth of a contrast threshold then goes unseen, which is less than thresholds are known to.
-_INTERVAL_TO_REFRACTORY_PERIOD = 20
+# Share of a device's free memory that the table of pairs may take. The rest is for the model and its gradients.
+_SHARE_OF_FREE_MEMORY = 0.5
 
 # t_sam: a truncated normal distribution over the interval of the pair's last event.
 _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
+# Share of the distribution before it is cut.
+_WITHIN_MASS = math.erf(_WITHIN_MEAN / (_WITHIN_DEVIATION * math.sqrt(2)))
 
 
 @dataclass
@@ -155,8 +166,8 @@ class PairSamplerConfig(SamplerConfig):
 
     _target: type = field(default_factory=lambda: PairSampler)
     max_events_per_pair: int = 64
-    """The most events of its pixel that a pair spans. 1: consecutive events, as in the paper. Pairs are of consecutive
-    events wherever the refractory period is more than a twentieth of the interval between two events."""
+    """The most events of its pixel that a pair spans, up to 255. 1: consecutive events, as in the paper. Pairs are of
+    consecutive events wherever the refractory period is more than a twentieth of the interval between two events."""
     share_to_moments: float = 0.25
     """Share of the pairs of a batch that end at a random moment at a random pixel, between two events. The others end
     at a random event. 0: all of them, as in the paper."""
@@ -179,11 +190,13 @@ class PairSampler(Sampler):
     events beside which the refractory period is short. A learned refractory period needs pairs of consecutive events
     and none that end at moments, because the pixel may be blind at a moment.
 
-    Draws from torch's global generator, which Nerfstudio seeds.
+    Draws from torch's global generator of the device that holds the pairs, which Nerfstudio seeds. That is the device
+    of the batches if the pairs take at most half of the device's free memory. Otherwise the pairs stay in host memory,
+    or in their file, and a step copies one pinned array to the device without waiting.
 
     Args:
         config: the options.
-        dataset: the training data, whose pairs stay in host memory.
+        dataset: the training data.
         supervision: tells whether rates are needed and whether the refractory period is learned.
         device: of the batches.
 
@@ -206,8 +219,12 @@ class PairSampler(Sampler):
         device: torch.device | str,
     ) -> None:
         super().__init__(config, dataset, supervision, device)
-        if config.max_events_per_pair < 1:
-            raise DataError("the sampler", f"max-events-per-pair is {config.max_events_per_pair}", "give 1 or more")
+        if not 1 <= config.max_events_per_pair <= MAX_REACH:
+            raise DataError(
+                "the sampler",
+                f"max-events-per-pair is {config.max_events_per_pair}",
+                f"give a number from 1 to {MAX_REACH}",
+            )
         if not 0 <= config.share_to_moments <= 1:
             raise DataError(
                 "the sampler", f"share-to-moments is {config.share_to_moments}", "give a number from 0 to 1"
@@ -219,27 +236,30 @@ class PairSampler(Sampler):
         scene = dataset.scene
         self.sensor = scene.sensor
         self.trajectory = deepcopy(scene.trajectory).to(device)
-        directions, has_direction = scene.event_camera.pixel_directions()
+        camera = scene.event_camera
+        directions, has_direction = camera.pixel_directions()
         if not has_direction.all():
             CONSOLE.print(
                 f"[yellow]The lens model gives {(~has_direction).sum()} pixels no direction; their events are left out"
             )
-        self._has_direction = has_direction
-        self._directions = torch.from_numpy(directions).to(device)
+        # By pixel, row by row.
+        self._directions = torch.from_numpy(directions).reshape(-1, 3).to(device)
+        rows, columns = np.divmod(np.arange(camera.width * camera.height), camera.width)
+        self._channels = torch.from_numpy(self.sensor.channel(columns, rows)).to(device)
         # Area of a pixel at distance one from the camera.
-        self._pixel_area = 1 / (scene.event_camera.fx * scene.event_camera.fy)
+        self._pixel_area = 1 / (camera.fx * camera.fy)
 
     def prepare(self) -> None:
-        """Read and link the events now rather than with the first batch.
+        """Read the events now rather than with the first batch.
 
         Raises:
             DataError: the events cannot be used.
         """
-        _ = self.dataset.pairs, self._usable
-        if self.max_events_per_pair > 1:
-            _ = self._predecessors
-        if self.share_to_moments > 0:
-            _ = self._in_time
+        _ = self._table
+
+    @cached_property
+    def _table(self) -> _PairTable:
+        return _PairTable(self.dataset.pairs, self.device)
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
         """Draw a batch of pairs.
@@ -259,112 +279,155 @@ class PairSampler(Sampler):
         with_time_within = training and self._needs_rates
         rays_per_pair = 3 if with_time_within else 2
         num_pairs = max(num_rays // rays_per_pair, 1)
-        pairs, device = self.dataset.pairs, self._directions.device
+        device = self._directions.device
         num_to_moments = round(self.share_to_moments * num_pairs)
-        index = self._draw(pairs, num_to_moments, num_pairs - num_to_moments)
-        x, y = pairs.x[index].astype(np.int64), pairs.y[index].astype(np.int64)
-        first, num_positive, num_negative = self._extend(pairs, index)
-        end, start, last_start = (
-            self.trajectory.seconds(torch.from_numpy(t).to(device))
-            for t in (
-                pairs.time[index],
-                pairs.previous_time[first] + self.sensor.refractory_period,
-                pairs.previous_time[index] + self.sensor.refractory_period,
-            )
-        )
+        rows = self._table.draw(num_to_moments, num_pairs - num_to_moments, self.max_events_per_pair)
+        times, numbers = rows.permute(2, 1, 0)
+        end = self.trajectory.seconds(times[0])
+        last_start, start = self.trajectory.seconds(times[1:] + self.sensor.refractory_period)
         last_interval = end - last_start
-        to_moments = slice(num_to_moments)
         # Given the interval that it lies in, a uniform moment is uniform there.
-        part = torch.rand(num_to_moments, dtype=torch.float64).to(device)
-        end[to_moments] = last_start[to_moments] + part * last_interval[to_moments]
-        num_positive[to_moments] -= pairs.num_positive[index[to_moments]]
-        num_negative[to_moments] -= pairs.num_negative[index[to_moments]]
-        times = [start, end]
+        part = torch.rand(num_to_moments, dtype=torch.float64, device=device)
+        end[:num_to_moments] = last_start[:num_to_moments] + part * last_interval[:num_to_moments]
+        seconds = [start, end]
         if with_time_within:
-            within = torch.empty(num_pairs, dtype=torch.float64)
-            nn.init.trunc_normal_(within, mean=_WITHIN_MEAN, std=_WITHIN_DEVIATION, a=0.0, b=1.0)
-            times.append(last_start + within.to(device) * last_interval)
-        seconds = torch.cat(times)
-
-        def as_float(counts: NDArray) -> Tensor:
-            return torch.from_numpy(counts.astype(np.float32)).to(device)
-
-        rows, columns = torch.from_numpy(y).to(device), torch.from_numpy(x).to(device)
-        in_camera = self._directions[rows, columns].repeat(rays_per_pair, 1)
+            # From the distribution's inverse, because torch's own function waits for a GPU.
+            within = torch.rand(num_pairs, dtype=torch.float64, device=device).mul_(2).sub_(1).mul_(_WITHIN_MASS)
+            within.erfinv_().mul_(_WITHIN_DEVIATION * math.sqrt(2)).add_(_WITHIN_MEAN)
+            seconds.append(last_start + within * last_interval)
+        # A head has its number in place of the sums, which are 0.
+        sums = torch.where(numbers >> REACH_SHIFT & REACH_MASK > 0, numbers, 0)
+        sums = torch.stack([sums, sums >> NEGATIVE_SHIFT])
+        # By polarity: from the pair's last event but one, and from its first event.
+        last_count, count = ((sums[:, :1] - sums[:, 1:]) & COUNT_MASK).float().unbind(1)
+        # A pair that ends at a moment has not seen its last event.
+        count[:, :num_to_moments] -= last_count[:, :num_to_moments]
+        pixel = numbers[0] >> PIXEL_SHIFT
+        in_camera = self._directions.index_select(0, pixel).repeat(rays_per_pair, 1)
+        num_rays = len(in_camera)
         rays = RayBundle(
-            origins=torch.zeros_like(in_camera).float(),
+            origins=torch.zeros((num_rays, 3), device=device),
             directions=in_camera.float(),
-            pixel_area=torch.full((len(seconds), 1), self._pixel_area, device=device),
-            camera_indices=torch.zeros((len(seconds), 1), dtype=torch.long, device=device),
-            times=seconds[:, None],
+            pixel_area=torch.full((num_rays, 1), self._pixel_area, device=device),
+            camera_indices=torch.zeros((num_rays, 1), dtype=torch.long, device=device),
+            times=torch.cat(seconds)[:, None],
             metadata={CAMERA_DIRECTIONS: in_camera},
         )
         batch = {
-            "num_positive": as_float(num_positive),
-            "num_negative": as_float(num_negative),
+            "num_positive": count[0],
+            "num_negative": count[1],
             "ends_between_events": torch.arange(num_pairs, device=device) < num_to_moments,
-            "last_num_positive": as_float(pairs.num_positive[index]),
-            "last_num_negative": as_float(pairs.num_negative[index]),
+            "last_num_positive": last_count[0],
+            "last_num_negative": last_count[1],
             "last_interval": last_interval.float(),
-            "channel": torch.from_numpy(self.sensor.channel(x, y)).to(device),
+            "channel": self._channels.index_select(0, pixel),
         }
         return rays, batch
 
-    def _extend(
-        self, pairs: EventPairs, last: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Return the pairs that the drawn ones begin with, and their counts of positive and negative events.
+
+class _PairTable:
+    """Draw pairs on the device that holds them.
+
+    Args:
+        pairs: all pairs.
+        device: of the batches. It also holds the pairs, if they take at most half of its free memory.
+    """
+
+    def __init__(self, pairs: EventPairs, device: torch.device | str) -> None:
+        self._batch_device = torch.device(device)
+        arrays = (pairs.rows, pairs.substitutes, pairs.bounds)
+        size = sum(array.nbytes for array in arrays)
+        self._device = self._batch_device if _fits(size, self._batch_device) else torch.device("cpu")
+        if self._device != self._batch_device:
+            CONSOLE.print(
+                f"The pairs take {size / 1e9:.1f} GB, more than half of the GPU's free memory: they stay outside"
+            )
+        self._num_pairs = len(pairs)
+        # Known here, because reading it from a GPU in a step would wait for the GPU.
+        self._duration = int(pairs.bounds[-1])
+        self._find_rows: Callable[[Tensor, Tensor, Tensor], Tensor]
+        if self._device.type == "cpu":
+            self._find_rows = _CpuTable(*arrays).find_rows
+        else:
+            self._find_rows = partial(find_rows, *(torch.from_numpy(array).to(self._device) for array in arrays))
+
+    def draw(self, num_moments: int, num_events: int, max_events: int) -> Tensor:
+        """Draw pairs: first around uniform moments at uniform pixels, then pairs that end at uniform events.
 
         Args:
-            pairs: all pairs.
-            last: (N,) indices of the pairs that the drawn ones end with.
+            num_moments: number of pairs around moments.
+            num_events: number of pairs that end at events.
+            max_events: the most events that a pair spans.
+
+        Returns:
+            (N, 3, 2) int64 rows of the table on the device of the batches: of the event that the pair ends with, of the
+            event of its pixel before, and of the event that the pair begins with.
         """
-        first = last.copy()
-        num_positive, num_negative = (
-            counts[last].astype(np.int64) for counts in (pairs.num_positive, pairs.num_negative)
-        )
-        if self.max_events_per_pair == 1:
-            return first, num_positive, num_negative
-        spans = (self.max_events_per_pair + 1) ** torch.rand(len(last), dtype=torch.float64).numpy()
-        # Each round goes on with the pairs that span more events: few are left for the last round.
-        going = np.arange(len(last))
-        for length in range(2, self.max_events_per_pair + 1):
-            going = going[spans[going] >= length]
-            earlier = self._predecessors[first[going]]
-            going, earlier = going[earlier >= 0], earlier[earlier >= 0]
-            first[going] = earlier
-            num_positive[going] += pairs.num_positive[earlier]
-            num_negative[going] += pairs.num_negative[earlier]
-        return first, num_positive, num_negative
+        device = self._device
+        places = torch.randint(self._duration, (num_moments,), device=device)
+        events = torch.randint(self._num_pairs, (num_events,), device=device)
+        if max_events == 1:
+            spans = torch.ones(num_moments + num_events, dtype=torch.int64, device=device)
+        else:
+            spans = (max_events + 1) ** torch.rand(num_moments + num_events, dtype=torch.float64, device=device)
+            spans = spans.long().clamp_(max=max_events)
+        rows = self._find_rows(places, events, spans)
+        if device != self._batch_device:
+            rows = rows.pin_memory().to(self._batch_device, non_blocking=True)
+        return rows
 
-    @cached_property
-    def _predecessors(self) -> NDArray[np.int32] | NDArray[np.int64]:
-        return self.dataset.pairs.predecessors(_INTERVAL_TO_REFRACTORY_PERIOD * self.sensor.refractory_period)
 
-    @cached_property
-    def _usable(self) -> NDArray[np.int64] | None:
-        """The indices of the pairs whose pixel has a direction, or None when all have."""
-        if self._has_direction.all():
-            return None
-        pairs = self.dataset.pairs
-        usable = np.flatnonzero(self._has_direction[pairs.y, pairs.x])
-        if len(usable) == 0:
-            raise DataError("the lens model", "no event lies on a pixel with a direction", "check the distortion")
-        return usable
+class _CpuTable:
+    """Does what :func:`find_rows` does, in less time on a CPU.
 
-    @cached_property
-    def _in_time(self) -> PairsInTime:
-        from aenerf_ns.events.pairs import PairsInTime
+    Args:
+        arrays: the first three arguments of :func:`find_rows`.
+    """
 
-        return PairsInTime(self.dataset.pairs, self._has_direction)
+    def __init__(self, *arrays: NDArray[np.int64]) -> None:
+        # Imported lazily: every ns-* command imports this module, and numba is slow to import.
+        from aenerf_ns.events import pairs
 
-    def _draw(self, pairs: EventPairs, num_moments: int, num_events: int) -> NDArray[np.int64]:
-        """Return indices of usable pairs: first pairs around uniform moments at uniform pixels, then uniform pairs."""
-        count = len(pairs) if self._usable is None else len(self._usable)
-        by_event = torch.randint(count, (num_events,)).numpy()
-        if self._usable is not None:
-            by_event = self._usable[by_event]
-        if num_moments == 0:
-            return by_event
-        places = torch.rand(num_moments, dtype=torch.float64).numpy()
-        return np.concatenate([self._in_time.at(places), by_event])
+        self._find = pairs.find_rows
+        self._table = (*arrays, *pairs.near_blocks(arrays[2]))
+
+    def find_rows(self, places: Tensor, events: Tensor, spans: Tensor) -> Tensor:
+        found = torch.empty((len(spans), 3, 2), dtype=torch.int64)
+        self._find(*self._table, *(array.numpy() for array in (places, events, spans, found)))
+        return found
+
+
+def find_rows(
+    rows: Tensor, substitutes: Tensor, bounds: Tensor, places: Tensor, events: Tensor, spans: Tensor
+) -> Tensor:
+    """Find the rows of pairs in a table of pairs, without waiting for a GPU.
+
+    Args:
+        rows: see :class:`~aenerf_ns.events.pair_table.EventPairs`.
+        substitutes: see there.
+        bounds: see there.
+        places: (M,) int64 nanoseconds along the intervals of all pairs, laid end to end. Each finds the pair around it.
+        events: (N - M,) int64 numbers below the number of pairs. Each finds a pair of its own.
+        spans: (N,) int64, how many consecutive pairs to join that end with the found one, if so many may be joined.
+
+    Returns:
+        (N, 3, 2) int64 rows: of the event that the pair ends with, of the event of its pixel before, and of the event
+        that the pair begins with.
+    """
+    number = rows[:, 1][events]
+    is_head = number >> REACH_SHIFT & REACH_MASK == 0
+    by_event = torch.where(is_head, substitutes[torch.where(is_head, number & NUMBER_MASK, 0)], events)
+    block = torch.searchsorted(bounds, places, right=True) - 1
+    time, number = rows.view(-1, BLOCK, 2)[block].unbind(-1)
+    # From the block's end backwards, because the row before its first belongs to another block.
+    is_head = number[:, 1:] >> REACH_SHIFT & REACH_MASK == 0
+    passed = F.pad(time.diff().masked_fill_(is_head, 0).cumsum(1), (1, 0))
+    ends = bounds[block + 1][:, None] - passed[:, -1:] + passed
+    row = torch.cat([BLOCK * block + (ends <= places[:, None]).sum(1), by_event])
+    spans = spans.minimum(rows[:, 1][row] >> REACH_SHIFT & REACH_MASK)
+    return rows[torch.stack([row, row - 1, row - spans], 1)]
+
+
+def _fits(size: int, device: torch.device) -> bool:
+    """Return whether a table of so many bytes has a place on a device."""
+    return device.type == "cpu" or size <= _SHARE_OF_FREE_MEMORY * torch.cuda.mem_get_info(device)[0]

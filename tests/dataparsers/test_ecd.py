@@ -12,6 +12,7 @@ from small_datasets import (
     parse,
     write_ecd,
 )
+from unpacked_pairs import unpacked
 
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS
@@ -34,7 +35,7 @@ def test_ecd_text_reads(tmp_path: Path) -> None:
     assert chunk.t.tolist() == [10_000_000, 20_000_000, 30_000_000, 310_000_000]
     assert chunk.p.tolist() == [1, -1, 1, 1]
     assert dataset.metadata[SCENE].window == TimeWindow(10_000_000, 310_000_000)
-    assert dataset.pairs.time.tolist() == [20_000_000, 310_000_000]
+    assert [pair[3] for pair in unpacked(dataset.pairs)] == [20_000_000, 310_000_000]
     # Images at 0.05 and 0.25 s validate, 0.15 s tests, 0.35 s is after the last event.
     assert len(parse(config, "val").image_filenames) == 2
     assert len(parse(config, "test").image_filenames) == 1

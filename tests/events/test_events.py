@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
+from dataclasses import fields
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from conftest import make_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from unpacked_pairs import unpacked
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pairs import EventPairs, PairsInTime, pair_events
+from aenerf_ns.events.pair_table import EventPairs
+from aenerf_ns.events.pairs import find_rows as find_rows_on_cpu
+from aenerf_ns.events.pairs import near_blocks, pair_events
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.supervision.pairs import find_rows
 
 WIDTH, HEIGHT = 4, 3
 # Small ranges, so that pixels repeat and times coincide.
@@ -41,8 +49,7 @@ def brute_force_pairs(rows: list[tuple[int, int, int, int]], refractory_period: 
 
 
 def as_set(pairs: EventPairs) -> set[tuple[int, ...]]:
-    columns = (pairs.x, pairs.y, pairs.previous_time, pairs.time, pairs.num_positive, pairs.num_negative)
-    rows = list(zip(*(column.tolist() for column in columns), strict=True))
+    rows = [row[:6] for row in unpacked(pairs)]
     assert len(set(rows)) == len(rows)
     return set(rows)
 
@@ -55,44 +62,105 @@ def cut(stream: EventStream, sizes: list[int]) -> Iterator[EventStream]:
 
 
 @settings(max_examples=300, deadline=None)
-@given(EVENTS, st.lists(st.integers(0, 20), max_size=6), st.integers(0, 5), st.integers(0, 10))
+@given(
+    EVENTS, st.lists(st.integers(0, 20), max_size=6), st.integers(0, 5), st.integers(1, 60), st.integers(0, 2**12 - 1)
+)
 def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
-    rows: list[tuple[int, int, int, int]], sizes: list[int], refractory_period: int, shortest: int
+    rows: list[tuple[int, int, int, int]], sizes: list[int], refractory_period: int, in_memory: int, unused: int
 ) -> None:
-    pairs = pair_events(cut(make_stream(rows), sizes), refractory_period=refractory_period)
-    assert as_set(pairs) == brute_force_pairs(rows, refractory_period)
-    assert (np.diff(pairs.time) >= 0).all()
+    # Intervals that are shorter and longer than 20 refractory periods.
+    rows = [(x, y, 10 * t, p) for x, y, t, p in rows]
+    usable = (unused >> np.arange(WIDTH * HEIGHT) & 1 == 0).reshape(HEIGHT, WIDTH)
+    used = [row for row in rows if usable[row[1], row[0]]]
+    options = {"refractory_period": refractory_period, "usable": usable}
+    if not used:
+        with pytest.raises(DataError, match="no event lies on a pixel with a direction"):
+            pair_events([make_stream(rows)], **options)
+        return
+    pairs = pair_events(cut(make_stream(rows), sizes), **options)
+    found = unpacked(pairs)
+    assert as_set(pairs) == brute_force_pairs(used, refractory_period)
+    # By pixel, then by time.
+    assert found == sorted(found, key=lambda pair: (pair[1], pair[0], pair[3]))
     # Every event is in a pair or accounted for.
-    merged_in_pairs = pairs.num_positive.astype(int).sum() + pairs.num_negative.astype(int).sum() - len(pairs)
-    assert pairs.num_events == len(rows)
-    distinct = len({(x, y, t) for x, y, t, _ in rows})
-    assert pairs.num_merged == len(rows) - distinct >= merged_in_pairs
+    assert (pairs.num_events, pairs.num_unusable) == (len(rows), len(rows) - len(used))
+    distinct = len({(x, y, t) for x, y, t, _ in used})
+    assert pairs.num_merged == len(used) - distinct >= sum(pair[4] + pair[5] - 1 for pair in found)
     assert len(pairs) + pairs.num_first + pairs.num_within_refractory_period == distinct
-    # The predecessor is the pair of the same pixel that ends where this one begins, if neither is too short.
-    long = pairs.time - pairs.previous_time >= shortest
-    ends = {(x, y, t): i for i, (x, y, t) in enumerate(zip(pairs.x, pairs.y, pairs.time, strict=True)) if long[i]}
-    begins = zip(pairs.x, pairs.y, pairs.previous_time, strict=True)
-    expected = [ends.get(begin, -1) if long[i] else -1 for i, begin in enumerate(begins)]
-    assert pairs.predecessors(shortest).tolist() == expected
+    # A pair is joined with the pair that ends where it begins, if neither is too short.
+    reaches: dict[tuple[int, int, int], int] = {}
+    for x, y, begin, end, _, _, reach in found:
+        is_long = end - begin >= 20 * refractory_period
+        assert reach == 1 + (reaches.get((x, y, begin), 0) if is_long else 0)
+        if is_long:
+            reaches[x, y, end] = reach
+    # The same in a file.
+    with tempfile.TemporaryDirectory() as folder, (Path(folder) / "rows").open("w+b") as file:
+        in_file = pair_events(
+            cut(make_stream(rows), sizes),
+            **options,
+            open_file=lambda: (file, Path(folder)),
+            events_in_memory=in_memory,
+        )
+        for field in fields(EventPairs):
+            assert np.array_equal(getattr(in_file, field.name), getattr(pairs, field.name))
 
 
 @settings(max_examples=200, deadline=None)
-@given(EVENTS, st.integers(1, 3), st.integers(0, 2**32))
-def test_moments_fall_into_the_intervals_laid_end_to_end(
-    rows: list[tuple[int, int, int, int]], times: int, seed: int
+@given(EVENTS, st.integers(0, 2), st.integers(0, 2**32))
+def test_pairs_are_found_by_place_and_by_number(
+    rows: list[tuple[int, int, int, int]], refractory_period: int, seed: int
 ) -> None:
     # Several blocks of pairs.
-    last = max((t for _, _, t, _ in rows), default=0) + 1
-    pairs = pair_events([make_stream([(x, y, t + i * last, p) for i in range(20 * times) for x, y, t, p in rows])])
-    generator = np.random.default_rng(seed)
-    usable = generator.random((3, 4)) < 0.7
-    durations = np.where(usable[pairs.y, pairs.x], pairs.time - pairs.previous_time, 0)
-    if durations.sum() == 0:
+    last = rows[-1][2] + 1
+    pairs = pair_events(
+        [make_stream([(x, y, t + i * last, p) for i in range(20) for x, y, t, p in rows])],
+        refractory_period=refractory_period,
+    )
+    known = unpacked(pairs)
+    if not known:
         return
-    places = np.concatenate([generator.random(50), [0.0, 1 - 2.0**-53, 1.0]])
-    ends = np.cumsum(durations)
-    expected = np.searchsorted(ends, np.minimum(places * ends[-1], np.nextafter(float(ends[-1]), 0)), side="right")
-    assert PairsInTime(pairs, usable).at(places).tolist() == expected.tolist()
+    durations = np.cumsum([pair[3] - pair[2] for pair in known])
+    generator = np.random.default_rng(seed)
+    places = np.append(generator.integers(0, durations[-1], 50), [0, durations[-1] - 1])
+    # Every pair once, from as many numbers.
+    events = np.arange(len(pairs))
+    spans = generator.integers(1, 12, len(places) + len(events))
+    arguments = (pairs.rows, pairs.substitutes, pairs.bounds, places, events, spans)
+    found = np.empty((len(spans), 3, 2), np.int64)
+    find_rows_on_cpu(*arguments[:3], *near_blocks(pairs.bounds), *arguments[3:], found)
+    # A GPU's way.
+    assert np.array_equal(find_rows(*map(torch.from_numpy, arguments)).numpy(), found)
+    ends = {(y * WIDTH + x, time): index for index, (x, y, _, time, *_) in enumerate(known)}
+    drawn = []
+    for (end, before, first), span in zip(found.tolist(), spans.tolist(), strict=True):
+        index = ends[end[1] >> 40, end[0]]
+        drawn.append(index)
+        assert before[0] == known[index][2]
+        assert first[0] == known[index + 1 - min(span, known[index][6])][2]
+    assert drawn[: len(places)] == np.searchsorted(durations, places, side="right").tolist()
+    assert sorted(drawn[len(places) :]) == list(range(len(known)))
+
+
+def test_a_pair_joins_255_events_at_most() -> None:
+    pairs = pair_events([make_stream([(1, 2, t, 1) for t in range(300) for _ in range(255)])])
+    found = unpacked(pairs)
+    assert [pair[6] for pair in found] == [min(i + 1, 255) for i in range(299)]
+    assert {pair[4:6] for pair in found} == {(255, 0)}
+
+
+def test_a_table_that_cannot_be_made_is_refused() -> None:
+    with pytest.raises(DataError, match="its sensor has 4 x 3 pixels, its lens model 3 x 4; state one size"):
+        pair_events([make_stream([(1, 2, 3, 1)])], usable=np.ones((4, 3), bool))
+    nothing = np.zeros(1, np.int64)
+    stream = EventStream(
+        *(nothing.astype(kind) for kind in (np.uint16, np.uint16)), nothing, np.ones(1, np.int8), 4096, 4096
+    )
+    with pytest.raises(DataError, match="its sensor has 4096 x 4096 pixels; use at most 8388608 of them"):
+        pair_events([stream])
+    rows = [(x, 0, t, 1) for t in (-(2**62), 2**62 - 1) for x in (0, 1)]
+    with pytest.raises(DataError, match="its intervals add up to more than 292 years; choose a shorter time window"):
+        pair_events([make_stream(rows)])
 
 
 def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:
@@ -101,12 +169,12 @@ def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:
     for gaps in (((10, 20),), ((-9, -3), (10, 20), (50, 60))):
         for sizes in ([8], [1] * 8, [3, 5]):
             pairs = pair_events(cut(make_stream(rows), sizes), window=TimeWindow(gaps=gaps))
-            assert list(zip(pairs.previous_time.tolist(), pairs.time.tolist(), strict=True)) == expected
+            assert [pair[2:4] for pair in unpacked(pairs)] == expected
             assert (pairs.num_outside, pairs.num_first, pairs.num_merged) == (2, 2, 1)
-            assert pairs.predecessors().tolist() == [-1, -1, 1]
+            assert [pair[6] for pair in unpacked(pairs)] == [1, 1, 2]
     # What a gap leaves of the time window.
     pairs = pair_events([make_stream(rows)], window=TimeWindow(10, 25, ((5, 11), (20, 30))))
-    assert list(zip(pairs.previous_time.tolist(), pairs.time.tolist(), strict=True)) == [(11, 15), (15, 20)]
+    assert [pair[2:4] for pair in unpacked(pairs)] == [(11, 15), (15, 20)]
 
 
 @given(EVENTS, st.integers(0, 30), st.integers(0, 30))

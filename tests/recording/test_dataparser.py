@@ -17,6 +17,7 @@ from small_datasets import (
     write_ecd,
     write_native,
 )
+from unpacked_pairs import unpacked
 
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
@@ -69,8 +70,9 @@ def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> N
     trajectory = dataset.metadata[SCENE].trajectory
     assert (trajectory.start, trajectory.end) == (start, START + 1_100_000_000)
     assert not any(dataset.metadata[SCENE].has_image)
-    assert dataset.pairs.previous_time.min() >= start
-    assert dataset.pairs.time.max() <= end
+    intervals = [pair[2:4] for pair in unpacked(dataset.pairs)]
+    assert min(begin for begin, _ in intervals) >= start
+    assert max(last for _, last in intervals) <= end
     assert dataset.pairs.num_outside > 0
     # The window is cut to the poses.
     config = NativeDataParserConfig(data=folder, start_time_ns=0, end_time_ns=END + 10**12)

@@ -146,6 +146,12 @@ def test_sampling_is_seeded(share: float, random_poses: torch.Tensor) -> None:
     assert not torch.equal(batches[0], batches[2])
 
 
+@pytest.mark.parametrize("number", [0, 256])
+def test_an_impossible_number_of_events_is_refused(number: int, random_poses: torch.Tensor) -> None:
+    with pytest.raises(DataError, match=f"max-events-per-pair is {number}; give a number from 1 to 255"):
+        make_sampler(random_poses, SensorModel(), max_events_per_pair=number)
+
+
 def test_the_colour_filter_is_that_of_the_raw_pixel(random_poses: torch.Tensor) -> None:
     _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB")).sample(40)
     # Pixel (3, 1) is blue and pixel (0, 2) red.
