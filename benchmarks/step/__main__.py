@@ -28,17 +28,19 @@ Measurement = Literal[
     "small", "small-two-threads", "full", "temporal-loss", "nerfacto-small", "nerfacto-full", "seconds-to-psnr"
 ]
 
+_ON_GPU = torch.cuda.is_available()
 _SMALL = ("aenerf-small", "--pipeline.model.camera-optimizer.mode", "spline")
-# With as few rays as the small method, because a step of 8192 rays takes too long on a CPU.
-_FEW_RAYS = (
-    "--pipeline.datamanager.train-num-rays-per-batch", "1024", "--pipeline.model.eval-num-rays-per-chunk", "1024",
-)  # fmt: skip
-_FULL = ("aenerf", *_SMALL[1:], *_FEW_RAYS)
+_RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
+# On a CPU, a step of 8192 rays takes too long, and a small chunk renders faster because it fits the cache.
+_CHUNK = () if _ON_GPU else ("--pipeline.model.eval-num-rays-per-chunk", "1024")
+_FULL_RAYS = (_RAYS, "8192" if _ON_GPU else "1024", *_CHUNK)
+_FULL = ("aenerf", *_SMALL[1:], *_FULL_RAYS)
 # The framework's implementation that needs no CUDA extension. Its grids, networks and samples are those of `aenerf`.
-_NERFACTO_FULL = ("nerfacto", "--pipeline.model.implementation", "torch", *_FEW_RAYS)
+_NERFACTO = ("nerfacto", "--pipeline.model.implementation", "torch")
+_NERFACTO_FULL = (*_NERFACTO, *_FULL_RAYS)
 # With the sizes of `aenerf-small`.
 _NERFACTO_SMALL = (
-    *_NERFACTO_FULL, "--pipeline.model.num-levels", "8", "--pipeline.model.max-res", "256",
+    *_NERFACTO, _RAYS, "1024", *_CHUNK, "--pipeline.model.num-levels", "8", "--pipeline.model.max-res", "256",
     "--pipeline.model.log2-hashmap-size", "15", "--pipeline.model.hidden-dim", "32",
     "--pipeline.model.hidden-dim-color", "32", "--pipeline.model.num-nerf-samples-per-ray", "24",
     "--pipeline.model.num-proposal-iterations", "1", "--pipeline.model.num-proposal-samples-per-ray", "48",
@@ -91,8 +93,7 @@ class StepCost:
                     figures = (
                         self._seconds_to_psnr(*trainings)
                         if name == "seconds-to-psnr"
-                        # Eight steps of the full method would be a long turn.
-                        else self._cost(trainings, steps=2 if _FULL in (side.arguments for side in sides) else 8)
+                        else self._cost(trainings, long=not _ON_GPU and "full" in name)
                     )
                 described = [{**vars(side), "arguments": shlex.join(side.arguments)} for side in sides]
                 rows.append({"measurement": name, "baseline": described[0], "subject": described[1], **figures})
@@ -101,7 +102,6 @@ class StepCost:
     @contextmanager
     def _trainings(self, sides: tuple[Side, Side], folder: Path) -> Iterator[list[Training]]:
         """Start the trainings of both sides, and end them."""
-        device = "cuda" if torch.cuda.is_available() else "cpu"
         trainings: list[Training] = []
         try:
             for index, side in enumerate(sides):
@@ -114,8 +114,8 @@ class StepCost:
                 # nerfacto reads the images with the estimated poses.
                 images = ("nerfstudio-data",) if side.arguments[0] == "nerfacto" else ()
                 ending = (
-                    "--machine.device-type", device, "--vis", "tensorboard", "--output-dir", str(folder / str(index)),
-                    *images, "--data", str(self.data.resolve()),
+                    "--machine.device-type", "cuda" if _ON_GPU else "cpu", "--vis", "tensorboard",
+                    "--output-dir", str(folder / str(index)), *images, "--data", str(self.data.resolve()),
                 )  # fmt: skip
                 trainings.append(Training(side, packages, folder / f"{index}.log", ending))
             yield trainings
@@ -123,14 +123,16 @@ class StepCost:
             for training in trainings:
                 training.end()
 
-    def _cost(self, trainings: list[Training], steps: int) -> dict[str, Any]:
+    def _cost(self, trainings: list[Training], long: bool) -> dict[str, Any]:
         """Return the cost of steps and of pictures, and the parts of a step.
 
         Args:
             trainings: of the baseline and of the subject.
-            steps: of a turn. An even number, because the proposal networks are trained every second step at first.
+            long: whether steps take so long that a turn has few steps, and a picture of a quarter of the width.
         """
-        about = [training.about() for training in trainings]
+        # An even number, because the proposal networks are trained every second step at first.
+        steps, scale = (2, 0.25) if long else (8, 1.0)
+        about = [training.about(scale) for training in trainings]
         for training in trainings:
             # The first steps compile.
             training.ask("train", steps)
@@ -155,6 +157,8 @@ class StepCost:
 
     def _seconds_to_psnr(self, *trainings: Training) -> dict[str, Any]:
         """Return the seconds of training until the PSNR is reached, without start-up and without the evaluations."""
+        for training in trainings:
+            training.about()
         steps = self.psnr_steps // _PSNR_TURNS
         curves: list[list[dict[str, float]]] = [[], []]
         spent = [{"wall": 0.0, "cpu": 0.0} for _ in trainings]

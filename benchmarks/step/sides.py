@@ -70,13 +70,16 @@ class Training:
             sys.exit(f"a training failed:\n{self._log.read_text('utf8')[-3000:]}")
         return json.loads(answer)
 
-    def about(self) -> dict[str, Any]:
-        """Return the rays of a step and the pixels of a picture, once the training is ready.
+    def about(self, scale: float = 1.0) -> dict[str, Any]:
+        """Wait until the training is ready, and scale the size of its picture.
+
+        Returns:
+            The most rays of a step and the pixels of the scaled picture.
 
         Raises:
             SystemExit: the training runs with the package of another commit.
         """
-        about = self.ask("about")
+        about = self.ask("about", scale)
         package = Path(about.pop("package"))
         if self._packages is not None and not package.is_relative_to(self._packages):
             sys.exit(f"{package} was measured in place of the package in {self._packages}")

@@ -40,8 +40,13 @@ class _Worker:
         self._model = trainer.pipeline.model
         self._camera = trainer.pipeline.datamanager.eval_dataset.cameras[:1].to(trainer.device)
 
-    def about(self) -> dict[str, Any]:
-        """Return where the package lies that is measured, the most rays of a step, and the pixels of a picture."""
+    def about(self, scale: float) -> dict[str, Any]:
+        """Scale the size of the picture.
+
+        Returns:
+            The file of the package that is measured, the most rays of a step, and the pixels of the scaled picture.
+        """
+        self._camera.rescale_output_resolution(scale)
         package = importlib.util.find_spec("aenerf_ns")
         return {
             "package": package.origin if package else None,
@@ -176,7 +181,7 @@ def main() -> None:
             name, *arguments = json.loads(request)
             answers.write(json.dumps(getattr(worker, name)(*arguments)) + "\n")
 
-    Trainer.train = serve  # type: ignore[method-assign]
+    Trainer.train = serve
     ns_train.entrypoint()
 
 
