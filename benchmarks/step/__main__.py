@@ -130,15 +130,17 @@ class StepCost:
             trainings: of the baseline and of the subject.
             long: whether steps take so long that a turn has few steps, and a picture of a quarter of the width.
         """
-        # An even number, because the proposal networks are trained every second step at first.
+        # An even number, because the proposal networks are trained every second step.
         steps, scale = (2, 0.25) if long else (8, 1.0)
         about = [training.about(scale) for training in trainings]
         for training in trainings:
-            # The first steps compile.
-            training.ask("train", steps)
             training.ask("render")
-        trained, rendered = (self._turns(trainings, *request) for request in (("train", steps), ("render",)))
+            # The first steps compile, and the first ten all train the proposal networks.
+            training.ask("train", 10)
+        trained = self._turns(trainings, "train", steps)
+        # Before the pictures, because rendering puts off the next training of the proposal networks.
         parts = [training.ask("parts", steps) for training in trainings]
+        rendered = self._turns(trainings, "render")
         return {
             "step": _compare(trained, steps, "rays", [one["rays"] for one in about]),
             "picture": _compare(rendered, 1, "pixels", [one["pixels"] for one in about]),
