@@ -97,7 +97,8 @@ class StepCost:
                     )
                 described = [{**vars(side), "arguments": shlex.join(side.arguments)} for side in sides]
                 rows.append({"measurement": name, "baseline": described[0], "subject": described[1], **figures})
-        write_result(self.output, {"rows": rows})
+                # After each comparison, because all of them take long.
+                write_result(self.output, {"rows": rows})
 
     @contextmanager
     def _trainings(self, sides: tuple[Side, Side], folder: Path) -> Iterator[list[Training]]:
