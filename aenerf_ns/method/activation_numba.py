@@ -51,15 +51,15 @@ def probe(device: torch.device) -> None:
     values(torch.zeros(1, device=device), None, 1.0)
 
 
-def _run(kernel: Callable[..., None], beta: float, *tensors: Tensor | None) -> None:
+def _run(kernel: Callable[..., None], beta: float, first_tensor: Tensor, *tensors: Tensor | None) -> None:
     """Run a kernel on all values of contiguous tensors."""
-    arrays = [None if tensor is None else as_array(tensor).reshape(-1) for tensor in tensors]
+    arrays = [None if tensor is None else as_array(tensor).reshape(-1) for tensor in (first_tensor, *tensors)]
 
     def run_range(first: int, last: int) -> None:
         # Sliced here, because the compiler makes vectors only of loops that begin at 0.
         kernel(_F(beta), *(None if array is None else array[first:last] for array in arrays))
 
-    run_ranges(run_range, len(arrays[0]), _BLOCK)
+    run_ranges(run_range, first_tensor.numel(), _BLOCK)
 
 
 @compiled
