@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import sys
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -81,6 +82,7 @@ def map_rows(file: BinaryIO, num_rows: int) -> NDArray[np.int64]:
     """Map the (R, 2) rows at the start of a file into memory."""
     # A copy on write, because torch takes no arrays that cannot be written. Nothing is written.
     mapped = mmap.mmap(file.fileno(), 16 * num_rows, access=mmap.ACCESS_COPY)
-    # Pairs are drawn from anywhere: without it the system would read 32 pages for each.
-    mapped.madvise(mmap.MADV_RANDOM)
+    # Pairs are drawn from anywhere: without this advice Linux would read 32 pages for each.
+    if sys.platform == "linux":
+        mapped.madvise(mmap.MADV_RANDOM)
     return np.frombuffer(mapped, np.int64).reshape(-1, 2)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
+import sys
 import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -160,14 +160,9 @@ class PairFile:
         Raises:
             DataError: the disk is full.
         """
-        # The folder's, because HDF5 locks its files itself.
-        lock = os.open(self.path.parent, os.O_RDONLY)
         try:
-            if alone:
-                # Some network folders have no locks.
-                with suppress(OSError):
-                    fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
+            with _locked(self.path.parent) if alone else nullcontext():
+                yield
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
@@ -179,7 +174,24 @@ class PairFile:
                 self._new.close()
                 if self._is_kept:
                     self._part.unlink(missing_ok=True)
-            os.close(lock)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold a folder's lock, where there are such locks: not on Windows nor in some network folders."""
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    # The folder's, because HDF5 locks its files itself.
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
 
 
 def _stamps(path: Path) -> list[tuple[str, int, int]]:
