@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import SpacedSampler, UniformLinDispPiecewiseSampler, UniformSampler
 
@@ -12,7 +14,9 @@ class _OnDevice(SpacedSampler):
     def generate_ray_samples(self, ray_bundle: RayBundle | None = None, num_samples: int | None = None) -> RaySamples:
         """Return samples along rays that have ``nears`` and ``fars``."""
         assert ray_bundle is not None
-        with ray_bundle.origins.device:
+        device = ray_bundle.origins.device
+        # Torch is slower as long as a device is set, and the CPU is set already.
+        with nullcontext() if device.type == "cpu" else device:
             return super().generate_ray_samples(ray_bundle, num_samples)
 
 
