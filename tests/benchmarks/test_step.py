@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from commands import simulate
 from small_datasets import CAMERA, write_native
 from torch.profiler import profile
 
@@ -19,10 +20,9 @@ from benchmarks.step.worker import ranged, seconds_of_parts
 ROOT = Path(__file__).parents[2]
 
 
-def measure(folder: Path, *options: str) -> dict[str, Any]:
-    """Measures on a small dataset and returns the row of the result."""
-    data = write_native(folder / "data")
-    output = folder / "result.json"
+def measure(data: Path, *options: str) -> dict[str, Any]:
+    """Measures on a dataset and returns the row of the result."""
+    output = data.with_name("result.json")
     command = (sys.executable, "-m", "benchmarks.step", "--data", str(data), "--output", str(output), *options)
     environment = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
@@ -54,7 +54,7 @@ def test_the_parts_of_a_step_add_up_and_take_their_share_of_the_backward_pass() 
 
 
 def test_the_command_compares_steps_and_pictures_and_lists_the_parts(tmp_path: Path) -> None:
-    row = measure(tmp_path, "--measure", "temporal-loss", "--rounds", "2")
+    row = measure(write_native(tmp_path / "data"), "--measure", "temporal-loss", "--rounds", "2")
     assert "temporal-loss 0.001" in row["subject"]["arguments"]
     assert "temporal-loss" not in row["baseline"]["arguments"]
     for what, unit, units in (("step", "rays", 1024), ("picture", "pixels", CAMERA.width * CAMERA.height)):
@@ -71,7 +71,8 @@ def test_the_command_compares_steps_and_pictures_and_lists_the_parts(tmp_path: P
 
 @pytest.mark.slow
 def test_the_command_compares_the_seconds_to_a_psnr_with_a_commit(tmp_path: Path) -> None:
-    row = measure(tmp_path, "--measure", "seconds-to-psnr", "--against", "HEAD", "--psnr", "3", "--psnr-steps", "32")
+    data = simulate(tmp_path / "data", "--scene", "object")
+    row = measure(data, "--measure", "seconds-to-psnr", "--against", "HEAD", "--psnr", "3", "--psnr-steps", "32")
     assert (row["baseline"]["commit"], row["subject"]["commit"]) == ("HEAD", None)
     for (reached,) in row["curves"]:
         assert reached["step"] == 16
