@@ -147,6 +147,15 @@ class SimulatedCuda(TorchDispatchMode):
         device()
         self.counts = Counts()
 
+    def __enter__(self) -> SimulatedCuda:
+        # torch starts a thread for every device with the first backward pass of a process, which may be over by now.
+        self._one_thread = torch.autograd.set_multithreading_enabled(False)
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        self._one_thread.__exit__(*error)
+
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _run(operation, args, kwargs or {}, self.counts)
 

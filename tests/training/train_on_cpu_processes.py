@@ -1,10 +1,14 @@
 """``ns-train`` with ``--machine.num-devices``, each process on a CPU where the framework wants a GPU for it.
 
 What each process sees and learns is left in ``process_0.pt``, ``process_1.pt``, ...
+
+With ``SHARED_BATCHES`` in the environment, any number of processes sees the same rays: each process sees its part of
+one batch, and samples are at the same places along the rays.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from datetime import timedelta
 from typing import Any
@@ -26,19 +30,47 @@ class DistributedDataParallelOnCPU(torch.nn.parallel.DistributedDataParallel):
         super().__init__(module, **options)
 
 
+def share_batches(trainer: Trainer) -> None:
+    """Give every process its part of a batch that is drawn for all of them."""
+    datamanager, model = trainer.pipeline.datamanager, trainer.pipeline.model
+    # Otherwise each process would move the samples along its rays at random.
+    model.proposal_sampler.initial_sampler.train_stratified = False
+    model.proposal_sampler.pdf_sampler.train_stratified = False
+
+    def next_train(step: int) -> Any:
+        torch.manual_seed(step)
+        num_rays = trainer.world_size * datamanager.config.train_num_rays_per_batch
+        rays, batch = datamanager.train_pixel_sampler.sample(num_rays)
+        num_pairs = len(batch["channel"])
+        part = torch.arange(num_pairs).chunk(trainer.world_size)[trainer.local_rank]
+        of_part = torch.arange(len(rays)).unflatten(0, (-1, num_pairs))[:, part].flatten()
+        return rays[of_part], {name: value[part] for name, value in batch.items()}
+
+    datamanager.next_train = next_train
+
+
 def train_and_keep(trainer: Trainer) -> None:
-    """Trains, and keeps the times of the first batch and what was learned."""
-    datamanager = trainer.pipeline.datamanager
+    """Trains, and keeps the times of the first batch, what was learned, and how often colours were fitted."""
+    if "SHARED_BATCHES" in os.environ:
+        share_batches(trainer)
+    datamanager, pipeline = trainer.pipeline.datamanager, trainer.pipeline
     next_train, times = datamanager.next_train, []
+    fit, fits = pipeline.fit_color_correction, []
 
     def watched(step: int) -> Any:
         rays, batch = next_train(step)
         times.append(rays.times.clone())
         return rays, batch
 
-    datamanager.next_train = watched
+    def fitted(*share: float) -> None:
+        fits.append(share)
+        fit(*share)
+
+    datamanager.next_train, pipeline.fit_color_correction = watched, fitted
+    before = {name: value.clone() for name, value in pipeline.model.state_dict().items()}
     train_alone(trainer)
-    torch.save({"times": times[0], "weights": trainer.pipeline.state_dict()}, f"process_{trainer.local_rank}.pt")
+    kept = {"times": times[0], "before": before, "weights": pipeline.model.state_dict(), "num_fits": len(fits)}
+    torch.save(kept, f"process_{trainer.local_rank}.pt")
 
 
 def worker(
@@ -67,4 +99,6 @@ def worker(
 
 if __name__ == "__main__":
     train._distributed_worker = worker
+    # Of a single process, which is no worker.
+    Trainer.train = train_and_keep
     train.entrypoint()
