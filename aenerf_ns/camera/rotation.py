@@ -10,7 +10,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-# Below this squared angle the series below are exact to the last bit of float64. Above it the closed forms are.
+# Below this squared angle the series are exact to the last bit of float64. Above it the closed forms lose a few bits at
+# most.
 _SMALL = 1.0
 _NUM_TERMS = 9
 

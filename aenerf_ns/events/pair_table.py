@@ -80,8 +80,8 @@ class EventPairs:
 
 def map_rows(file: BinaryIO, num_rows: int) -> NDArray[np.int64]:
     """Map the (R, 2) rows at the start of a file into memory."""
-    # A copy on write, because torch takes no arrays that cannot be written. Nothing is written.
-    mapped = mmap.mmap(file.fileno(), 16 * num_rows, access=mmap.ACCESS_COPY)
+    # Read-only, because the system charges a copy-on-write mapping as if all of it were memory.
+    mapped = mmap.mmap(file.fileno(), 16 * num_rows, access=mmap.ACCESS_READ)
     # Pairs are drawn from anywhere: without this advice Linux would read 32 pages for each.
     if sys.platform == "linux":
         mapped.madvise(mmap.MADV_RANDOM)

@@ -405,7 +405,8 @@ def near_blocks(bounds: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
         nanoseconds a step takes. A step has 8 blocks on average.
     """
     step = int(bounds[-1]) // max(len(bounds) // 8, 1) + 1
-    return np.searchsorted(bounds, step * np.arange(int(bounds[-1]) // step + 2), side="right") - 1, step
+    times = step * np.arange(int(bounds[-1]) // step + 2, dtype=np.int64)
+    return np.searchsorted(bounds, times, side="right") - 1, step
 
 
 @numba.njit(cache=True)

@@ -55,21 +55,24 @@ class PolaritySums:
         for chunk in chunks:
             for time, before, after in zip(self._times, self._before, self._after, strict=True):
                 middle = int(np.searchsorted(chunk.t, time))
-                before.append(chunk[max(middle - self._num_events, 0) : middle])
+                # By indices, because a slice would keep the whole chunk in memory.
+                if middle > 0:
+                    before.append(chunk[np.arange(max(middle - self._num_events, 0), middle)])
                 while len(before) > 1 and sum(map(len, before[1:])) >= self._num_events:
                     before.pop(0)
                 lacking = self._num_events - sum(map(len, after))
-                if lacking > 0:
-                    after.append(chunk[middle : middle + lacking])
+                if lacking > 0 and middle < len(chunk):
+                    after.append(chunk[np.arange(middle, min(middle + lacking, len(chunk)))])
             yield chunk
 
     def sums(self, height: int, width: int) -> NDArray[np.int16]:
         """Return the (M, height, width) sums of polarities, at most 32767."""
         sums = np.zeros((len(self._times), height, width), np.int64)
         for net, before, after in zip(sums, self._before, self._after, strict=True):
-            x, y, p = (np.concatenate([getattr(part, name) for part in before]) for name in "xyp")
-            begin = max(len(p) - self._num_events, 0)
-            np.add.at(net, (y[begin:], x[begin:]), p[begin:])
+            if before:
+                x, y, p = (np.concatenate([getattr(part, name) for part in before]) for name in "xyp")
+                begin = max(len(p) - self._num_events, 0)
+                np.add.at(net, (y[begin:], x[begin:]), p[begin:])
             for part in after:
                 np.add.at(net, (part.y, part.x), part.p)
         return np.clip(sums, -(2**15) + 1, 2**15 - 1).astype(np.int16)

@@ -160,7 +160,9 @@ class EventRadianceField(DensityField):
         directions = self.direction_encoding(ray_samples.frustums.directions[..., :1, :])
         first, *others = self.radiance_network.layers
         of_direction, of_feature = first.weight.split([directions.shape[-1], density_embedding.shape[-1]], dim=1)
-        raw = F.linear(density_embedding, of_feature) + F.linear(directions, of_direction, first.bias)
+        raw = F.linear(density_embedding, of_feature) + F.linear(
+            directions.to(first.weight.dtype), of_direction, first.bias
+        )
         for layer in others:
             raw = layer(self.radiance_network.activation(raw))
         return {FieldHeadNames.RGB: F.softplus(raw.to(directions.dtype))}

@@ -311,8 +311,11 @@ class AENeRFModel(Model):
         """Return log-radiance (N, channels) of any number of rays, rendered in evaluation mode."""
         was_training = self.training
         self.eval()
+        # The sampler counts renderings to find the steps that train the proposal networks.
+        steps_since_update = self.proposal_sampler._steps_since_update
         chunk = self.config.eval_num_rays_per_chunk
         rendered = [self(rays[begin : begin + chunk])["log_radiance"] for begin in range(0, len(rays), chunk)]
+        self.proposal_sampler._steps_since_update = steps_since_update
         self.train(was_training)
         return torch.cat(rendered)
 

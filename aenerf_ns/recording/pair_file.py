@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import sys
 import tempfile
@@ -93,7 +94,7 @@ class PairFile:
         file.seek(16 * num_rows)
         checksum, arrays = 0, []
         for dtype, shape in about["arrays"]:
-            array = np.fromfile(file, dtype, int(np.prod(shape))).reshape(shape)
+            array = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)
             checksum = zlib.crc32(array.data, checksum)
             arrays.append(array)
         if file.tell() != end or checksum != about["checksum"]:
@@ -107,6 +108,8 @@ class PairFile:
         """Open a new file to write the rows to. Returns it with a folder for temporary files."""
         try:
             folder = self.path.parent
+            if sys.platform == "win32":
+                raise OSError(errno.EACCES, "Windows renames no file that is mapped")
             self._new = self._part.open("w+b")
             self._is_kept = True
         except OSError as error:
@@ -124,7 +127,7 @@ class PairFile:
         return self.path.with_name(self.path.name + ".part")
 
     def keep(self, pairs: EventPairs, pictures: NDArray[np.int16]) -> None:
-        """Keep pairs and pictures, if their rows went to a file. Otherwise no file is left that is of no use."""
+        """Keep pairs and pictures if their rows went to a file. Otherwise delete an older file of pairs."""
         if self._new is None:
             with suppress(OSError):
                 self.path.unlink(missing_ok=True)
@@ -152,7 +155,7 @@ class PairFile:
 
     @contextmanager
     def making(self, alone: bool) -> Iterator[None]:
-        """Delete what is not finished, and say so in one clear line where the disk is full.
+        """Delete an unfinished file at the end, and raise one clear error where the disk is full.
 
         Args:
             alone: let one process at a time make the file.

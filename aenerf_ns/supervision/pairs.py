@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -349,7 +350,10 @@ class _PairTable:
         if self._device.type == "cpu":
             self._find_rows = _CpuTable(*arrays).find_rows
         else:
-            self._find_rows = partial(find_rows, *(torch.from_numpy(array).to(self._device) for array in arrays))
+            with warnings.catch_warnings():
+                # Torch warns of rows that are mapped read-only. They are only copied.
+                warnings.simplefilter("ignore", UserWarning)
+                self._find_rows = partial(find_rows, *(torch.from_numpy(array).to(self._device) for array in arrays))
 
     def draw(self, num_moments: int, num_events: int, max_events: int) -> Tensor:
         """Draw pairs: first around uniform moments at uniform pixels, then pairs that end at uniform events.
@@ -378,7 +382,7 @@ class _PairTable:
 
 
 class _CpuTable:
-    """Does what :func:`find_rows` does, in less time on a CPU.
+    """Find rows as :func:`find_rows` does, in less time on a CPU.
 
     Args:
         arrays: the first three arguments of :func:`find_rows`.

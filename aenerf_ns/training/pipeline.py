@@ -102,11 +102,11 @@ class AENeRFPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
         """Return outputs, weighted losses and metrics of a training batch.
 
-        There are metrics at the steps that the trainer logs. At every hundredth step the errors of the corrected poses
-        are among them. Whether the losses are finite is looked at after the backward pass, with the gradients.
+        There are metrics only at the steps that the trainer logs, with the errors of the corrected poses if the step is
+        a multiple of 100. The losses are checked after the backward pass, together with the gradients.
         """
         rays, batch = self.datamanager.next_train(step)
-        # In several processes it is wrapped in DistributedDataParallel.
+        # In several processes the model is wrapped in DistributedDataParallel.
         outputs = self._model(rays)
         metrics = {}
         if step_check(step, self._steps_per_log, run_at_zero=True):

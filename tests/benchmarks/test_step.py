@@ -53,6 +53,7 @@ def test_the_parts_of_a_step_add_up_and_take_their_share_of_the_backward_pass() 
     assert seconds["backward of losses"] > 3 * seconds["backward of field"]
 
 
+@pytest.mark.slow
 def test_the_command_compares_steps_and_pictures_and_lists_the_parts(tmp_path: Path) -> None:
     row = measure(write_native(tmp_path / "data"), "--measure", "temporal-loss", "--rounds", "2")
     assert "temporal-loss 0.001" in row["subject"]["arguments"]

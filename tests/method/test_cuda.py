@@ -163,10 +163,10 @@ def test_a_step_waits_once_and_copies_nothing_else(temporal: bool, tmp_path: Pat
 @pytest.mark.parametrize(
     ("grid", "temporal", "launches", "gigabytes"),
     [
-        ("torch", False, 862, 48.6),
-        ("torch", True, 1668, 59.9),
-        ("triton", False, 767, 14.0),
-        ("triton", True, 1473, 20.1),
+        ("torch", False, 856, 48.6),
+        ("torch", True, 1670, 59.9),
+        ("triton", False, 761, 14.0),
+        ("triton", True, 1475, 20.1),
     ],
 )
 def test_what_a_step_of_the_full_method_costs(
