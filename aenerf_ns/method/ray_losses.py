@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def distortion_loss(weights: Tensor, samples: RaySamples) -> Tensor:
-    """Return the distortion loss (paper, eq. 14; Mip-NeRF 360, eq. 15), the mean over rays, as the framework does.
+    """Return the distortion loss (paper, eq. 13; Mip-NeRF 360, eq. 15), the mean over rays, as the framework does.
 
     The framework compares every sample of a ray with every other one. Running sums give the same value in linear time,
     because the samples are ordered: the sum of w_i w_j |m_i - m_j| is twice that of w_i w_j (m_i - m_j) over j < i.
