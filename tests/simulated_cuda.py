@@ -1,8 +1,8 @@
 """A simulated GPU: tensors that say they are on another device and are computed on the CPU.
 
-What costs time on a GPU is recorded: transfers, waits, kernels, and the bytes that kernels read and write. Operations
-on tensors of two devices are refused as on a GPU. Within a ``FakeTensorMode`` shapes are computed and no values, so a
-step of any size can be counted.
+It records the events that cost time on a GPU: transfers, waits, kernels, and the bytes that kernels read and write.
+It refuses operations on tensors of two devices, as a GPU does. Within a ``FakeTensorMode`` shapes are computed and no
+values, so a step of any size can be counted.
 
 torch gives Python a kind of device, with streams that do nothing, for backends that are written in Python. So the real
 autograd engine and the real optimizers run. No kernel of CUDA does: nothing is learned of their numerics or speed.
@@ -51,7 +51,7 @@ def device() -> torch.device:
 
 
 class _Backend:
-    """What torch asks a kind of device for."""
+    """Answer the questions that torch asks a kind of device."""
 
     def is_initialized(self) -> bool:
         return True
@@ -113,7 +113,7 @@ class OnDevice(Tensor):
 
 @dataclass
 class Counts:
-    """What a piece of a program did with the device.
+    """Count the uses of the device by a piece of a program.
 
     Attributes:
         uploads: transfers from the CPU. From pageable memory, as all here are, they wait for the device.
@@ -252,7 +252,7 @@ def _bytes(name: str, inputs: list[Tensor], outputs: list[Tensor]) -> int:
     if name in ("index_select", "gather", "index"):
         return sum(map(_size, integers)) + 2 * _size(outputs[0])
     if "index_put" in name or name.startswith(("index_add", "scatter_add")):
-        # What is added is read, and the places where it goes are read and written.
+        # The kernel reads the values to add, and it reads and writes the places that they are added to.
         copied = 0 if name.endswith("_") else 2 * _size(outputs[0])
         return sum(map(_size, integers)) + 3 * _size(inputs[-1]) + copied
     return sum(map(_size, inputs)) + sum(map(_size, outputs))

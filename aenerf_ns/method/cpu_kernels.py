@@ -1,4 +1,4 @@
-"""What kernels for CPUs share: how numba compiles them, and the threads that run them.
+"""Shared by the kernels for CPUs: the way numba compiles kernels, and the threads that run kernels.
 
 The kernels release Python's lock and run on a pool of this module's own. Numba's own threads die when two Python
 threads enter them at once, as the viewer and the training do.

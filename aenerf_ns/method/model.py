@@ -212,7 +212,11 @@ class AENeRFModel(Model):
             needs rates of. Otherwise also ``rgb`` (N, 3) colour-corrected display values, ``accumulation`` (N, 1) and
             ``depth`` (N, 1), the median distance along the ray in scene units.
         """
+        steps_since_update = self.proposal_sampler._steps_since_update
         samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
+        if not self.training:
+            # A picture must not move the steps that train the proposal networks.
+            self.proposal_sampler._steps_since_update = steps_since_update
         outputs: dict[str, Any] = {}
         num_rates = 0
         if self.training and _is_of_batch(ray_bundle):
@@ -311,11 +315,8 @@ class AENeRFModel(Model):
         """Return log-radiance (N, channels) of any number of rays, rendered in evaluation mode."""
         was_training = self.training
         self.eval()
-        # The sampler counts renderings to find the steps that train the proposal networks.
-        steps_since_update = self.proposal_sampler._steps_since_update
         chunk = self.config.eval_num_rays_per_chunk
         rendered = [self(rays[begin : begin + chunk])["log_radiance"] for begin in range(0, len(rays), chunk)]
-        self.proposal_sampler._steps_since_update = steps_since_update
         self.train(was_training)
         return torch.cat(rendered)
 

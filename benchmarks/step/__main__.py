@@ -64,7 +64,7 @@ class StepCost:
     against: str = "ae14542"
     """Earlier commit to compare with."""
     measure: tuple[Measurement, ...] = get_args(Measurement)
-    """What to measure."""
+    """The comparisons to make."""
     rounds: int = 12
     """Turns of each side, at least 2."""
     psnr: float = 28.5

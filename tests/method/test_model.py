@@ -195,3 +195,14 @@ def test_the_viewer_s_cameras_are_rendered(mode: str) -> None:
     camera = get_camera(state, 6, 8)
     assert camera.times is not None
     assert model.get_outputs_for_camera(camera)["rgb"].shape == (6, 8, 3)
+
+
+def test_a_picture_does_not_move_the_steps_that_train_the_proposal_networks() -> None:
+    model = make_model()
+    sampler = model.proposal_sampler
+    # Late enough for the sampler to leave out steps, and due for an update.
+    sampler._step, sampler._steps_since_update = 5000, 100
+    model.eval()(make_rays())
+    assert sampler._steps_since_update == 100
+    model.train()(make_rays())
+    assert sampler._steps_since_update == 0
