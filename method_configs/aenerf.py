@@ -42,7 +42,7 @@ aenerf = MethodSpecification(
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
             "camera_opt": {
-                "optimizer": FusedAdamOptimizerConfig(lr=2e-3, eps=1e-15),
+                "optimizer": FusedAdamOptimizerConfig(lr=8e-3, eps=1e-15),
                 "scheduler": RelativeCosineSchedulerConfig(),
             },
         },

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,6 +25,9 @@ from aenerf_ns.method.encoding.hash_grid import HashEncoding, Implementation
 # The framework's trunc_exp cuts gradients at the same value, but it overflows, and it is a custom function without
 # forward-mode derivatives.
 _MAX_LOG_DENSITY = 15.0
+
+ToFieldSpace = Callable[[Tensor], Tensor]
+"""Maps positions (..., 3) in the scene to the places where a field is looked up."""
 
 # The hidden layer whose output the encoding is joined to (NeRF, https://arxiv.org/abs/2003.08934, fig. 7).
 _SKIP_LAYER = 5
@@ -75,15 +79,22 @@ class DensityField(Field):
         spatial_distortion: contraction of space to a ball or cube of radius 2, or None for a bounded scene.
         encoding: of positions in the contracted space or box, which is scaled to [0, 1] along each axis.
         shape: of the network.
+        to_field_space: see :class:`.comoving.CoMovingSpace`, or None for a field that is fixed in the scene.
     """
 
     aabb: Tensor
 
     def __init__(
-        self, aabb: Tensor, spatial_distortion: SpatialDistortion | None, encoding: Encoding, shape: DensityShape
+        self,
+        aabb: Tensor,
+        spatial_distortion: SpatialDistortion | None,
+        encoding: Encoding,
+        shape: DensityShape,
+        to_field_space: ToFieldSpace | None,
     ) -> None:
         super().__init__()
         self.register_buffer("aabb", aabb)
+        self.to_field_space = to_field_space
         self.spatial_distortion = spatial_distortion
         self.density_activation = shape.activation
         self.average_init_density = shape.average_init_density
@@ -128,6 +139,7 @@ class EventRadianceField(DensityField):
         encoding: see :class:`DensityField`.
         density: the network to density and feature.
         radiance: the network to radiance.
+        to_field_space: see :class:`DensityField`.
     """
 
     def __init__(
@@ -137,8 +149,9 @@ class EventRadianceField(DensityField):
         encoding: Encoding,
         density: DensityShape,
         radiance: RadianceShape,
+        to_field_space: ToFieldSpace | None,
     ) -> None:
-        super().__init__(aabb, spatial_distortion, encoding, density)
+        super().__init__(aabb, spatial_distortion, encoding, density, to_field_space)
         self.direction_encoding = NeRFEncoding(
             in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True, implementation="torch"
         )
@@ -179,6 +192,7 @@ class ProposalNetwork(HashMLPDensityField):
         max_res: cells along an axis on the finest level.
         log2_hashmap_size: binary logarithm of the entries of a level.
         grid_implementation: how the hash grid is computed, see :class:`.encoding.hash_grid.HashEncoding`.
+        to_field_space: see :class:`DensityField`.
         options: the other options of the framework's network.
     """
 
@@ -189,11 +203,13 @@ class ProposalNetwork(HashMLPDensityField):
         max_res: int,
         log2_hashmap_size: int,
         grid_implementation: Implementation,
+        to_field_space: ToFieldSpace | None,
         **options: Any,
     ) -> None:
         grid = {"num_levels": num_levels, "max_res": max_res, "log2_hashmap_size": log2_hashmap_size}
         super().__init__(aabb, implementation="torch", **grid, **options)
         self.encoding = self.mlp_base[0] = HashEncoding(grid_implementation, **grid)
+        self.to_field_space = to_field_space
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, None]:
         """Return density (..., 1), and no feature."""
@@ -205,12 +221,18 @@ class ProposalNetwork(HashMLPDensityField):
 def _unit_positions(field: DensityField | ProposalNetwork, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
     """Return positions (..., 3) of samples in the unit cube, 0 outside the scene, and which (..., 1) are inside."""
     positions = ray_samples.frustums.get_positions()
-    if field.spatial_distortion is not None:
-        positions = (field.spatial_distortion(positions) + 2) / 4
-    else:
-        positions = SceneBox.get_normalized_positions(positions, field.aabb)
+    if field.to_field_space is not None:
+        positions = field.to_field_space(positions)
+    positions = to_unit_cube(positions, field.spatial_distortion, field.aabb)
     inside = ((positions > 0) & (positions < 1)).all(-1, keepdim=True)
     return positions * inside, inside
+
+
+def to_unit_cube(positions: Tensor, spatial_distortion: SpatialDistortion | None, aabb: Tensor) -> Tensor:
+    """Return positions (..., 3) scaled to the unit cube: of the contracted space, or of the scene box without one."""
+    if spatial_distortion is not None:
+        return (spatial_distortion(positions) + 2) / 4
+    return SceneBox.get_normalized_positions(positions, aabb)
 
 
 def _exponential_density(raw: Tensor, average_init_density: float) -> Tensor:

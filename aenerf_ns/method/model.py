@@ -30,6 +30,8 @@ from aenerf_ns.camera.image_encoding import decode, encode, to_channels
 from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
 from aenerf_ns.method.box_collider import BoxCollider
 from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
+from aenerf_ns.method.comoving import CoMovingSpace
+from aenerf_ns.method.field import to_unit_cube
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method.initial_samplers import EvenSampler, EvenThenDisparitySampler
 from aenerf_ns.method.networks import Backbone, FieldConfig, ProposalConfig, make_networks
@@ -42,6 +44,10 @@ from aenerf_ns.supervision.pairs import PairSupervisionConfig
 
 # ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
+
+# Share of a run in which the space that moves along with the poses counts rays, and the steps between two of its
+# weighings. A weighing moves the field a little, so the weights must stay for the rest of the run.
+_OBSERVED_SHARE, _WEIGHING_INTERVAL = 0.3, 8
 
 
 @dataclass
@@ -66,8 +72,9 @@ class AENeRFModelConfig(ModelConfig):
     """The event radiance field."""
     proposal: ProposalConfig = dataclasses.field(default_factory=ProposalConfig)
     """The proposal networks."""
-    average_init_density: float = 0.01
-    """Density of field and proposal networks before training."""
+    average_init_density: float = 10.0
+    """Density of field and proposal networks before training, per scene unit. A scene that starts nearly transparent
+    sits in a fog for hundreds of steps, until matter grows out of it."""
     loss_coefficients: dict[str, float] = to_immutable_dict(
         {"reconstruction_loss": 1.0, "temporal_loss": 0.0, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
     )
@@ -113,6 +120,19 @@ class AENeRFModel(Model):
         else:
             self.collider = NearFarCollider(config.near_plane, config.far_plane, reset_near_plane=False)
 
+        self.camera_optimizer: PoseCorrection = config.camera_optimizer.setup(
+            num_cameras=self.num_train_data,
+            device=self.kwargs.get("device", "cpu"),
+            trajectory=deepcopy(scene.trajectory),
+            camera_times=scene.camera_times,
+            ground_truth=deepcopy(scene.ground_truth),
+        )
+        self.space = (
+            CoMovingSpace(self.camera_optimizer, lambda positions: to_unit_cube(positions, distortion, self.field.aabb))
+            if self.camera_optimizer.twists is not None
+            else None
+        )
+        self._observes_rays = False
         self.field, proposal_networks = make_networks(
             config.backbone,
             config.field,
@@ -121,6 +141,7 @@ class AENeRFModel(Model):
             distortion,
             self.sensor.num_channels,
             config.average_init_density,
+            self.space,
         )
         self.proposal_networks = nn.ModuleList(proposal_networks)
         self.density_fns = [network.density_fn for network in proposal_networks]
@@ -137,13 +158,6 @@ class AENeRFModel(Model):
         # softplus(0.54) = 1: of the size of the radiance before training.
         self.raw_background = (
             Parameter(torch.full((self.sensor.num_channels,), 0.54)) if background == "learned" else None
-        )
-        self.camera_optimizer: PoseCorrection = config.camera_optimizer.setup(
-            num_cameras=self.num_train_data,
-            device=self.kwargs.get("device", "cpu"),
-            trajectory=deepcopy(scene.trajectory),
-            camera_times=scene.camera_times,
-            ground_truth=deepcopy(scene.ground_truth),
         )
         self.supervision: Supervision = config.supervision.setup(
             sensor=self.sensor, loss_coefficients=config.loss_coefficients
@@ -173,7 +187,15 @@ class AENeRFModel(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return the callbacks that schedule the proposal sampler as the framework's own methods do."""
+        """Return the callbacks that schedule the proposal sampler, as the framework's own methods do, and the space."""
+        trainer = training_callback_attributes.trainer
+        assert trainer is not None
+        observed_until = _OBSERVED_SHARE * trainer.config.max_num_iterations
+
+        def weigh(step: int) -> None:
+            self._observes_rays = self.space is not None and step < observed_until
+            if self.space is not None and self._observes_rays and step % _WEIGHING_INTERVAL == 0:
+                self.space.weigh()
 
         def set_anneal(step: int) -> None:
             # https://arxiv.org/pdf/2111.12077.pdf, eq. 18
@@ -181,8 +203,10 @@ class AENeRFModel(Model):
             slope = 10.0
             self.proposal_sampler.set_anneal(slope * progress / ((slope - 1) * progress + 1))
 
+        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         return [
-            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], set_anneal, update_every_num_iters=1),
+            TrainingCallback(before, set_anneal, update_every_num_iters=1),
+            TrainingCallback(before, weigh, update_every_num_iters=1),
             TrainingCallback(
                 [TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
                 self.proposal_sampler.step_cb,
@@ -212,6 +236,8 @@ class AENeRFModel(Model):
             needs rates of. Otherwise also ``rgb`` (N, 3) colour-corrected display values, ``accumulation`` (N, 1) and
             ``depth`` (N, 1), the median distance along the ray in scene units.
         """
+        if self.space is not None:
+            self.space.follow()
         steps_since_update = self.proposal_sampler._steps_since_update
         samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
         if not self.training:
@@ -234,6 +260,9 @@ class AENeRFModel(Model):
             log_radiance, weights = torch.cat([ends, log_radiance]), torch.cat([weights_of_ends, weights])
         else:
             log_radiance, weights = self._composite(samples)
+        if self.space is not None and self.training and self._observes_rays and ray_bundle.times is not None:
+            positions = samples.frustums.get_positions().detach()
+            self.space.observe(positions, weights[..., 0].detach(), ray_bundle.times[:, 0])
         weights_list.append(weights)
         samples_list.append(samples)
         outputs["log_radiance"] = log_radiance

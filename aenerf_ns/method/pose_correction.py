@@ -94,12 +94,12 @@ class PoseCorrection(CameraOptimizer):
         self.has_ground_truth = ground_truth is not None
         self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
         self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
-        self._duration = (trajectory.end - trajectory.start) * 1e-9
+        self.duration = (trajectory.end - trajectory.start) * 1e-9
         # A camera that only turns gives translations no unit. The unit of the scene serves instead.
         extent = trajectory.extent if trajectory.extent > _SMALLEST_EXTENT else 1.0
         # Times in every interval of the spline, at which the size of the corrections is taken.
-        count = max(64, math.ceil(self._duration / config.knot_interval))
-        sampled = torch.linspace(0, self._duration, count, dtype=torch.float64)
+        count = max(64, math.ceil(self.duration / config.knot_interval))
+        sampled = torch.linspace(0, self.duration, count, dtype=torch.float64)
         for name, value in (
             ("_twist_units", torch.tensor([extent] * 3 + [1.0] * 3, dtype=torch.float64)),
             ("_sampled_seconds", sampled),
@@ -113,7 +113,7 @@ class PoseCorrection(CameraOptimizer):
         if config.mode == "network":
             self.twists = TwistNetwork(trajectory, config.num_frequencies)
         elif config.mode == "spline":
-            self.twists = TwistSpline(self._duration, config.knot_interval)
+            self.twists = TwistSpline(self.duration, config.knot_interval)
 
     def pose(self, seconds: Tensor) -> Tensor:
         """Return corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
@@ -173,6 +173,20 @@ class PoseCorrection(CameraOptimizer):
                 moved = (motion @ homogeneous(poses.double()))[:, :3]
                 carried = torch.where(on_trajectory[:, None, None], moved, carried)
             return carried.to(poses)
+
+    def world_twists(self, seconds: Tensor, base: Tensor) -> Tensor:
+        """Return the float64 twists (N, 6) in the world that correct poses, in scene units and radians.
+
+        The corrected pose is exp(twist) · base pose, to first order base pose + (v + ω × position).
+
+        Args:
+            seconds: (N,) float64 times since the trajectory's start.
+            base: (N, 3, 4) base poses at these times.
+        """
+        assert self.twists is not None
+        twists = self._twist_units * self.twists(seconds, base)
+        translation, rotation = (base[:, None, :, :3] @ twists.unflatten(-1, (2, 3, 1)))[..., 0].unbind(1)
+        return torch.cat([translation + torch.linalg.cross(base[..., 3], rotation), rotation], -1)
 
     def alignment(self) -> Similarity:
         """Return the Sim(3) that best maps the corrected trajectory to the true one.

@@ -1,0 +1,76 @@
+"""Lookup of twists for CPUs: kernels compiled by numba, which :mod:`.comoving` differentiates."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from aenerf_ns.method.cpu_kernels import as_array, compiled, run_ranges
+
+# Points that one thread computes at least.
+_BLOCK = 4096
+
+_F = np.float32
+_ZERO, _HALF, _ONE = _F(0), _F(0.5), _F(1)
+
+
+def values(grid: Tensor, unit: Tensor) -> Tensor:
+    """Return the values (N, columns) of a contiguous grid (r, r, r, columns) at contiguous places (N, 3)."""
+    out = unit.new_empty(len(unit), grid.shape[-1])
+    cells, places, found = as_array(grid), as_array(unit), as_array(out)
+    run_ranges(lambda first, last: _fill_values(cells, places[first:last], found[first:last]), len(unit), _BLOCK)
+    return out
+
+
+def gradient(unit: Tensor, grad: Tensor, resolution: int) -> Tensor:
+    """Return the gradient (r, r, r, columns) of the grid for that (N, columns) of its values.
+
+    One thread adds up, because several would need a grid each and would change the order of the sums.
+    """
+    out = grad.new_zeros(resolution, resolution, resolution, grad.shape[-1])
+    _add_gradient(as_array(unit), as_array(grad), as_array(out))
+    return out
+
+
+def probe(device: torch.device) -> None:
+    """Compute one value."""
+    values(torch.zeros(2, 2, 2, 6, device=device), torch.zeros(1, 3, device=device))
+
+
+@compiled
+def _place(unit, resolution):
+    """Return the cell below a coordinate in [0, 1], and the share of the next cell."""
+    x = min(max(unit * _F(resolution) - _HALF, _ZERO), _F(resolution - 1))
+    lower = min(int(x), resolution - 2)
+    return lower, x - _F(lower)
+
+
+@compiled
+def _fill_values(grid, unit, out):
+    resolution, columns = grid.shape[0], grid.shape[3]
+    for n in range(len(unit)):
+        i, u = _place(unit[n, 0], resolution)
+        j, v = _place(unit[n, 1], resolution)
+        k, w = _place(unit[n, 2], resolution)
+        for c in range(columns):
+            out[n, c] = _ZERO
+        for corner in range(8):
+            a, b, d = corner >> 2, (corner >> 1) & 1, corner & 1
+            weight = (u if a else _ONE - u) * (v if b else _ONE - v) * (w if d else _ONE - w)
+            for c in range(columns):
+                out[n, c] += weight * grid[i + a, j + b, k + d, c]
+
+
+@compiled
+def _add_gradient(unit, grad, out):
+    resolution, columns = out.shape[0], out.shape[3]
+    for n in range(len(unit)):
+        i, u = _place(unit[n, 0], resolution)
+        j, v = _place(unit[n, 1], resolution)
+        k, w = _place(unit[n, 2], resolution)
+        for corner in range(8):
+            a, b, d = corner >> 2, (corner >> 1) & 1, corner & 1
+            weight = (u if a else _ONE - u) * (v if b else _ONE - v) * (w if d else _ONE - w)
+            for c in range(columns):
+                out[i + a, j + b, k + d, c] += weight * grad[n, c]
