@@ -123,7 +123,8 @@ class Trajectory(nn.Module):
             (..., 3, 4) float64 camera-to-world poses.
         """
         (c0, c1, c2, c3), time = self._place(seconds)
-        position, quaternion = (c0 + time * (c1 + time * (c2 + time * c3))).split((3, 4), -1)
+        value = torch.addcmul(c0, time, torch.addcmul(c1, time, torch.addcmul(c2, time, c3)))
+        position, quaternion = value.split((3, 4), -1)
         unit = quaternion / quaternion.norm(dim=-1, keepdim=True)
         rotation = (unit[..., None] * unit[..., None, :]).flatten(-2) @ self._products
         return torch.cat([rotation.unflatten(-1, (3, 3)), position[..., None]], -1)
@@ -141,13 +142,17 @@ class Trajectory(nn.Module):
             (..., 3, 4) float64 poses and (..., 3, 4) float64 rates per second.
         """
         (c0, c1, c2, c3), time = self._place(seconds)
-        position, quaternion = (c0 + time * (c1 + time * (c2 + time * c3))).split((3, 4), -1)
-        velocity, rate = (c1 + time * (2 * c2 + time * (3 * c3))).split((3, 4), -1)
+        # Horner's scheme, which gives the derivative on the way.
+        b2 = torch.addcmul(c2, time, c3)
+        b1 = torch.addcmul(c1, time, b2)
+        position, quaternion = torch.addcmul(c0, time, b1).split((3, 4), -1)
+        velocity, rate = torch.addcmul(b1, time, torch.addcmul(b2, time, c3)).split((3, 4), -1)
         length = quaternion.norm(dim=-1, keepdim=True)
         unit, rate = quaternion / length, rate / length
-        # The rotation depends on the direction of the quaternion only. It is quadratic in it, hence the 2.
-        rate = 2 * (rate - (unit * rate).sum(-1, keepdim=True) * unit)
-        products = torch.stack([unit, rate], -2)[..., None] * unit[..., None, None, :]
+        # The rotation depends on the direction of the quaternion only.
+        rate = torch.addcmul(rate, (unit * rate).sum(-1, keepdim=True), unit, value=-1)
+        # The rotation is quadratic in the unit quaternion, hence the 2.
+        products = torch.stack([unit, 2 * rate], -2)[..., None] * unit[..., None, None, :]
         rotation, turning = (products.flatten(-2) @ self._products).unflatten(-1, (3, 3)).unbind(-3)
         return torch.cat([rotation, position[..., None]], -1), torch.cat([turning, velocity[..., None]], -1)
 
@@ -156,7 +161,8 @@ class Trajectory(nn.Module):
 
         The times in the segments are (..., 1), in seconds.
         """
-        segment = (torch.searchsorted(self._knots, seconds.detach(), right=True) - 1).clamp(0, len(self) - 2)
+        # The inner knots bound the segments: a time at the last knot lies in the last segment.
+        segment = torch.searchsorted(self._knots[1:-1], seconds.detach(), right=True)
         return self._polynomials[segment].unbind(-2), (seconds - self._knots[segment])[..., None]
 
     def interpolate(self, times: ArrayLike | Tensor) -> Tensor:
