@@ -9,11 +9,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from aenerf_ns.camera.rotation import (
-    cross_matrix,
-    quaternion_from_rotation,
-    vector_from_quaternion,
-)
+from aenerf_ns.camera.pose_spline import pose_polynomials, rotation_from_products
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.time_window import TimeWindow
 
@@ -28,7 +24,9 @@ _MAX_RIGIDITY_ERROR = 1e-4
 class Trajectory(nn.Module):
     """Camera-to-world poses in continuous time (paper, appendix "Training").
 
-    Between knots, positions are interpolated linearly and rotations spherically.
+    The poses pass through the knots. Between knots, positions and rotations follow cubic splines with continuous
+    velocities and accelerations (:func:`~aenerf_ns.camera.pose_spline.pose_polynomials`). No spline crosses a gap,
+    which is a segment much longer than its neighbours. There the camera moves straight and turns about one axis.
 
     It is a module so that the knots move with a model to its device. It has no parameters and adds nothing to
     checkpoints. Everything is float64, and times are integer nanoseconds or float64 seconds since ``start``: in float32
@@ -56,8 +54,8 @@ class Trajectory(nn.Module):
     times: Tensor
     camera_to_worlds: Tensor
     _knots: Tensor
-    _segments: Tensor
-    _motions: Tensor
+    _polynomials: Tensor
+    _products: Tensor
 
     def __init__(self, times: ArrayLike | Tensor, camera_to_worlds: Tensor, source: str | Path = "trajectory") -> None:
         super().__init__()
@@ -79,26 +77,13 @@ class Trajectory(nn.Module):
         if bad.any():
             raise DataError(source, f"pose {int(bad.nonzero()[0])} is not finite", "drop it or interpolate it")
         require_rigid(poses, source)
-        rotations = poses[:, :, :3]
-        relative = rotations[:-1].mT @ rotations[1:]
-        steps = vector_from_quaternion(quaternion_from_rotation(relative))
-        angles = steps.norm(dim=-1, keepdim=True)
-        # Along a segment the camera turns about one axis, at one speed: by Rodrigues' formula its pose is a sum of four
-        # matrices, with the factors 1, sin α, 1 − cos α and the share w of the segment that has passed, α = w angle.
-        axes = cross_matrix(steps / angles.clamp_min(torch.finfo(torch.float64).tiny))
-        motions = torch.zeros(len(steps), 4, 3, 4, dtype=torch.float64, device=poses.device)
-        motions[:, 0] = poses[:-1]
-        motions[:, 1, :, :3] = rotations[:-1] @ axes
-        motions[:, 2, :, :3] = rotations[:-1] @ axes @ axes
-        motions[:, 3, :, 3] = poses[1:, :, 3] - poses[:-1, :, 3]
         seconds = (times - times[0]).to(torch.float64) * 1e-9
         for name, value in (
             ("times", times),
             ("camera_to_worlds", poses),
             ("_knots", seconds),
-            # Start and duration in seconds, and angle in radians.
-            ("_segments", torch.stack([seconds[:-1], seconds.diff(), angles[:, 0]], -1)),
-            ("_motions", motions.flatten(2)),
+            ("_polynomials", pose_polynomials(seconds, poses)),
+            ("_products", rotation_from_products().to(poses.device)),
         ):
             self.register_buffer(name, value, persistent=False)
 
@@ -137,15 +122,18 @@ class Trajectory(nn.Module):
         Returns:
             (..., 3, 4) float64 camera-to-world poses.
         """
-        segment, _, _, weight, turned = self._place(seconds)
-        factors = torch.stack([torch.ones_like(weight), torch.sin(turned), 1 - torch.cos(turned), weight], -1)
-        return (factors[..., None, :] @ self._motions[segment]).unflatten(-1, (3, 4)).squeeze(-3)
+        (c0, c1, c2, c3), time = self._place(seconds)
+        value = torch.addcmul(c0, time, torch.addcmul(c1, time, torch.addcmul(c2, time, c3)))
+        position, quaternion = value.split((3, 4), -1)
+        unit = quaternion / quaternion.norm(dim=-1, keepdim=True)
+        rotation = (unit[..., None] * unit[..., None, :]).flatten(-2) @ self._products
+        return torch.cat([rotation.unflatten(-1, (3, 3)), position[..., None]], -1)
 
     def pose_and_rate(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of :meth:`pose` and their derivatives with respect to time.
 
-        The closed form costs a fraction of differentiating :meth:`pose`. At a knot the rate is the rate of the segment
-        after the knot.
+        The closed form costs a fraction of differentiating :meth:`pose`. The rate jumps at the ends of a gap, and there
+        it is the rate after the knot.
 
         Args:
             seconds: (...) float64 seconds since ``start``.
@@ -153,25 +141,29 @@ class Trajectory(nn.Module):
         Returns:
             (..., 3, 4) float64 poses and (..., 3, 4) float64 rates per second.
         """
-        segment, duration, angle, weight, turned = self._place(seconds)
-        sine, cosine, one = torch.sin(turned), torch.cos(turned), torch.ones_like(weight)
-        speed = angle / duration
-        factors = torch.stack(
-            [one, sine, 1 - cosine, weight, torch.zeros_like(one), speed * cosine, speed * sine, one / duration], -1
-        )
-        pose, rate = (factors.unflatten(-1, (2, 4)) @ self._motions[segment]).unflatten(-1, (3, 4)).unbind(-3)
-        return pose, rate
+        (c0, c1, c2, c3), time = self._place(seconds)
+        # Horner's scheme, which gives the derivative on the way.
+        b2 = torch.addcmul(c2, time, c3)
+        b1 = torch.addcmul(c1, time, b2)
+        position, quaternion = torch.addcmul(c0, time, b1).split((3, 4), -1)
+        velocity, rate = torch.addcmul(b1, time, torch.addcmul(b2, time, c3)).split((3, 4), -1)
+        length = quaternion.norm(dim=-1, keepdim=True)
+        unit, rate = quaternion / length, rate / length
+        # The rotation depends on the direction of the quaternion only.
+        rate = torch.addcmul(rate, (unit * rate).sum(-1, keepdim=True), unit, value=-1)
+        # The rotation is quadratic in the unit quaternion, hence the 2.
+        products = torch.stack([unit, 2 * rate], -2)[..., None] * unit[..., None, None, :]
+        rotation, turning = (products.flatten(-2) @ self._products).unflatten(-1, (3, 3)).unbind(-3)
+        return torch.cat([rotation, position[..., None]], -1), torch.cat([turning, velocity[..., None]], -1)
 
-    def _place(self, seconds: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return the segments that times (...) lie in, and the place in the segment, each (...).
+    def _place(self, seconds: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Return the four coefficients (..., 7) of the segments that times (...) lie in, and the time in them.
 
-        They are the index of the segment, its duration in seconds and its angle in radians, the share of the duration
-        that has passed, and the angle that the camera has turned by.
+        The times in the segments are (..., 1), in seconds.
         """
-        segment = (torch.searchsorted(self._knots, seconds.detach(), right=True) - 1).clamp(0, len(self) - 2)
-        start, duration, angle = self._segments[segment].unbind(-1)
-        weight = (seconds - start) / duration
-        return segment, duration, angle, weight, weight * angle
+        # The inner knots bound the segments: a time at the last knot lies in the last segment.
+        segment = torch.searchsorted(self._knots[1:-1], seconds.detach(), right=True)
+        return self._polynomials[segment].unbind(-2), (seconds - self._knots[segment])[..., None]
 
     def interpolate(self, times: ArrayLike | Tensor) -> Tensor:
         """Return the poses at given times.
@@ -199,6 +191,8 @@ class Trajectory(nn.Module):
     def between(self, start: int, end: int) -> Trajectory:
         """Return the shortest run of knots that covers as much of [start, end] (nanoseconds) as the trajectory does.
 
+        The poses within the part are those of the whole trajectory.
+
         Raises:
             DataError: the trajectory and the interval do not overlap.
         """
@@ -210,7 +204,9 @@ class Trajectory(nn.Module):
                 f"its poses from {self.start} to {self.end} ns do not overlap the events from {start} to {end} ns",
                 "check that events and poses share one clock and one unit of time",
             )
-        return Trajectory(self.times[first : last + 1], self.camera_to_worlds[first : last + 1], self.source)
+        part = Trajectory(self.times[first : last + 1], self.camera_to_worlds[first : last + 1], self.source)
+        part._polynomials = self._polynomials[first:last]
+        return part
 
     def window(self, longest_gap: int | None = None) -> TimeWindow:
         """Return the time in which poses are known: the span of the knots, without the gaps.
@@ -246,7 +242,11 @@ class Trajectory(nn.Module):
         return times
 
     def mapped(self, function) -> Trajectory:
-        """Return the trajectory with ``function`` applied to its (N, 4, 4) float64 camera-to-world matrices."""
+        """Return the trajectory with ``function`` applied to its (N, 4, 4) float64 camera-to-world matrices.
+
+        The poses between the knots follow from the mapped knots. They do not depend on knots that :meth:`between` has
+        cut off, so map before you cut.
+        """
         return Trajectory(self.times, function(homogeneous(self.camera_to_worlds)), self.source)
 
 

@@ -73,16 +73,16 @@ class EventDataParser(DataParser):
     def _generate_dataparser_outputs(self, split: Split = "train", **kwargs: object) -> DataparserOutputs:
         recording = self.recording
         window = self._time_window(recording, say=split == "train")
-        trajectory = recording.trajectory.between(window.start, window.end).mapped(
-            lambda poses: poses @ OPENCV_TO_OPENGL
+        trajectory = recording.trajectory.mapped(lambda poses: poses @ OPENCV_TO_OPENGL)
+        transform, scale, scene_box = self._world_transform(
+            trajectory.between(window.start, window.end), recording.scene_box
         )
-        transform, scale, scene_box = self._world_transform(trajectory, recording.scene_box)
 
         def to_scene(poses: Tensor) -> Tensor:
             moved = transform @ poses
             return torch.cat([moved[..., :3], scale * moved[..., 3:]], -1)
 
-        trajectory = trajectory.mapped(to_scene)
+        trajectory = trajectory.mapped(to_scene).between(window.start, window.end)
         ground_truth = recording.ground_truth
         if ground_truth is not None:
             ground_truth = ground_truth.mapped(lambda poses: to_scene(poses @ OPENCV_TO_OPENGL))

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
 
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import (
@@ -60,23 +62,155 @@ def test_the_pose_at_a_knot_is_the_knot(random_poses: torch.Tensor) -> None:
     torch.testing.assert_close(trajectory.interpolate(times), random_poses, rtol=0, atol=1e-13)
 
 
-def test_between_knots_is_lerp_and_slerp(random_poses: torch.Tensor) -> None:
-    first, second = random_poses[:2]
-    trajectory = Trajectory([EPOCH, EPOCH + 1000], random_poses[:2])
+def smooth_poses(seconds: np.ndarray) -> torch.Tensor:
+    """Poses on a smooth path that turns by up to 130 degrees a second, faster and slower."""
+    t = torch.as_tensor(seconds, dtype=torch.float64)[:, None]
+    waves = torch.cat([torch.sin(3 * t), torch.cos(2 * t + 0.4), torch.sin(2.3 * t + 1)], -1)
+    positions = torch.cat([torch.cos(2 * t), torch.sin(2.4 * t), 0.3 * t], -1)
+    return torch.cat([rotation_from_vector(waves), positions[..., None]], -1)
+
+
+def degrees_between(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    relative = first[..., :3].mT @ second[..., :3]
+    return torch.rad2deg(vector_from_quaternion(quaternion_from_rotation(relative)).norm(dim=-1))
+
+
+def lerp_and_slerp(times: np.ndarray, poses: torch.Tensor, at: np.ndarray) -> torch.Tensor:
+    rotations = Slerp(times, Rotation.from_matrix(poses[:, :, :3].numpy()))(at).as_matrix()
+    positions = np.stack([np.interp(at, times, poses[:, k, 3].numpy()) for k in range(3)], -1)
+    return torch.from_numpy(np.concatenate([rotations, positions[..., None]], -1))
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_between_knots_the_pose_is_far_closer_than_lerp_and_slerp(uneven: bool) -> None:
+    times = 40_000_000 * np.arange(76)
+    if uneven:
+        times[1:-1] += np.random.default_rng(1).integers(-12_000_000, 12_000_000, 74)
+    fine = np.arange(0, times[-1], 3_000_000)
+    knots, truth = smooth_poses(times * 1e-9), smooth_poses(fine * 1e-9)
+    poses, chords = Trajectory(times, knots).interpolate(fine), lerp_and_slerp(times, knots, fine)
+    assert degrees_between(chords, truth).mean() > 0.05
+    assert degrees_between(poses, truth).mean() < degrees_between(chords, truth).mean() / 50
+    assert (poses - truth)[..., 3].norm(dim=-1).mean() < (chords - truth)[..., 3].norm(dim=-1).mean() / 50
+    # The ends are no worse.
+    assert degrees_between(poses, truth).max() < degrees_between(chords, truth).mean() / 5
+
+
+def test_the_spline_is_that_of_scipy() -> None:
+    seconds = np.array([0, 0.8, 2, 3, 4.5, 5, 6, 7.3])
+    knots = smooth_poses(seconds / 10)
+    trajectory = Trajectory(np.rint(seconds * 1e9).astype(int), knots)
+    fine = np.linspace(0, 7.3, 50)
+    expected = CubicSpline(seconds, knots[:, :, 3].numpy())(fine)
+    positions = trajectory.pose(torch.from_numpy(fine))[:, :, 3]
+    np.testing.assert_allclose(positions, expected, rtol=0, atol=1e-12)
+
+
+def test_velocity_and_acceleration_are_continuous_at_knots() -> None:
+    seconds = np.array([0, 0.1, 0.25, 0.3, 0.42, 0.5, 0.62])
+    trajectory = Trajectory(np.rint(seconds * 1e9).astype(int), smooth_poses(seconds))
+    step = 1e-6
+    rates = [trajectory.pose_and_rate(torch.from_numpy(seconds[1:-1]) + k * step)[1] for k in (-1.5, -0.5, 0.5, 1.5)]
+    torch.testing.assert_close(rates[1], rates[2], rtol=0, atol=1e-4)
+    before, after = (rates[1] - rates[0]) / step, (rates[3] - rates[2]) / step
+    torch.testing.assert_close(before, after, rtol=0, atol=2e-3)
+    assert before.abs().max() > 1
+
+
+def test_two_knots_are_joined_by_a_steady_motion(random_poses: torch.Tensor) -> None:
+    # A quarter turn about one axis: the rate differs by less than a thousandth from slerp's.
+    turn = rotation_from_vector(torch.tensor([[0.0, 0.0, math.pi / 2]], dtype=torch.float64))
+    second = torch.cat([random_poses[:1, :, :3] @ turn, random_poses[1:2, :, 3:]], -1)
+    poses = torch.cat([random_poses[:1], second])
+    trajectory = Trajectory([EPOCH, EPOCH + 1000], poses)
     for weight in (0.001, 0.25, 0.5, 0.999):
         pose = trajectory.interpolate(EPOCH + round(1000 * weight))
-        torch.testing.assert_close(pose[:, 3], torch.lerp(first[:, 3], second[:, 3], weight), rtol=0, atol=1e-12)
-        # Slerp turns by a share of the angle about the one axis.
-        whole = vector_from_quaternion(quaternion_from_rotation(first[:, :3].T @ second[:, :3]))
-        part = vector_from_quaternion(quaternion_from_rotation(first[:, :3].T @ pose[:, :3]))
-        torch.testing.assert_close(part, weight * whole, rtol=0, atol=1e-12)
+        torch.testing.assert_close(pose[:, 3], torch.lerp(poses[0, :, 3], poses[1, :, 3], weight), rtol=0, atol=1e-12)
+        part = vector_from_quaternion(quaternion_from_rotation(poses[0, :, :3].T @ pose[:, :3]))
+        torch.testing.assert_close(part, torch.tensor([0, 0, weight * math.pi / 2]).double(), rtol=0, atol=1e-3)
+
+
+def test_three_knots_are_joined_by_a_parabola() -> None:
+    seconds = np.array([0, 0.4, 1.0])
+    poses = torch.eye(4, dtype=torch.float64)[:3].repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.from_numpy(seconds**2 - seconds)
+    fine = torch.linspace(0, 1, 9, dtype=torch.float64)
+    x = Trajectory(np.rint(seconds * 1e9).astype(int), poses).pose(fine)[:, 0, 3]
+    torch.testing.assert_close(x, fine**2 - fine, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("lost", [4, 5, 60])
+def test_no_spline_crosses_a_long_gap(lost: int) -> None:
+    times = 10**7 * np.r_[np.arange(40), 39 + lost + 1 + np.arange(40)]
+    seconds = times * 1e-9
+    trajectory = Trajectory(times, smooth_poses(seconds))
+    start, end = seconds[39:41]
+    middle = trajectory.pose(torch.tensor([(start + end) / 2], dtype=torch.float64))
+    truth = smooth_poses(np.array([(start + end) / 2]))
+    ends = trajectory.camera_to_worlds[39:41]
+    if lost == 4:
+        # Four lost frames in a row are bridged.
+        assert degrees_between(middle, truth) < 1e-3
+        return
+    torch.testing.assert_close(middle[0, :, 3], ends[:, :, 3].mean(0), rtol=0, atol=1e-12)
+    halves = degrees_between(middle.expand(2, 3, 4), ends)
+    assert halves[0].item() == pytest.approx(halves[1].item(), rel=1e-9)
+    assert halves.sum().item() == pytest.approx(degrees_between(*ends).item(), rel=1e-9)
+    # On both sides the spline is as good as without the gap, and it does not depend on the other side.
+    for part, kept in ((slice(0, 40), slice(0, 40)), (slice(40, 80), slice(40, 80))):
+        fine = torch.linspace(seconds[part][0], seconds[part][-1], 100, dtype=torch.float64)
+        alone = Trajectory(times[kept], smooth_poses(seconds[kept]))
+        expected = alone.pose((fine - seconds[kept][0]).clamp_min(0))
+        torch.testing.assert_close(trajectory.pose(fine)[:-1], expected[:-1], rtol=0, atol=1e-10)
+        assert degrees_between(trajectory.pose(fine), smooth_poses(fine.numpy())).max() < 1e-3
+
+
+def test_a_step_to_another_rate_of_poses_is_no_gap_on_either_side() -> None:
+    # Only the first of the longer segments is beside a short one.
+    seconds = np.r_[np.arange(10) * 0.01, 0.09 + 0.08 * np.arange(1, 11)]
+    trajectory = Trajectory(np.rint(seconds * 1e9).astype(int), smooth_poses(seconds))
+    fine = np.linspace(0.18, seconds[-1], 99)
+    assert degrees_between(trajectory.pose(torch.from_numpy(fine)), smooth_poses(fine)).max() < 0.1
+
+
+@pytest.mark.parametrize("turn", [60.0, 149.0, 151.0, 179.0])
+def test_large_turns_between_knots_do_not_flip(turn: float) -> None:
+    # The camera turns about one axis. Whatever the knots' quaternions, it never goes the longer way round.
+    angles = math.radians(turn) * torch.arange(12, dtype=torch.float64)
+    axis = torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64)
+    poses = torch.cat([rotation_from_vector(angles[:, None] * axis), torch.zeros(12, 3, 1).double()], -1)
+    fine = torch.linspace(0, 10.999, 400, dtype=torch.float64)
+    expected = rotation_from_vector(math.radians(turn) * fine[:, None] * axis)
+    pose, rate = Trajectory(10**9 * np.arange(12), poses).pose_and_rate(fine)
+    assert degrees_between(pose, expected).max() < 8
+    turning = (pose[..., :3].mT @ rate[..., :3])[:, 2, 1] / axis[0]
+    assert (turning > 0).all()
+
+
+def test_a_part_has_the_poses_of_the_whole(random_poses: torch.Tensor) -> None:
+    trajectory = Trajectory(EPOCH + 10**9 * np.arange(8), random_poses)
+    part = trajectory.between(EPOCH + 3 * 10**9 + 5, EPOCH + 5 * 10**9)
+    assert len(part) == 3
+    times = EPOCH + np.linspace(3 * 10**9, 5 * 10**9 - 1, 31).astype(np.int64)
+    torch.testing.assert_close(part.interpolate(times), trajectory.interpolate(times), rtol=0, atol=1e-12)
+    again = part.between(EPOCH + 4 * 10**9, EPOCH + 5 * 10**9).interpolate(times[16:])
+    torch.testing.assert_close(again, trajectory.interpolate(times[16:]), rtol=0, atol=1e-12)
+
+
+def test_the_world_and_the_axes_of_the_camera_do_not_matter(random_poses: torch.Tensor) -> None:
+    trajectory = Trajectory(10**9 * np.arange(8), random_poses)
+    world, axes = homogeneous(random_poses[3]), OPENCV_TO_OPENGL
+    times = np.linspace(0, 7 * 10**9, 50).astype(np.int64)
+    mapped = trajectory.mapped(lambda poses: world @ poses @ axes).interpolate(times)
+    expected = (world @ homogeneous(trajectory.interpolate(times)) @ axes)[:, :3]
+    torch.testing.assert_close(mapped, expected, rtol=0, atol=1e-12)
 
 
 def test_the_pose_resolves_nanoseconds_of_the_unix_time(random_poses: torch.Tensor) -> None:
     trajectory = Trajectory(EPOCH + 10**9 * np.arange(8), random_poses)
     here, there = trajectory.interpolate([EPOCH + 10**9 + 5, EPOCH + 10**9 + 6])
-    speed = (random_poses[2, :, 3] - random_poses[1, :, 3]) * 1e-9
-    torch.testing.assert_close(there[:, 3] - here[:, 3], speed, rtol=1e-5, atol=0)
+    _, rate = trajectory.pose_and_rate(torch.tensor([1.0], dtype=torch.float64))
+    torch.testing.assert_close(there[:, 3] - here[:, 3], rate[0, :, 3] * 1e-9, rtol=1e-5, atol=1e-15)
 
 
 def test_the_pose_is_differentiable_in_time(random_poses: torch.Tensor) -> None:

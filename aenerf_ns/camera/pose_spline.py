@@ -1,0 +1,143 @@
+"""Cubic splines through timed poses."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.linalg import solve_banded
+from torch import Tensor
+
+from aenerf_ns.camera.rotation import quaternion_from_rotation
+
+# Four lost frames in a row make a segment five times as long as its neighbours. The errors of the poses at its ends
+# grow with its length, but the spline is still closer to the path than a straight line (docs/experiments.md).
+_LONGEST_SEGMENT = 5.5
+# Closer to half a turn, the shorter way round is hardly known.
+_LARGEST_TURN = math.radians(150)
+
+
+def pose_polynomials(seconds: Tensor, poses: Tensor) -> Tensor:
+    """Return cubic polynomials of time that pass through poses.
+
+    Positions and quaternions follow a cubic spline with continuous first and second derivatives. The first two segments
+    of a spline are one polynomial, and so are the last two ("not-a-knot"). The quaternion has unit length at the poses
+    only; the rotation is that of its direction.
+
+    A spline would swing in a gap. So the spline ends where a gap begins, and another spline begins where the gap ends.
+    In the gap the position moves straight at a constant speed, and the rotation turns about one axis at an almost
+    constant rate. A gap is a segment more than 5.5 times as long as one of its neighbours, or one that turns by more
+    than 150 degrees. Two poses alone are joined like the ends of a gap, and three by a parabola.
+
+    Args:
+        seconds: (N,) float64 times, strictly increasing, N >= 2.
+        poses: (N, 3, 4) float64 rigid motions.
+
+    Returns:
+        (N - 1, 4, 7) float64 coefficients of 1, t, t² and t³ on each segment, where t are the seconds since its start.
+        The columns are x, y, z of the position, and x, y, z, w of the quaternion.
+    """
+    quaternions = quaternion_from_rotation(poses[:, :, :3])
+    # A quaternion and its negative are one rotation: of both, the spline takes the one closer to the quaternion ahead.
+    flips = torch.where((quaternions[1:] * quaternions[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(poses.dtype)
+    quaternions = torch.cat([quaternions[:1], quaternions[1:] * flips.cumprod(0)])
+    # A rotation turns by twice the angle between its quaternions.
+    start, end = quaternions[:-1], quaternions[1:]
+    angles = 2 * torch.atan2((end - start).norm(dim=-1, keepdim=True), (end + start).norm(dim=-1, keepdim=True))
+    values = torch.cat([poses[:, :, 3], quaternions], -1)
+    steps = seconds.diff()[:, None]
+    chords = values.diff(dim=0) / steps
+    in_spline = _in_spline(steps[:, 0], 2 * angles[:, 0])
+    slopes = _slopes(steps, chords, in_spline)
+    # The slopes of steady motions, in which quaternions move along great circles.
+    scale = 1 / (torch.sinc(angles / math.pi) * steps)
+    leaving = torch.cat([chords[:, :3], scale * (end - torch.cos(angles) * start)], -1)
+    arriving = torch.cat([chords[:, :3], scale * (torch.cos(angles) * end - start)], -1)
+    leaving = torch.where(in_spline[:, None], slopes[:-1], leaving)
+    arriving = torch.where(in_spline[:, None], slopes[1:], arriving)
+    second, third = 3 * chords - 2 * leaving - arriving, leaving + arriving - 2 * chords
+    return torch.stack([values[:-1], leaving, second / steps, third / steps**2], 1)
+
+
+def rotation_from_products() -> Tensor:
+    """Return the (16, 9) float64 matrix that makes a rotation of the products of a quaternion's components.
+
+    It maps the (4, 4) products q qᵀ of a unit quaternion x, y, z, w, flattened, to the flattened rotation matrix. It
+    maps the products of q and its rate to half of the rotation's rate.
+    """
+    identity = torch.eye(4, dtype=torch.float64)
+    # The matrix of a quadratic form is (f(a + b) − f(a − b)) / 4.
+    sums, differences = identity[:, None] + identity, identity[:, None] - identity
+    return ((_quadratic_rotation(sums) - _quadratic_rotation(differences)) / 4).flatten(0, 1)
+
+
+def _quadratic_rotation(quaternion: Tensor) -> Tensor:
+    """Return the flattened rotation matrices (..., 9) times |q|² of quaternions (..., 4) of any length."""
+    x, y, z, w = quaternion.unbind(-1)
+    return torch.stack(
+        [
+            w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w),
+            2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w),
+            2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z,
+        ],
+        -1,
+    )  # fmt: skip
+
+
+def _in_spline(steps: Tensor, turns: Tensor) -> Tensor:
+    """Return which of the (N,) segments, of given lengths and angles, belong to a spline of at least two segments."""
+    longest = torch.full_like(steps, math.inf)
+    longest[1:] = _LONGEST_SEGMENT * steps[:-1]
+    longest[:-1] = torch.minimum(longest[:-1], _LONGEST_SEGMENT * steps[1:])
+    known = (steps <= longest) & (turns <= _LARGEST_TURN)
+    beside = torch.zeros_like(known)
+    beside[1:] |= known[:-1]
+    beside[:-1] |= known[1:]
+    return known & beside
+
+
+def _slopes(steps: Tensor, chords: Tensor, in_spline: Tensor) -> Tensor:
+    """Return the (N, columns) derivatives at the knots of the splines, and zeros at the other knots.
+
+    The equations of all splines are one tridiagonal system, because no knot belongs to two splines.
+
+    Args:
+        steps: (N - 1, 1) lengths of the segments in seconds.
+        chords: (N - 1, columns) differences between the knots, per second.
+        in_spline: (N - 1,) which segments belong to a spline.
+    """
+    h, m = steps.cpu().numpy(), chords.cpu().numpy()
+    # Whether the segment ahead of a knot and the segment after it belong to a spline.
+    ahead, after = np.zeros((2, len(h) + 1), bool)
+    ahead[1:] = after[:-1] = in_spline.cpu().numpy()
+    # The row of a knot has the factors of the slopes at the knot ahead, at the knot itself and at the next knot.
+    lower, upper = np.zeros((2, len(h) + 1, 1))
+    diagonal, right = np.ones((len(h) + 1, 1)), np.zeros((len(h) + 1, m.shape[1]))
+    # The second derivative is continuous.
+    i = np.nonzero(ahead & after)[0]
+    lower[i], diagonal[i], upper[i] = h[i], 2 * (h[i - 1] + h[i]), h[i - 1]
+    right[i] = 3 * (h[i] * m[i - 1] + h[i - 1] * m[i])
+    # The third derivative is continuous at the second knot and at the last but one.
+    i = np.nonzero(after & ~ahead)[0]
+    diagonal[i], upper[i], right[i] = _not_a_knot(h[i], h[i + 1], m[i], m[i + 1])
+    i = np.nonzero(ahead & ~after)[0]
+    diagonal[i], lower[i], right[i] = _not_a_knot(h[i - 1], h[i - 2], m[i - 1], m[i - 2])
+    # With three knots both of these say the same. A parabola has no third derivative.
+    i = i[~ahead[i - 2]]
+    diagonal[i], lower[i], right[i] = 1, 1, 2 * m[i - 1]
+    bands = np.stack([np.roll(upper[:, 0], 1), diagonal[:, 0], np.roll(lower[:, 0], -1)])
+    return torch.from_numpy(solve_banded((1, 1), bands, right)).to(chords)
+
+
+def _not_a_knot(end: np.ndarray, inner: np.ndarray, end_chord: np.ndarray, inner_chord: np.ndarray) -> tuple:
+    """Return the factors of the slopes at the end of a spline and at the knot beside it, and the right-hand side.
+
+    Args:
+        end: (K, 1) lengths of the segments at the ends of K splines.
+        inner: (K, 1) lengths of the segments beside them.
+        end_chord: (K, columns) differences over the segments at the ends, per second.
+        inner_chord: (K, columns) differences over the segments beside them, per second.
+    """
+    both = end + inner
+    return inner, both, ((end + 2 * both) * inner * end_chord + end**2 * inner_chord) / both
