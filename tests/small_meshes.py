@@ -85,7 +85,7 @@ def painted_box() -> trimesh.Trimesh:
     )
     picture = np.random.default_rng(0).integers(40, 220, (12, 16, 3)).astype(np.uint8)
     material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(picture), baseColorFactor=[0.8, 1.0, 0.6, 1.0]
+        name="paint", baseColorTexture=Image.fromarray(picture), baseColorFactor=[0.8, 1.0, 0.6, 1.0]
     )
     body.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     return body
