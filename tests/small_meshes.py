@@ -37,8 +37,8 @@ def light_mesh(mesh: Mesh, *rest: object, **options: float) -> Renderer:
 def mesh_of(shape: trimesh.Trimesh, colour: object = (0.5, 0.5, 0.5)) -> Mesh:
     colours = np.tile(np.asarray(colour, np.float64), (len(shape.vertices), 1))
     uv, texture = np.zeros((len(shape.vertices), 2)), np.full(len(shape.faces), -1)
-    glow = np.zeros(len(shape.faces))
-    return scaled(Mesh(np.array(shape.vertices), np.array(shape.faces), uv, colours, texture, glow, ()), 1.0)
+    glow, coat = np.zeros(len(shape.faces)), np.zeros((len(shape.faces), 2))
+    return scaled(Mesh(np.array(shape.vertices), np.array(shape.faces), uv, colours, texture, glow, coat, ()), 1.0)
 
 
 def plate(half: float, picture: np.ndarray | None = None, tiles: float = 1.0) -> Mesh:
@@ -48,7 +48,8 @@ def plate(half: float, picture: np.ndarray | None = None, tiles: float = 1.0) ->
     textures = () if picture is None else (np.asarray(picture, np.float32),)
     colour = np.full((4, 3), 0.5 if picture is None else 1.0)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    return scaled(Mesh(corners, faces, uv, colour, np.full(2, len(textures) - 1), np.zeros(2), textures), 1.0)
+    texture = np.full(2, len(textures) - 1)
+    return scaled(Mesh(corners, faces, uv, colour, texture, np.zeros(2), np.zeros((2, 2)), textures), 1.0)
 
 
 def joined(*meshes: Mesh) -> Mesh:
@@ -60,6 +61,7 @@ def joined(*meshes: Mesh) -> Mesh:
         np.concatenate([mesh.colour for mesh in meshes]),
         np.concatenate([mesh.texture for mesh in meshes]),
         np.concatenate([mesh.emission for mesh in meshes]),
+        np.concatenate([mesh.gloss for mesh in meshes]),
         (),
     )
 
@@ -83,7 +85,7 @@ def painted_box() -> trimesh.Trimesh:
     )
     picture = np.random.default_rng(0).integers(40, 220, (12, 16, 3)).astype(np.uint8)
     material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(picture), baseColorFactor=[0.8, 1.0, 0.6, 1.0]
+        name="paint", baseColorTexture=Image.fromarray(picture), baseColorFactor=[0.8, 1.0, 0.6, 1.0]
     )
     body.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     return body

@@ -31,8 +31,9 @@ class Simulate:
     output: Path
     """Dataset folder to create."""
     scene: str = "room"
-    """room: a furnished room seen from inside. object: a toy locomotive seen from around it. A .glb, .obj or .ply file:
-    a mesh seen from around it. A .json file: a mesh, its light and the camera's path (docs/simulator.md)."""
+    """room: a furnished room seen from inside. object: a toy locomotive seen from around it. shiny_object: the
+    same, varnished and polished. A .glb, .obj or .ply file: a mesh seen from around it. A .json file: a mesh, its light
+    and the camera's path (docs/simulator.md)."""
     speed: Literal["easy", "hard"] = "easy"
     """easy: constant speed. hard: the same path at 8^sin(2 pi t) times that speed."""
     width: int = 346

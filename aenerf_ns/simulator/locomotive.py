@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from aenerf_ns.simulator import textures as tx
 from aenerf_ns.simulator.arrays import Texture
 from aenerf_ns.simulator.rendering.environment import sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight
+from aenerf_ns.simulator.rendering.mesh import Gloss
 from aenerf_ns.simulator.rendering.renderer import Renderer
 from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, Shape, box, lit, pillar, rod, sphere, turned_box
 
@@ -18,13 +21,37 @@ RAIL = 0.3
 HALF = (0.5, 0.5)
 
 
-def locomotive_scene(seed: int = 0) -> Renderer:
-    """Build and light the locomotive, in front of grey. The seed moves the patterns of the textures."""
+_VARNISH, _METAL = Gloss(0.06, 0.15), Gloss(0.6, 0.2)
+_COATS = {
+    **dict.fromkeys(("green", "red", "blue", "cream", "stripes", "spokes", "checker"), _VARNISH),
+    **dict.fromkeys(("brass", "steel"), _METAL),
+}
+"""Coats of the shiny locomotive, by the textures that they cover. Gravel, wood and coal are diffuse."""
+
+
+def locomotive_scene(seed: int = 0, *, shiny: bool = False) -> Renderer:
+    """Build and light the locomotive, in front of grey.
+
+    Args:
+        seed: moves the patterns of the textures.
+        shiny: whether its paint is varnished and its metal polished. Highlights clip at a radiance of 1.
+    """
     rng = np.random.default_rng(seed)
     shapes = [*_track(), *_wheels(), *_frame(), *_boiler(), *_cab(), *_tender()]
     lamp = AreaLight((2.0, -2.4, 3.6), (-0.42, 0.5, 0.75), (0.85, 0.7, 0.0), (8.4, 7.9, 7.1))
     above = sky((0.3, 0.28, 0.26), (0.62, 0.66, 0.74))
-    return lit(shapes, _textures(rng), above, [lamp], np.array(BACKGROUND), spacing=0.03, ambient=0.08, seed=seed)
+    scene = lit(
+        shapes,
+        _textures(rng),
+        above,
+        [lamp],
+        np.array(BACKGROUND),
+        spacing=0.03,
+        ambient=0.08,
+        seed=seed,
+        gloss=_COATS if shiny else None,
+    )
+    return replace(scene, limit=1.0)
 
 
 def _textures(rng: np.random.Generator) -> dict[str, Texture]:

@@ -9,12 +9,15 @@ import numpy as np
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.scene import SimulationScene
 
+BUILT_IN = ("room", "object", "shiny_object")
+"""Names of the built-in scenes."""
+
 
 def built_in_scene(name: str, seed: int = 0) -> SimulationScene:
     """Make and light a built-in scene. It takes a few seconds.
 
     Raises:
-        ValueError: the name is neither "room" nor "object".
+        ValueError: the name is not among `BUILT_IN`.
     """
     if name == "room":
         from aenerf_ns.simulator.room import room_scene
@@ -29,10 +32,10 @@ def built_in_scene(name: str, seed: int = 0) -> SimulationScene:
             validation_views=paths.room_validation_views,
             test_views=paths.room_test_views,
         )
-    if name == "object":
+    if name in ("object", "shiny_object"):
         from aenerf_ns.simulator.locomotive import locomotive_scene
 
-        scene = locomotive_scene(seed)
+        scene = locomotive_scene(seed, shiny=name == "shiny_object")
         return SimulationScene(
             name,
             scene,
@@ -43,7 +46,7 @@ def built_in_scene(name: str, seed: int = 0) -> SimulationScene:
             validation_views=paths.object_validation_views,
             test_views=paths.object_test_views,
         )
-    raise ValueError(f'scene must be "room" or "object", got {name!r}')
+    raise ValueError(f"scene must be one of {', '.join(BUILT_IN)}, got {name!r}")
 
 
 def open_scene(name: str, seed: int = 0) -> SimulationScene:
@@ -52,7 +55,7 @@ def open_scene(name: str, seed: int = 0) -> SimulationScene:
     Raises:
         DataError: there is no such scene, or the file cannot be used.
     """
-    if name in ("room", "object"):
+    if name in BUILT_IN:
         return built_in_scene(name, seed)
     from aenerf_ns.simulator.scene_file import load_scene
 

@@ -14,7 +14,7 @@ class SimulationScene:
     """A scene and the cameras in it. Poses are camera-to-world, OpenCV axes, z up, metres.
 
     Attributes:
-        name: "room", "object", or the name of a file.
+        name: name of a built-in scene or of a file.
         renderer: renders the scene.
         path: returns the pose (4, 4) at a parameter in [0, 1].
         focal_ratio: focal length divided by image width. Pixels are square, and the principal point is the middle.

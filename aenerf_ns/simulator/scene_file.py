@@ -17,7 +17,7 @@ from aenerf_ns.simulator.free_space import FreeSpace
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight, baked_mesh, light_mesh
-from aenerf_ns.simulator.rendering.mesh import Mesh, scaled
+from aenerf_ns.simulator.rendering.mesh import Gloss, Mesh, scaled
 from aenerf_ns.simulator.rendering.mesh_loading import SUFFIXES, load_mesh
 from aenerf_ns.simulator.rendering.mesh_repair import prepared
 from aenerf_ns.simulator.rendering.renderer import Renderer
@@ -32,10 +32,12 @@ _RADIUS = 4.0
 _RADII = 3.6
 """Default distance of the camera from an object: in metres, and in half diagonals of the object's bounds."""
 _DURATION = 4.0
+_ROUGHEST = 0.5
+"""Highest roughness. The narrow lobe that reflections assume does not describe rougher surfaces."""
 _BRIGHTEST = 0.9
 """Radiance that the brightest surface in probes of the path is scaled to, with room for brighter ones between them."""
 
-_KEYS = {"mesh", "up", "scale", "light", "background", "path", "focal_ratio", "box", "credits"}
+_KEYS = {"mesh", "up", "scale", "materials", "light", "background", "path", "focal_ratio", "box", "credits"}
 _PATH_KEYS = {
     "around": {"kind", "centre", "radius", "turns", "duration"},
     "walk": {"kind", "positions", "targets", "duration"},
@@ -69,11 +71,12 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
         values = JsonObject.read(path, _REMEDY)
         values.refuse_keys_except(_KEYS)
     else:
-        raise DataError(path, "an unknown scene", 'give "room", "object", a .glb, .obj or .ply file, or a scene.json')
+        raise DataError(path, "an unknown scene", "give a built-in scene, a .glb, .obj or .ply file, or a scene.json")
     file = path.parent / values.get("mesh", str)
     up = values.choice("up", ("y", "z"), "y" if file.suffix.lower() == ".glb" else "z")
     scale = values.positive("scale", 1.0)
     light = _light(values)
+    gloss = _gloss(values, light is None)
     background = _background(values, light)
     route = values.block("path") if "path" in values else JsonObject(path, {"kind": "around"}, remedy=_REMEDY)
     kind = route.choice("kind", tuple(_PATH_KEYS))
@@ -82,7 +85,7 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
     focal_ratio = values.positive("focal_ratio", _FOCAL_RATIO[kind])
     box = _box(values, kind)
 
-    mesh = load_mesh(file, up == "y")
+    mesh = load_mesh(file, up == "y", gloss)
     if is_bare:
         scale = _half_diagonal_scale(mesh)
     try:
@@ -147,6 +150,26 @@ def _light(values: JsonObject) -> tuple[Environment, list[AreaLight]] | None:
         file = values.path.parent / light.get("environment", str)
         environment = load_environment(file, light.get("turn_degrees", float, 0.0), light.positive("gain", 1.0))
     return environment, [_lamp(light.entry_block("lamps", i)) for i in range(len(light.get("lamps", list, [])))]
+
+
+def _gloss(values: JsonObject, is_baked: bool) -> dict[str, Gloss]:
+    """Return the coats of materials by their names."""
+    materials = values.block("materials") if "materials" in values else JsonObject(values.path, {})
+    coats = {}
+    for name in values.get("materials", dict, {}):
+        material = materials.block(name)
+        material.refuse_keys_except(Gloss._fields)
+        coats[name] = Gloss(_number_up_to(material, "specular", 1.0), _number_up_to(material, "roughness", _ROUGHEST))
+    if coats and is_baked:
+        raise values.error("materials", "with baked light, which nothing can reflect", "give a sky or an environment")
+    return coats
+
+
+def _number_up_to(values: JsonObject, name: str, highest: float) -> float:
+    number = values.get(name, float)
+    if not 0 <= number <= highest:
+        raise values.error(name, f"is {number:g}", f"give a number from 0 to {highest:g}")
+    return number
 
 
 def _lamp(lamp: JsonObject) -> AreaLight:
@@ -215,13 +238,14 @@ def _views(values: JsonObject, kind: str, bounds: Array, caster: RayCaster) -> _
 
 
 def _exposed(scene: SimulationScene, renderer: Renderer) -> Renderer:
-    """Scale the light so that no surface clips in the pictures. Clip the surroundings to 1."""
+    """Scale the light so that no diffuse surface clips in the pictures. Clip surroundings and highlights to 1."""
     width, height = 192, 144
     poses = [scene.path((k + 0.5) / 48) for k in range(48)]
     poses += [*scene.validation_views(16), *scene.test_views(16, 0)]
     brightest = 0.0
+    without_highlights = replace(renderer, reflections=None)
     for pose in poses:
-        radiance, _, alpha = renderer.render(pose, scene.intrinsics(width, height), width, height, 1)
+        radiance, _, alpha = without_highlights.render(pose, scene.intrinsics(width, height), width, height, 1)
         brightest = max(brightest, float(radiance[alpha > 0].max(initial=0.0)))
     if brightest == 0:
         raise DataError(scene.name, "no light reaches what the camera sees", "give it light, or another path")
@@ -232,6 +256,7 @@ def _exposed(scene: SimulationScene, renderer: Renderer) -> Renderer:
         light=(gain * renderer.light).astype(np.float32),
         surroundings=seen._replace(texels=(gain * seen.texels).astype(np.float32)),
         limit=1.0,
+        reflections=renderer.reflections and renderer.reflections.scaled(gain),
     )
 
 

@@ -15,7 +15,7 @@ from aenerf_ns.simulator.arrays import Array, Texture
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment
 from aenerf_ns.simulator.rendering.lighting import AreaLight, light_mesh
-from aenerf_ns.simulator.rendering.mesh import Mesh, scaled
+from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh, scaled
 from aenerf_ns.simulator.rendering.mesh_repair import prepared
 from aenerf_ns.simulator.rendering.renderer import Renderer
 
@@ -54,8 +54,12 @@ class Shape:
     spacing: float = math.inf
 
 
-def mesh_of(shapes: Sequence[Shape], textures: Mapping[str, Texture], spacing: float) -> Mesh:
+def mesh_of(
+    shapes: Sequence[Shape], textures: Mapping[str, Texture], spacing: float, gloss: Mapping[str, Gloss] | None = None
+) -> Mesh:
     """Join shapes to one mesh of cells with sides of at most ``spacing`` metres.
+
+    ``gloss`` has coats by the names of the textures that they cover. Other shapes are diffuse.
 
     Raises:
         KeyError: the texture of a shape is missing.
@@ -70,7 +74,7 @@ def mesh_of(shapes: Sequence[Shape], textures: Mapping[str, Texture], spacing: f
         uv.append(tiles + shape.texture_offset)
         colour.append(np.tile(np.asarray(shape.tint, np.float64), (len(local), 1)))
         count += len(local)
-    sizes = [len(part) for part in faces]
+    sizes, coats = [len(part) for part in faces], gloss or {}
     mesh = Mesh(
         np.concatenate(vertices),
         np.concatenate(faces),
@@ -78,6 +82,7 @@ def mesh_of(shapes: Sequence[Shape], textures: Mapping[str, Texture], spacing: f
         np.concatenate(colour),
         np.repeat([index[shape.texture] for shape in shapes], sizes),
         np.repeat([shape.emission for shape in shapes], sizes).astype(np.float64),
+        np.repeat([coats.get(shape.texture, DIFFUSE) for shape in shapes], sizes, axis=0),
         tuple(textures.values()),
     )
     return scaled(mesh, 1.0)
@@ -93,6 +98,7 @@ def lit(
     spacing: float,
     ambient: float,
     seed: int,
+    gloss: Mapping[str, Gloss] | None = None,
 ) -> Renderer:
     """Join and light shapes.
 
@@ -100,8 +106,9 @@ def lit(
         shapes, textures: the scene.
         spacing: largest distance in metres of the points at which light is computed.
         environment, lamps, background, ambient, seed: see `light_mesh`.
+        gloss: coats by the names of textures, see `mesh_of`.
     """
-    mesh, _ = prepared(mesh_of(shapes, textures, spacing), math.inf)
+    mesh, _ = prepared(mesh_of(shapes, textures, spacing, gloss), math.inf)
     caster = RayCaster(mesh.vertices, mesh.faces)
     return light_mesh(mesh, caster, environment, lamps, background, ambient=ambient, seed=seed)
 

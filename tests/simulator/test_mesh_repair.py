@@ -51,7 +51,7 @@ def test_coincident_faces_show_the_first_from_everywhere() -> None:
 def test_degenerate_faces_are_dropped() -> None:
     square = plate(1.0)
     faces = np.concatenate([square.faces, [[0, 0, 1], [0, 2, 2]]])
-    rest = {"texture": np.full(4, -1), "emission": np.zeros(4)}
+    rest = {"texture": np.full(4, -1), "emission": np.zeros(4), "gloss": np.zeros((4, 2))}
     mesh, _ = prepared(dataclasses.replace(square, faces=faces, **rest), 10.0)
     assert len(mesh.faces) == 2
     with pytest.raises(ValueError, match="no face has an area"):

@@ -25,6 +25,10 @@ from aenerf_ns.simulator.open_scene import open_scene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
+TIN = {"specular": 0.5, "roughness": 0.2}
+DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [
+    {"centre": [0, 0, 3], "half_u": [1, 0, 0], "half_v": [0, -1, 0], "radiance": [9, 9, 9]}]}  # fmt: skip
+
 
 @pytest.mark.parametrize(
     ("values", "told"),
@@ -43,6 +47,13 @@ pytestmark = pytest.mark.usefixtures("small_work")
         ({"light": {"environment": "box.glb"}}, "box.glb: not a Radiance picture"),
         ({"light": {"sky": [[0] * 3, [1] * 3], "lamps": [{"centre": [0, 0, 1]}]}}, "light.lamps[0].half_u is missing"),
         ({"light": {"sky": [[0] * 3, [1] * 3], "lamps": [3]}}, "light.lamps[0] is 3, not an object"),
+        ({"light": DAY, "materials": {"tin": TIN}}, "no surface has the material 'tin'; the file has paint"),
+        ({"light": DAY, "materials": {"paint": {"specular": 0.5}}}, "materials.paint.roughness is missing"),
+        ({"light": DAY, "materials": {"paint": {**TIN, "specular": 50}}}, "specular is 50; give a number from 0 to 1"),
+        ({"light": DAY, "materials": {"paint": {**TIN, "roughness": 1}}}, "is 1; give a number from 0 to 0.5"),
+        ({"light": DAY, "materials": {"paint": {**TIN, "shine": 1}}}, "unknown key 'materials.paint.shine'"),
+        ({"light": DAY, "materials": ["paint"]}, 'materials is ["paint"], not of type dict'),
+        ({"materials": {"paint": TIN}}, "materials with baked light"),
         ({"background": [1, 1]}, "background must be 3 finite numbers, not [1, 1]"),
         ({"background": [2, 1, 1]}, "at most 1"),
         ({"background": "environment"}, "the light is baked"),
@@ -86,6 +97,25 @@ def test_views_are_off_the_path_seeded_and_free(box_file: Path, path: dict) -> N
     for pose in [*validation, *test]:
         assert np.abs(on_path - pose[:3]).max((1, 2)).min() > 1e-3
         assert distance(pose[:3, 3])[0] >= clearance - 1e-4
+
+
+def test_materials_get_their_coats_and_keep_their_exposure(box_file: Path) -> None:
+    diffuse, shiny = (
+        open_scene(scene_file(box_file, light=DAY, **more)) for more in ({}, {"materials": {"paint": TIN}})
+    )
+    np.testing.assert_array_equal(diffuse.renderer.light, shiny.renderer.light)
+    assert diffuse.renderer.reflections is None
+    assert shiny.renderer.reflections is not None
+    np.testing.assert_allclose(shiny.renderer.reflections.coats.specular, 0.5)
+    np.testing.assert_allclose(shiny.renderer.reflections.coats.lobe, np.sqrt(2) * 0.04, rtol=1e-6)
+    pose, intrinsics = shiny.path(0.99), shiny.intrinsics(64, 48)  # from above, where the lamp is mirrored
+    before, after = (scene.renderer.render(pose, intrinsics, 64, 48, 4)[0] for scene in (diffuse, shiny))
+    assert after.max() == pytest.approx(1, abs=1e-4)
+    assert before.max() < 0.95
+    # Exposure scales lamps and sky alike. The sky's uppermost texel is a little darker than its zenith.
+    assert shiny.renderer.reflections.lamps[0, 3] == pytest.approx(
+        9 * shiny.renderer.reflections.environment.texels.max(), rel=2e-3
+    )
 
 
 def test_a_bare_mesh_is_an_object_in_view(tmp_path: Path) -> None:

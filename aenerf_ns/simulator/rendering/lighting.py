@@ -22,7 +22,9 @@ from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment
 from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position_ids
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps, panorama
-from aenerf_ns.simulator.rendering.renderer import MeshArrays, Renderer, mesh_arrays, surroundings
+from aenerf_ns.simulator.rendering.reflections import reflections
+from aenerf_ns.simulator.rendering.renderer import Renderer, surroundings
+from aenerf_ns.simulator.rendering.surface import MeshArrays, mesh_arrays, ray_offset
 
 _CREASE = math.cos(math.radians(40.0))
 """Cosine of the angle below which adjacent faces belong to one smooth surface."""
@@ -143,6 +145,8 @@ def light_mesh(
 ) -> Renderer:
     """Light a mesh on both sides of its faces.
 
+    Light that a glossy face passes on to other faces is computed as if the face were diffuse.
+
     Args:
         mesh: the mesh. Light is computed at the corners of its faces and is linear between them.
         caster: casts rays against the mesh.
@@ -157,19 +161,23 @@ def light_mesh(
     points = light_points(mesh)
     arrays = mesh_arrays(mesh, points.corner)
     textures = mip_maps(mesh.textures, bits16=True)
-    light = _light(arrays, textures, caster, points, environment, lamps, ambient, seed)
+    emitters = np.array([[a.centre, a.half_u, a.half_v, a.radiance] for a in lamps], np.float64).reshape(-1, 4, 3)
+    light = _light(arrays, textures, caster, points, environment, emitters, ambient, seed)
     glow = np.zeros(len(points.position), np.float32)
     np.maximum.at(glow, points.corner, mesh.emission[:, None].astype(np.float32))
     light += glow[:, None]
     shown = surroundings(environment if show_environment else None)
-    return Renderer(arrays, textures, caster, light, background, shown, math.inf)
+    gloss = None
+    if mesh.gloss[:, 0].any():
+        gloss = reflections(mesh, points.corner, points.normal, emitters, surroundings(environment), ambient)
+    return Renderer(arrays, textures, caster, light, background, shown, math.inf, gloss)
 
 
 def baked_mesh(mesh: Mesh, caster: RayCaster, background: Array) -> Renderer:
     """Return a renderer of a mesh whose colours are radiance, in front of a uniform background (3,)."""
     arrays = mesh_arrays(mesh, np.zeros_like(mesh.faces))
     light, textures = np.ones((2, 1, 3), np.float32), mip_maps(mesh.textures, bits16=True)
-    return Renderer(arrays, textures, caster, light, background, surroundings(None), math.inf)
+    return Renderer(arrays, textures, caster, light, background, surroundings(None), math.inf, None)
 
 
 def _light(
@@ -178,14 +186,13 @@ def _light(
     caster: RayCaster,
     points: LightPoints,
     environment: Environment,
-    lamps: Sequence[AreaLight],
+    emitters: Array,
     ambient: float,
     seed: int,
 ) -> NDArray[np.float32]:
     """Compute irradiance / pi (2, G, 3) in front of the light points and behind them."""
     count = len(points.position)
-    extent = float(np.abs(arrays.vertices).max())
-    offset = max(1e-4, 2e-5 * extent)
+    extent, offset = float(np.abs(arrays.vertices).max()), ray_offset(arrays)
     normals = np.concatenate([points.normal, -points.normal])
     positions = np.concatenate([points.position, points.position]) + offset * normals
     size = np.concatenate([points.size, points.size])
@@ -193,7 +200,6 @@ def _light(
     even, bright = environment.split()
     sky = mip_maps([even], bits16=False)
     sun = _Sun(bright) if bright.max() > 0 else None
-    emitters = np.array([[a.centre, a.half_u, a.half_v, a.radiance] for a in lamps], np.float64).reshape(-1, 4, 3)
     directions = _plane_sequence(_DIRECTIONS)
 
     sharp = np.zeros((2 * count, 3), np.float32)

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.simulator.arrays import Array, Texture
+
+
+class Gloss(NamedTuple):
+    """The glossy coat of a material."""
+
+    specular: float = 0.0
+    """Share of light that the coat reflects at normal incidence (F0), in all colours; 0 for a diffuse surface."""
+    roughness: float = 0.0
+    """Square root of the slopes' root mean square in the microfacet model (alpha = roughness^2); 0 for a mirror."""
+
+
+DIFFUSE = Gloss()
 
 
 @dataclass(frozen=True)
@@ -24,6 +37,7 @@ class Mesh:
         texture: (F,) index into ``textures``, -1 for none.
         emission: (F,) irradiance / pi that a face seems to receive in addition. It makes the face glow and lights
             nothing else.
+        gloss: (F, 2) `Gloss` of each face.
         textures: linear RGB, float32 (rows, columns, 3), the lowest row first. They repeat.
     """
 
@@ -33,11 +47,18 @@ class Mesh:
     colour: Array
     texture: NDArray[np.int64]
     emission: Array
+    gloss: Array
     textures: tuple[Texture, ...]
 
     def with_faces_kept(self, kept: NDArray) -> Mesh:
         """Return the mesh with the faces that an index or a mask (F,) selects."""
-        return replace(self, faces=self.faces[kept], texture=self.texture[kept], emission=self.emission[kept])
+        return replace(
+            self,
+            faces=self.faces[kept],
+            texture=self.texture[kept],
+            emission=self.emission[kept],
+            gloss=self.gloss[kept],
+        )
 
 
 def scaled(mesh: Mesh, scale: float) -> Mesh:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.arrays import Array, Texture
-from aenerf_ns.simulator.rendering.mesh import Mesh
+from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh
 from aenerf_ns.simulator.rendering.polygons import triangulated_obj
 
 SUFFIXES = (".glb", ".obj", ".ply")
@@ -22,7 +23,7 @@ UNCOLOURED = 0.5
 """Albedo of a surface that has no colour in its file."""
 
 
-def load_mesh(path: Path, y_up: bool) -> Mesh:
+def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) -> Mesh:
     """Read a mesh with all the parts and transforms of its scene.
 
     Of a material, only the base colour is read: a factor, a texture, and colours of vertices or faces. Vertex colours
@@ -31,9 +32,11 @@ def load_mesh(path: Path, y_up: bool) -> Mesh:
     Args:
         path: a .glb, .obj (with its .mtl) or .ply file.
         y_up: whether the file's y axis points up, in place of z. Vertices are then turned by (x, y, z) -> (x, -z, y).
+        gloss: coats of materials, by the names of the materials. The others are diffuse.
 
     Raises:
-        DataError: the file, or a file that it refers to, is missing or cannot be read, or it has no surface.
+        DataError: the file, or a file that it refers to, is missing or cannot be read, or it has no surface, or no
+            material of a name in ``gloss``.
     """
     import trimesh
 
@@ -69,6 +72,12 @@ def load_mesh(path: Path, y_up: bool) -> Mesh:
     if not meshes:
         raise DataError(path, "there is no surface in it", "give a mesh of triangles, not points or lines")
     textures: dict[int, tuple[int, Texture]] = {}
+    gloss = gloss or {}
+    names = [_material_name(mesh.visual) for mesh, _ in meshes]
+    for name in gloss:
+        if name not in names:
+            known = ", ".join(sorted({known for known in names if known})) or "no names of materials"
+            raise DataError(path, f"no surface has the material {name!r}", f"the file has {known}")
     parts = [_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in meshes]
     vertices, faces, uv, colour, texture = zip(*parts, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
@@ -85,6 +94,7 @@ def load_mesh(path: Path, y_up: bool) -> Mesh:
         np.concatenate(colour),
         np.concatenate(texture),
         np.zeros(len(joined)),
+        np.repeat([gloss.get(name, DIFFUSE) for name in names], [len(part) for part in faces], axis=0),
         tuple(image for _, image in textures.values()),
     )
 
@@ -130,6 +140,11 @@ def _part(
     if np.linalg.det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return turned, faces, uv, colour, np.full(len(faces), index)
+
+
+def _material_name(visual: Any) -> str:
+    """Return the name of a surface's material, or "" if it has none."""
+    return getattr(getattr(visual, "material", None), "name", None) or ""
 
 
 def _material(material: Any) -> tuple[Array, Any]:

@@ -83,6 +83,7 @@ def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
                 faces=faces,
                 texture=mesh.texture[source],
                 emission=mesh.emission[source],
+                gloss=mesh.gloss[source],
             )
             return parts, source
         turn = (longest[split, None] + np.arange(3)) % 3

@@ -1,9 +1,9 @@
 """Pictures of a lit mesh: Embree casts the primary rays, compiled code shades the hits.
 
-Every surface is Lambertian, so the light that a surface receives does not depend on the view. `lighting` computes that
-light once; rendering casts primary rays only. Radiance is linear RGB, lengths are metres, and the world's z axis points
-up. A camera has OpenCV axes (x right, y down, z forward). The centre of pixel (x, y) lies at (x + 0.5, y + 0.5), as in
-Nerfstudio.
+The light that a surface receives does not depend on the view. `lighting` computes that light once, and diffuse surfaces
+need primary rays only. Glossy surfaces take a second ray each (`reflections`). Radiance is linear RGB, lengths are
+metres, and the world's z axis points up. A camera has OpenCV axes (x right, y down, z forward). The centre of pixel
+(x, y) lies at (x + 0.5, y + 0.5), as in Nerfstudio.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -22,43 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment
-from aenerf_ns.simulator.rendering.mesh import Mesh
-from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps, panorama
+from aenerf_ns.simulator.rendering.mip_maps import MipMaps, mip_maps, panorama
+from aenerf_ns.simulator.rendering.reflections import Reflections, add_reflections
+from aenerf_ns.simulator.rendering.surface import FOOTPRINT, MeshArrays, diffuse_radiance
 
 POINT_SPREAD = 0.5
 """Standard deviation of a pixel's Gaussian point-spread function, in pixels."""
-_FOOTPRINT = 0.5
-"""Side of the texture region that a sample averages, in pixels: about the distance between the samples of a pixel."""
-
-
-class MeshArrays(NamedTuple):
-    """The arrays of a mesh that the compiled functions read: V vertices, F faces, G light points."""
-
-    vertices: Array  # (V, 3)
-    faces: NDArray[np.int32]  # (F, 3)
-    uv: Array  # (V, 2)
-    colour: NDArray[np.float32]  # (V, 3)
-    texture: NDArray[np.int32]  # (F,) -1 for none
-    density: NDArray[np.float32]  # (F,) texels per metre
-    light_point: NDArray[np.int32]  # (F, 3) light point of each corner
-
-
-def mesh_arrays(mesh: Mesh, light_point: NDArray[np.integer]) -> MeshArrays:
-    """Return the arrays of a mesh, given the light points (F, 3) of its faces' corners."""
-    a, b, c = mesh.vertices[mesh.faces.T]
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    p, q, r = mesh.uv[mesh.faces.T]
-    in_texture = np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
-    texels = np.array([*(len(image) * image.shape[1] for image in mesh.textures), 0.0])
-    return MeshArrays(
-        mesh.vertices,
-        mesh.faces.astype(np.int32),
-        mesh.uv,
-        mesh.colour.astype(np.float32),
-        mesh.texture.astype(np.int32),
-        np.sqrt(in_texture * texels[mesh.texture] / np.maximum(area, 1e-300)).astype(np.float32),
-        light_point.astype(np.int32),
-    )
 
 
 # Not parallel: starting threads for this little work takes longer than the work, above all on a busy machine.
@@ -127,7 +95,7 @@ def _shade(
 
     A ray that hits nothing sees the panorama ``sky``, or ``background`` if ``sky`` is empty.
     """
-    vertices, faces, uv, colour, texture, density, light_point = arrays
+    vertices, faces, texture = arrays.vertices, arrays.faces, arrays.texture
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics
     samples = len(offsets)
@@ -149,7 +117,7 @@ def _shade(
                 if face == NOTHING:
                     if has_sky:
                         per_radian = sky.level[0, 2] / (2.0 * math.pi)
-                        r, g, b = panorama(sky, dx, dy, dz, _FOOTPRINT / fx * per_radian)
+                        r, g, b = panorama(sky, dx, dy, dz, FOOTPRINT / fx * per_radian)
                         red += min(r, limit)
                         green += min(g, limit)
                         blue += min(b, limit)
@@ -167,27 +135,14 @@ def _shade(
                 distance = rotation[0, 2] * px + rotation[1, 2] * py + rotation[2, 2] * pz
                 facing = nx * dx + ny * dy + nz * dz
                 side = 0 if facing < 0.0 else 1
-                li, lj, lk = light_point[face, 0], light_point[face, 1], light_point[face, 2]
-                r = wi * light[side, li, 0] + wj * light[side, lj, 0] + wk * light[side, lk, 0]
-                g = wi * light[side, li, 1] + wj * light[side, lj, 1] + wk * light[side, lk, 1]
-                b = wi * light[side, li, 2] + wj * light[side, lj, 2] + wk * light[side, lk, 2]
-                r *= wi * colour[i, 0] + wj * colour[j, 0] + wk * colour[k, 0]
-                g *= wi * colour[i, 1] + wj * colour[j, 1] + wk * colour[k, 1]
-                b *= wi * colour[i, 2] + wj * colour[j, 2] + wk * colour[k, 2]
+                footprint = 0.0
                 if texture[face] >= 0:
                     # A pixel covers depth / focal length, stretched where the surface is seen at a slant; the geometric
                     # mean of its two sides keeps textures crisp there without aliasing.
                     lengths = math.sqrt((nx * nx + ny * ny + nz * nz) * (dx * dx + dy * dy + dz * dz))
                     slant = max(abs(facing) / lengths, 0.02)
-                    tr, tg, tb = lookup(
-                        textures,
-                        texture[face],
-                        wi * uv[i, 0] + wj * uv[j, 0] + wk * uv[k, 0],
-                        wi * uv[i, 1] + wj * uv[j, 1] + wk * uv[k, 1],
-                        _FOOTPRINT * distance / (fx * math.sqrt(slant)) * density[face],
-                        True,
-                    )
-                    r, g, b = r * tr / 65535.0, g * tg / 65535.0, b * tb / 65535.0
+                    footprint = FOOTPRINT * distance / (fx * math.sqrt(slant))
+                r, g, b = diffuse_radiance(arrays, textures, light, face, side, wi, wj, wk, footprint)
                 red += r
                 green += g
                 blue += b
@@ -211,7 +166,8 @@ class Renderer:
         light: (2, G, 3) irradiance / pi at the light points, in front of the faces and behind them.
         background: (3,) radiance where a ray hits nothing and ``surroundings`` is empty.
         surroundings: panorama that is seen where a ray hits nothing, or empty.
-        limit: the radiance of the surroundings is clipped to this value.
+        limit: the radiance of the surroundings and of glossy surfaces is clipped to this value.
+        reflections: reflections of glossy surfaces, or None if all surfaces are diffuse.
     """
 
     arrays: MeshArrays
@@ -221,6 +177,7 @@ class Renderer:
     background: Array
     surroundings: MipMaps
     limit: float
+    reflections: Reflections | None
 
     def render(
         self,
@@ -253,14 +210,14 @@ class Renderer:
         left, right, top, bottom = window
         rays = np.empty(((bottom - top) * (right - left) * len(offsets), 6), np.float32)
         _camera_rays(rotation, centre, lens, offsets, window, rays)
-        hits = self.caster.cast(rays)["primitive_ids"]
+        hits = self.caster.cast(rays)
         radiance = np.empty((height, width, 3), np.float32)
         depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
         _shade(
             self.arrays,
             self.textures,
             self.light,
-            hits,
+            hits["primitive_ids"],
             window,
             rotation,
             centre,
@@ -273,6 +230,20 @@ class Renderer:
             depth,
             alpha,
         )
+        if self.reflections is not None:
+            add_reflections(
+                self.reflections,
+                self.arrays,
+                self.textures,
+                self.light,
+                self.caster,
+                rays,
+                hits,
+                lens[0],
+                len(offsets),
+                self.limit,
+                radiance[top:bottom, left:right],
+            )
         return radiance, depth, alpha
 
     @cached_property
