@@ -157,12 +157,17 @@ class WarpedEvents:
         """Duration of each slice in seconds."""
         return [float(events.t[-1] - events.t[0]) * 1e-9 for events in self._slices]
 
-    def compare(self, hypothesis: Hypothesis, step: int = 1) -> Comparison | None:
+    @property
+    def spans(self) -> list[tuple[int, int]]:
+        """Times of the first and the last event of each slice in nanoseconds."""
+        return [(int(events.t[0]), int(events.t[-1])) for events in self._slices]
+
+    def compare(self, hypothesis: Hypothesis, slices: slice = slice(None)) -> Comparison | None:
         """Compare the contrast under a hypothesis with the given contrast, over the same events.
 
         Args:
             hypothesis: the hypothesis.
-            step: 1 to compare all slices, n to compare every n-th.
+            slices: which slices of events to compare; by default all.
 
         Returns:
             The comparison, or None if too few events have a pose and a direction under the hypothesis.
@@ -170,7 +175,7 @@ class WarpedEvents:
         covered = TimeWindow(self._trajectory.start, self._trajectory.end)
         given, alternative = [], []
         has_direction = np.isfinite(hypothesis.plane(self._plane) + self._plane).all(-1)
-        for events, as_given in list(zip(self._slices, self.given, strict=True))[::step]:
+        for events, as_given in list(zip(self._slices, self.given, strict=True))[slices]:
             seen = has_direction[events.y, events.x]
             usable = seen & covered.contains(events.t + hypothesis.clock_offset)
             if usable.sum() < max(_MIN_USABLE * seen.sum(), 2):
@@ -199,7 +204,7 @@ class WarpedEvents:
         offsets = [round(sign * seconds * 1e9) for seconds in CLOCK_OFFSETS for sign in (-1, 1)]
         found = []
         for hypothesis in (*ALTERNATIVES, *map(clock_hypothesis, offsets)):
-            comparison = self.compare(hypothesis, step=3)
+            comparison = self.compare(hypothesis, slice(None, None, 3))
             if comparison is not None and comparison.contrast > _HOPELESS * comparison.given:
                 comparison = self.compare(hypothesis)
             if comparison is not None:

@@ -1,4 +1,4 @@
-"""Colour correction: from rendered log-radiance to a picture, by four named protocols.
+"""Colour correction: from rendered log-radiance to a picture, by five named protocols.
 
 Events determine log-radiance only up to an affine map per channel, so that map has to come from elsewhere.
 """
@@ -8,13 +8,15 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import ClassVar, Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from aenerf_ns.camera.image_encoding import ImageEncoding, encode
 
-ColorCorrectionProtocol = Literal["affine", "affine-test", "network", "none"]
+ColorCorrectionProtocol = Literal["affine", "affine-test", "translated-gamma", "network", "none"]
 
 # Added to radiance in [0, 1] before the logarithm, so that black reference pixels stay finite.
 _EPSILON = 1e-3
@@ -141,6 +143,83 @@ class AffineTestColorCorrection(AffineColorCorrection):
         return f"the {int(self.num_views)} test views themselves"
 
 
+class TranslatedGammaColorCorrection(AffineColorCorrection):
+    """Protocol ``translated-gamma``: L_ref = b L̂ᵃ − c per channel, in linear radiance, as Deblur e-NeRF does.
+
+    Cameras add a black level c to their images, which no affine map of log-radiance can express. The affine map is this
+    map with c = ε, its ``scale`` is a and its ``offset`` is log b.
+    """
+
+    protocol = "translated-gamma"
+    black: Tensor
+
+    def __init__(self, num_channels: int, encoding: ImageEncoding) -> None:
+        super().__init__(num_channels, encoding)
+        self.register_buffer("black", torch.full((num_channels,), _EPSILON))
+
+    def forward(self, log_radiance: Tensor) -> Tensor:
+        """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
+        return encode(torch.exp(self.scale * log_radiance + self.offset) - self.black, self.encoding)
+
+    @property
+    def _fitted_on(self) -> str:
+        exponents = ", ".join(f"{exponent:.3f}" for exponent in self.scale.tolist())
+        return f"{super()._fitted_on}, exponent a = {exponents}"
+
+    @torch.no_grad()
+    def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
+        """Fit the reference radiance by least squares with the algorithm of Levenberg and Marquardt, per channel.
+
+        The affine fit is the start.
+
+        Args:
+            log_radiance: (N, channels) rendered.
+            reference: (N, channels) linear radiance in [0, 1] of the same pixels.
+            num_views: number of reference views these pixels are from.
+            rough: leave out whatever takes time. This fit takes milliseconds, so it is the same either way.
+        """
+        super().fit(log_radiance, reference, num_views)
+        self.black.fill_(_EPSILON)
+        if len(reference) < 3:
+            # Fewer pixels than unknowns.
+            return
+        start = torch.stack([self.scale, self.offset, self.black]).double().cpu().numpy()
+        for channel, (x, y) in enumerate(zip(log_radiance.double().T, reference.double().T, strict=True)):
+            fitted = _fit_translated_gamma(x.cpu().numpy(), y.cpu().numpy(), start[:, channel])
+            for buffer, value in zip((self.scale, self.offset, self.black), fitted.tolist(), strict=True):
+                buffer[channel] = value
+
+    @torch.no_grad()
+    def stretch(self, log_radiance: Tensor) -> None:
+        """Apply the percentile stretch, without reference images.
+
+        Args:
+            log_radiance: (N, channels) rendered.
+        """
+        super().stretch(log_radiance)
+        self.black.fill_(_EPSILON)
+
+
+def _fit_translated_gamma(
+    log_radiance: NDArray[np.float64], reference: NDArray[np.float64], start: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return a, log b and c of reference ≈ exp(a log_radiance + log b) − c, by least squares over (N,) values."""
+    # Imported lazily: every ns-* command imports this module.
+    from scipy.optimize import least_squares
+
+    def residuals(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        a, log_b, c = unknowns
+        # A step that overflows is refused, because its sum of squares is infinite.
+        with np.errstate(over="ignore"):
+            return np.exp(a * log_radiance + log_b) - c - reference
+
+    def jacobian(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        power = np.exp(unknowns[0] * log_radiance + unknowns[1])
+        return np.stack([power * log_radiance, power, -np.ones_like(power)], 1)
+
+    return least_squares(residuals, start, jacobian, method="lm").x
+
+
 class NetworkColorCorrection(AffineColorCorrection):
     """Protocol ``network``: the paper's learned F (eq. 15), from a pixel's log-radiance to its display values.
 
@@ -238,6 +317,7 @@ ColorCorrection = NoColorCorrection | AffineColorCorrection
 COLOR_CORRECTIONS: dict[ColorCorrectionProtocol, type[ColorCorrection]] = {
     "affine": AffineColorCorrection,
     "affine-test": AffineTestColorCorrection,
+    "translated-gamma": TranslatedGammaColorCorrection,
     "network": NetworkColorCorrection,
     "none": NoColorCorrection,
 }

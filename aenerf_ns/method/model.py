@@ -87,7 +87,8 @@ class AENeRFModelConfig(ModelConfig):
     color_correction: ColorCorrectionProtocol = "affine"
     """How log-radiance becomes a picture. "affine": by an affine map per channel, fitted on the validation views.
     "affine-test": by one fitted on the test views themselves, only to compare with figures that were made that way.
-    "network": by a network fitted on the validation views (paper, eq. 15). "none": unchanged."""
+    "translated-gamma": by a power and a black level per channel, fitted on the validation views. "network": by a
+    network fitted on the validation views (paper, eq. 15). "none": unchanged."""
     color_correction_num_rays: int = 16384
     """Pixels that the colour correction is fitted on, spread over the reference views."""
     lpips: bool = False

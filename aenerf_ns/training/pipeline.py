@@ -24,6 +24,7 @@ from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
+from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
 from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
@@ -76,6 +77,7 @@ class AENeRFPipeline(VanillaPipeline):
             provide_ffmpeg()
         super().__init__(config, device, test_mode=test_mode, **kwargs)
         self._refined_test_poses = False
+        self._pose_diagnosis: dict[str, Any] | None = None
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
         # Chosen once: otherwise every fit would read the images again.
@@ -98,6 +100,14 @@ class AENeRFPipeline(VanillaPipeline):
                 data.place_reference_views(correction.apply_to_camera(data.eval_dataset.cameras.to(self.device)))
             data.place_training_cameras(correction.apply_to_camera(data.train_dataset.cameras.to(self.device)))
             correction.training_cameras_are_corrected = True
+
+    def get_extra_state(self) -> dict[str, Any] | None:
+        """Return the diagnosis of the pose correction, which checkpoints hold; None before the last step."""
+        return self._pose_diagnosis
+
+    def set_extra_state(self, state: dict[str, Any] | None) -> None:
+        """Take the diagnosis of the pose correction from a checkpoint."""
+        self._pose_diagnosis = state
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
         """Return outputs, weighted losses and metrics of a training batch.
@@ -122,14 +132,27 @@ class AENeRFPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return all callbacks, with the colour correction's, and make every optimizer check its gradients."""
+        """Return all callbacks, with the colour correction's and the diagnosis', and let optimizers check gradients."""
         trainer = training_callback_attributes.trainer
         assert trainer is not None
         # Saved again, because the dataparser has resolved the time window by now: opening the run must give the same
         # cameras without reading the events.
         if trainer.local_rank == 0:
             trainer.config.save_config()
-        last_step = trainer._start_step + trainer.config.max_num_iterations - 1
+        num_steps = trainer.config.max_num_iterations
+        last_step = trainer._start_step + num_steps - 1
+        # A run that goes on from a checkpoint is diagnosed anew at its own end.
+        self._pose_diagnosis = None
+        earlier_poses: list[Tensor] = []
+
+        def diagnose_poses(step: int) -> None:
+            if self.model.camera_optimizer.twists is None or not comms.is_main_process():
+                return
+            if step == max(last_step - max(round(LAST_PART * num_steps), 1), trainer._start_step):
+                earlier_poses.append(self.model.camera_optimizer.compared_poses()[1])
+            if step == last_step:
+                self._pose_diagnosis = diagnose(self, *earlier_poses)
+                CONSOLE.print(self._pose_diagnosis["summary"])
 
         def fit(step: int) -> None:
             # The main process writes the checkpoints, and DistributedDataParallel copies its buffers to the others.
@@ -159,7 +182,7 @@ class AENeRFPipeline(VanillaPipeline):
         # After every step, because the trainer saves its last checkpoint before it calls the callbacks for the end.
         callbacks = [
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], function, update_every_num_iters=1)
-            for function in (check_losses, fit)
+            for function in (check_losses, diagnose_poses, fit)
         ]
         return [*super().get_training_callbacks(training_callback_attributes), *callbacks]
 
@@ -328,6 +351,7 @@ class AENeRFPipeline(VanillaPipeline):
             metrics["num_views"] = len(self.datamanager.eval_dataset) if self.datamanager.has_reference_views else 0
             metrics["pose_correction"] = self.model.config.camera_optimizer.mode
             metrics["pose_errors"] = self.pose_errors()
+            metrics["pose_diagnosis"] = self._pose_diagnosis
             metrics["test_poses"] = self._test_poses
             metrics |= self.model.supervision.learned()
             if self.model.image_metrics.lpips_absent is not None:

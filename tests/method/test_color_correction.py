@@ -17,6 +17,7 @@ from aenerf_ns.method.color_correction import (
     ColorCorrectionProtocol,
     NetworkColorCorrection,
     NoColorCorrection,
+    TranslatedGammaColorCorrection,
 )
 
 FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
@@ -41,7 +42,7 @@ def test_every_protocol_has_a_class_of_its_name() -> None:
         assert correction.protocol == protocol
 
 
-@pytest.mark.parametrize("protocol", ["affine", "affine-test"])
+@pytest.mark.parametrize("protocol", ["affine", "affine-test", "translated-gamma"])
 def test_affine_fit_recovers_gain_and_exponent_of_each_channel(protocol: ColorCorrectionProtocol) -> None:
     generator = torch.Generator().manual_seed(0)
     reference = torch.rand(5000, 3, generator=generator)
@@ -55,10 +56,34 @@ def test_affine_fit_recovers_gain_and_exponent_of_each_channel(protocol: ColorCo
     torch.testing.assert_close(correction(log_radiance), encode(reference, "srgb"), atol=1e-4, rtol=1e-4)
 
 
-def test_affine_fit_of_a_constant_rendering_is_the_mean() -> None:
-    correction = AffineColorCorrection(1, "linear")
-    correction.fit(torch.full((4, 1), 0.7), torch.full((4, 1), 0.25), num_views=1)
+@pytest.mark.parametrize("num_pixels", [1, 4])
+@pytest.mark.parametrize("protocol", ["affine", "translated-gamma"])
+def test_fit_of_a_constant_rendering_is_the_mean(protocol: ColorCorrectionProtocol, num_pixels: int) -> None:
+    correction = COLOR_CORRECTIONS[protocol](1, "linear")
+    assert isinstance(correction, AffineColorCorrection)
+    correction.fit(torch.full((num_pixels, 1), 0.7), torch.full((num_pixels, 1), 0.25), num_views=1)
     torch.testing.assert_close(correction(torch.tensor([[0.7]])), torch.tensor([[0.25]]))
+
+
+def black_level(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log-radiance and reference radiance (count, 3) = b L^a - c, with a black level c that differs by channel."""
+    log_radiance = 2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) - 1
+    a, b, c = torch.tensor([0.7, 1.0, 1.6]), torch.tensor([0.3, 0.25, 0.1]), torch.tensor([-0.05, 0.02, -0.1])
+    return log_radiance, b * torch.exp(a * log_radiance) - c
+
+
+def test_translated_gamma_recovers_exponent_gain_and_black_level() -> None:
+    affine, gamma = AffineColorCorrection(3, "srgb"), TranslatedGammaColorCorrection(3, "srgb")
+    for correction in (affine, gamma):
+        correction.fit(*black_level(2000, seed=0), num_views=4)
+    torch.testing.assert_close(gamma.scale, torch.tensor([0.7, 1.0, 1.6]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(gamma.offset.exp(), torch.tensor([0.3, 0.25, 0.1]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(gamma.black, torch.tensor([-0.05, 0.02, -0.1]), atol=1e-4, rtol=0)
+    assert gamma.description == "translated-gamma, fitted on 4 validation views, exponent a = 0.700, 1.000, 1.600"
+    held_out = black_level(2000, seed=1)
+    assert mean_squared_error(gamma, *held_out) < 1e-8
+    # A PSNR of less than 45 dB.
+    assert mean_squared_error(affine, *held_out) > 3e-5
 
 
 def test_the_network_learns_what_no_affine_map_can() -> None:
@@ -152,13 +177,14 @@ def test_each_protocol_is_fitted_on_its_own_views(test_mode: Literal["test", "va
     expected: dict[ColorCorrectionProtocol, tuple[str, torch.Tensor]] = {
         "affine": ("affine, fitted on 2 validation views", grey),
         "affine-test": ("affine-test, fitted on the 3 test views themselves", orange),
+        "translated-gamma": ("translated-gamma, fitted on 2 validation views, exponent a = ", grey),
         "network": ("network, fitted on 2 validation views", grey),
     }
     camera = pipeline.datamanager.reference_views("test").cameras[0:1]
     rays = camera.generate_rays(0, keep_shape=False)
     for protocol, (description, color) in expected.items():
         pipeline.replace_color_correction(protocol)
-        assert pipeline.model.color_correction.description == description
+        assert pipeline.model.color_correction.description.startswith(description)
         # All references are alike, so whatever is rendered becomes their colour.
         shown = pipeline.model.eval()(rays)["rgb"]
         torch.testing.assert_close(shown, color.expand_as(shown), atol=0.02, rtol=0)
@@ -173,6 +199,7 @@ def test_without_reference_views_every_fitted_protocol_says_that_it_is_a_stretch
     # There is one test view, which the protocols for validation views may not use.
     for protocol, description in (
         ("affine", "percentile stretch, no validation views (protocol affine)"),
+        ("translated-gamma", "percentile stretch, no validation views (protocol translated-gamma)"),
         ("network", "percentile stretch, no validation views (protocol network)"),
         ("affine-test", "affine-test, fitted on the 1 test views themselves"),
     ):

@@ -1,0 +1,221 @@
+"""The diagnosis of pose correction: what it sees in poses that are right, wrong or not moving, and what it says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_stream
+from small_pipelines import make_pipeline, make_pipeline_config
+
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.rotation import rotation_from_vector
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.training import pose_diagnosis
+from aenerf_ns.training.pipeline import AENeRFPipeline
+from aenerf_ns.training.pose_diagnosis import diagnose, summary
+
+CAMERA = EventCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
+SECOND = 10**9
+
+
+def write_dots(folder: Path, speed: float = 1.0) -> None:
+    """Write a second of a camera that slides and turns past dots; a dot triggers an event in each pixel it enters."""
+    rng = np.random.default_rng(0)
+    dots = np.stack([rng.uniform(-4, 4, 3000), rng.uniform(-2, 2, 3000), rng.uniform(1.5, 2.5, 3000)], 1)
+    polarity = rng.choice([-1, 1], 3000)
+    times = np.linspace(0, SECOND, 1001).astype(np.int64)
+    phase = torch.from_numpy(speed * times / SECOND)
+    turns = torch.stack([0.2 * torch.sin(9 * phase), 0.2 * torch.cos(8 * phase), 0.1 * phase], 1)
+    places = torch.stack([phase - 0.5, 0.1 * torch.sin(6 * phase), 0.1 * torch.cos(5 * phase)], 1)
+    poses = torch.cat([rotation_from_vector(turns), places[..., None]], -1)
+    seen = np.einsum("tji,tnj->tni", poses[..., :3].numpy(), dots[None] - poses[:, None, :, 3].numpy())
+    x, y = (np.floor(60 * seen[..., i] / seen[..., 2] + (32, 24)[i]).astype(np.int64) for i in (0, 1))
+    inside = (x >= 0) & (x < 64) & (y >= 0) & (y < 48)
+    moved = np.zeros_like(inside)
+    moved[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1])
+    step, dot = (moved & inside).nonzero()
+    if speed == 0:
+        # Noise alone.
+        step, dot = np.repeat(np.arange(1, 1001), 10), rng.choice(inside[0].nonzero()[0], 10_000)
+    columns = (x[step, dot].astype(np.uint16), y[step, dot].astype(np.uint16), times[step])
+    events = EventStream(*columns, polarity[dot].astype(np.int8), 64, 48)
+    with NativeDatasetWriter(folder, CAMERA, SensorModel(), "srgb") as writer:
+        writer.events.append(events)
+        writer.add_trajectories(Trajectory(times, poses), None)
+
+
+@pytest.fixture(scope="module")
+def dots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("diagnosis") / "dots"
+    write_dots(folder)
+    return folder
+
+
+def diagnosed(pipeline: AENeRFPipeline) -> dict[str, Any]:
+    return diagnose(pipeline, pipeline.model.camera_optimizer.compared_poses()[1])
+
+
+def move(pipeline: AENeRFPipeline, size: float) -> None:
+    """Turn the corrected poses by different angles at every knot."""
+    twists = pipeline.model.camera_optimizer.twists
+    assert twists is not None
+    with torch.no_grad():
+        twists.control_twists[:, 3:] = size * torch.randn(
+            len(twists.control_twists), 3, generator=torch.Generator().manual_seed(0)
+        )
+
+
+def test_right_poses_have_no_sign_of_failure_in_the_events(dots: Path) -> None:
+    pipeline = make_pipeline(dots, "val", pose_correction="spline")
+    state = torch.get_rng_state()
+    figures = diagnosed(pipeline)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert pipeline.model.training
+    assert figures["contrast_corrected"] == pytest.approx(figures["contrast_estimated"], rel=1e-6)
+    assert figures["turned_slices"] == 3
+    assert figures["turned_slices_sharper"] == 0
+    assert figures["correction_rotation_degrees"] == pytest.approx(0, abs=1e-5)
+    assert figures["penalty_share_of_loss"] == 0
+    # Of pairs over all times, each once, and the same every time. An untrained field leaves all of the loss.
+    assert [s["start_seconds"] for s in figures["stretches"]] == pytest.approx(np.arange(0, 1, 0.1), abs=0.01)
+    for stretch in figures["stretches"]:
+        assert stretch["num_pairs"] >= 64
+        assert stretch["loss"] == pytest.approx(stretch["loss_of_constant_field"], rel=0.05)
+    assert "Undecided, because 101% of the loss" in figures["summary"]
+    assert diagnosed(pipeline) == figures
+
+
+def test_corrections_that_spoil_the_poses_are_seen_in_the_events(dots: Path) -> None:
+    pipeline = make_pipeline(dots, "val", pose_correction="spline")
+    move(pipeline, 0.1)
+    figures = diagnosed(pipeline)
+    assert figures["contrast_corrected"] < 0.9 * figures["contrast_estimated"]
+    assert figures["contrast_is_clearly_lower"]
+    assert figures["turned_slices_sharper"] >= 2
+    assert figures["correction_rotation_degrees"] > 2
+    assert "--pipeline.model.camera-optimizer.mode off" in figures["summary"]
+    assert f"in {figures['turned_slices_sharper']} of 3 slices" in figures["summary"]
+
+
+@pytest.mark.parametrize("mode", ["spline", "network"])
+def test_a_still_camera_and_few_events_can_be_diagnosed(tmp_path: Path, mode: str) -> None:
+    write_dots(tmp_path / "still", speed=0.0)
+    config = make_pipeline_config(tmp_path / "still", pose_correction=mode)
+    config.datamanager.dataparser.auto_scale_poses = False
+    still = diagnosed(config.setup(device="cpu", test_mode="val"))
+    assert still["contrast_corrected"] is not None
+    # Two events.
+    few = diagnosed(make_pipeline(tmp_path / "few", "val", pose_correction=mode))
+    assert few["contrast_corrected"] is None
+    for figures in (still, few):
+        json.dumps(figures, allow_nan=False)
+
+
+def test_the_events_of_pairs_are_those_of_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [
+        (0, 0, 1, 1), (1, 0, 2, -1), (0, 0, 3, -1), (3, 2, 4, 1), (1, 0, 5, 1), (1, 0, 5, 1), (0, 0, 6, 1), (3, 2, 7, 1)
+    ]  # fmt: skip
+    pairs = pair_events([make_stream(rows)])
+    events = pose_diagnosis._events(pairs)
+    # Without the first of each pixel, and events of one pixel and time once.
+    expected = [(0, 0, 3, -1), (1, 0, 5, 1), (0, 0, 6, 1), (3, 2, 7, 1)]
+    assert list(zip(events.x, events.y, events.t, events.p, strict=True)) == expected
+    # Only the rows in the middle of the table: 16, with 8 behind the last event's.
+    monkeypatch.setattr(pose_diagnosis, "_MAX_ROWS", len(pairs.rows) - 2)
+    assert 0 < len(pose_diagnosis._events(pairs)) <= 4
+
+
+def test_the_last_step_is_diagnosed_and_the_checkpoint_keeps_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "val", pose_correction="spline")
+    config = SimpleNamespace(
+        max_num_iterations=20, steps_per_save=1000, logging=SimpleNamespace(steps_per_log=10), save_config=lambda: None
+    )
+    trainer = SimpleNamespace(
+        local_rank=0, _start_step=100, config=config, optimizers=SimpleNamespace(optimizers={}),
+        grad_scaler=torch.amp.GradScaler("cpu", enabled=False),
+    )  # fmt: skip
+    # Of the run that this run goes on from.
+    pipeline.set_extra_state({"summary": "of before"})
+    callbacks = pipeline.get_training_callbacks(SimpleNamespace(trainer=trainer))
+    (callback,) = [c.func for c in callbacks if c.func.__name__ == "diagnose_poses"]
+    states = []
+    for step in range(100, 120):
+        move(pipeline, 0.001 * max(step - 117, 0))
+        callback(step)
+        states.append(pipeline.state_dict()["_extra_state"])
+    assert states[:-1] == [None] * 19
+    found = states[-1]
+    # The poses moved in the last two of 20 steps.
+    assert found["last_tenth_rotation_degrees"] == pytest.approx(found["correction_rotation_degrees"], rel=1e-3)
+    assert found["correction_rotation_degrees"] > 0.01
+    torch.save(pipeline.state_dict(), tmp_path / "checkpoint.pt")
+    opened = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
+    monkeypatch.setattr(opened.model, "get_image_metrics_and_images", lambda *_: ({"psnr": 20.0, "ssim": 0.5}, {}))
+    loaded = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    opened.load_pipeline(loaded, 119)
+    assert opened.get_average_eval_image_metrics()["pose_diagnosis"] == found
+    # Checkpoints of before have no diagnosis.
+    older = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
+    del loaded["_extra_state"]
+    older.load_pipeline(loaded, 119)
+    assert older.get_extra_state() is None
+
+
+GOOD: dict[str, Any] = {
+    "correction_rotation_degrees": 0.5,
+    "correction_translation_recording_units": 0.02,
+    "last_tenth_rotation_degrees": 0.01,
+    "last_tenth_translation_recording_units": 0.001,
+    "penalty_share_of_loss": 1e-5,
+    "contrast_estimated": 0.5,
+    "contrast_corrected": 0.52,
+    "contrast_is_clearly_lower": False,
+    "turned_slices": 4,
+    "turned_slices_sharper": 1,
+    "stretches": [
+        {"start_seconds": 0.4 * i, "end_seconds": 0.4 * (i + 1), "loss": share, "loss_of_constant_field": 2.0}
+        for i, share in enumerate((0.1, 0.2, 0.1, 0.06, 0.1))
+    ],
+}
+
+
+def with_loss(index: int, loss: float | None) -> dict[str, Any]:
+    stretches = [dict(stretch) for stretch in GOOD["stretches"]]
+    stretches[index]["loss"] = loss
+    return {"stretches": stretches}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, "contrast of warped events 0.500 before, 0.520 after. No sign of failure."),
+        (with_loss(3, None), "No sign of failure"),
+        ({"stretches": [], "penalty_share_of_loss": None}, "No sign of failure"),
+        ({"contrast_estimated": None, "contrast_corrected": None}, "recording on average. No sign of failure"),
+        ({"contrast_is_clearly_lower": True}, "the events fit the estimated poses better"),
+        ({"turned_slices_sharper": 2}, "in 2 of 4 slices"),
+        ({"turned_slices": 1, "turned_slices_sharper": 1}, "No sign of failure"),
+        (with_loss(3, 0.5), "the loss is far higher from 1.2 to 1.6 s than elsewhere"),
+        ({"last_tenth_rotation_degrees": 0.3}, "the poses still moved by 0.3 degrees"),
+        # A tenth of a pixel.
+        ({"correction_rotation_degrees": 0.1, "last_tenth_rotation_degrees": 0.05}, "No sign of failure"),
+        ({"penalty_share_of_loss": 0.3}, "the penalty on corrections is 30% of the reconstruction loss"),
+        ({"stretches": [{**s, "loss": 8 * s["loss"]} for s in GOOD["stretches"]]}, "Undecided, because 40% of the"),
+    ],
+)
+def test_the_summary_names_each_clear_sign(change: dict[str, Any], said: str) -> None:
+    line = summary({**GOOD, **change}, focal=100.0)
+    assert said in line
+    assert ("Signs of failure" in line) == (not said.endswith(("failure", "failure.")) and "Undecided" not in said)
