@@ -99,10 +99,11 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
 
-def write_result(output: Path, result: dict[str, Any]) -> None:
-    """Write a result with its machine, versions, commit and command as JSON, and print the result."""
+def write_result(output: Path, result: dict[str, Any], show: bool = True) -> None:
+    """Write a result with its machine, versions, commit and command as JSON, and print the result unless not shown."""
     output.write_text(json.dumps({**result, **_environment()}, indent=2) + "\n", "utf8")
-    print(json.dumps(result, indent=2), flush=True)
+    if show:
+        print(json.dumps(result, indent=2), flush=True)
 
 
 # Looked up once: a result that was just written into the checkout would count as a change to the commit.

@@ -111,6 +111,7 @@ class Poses:
                         "table": table(runs),
                         "runs": runs,
                     },
+                    show=False,
                 )
         print(as_text(table(runs)))
 
