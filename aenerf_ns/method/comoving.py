@@ -53,8 +53,6 @@ class CoMovingSpace(nn.Module):
     _seen: Tensor
     _weights: Tensor
     _strides: Tensor
-    _corners: Tensor
-    _neighbours: Tensor
 
     def __init__(self, correction: PoseCorrection, unit_positions: Callable[[Tensor], Tensor]) -> None:
         super().__init__()
@@ -68,10 +66,7 @@ class CoMovingSpace(nn.Module):
         self.register_buffer("_base_poses", correction.trajectory.pose(seconds), persistent=False)
         self.register_buffer("_seen", torch.zeros(_RESOLUTION**3, count))
         self.register_buffer("_weights", torch.full((_RESOLUTION**3, count), 1 / count))
-        strides = torch.tensor([_RESOLUTION**2, _RESOLUTION, 1])
-        corners = torch.cartesian_prod(*[torch.arange(2)] * 3)
-        for name, value in (("_strides", strides), ("_corners", corners), ("_neighbours", corners @ strides)):
-            self.register_buffer(name, value, persistent=False)
+        self.register_buffer("_strides", torch.tensor([_RESOLUTION**2, _RESOLUTION, 1]), persistent=False)
         self._twists: Tensor | None = None
 
     def follow(self) -> None:
@@ -102,12 +97,10 @@ class CoMovingSpace(nn.Module):
         if kernels is not None:
             found: Tensor = _LookUp.apply(grid, unit.contiguous(), kernels)
             return found
-        place = (unit * _RESOLUTION - 0.5).clamp(0, _RESOLUTION - 1)
-        lower = place.floor().clamp(max=_RESOLUTION - 2)
-        share = (place - lower)[:, None]
-        weights = torch.where(self._corners == 1, share, 1 - share).prod(-1)
-        index = (lower.long() * self._strides).sum(-1, keepdim=True) + self._neighbours
-        return (weights[:, None] @ grid.flatten(0, 2)[index])[:, 0]
+        # torch counts the coordinates of a place from the last axis.
+        places = (2 * unit - 1).flip(-1)[None, None, None]
+        cells = grid.permute(3, 0, 1, 2)[None]
+        return F.grid_sample(cells, places, padding_mode="border", align_corners=False)[0, :, 0, 0].T
 
     @torch.no_grad()
     def observe(self, positions: Tensor, weights: Tensor, seconds: Tensor) -> None:

@@ -41,9 +41,13 @@ def probe(device: torch.device) -> None:
 @compiled
 def _place(unit, resolution):
     """Return the cell below a coordinate in [0, 1], and the share of the next cell."""
-    x = min(max(unit * _F(resolution) - _HALF, _ZERO), _F(resolution - 1))
-    lower = min(int(x), resolution - 2)
-    return lower, x - _F(lower)
+    x = unit * _F(resolution) - _HALF
+    last = _F(resolution - 1)
+    # Not a number fails every comparison: it must not become an index, but it must stay in the share.
+    inside = x if x > _ZERO else _ZERO
+    lower = min(int(inside if inside < last else last), resolution - 2)
+    bounded = x if not x < _ZERO else _ZERO
+    return lower, (bounded if not bounded > last else last) - _F(lower)
 
 
 @compiled

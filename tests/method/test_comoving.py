@@ -113,6 +113,19 @@ def test_kernels_and_plain_torch_agree(correction: PoseCorrection, monkeypatch: 
     torch.testing.assert_close(by_kernels[1], plain[1], rtol=1e-4, atol=1e-3)
 
 
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_position_that_is_not_a_number_stays_one(
+    correction: PoseCorrection, monkeypatch: pytest.MonkeyPatch, plain: bool
+) -> None:
+    if plain:
+        monkeypatch.setattr(comoving, "kernels_or_none", lambda *_: None)
+    space = CoMovingSpace(correction, _unit)
+    space.follow()
+    found = space(torch.tensor([[math.nan, math.inf, -math.inf], [0.0, 0.0, 0.0]]))
+    assert found[0, 0].isnan()
+    assert found[1].isfinite().all()
+
+
 def test_positions_that_move_have_rates(correction: PoseCorrection) -> None:
     space = CoMovingSpace(correction, _unit)
     correction.twists.control_twists.data.fill_(0.01)

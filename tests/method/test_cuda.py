@@ -163,10 +163,10 @@ def test_a_step_waits_once_and_copies_nothing_else(temporal: bool, tmp_path: Pat
 @pytest.mark.parametrize(
     ("grid", "temporal", "launches", "gigabytes"),
     [
-        ("torch", False, 856, 48.6),
-        ("torch", True, 1670, 59.9),
-        ("triton", False, 761, 14.0),
-        ("triton", True, 1475, 20.1),
+        ("torch", False, 950, 49.4),
+        ("torch", True, 1806, 60.6),
+        ("triton", False, 855, 14.8),
+        ("triton", True, 1611, 20.8),
     ],
 )
 def test_what_a_step_of_the_full_method_costs(
