@@ -63,7 +63,8 @@ def pixel_errors(poses: Tensor, reference: Tensor, seconds: Tensor, camera: dict
 
     errors = {}
     for lag in LAGS:
-        later = torch.searchsorted(seconds, seconds + lag)
+        # A microsecond less, because sums of seconds are rounded.
+        later = torch.searchsorted(seconds, seconds + (lag - 1e-6))
         first = (later < len(seconds)).nonzero()[:, 0]
         later = later[first]
 

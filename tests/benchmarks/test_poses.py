@@ -1,0 +1,79 @@
+"""The measures and the table of the benchmark of the correction of poses."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from aenerf_ns.camera.rotation import motion_from_twist
+from benchmarks.poses.__main__ import as_text, table
+from benchmarks.poses.worker import pixel_errors, plateau_left_at
+
+_CAMERA = {"fx": 100.0, "fy": 100.0, "width": 100.0, "height": 80.0, "depth": 2.0}
+
+
+def _poses(count: int = 41) -> torch.Tensor:
+    """Return poses that slide along x by 0.5 in 4 seconds, while they bob."""
+    poses = torch.eye(4, dtype=torch.float64)[:3].repeat(count, 1, 1)
+    along = torch.linspace(0, 1, count, dtype=torch.float64)
+    poses[:, 0, 3], poses[:, 1, 3] = 0.5 * along, 0.1 * torch.sin(12 * along)
+    return poses
+
+
+def test_an_error_that_all_poses_share_is_none() -> None:
+    poses = _poses()
+    shared = torch.eye(4, dtype=torch.float64)
+    shared[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    seconds = torch.linspace(0, 4, len(poses), dtype=torch.float64)
+    errors = pixel_errors(
+        (shared @ torch.cat([poses, shared[3:].expand(len(poses), 1, 4)], 1))[:, :3], poses, seconds, _CAMERA
+    )
+    assert max(errors.values()) < 1e-6
+
+
+def test_a_turn_between_nearby_times_is_seen_in_pixels() -> None:
+    poses = _poses()
+    wrong = poses.clone()
+    # Every second pose, 0.1 seconds from its neighbours, is turned by 0.01 radians.
+    turn = motion_from_twist(torch.tensor([0.0, 0, 0, 0, 0.01, 0], dtype=torch.float64))
+    wrong[1::2, :, :3] = wrong[1::2, :, :3] @ turn[:3, :3]
+    seconds = torch.linspace(0, 4, len(poses), dtype=torch.float64)
+    errors = pixel_errors(wrong, poses, seconds, _CAMERA)
+    # A pixel, 100 x 0.01, and a little more away from the middle of the picture.
+    assert errors["0.1"] == pytest.approx(1.08, abs=0.04)
+    assert errors["0.2"] == pytest.approx(0, abs=0.05)
+
+
+def test_lags_longer_than_the_recording_have_no_error() -> None:
+    errors = pixel_errors(_poses(5), _poses(5), torch.linspace(0, 0.3, 5, dtype=torch.float64), _CAMERA)
+    assert math.isnan(errors["0.4"])
+    assert errors["0.2"] < 1e-6
+
+
+def test_the_step_at_which_the_loss_falls() -> None:
+    losses = torch.cat([torch.full((300,), 2.0), torch.full((700,), 0.5)])
+    assert plateau_left_at(losses) == pytest.approx(300, abs=25)
+
+
+def _run(case: str, variant: str, seed: int, psnr: float) -> dict:
+    end = {"degrees": 0.5, "translation": 0.02, "pixels": {"0.1": 0.1, "0.2": 0.2, "0.4": 0.4, "0.8": 0.8}}
+    return {
+        "scene": "room", "case": case, "variant": variant, "seed": seed,
+        "placed": {"psnr": psnr}, "poses": {"end": end}, "plateau_left_at": 7,
+    }  # fmt: skip
+
+
+def test_differences_are_taken_seed_by_seed() -> None:
+    runs = [
+        _run("noise, corrected", "default", 1, 20.0), _run("noise, corrected", "default", 2, 30.0),
+        _run("true poses", "default", 1, 21.0), _run("true poses", "default", 2, 33.0),
+        _run("noise, corrected", "other", 1, 22.0), _run("noise, corrected", "other", 2, 31.0),
+    ]  # fmt: skip
+    rows = {(row["case"], row["variant"]): row for row in table(runs)}
+    corrected = rows["noise, corrected", "default"]
+    assert corrected["psnr_placed"] == {"mean": 25.0, "spread": 10.0}
+    assert corrected["psnr_placed_less_than_true_poses"] == {"mean": 2.0, "spread": 2.0}
+    assert rows["noise, corrected", "other"]["psnr_placed_more_than_default"] == {"mean": 1.5, "spread": 1.0}
+    assert "2.00 dB less" in as_text(table(runs))
