@@ -72,7 +72,9 @@ class CoMovingSpace(nn.Module):
     def follow(self) -> None:
         """Take the corrections as they are now, for all positions until the next call."""
         twists = self._correction[0].world_twists(self._seconds, self._base_poses).to(self._weights)
-        self._twists = (self._weights @ twists).unflatten(0, [_RESOLUTION] * 3)
+        # Half precision would round the places to a thousandth of the twists' size, and kernels take float32.
+        with torch.autocast(twists.device.type, enabled=False):
+            self._twists = (self._weights @ twists).unflatten(0, [_RESOLUTION] * 3)
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the places (..., 3) in the field's space of positions (..., 3) in the scene."""
@@ -86,7 +88,7 @@ class CoMovingSpace(nn.Module):
 
     def _moved(self, positions: Tensor, grid: Tensor) -> Tensor:
         with torch.no_grad():
-            unit = self._unit_positions(forward_ad.unpack_dual(positions).primal.flatten(0, -2))
+            unit = self._unit_positions(forward_ad.unpack_dual(positions).primal.flatten(0, -2)).to(grid.dtype)
         translation, rotation = self._look_up(grid, unit).unflatten(0, positions.shape[:-1]).split(3, -1)
         return positions - translation - torch.linalg.cross(rotation, positions)
 
