@@ -152,7 +152,7 @@ class AENeRFPipeline(VanillaPipeline):
                 earlier_poses.append(self.model.camera_optimizer.compared_poses()[1])
             if step == last_step:
                 self._pose_diagnosis = diagnose(self, *earlier_poses)
-                CONSOLE.print(self._pose_diagnosis["summary"])
+                CONSOLE.print(self._pose_diagnosis["summary"], soft_wrap=True)
 
         def fit(step: int) -> None:
             # The main process writes the checkpoints, and DistributedDataParallel copies its buffers to the others.

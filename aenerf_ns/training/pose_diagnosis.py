@@ -92,10 +92,8 @@ def summary(figures: dict[str, Any], focal: float) -> str:
         focal: focal length of the event camera in pixels.
     """
     degrees, moved = figures["correction_rotation_degrees"], figures["last_tenth_rotation_degrees"]
-    line = (
-        f"Pose correction: {degrees:.2g} degrees and {figures['correction_translation_recording_units']:.2g} units of "
-        "the recording on average"
-    )
+    length = round(figures["correction_translation_recording_units"], 6)
+    line = f"Pose correction: {degrees:.2f} degrees and {length:.2g} units of the recording on average"
     signs = []
     if figures["contrast_corrected"] is not None:
         before, after = figures["contrast_estimated"], figures["contrast_corrected"]
