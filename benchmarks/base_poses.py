@@ -43,7 +43,7 @@ class BasePoses:
     """Poses a second."""
     noises: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.15, 0.005), (0.5, 0.02))
     """Root mean squares of the noise of the given poses, in degrees and metres."""
-    lost: tuple[int, ...] = (0, 1, 2, 4, 8)
+    lost: tuple[int, ...] = (1, 2, 4, 8)
     """Frames in a row that are left out, in the rows on lost frames."""
     seeds: int = 5
     """Number of draws of the noise."""
@@ -63,7 +63,7 @@ class BasePoses:
             for name in _PATHS
             for rate in self.rates[-1:]
             for degrees, metres in self.noises
-            for lost in self.lost[1:]
+            for lost in self.lost
         ]
         write_result(self.output, {"duration_easy": _DURATION, "seeds": self.seeds, "rows": rows, "lost_frames": gaps})
 

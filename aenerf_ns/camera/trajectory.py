@@ -101,6 +101,11 @@ class Trajectory(nn.Module):
         return int(self.times[-1])
 
     @property
+    def duration(self) -> float:
+        """Seconds from the first knot to the last."""
+        return (self.end - self.start) * 1e-9
+
+    @property
     def extent(self) -> float:
         """Root mean square distance of the positions at the knots from their mean."""
         positions = self.camera_to_worlds[:, :, 3]

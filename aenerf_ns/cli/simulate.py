@@ -132,10 +132,9 @@ class Simulate:
                 for pose in poses:
                     seen = simulation.reference_picture(pose)
                     writer.add_image(split, seen.display, pose, linear=seen.linear, depth=seen.depth)
-        seconds = (truth.end - truth.start) * 1e-9
         CONSOLE.print(
-            f"{self.output}: {num_events:,} events in {seconds:.2f} s, {len(estimated)} poses, {self.train_images} "
-            f"train, {self.validation_views} validation and {self.test_views} test images.\n"
+            f"{self.output}: {num_events:,} events in {truth.duration:.2f} s, {len(estimated)} poses, "
+            f"{self.train_images} train, {self.validation_views} validation and {self.test_views} test images.\n"
             f"Train with: ns-train aenerf --data {self.output}"
         )
 

@@ -46,6 +46,9 @@ class CoMovingSpace(nn.Module):
     Args:
         correction: of the poses, of mode "network" or "spline". It stays the model's.
         unit_positions: maps (N, 3) positions in the scene to the unit cube, as the fields do.
+
+    Attributes:
+        observing: whether rays are being counted. The model switches it.
     """
 
     _seconds: Tensor
@@ -59,9 +62,11 @@ class CoMovingSpace(nn.Module):
         # Not as a submodule: the correction's parameters are the model's already.
         self._correction = (correction,)
         self._unit_positions = unit_positions
-        count = min(math.ceil(correction.duration / correction.config.knot_interval) + 1, _MAX_TIMES)
-        self._interval = correction.duration / (count - 1)
-        seconds = torch.linspace(0, correction.duration, count, dtype=torch.float64)
+        self.observing = False
+        duration = correction.trajectory.duration
+        count = min(math.ceil(duration / correction.config.knot_interval) + 1, _MAX_TIMES)
+        self._interval = duration / (count - 1)
+        seconds = torch.linspace(0, duration, count, dtype=torch.float64)
         self.register_buffer("_seconds", seconds, persistent=False)
         self.register_buffer("_base_poses", correction.trajectory.pose(seconds), persistent=False)
         self.register_buffer("_seen", torch.zeros(_RESOLUTION**3, count))

@@ -51,30 +51,42 @@ def _place(unit, resolution):
 
 
 @compiled
+def _cells(unit, resolution):
+    """Return the cell (i, j, k) below a place (3,) in the unit cube, and the shares of the next cells."""
+    i, u = _place(unit[0], resolution)
+    j, v = _place(unit[1], resolution)
+    k, w = _place(unit[2], resolution)
+    return i, j, k, u, v, w
+
+
+@compiled
+def _corner(cells, corner):
+    """Return one of the eight cells around a place of :func:`_cells`, and its weight."""
+    i, j, k, u, v, w = cells
+    a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
+    weight = (u if a else _ONE - u) * (v if b else _ONE - v) * (w if c else _ONE - w)
+    return i + a, j + b, k + c, weight
+
+
+@compiled
 def _fill_values(grid, unit, out):
     resolution, columns = grid.shape[0], grid.shape[3]
     for n in range(len(unit)):
-        i, u = _place(unit[n, 0], resolution)
-        j, v = _place(unit[n, 1], resolution)
-        k, w = _place(unit[n, 2], resolution)
-        for c in range(columns):
-            out[n, c] = _ZERO
+        cells = _cells(unit[n], resolution)
+        for column in range(columns):
+            out[n, column] = _ZERO
         for corner in range(8):
-            a, b, d = corner >> 2, (corner >> 1) & 1, corner & 1
-            weight = (u if a else _ONE - u) * (v if b else _ONE - v) * (w if d else _ONE - w)
-            for c in range(columns):
-                out[n, c] += weight * grid[i + a, j + b, k + d, c]
+            i, j, k, weight = _corner(cells, corner)
+            for column in range(columns):
+                out[n, column] += weight * grid[i, j, k, column]
 
 
 @compiled
 def _add_gradient(unit, grad, out):
     resolution, columns = out.shape[0], out.shape[3]
     for n in range(len(unit)):
-        i, u = _place(unit[n, 0], resolution)
-        j, v = _place(unit[n, 1], resolution)
-        k, w = _place(unit[n, 2], resolution)
+        cells = _cells(unit[n], resolution)
         for corner in range(8):
-            a, b, d = corner >> 2, (corner >> 1) & 1, corner & 1
-            weight = (u if a else _ONE - u) * (v if b else _ONE - v) * (w if d else _ONE - w)
-            for c in range(columns):
-                out[i + a, j + b, k + d, c] += weight * grad[n, c]
+            i, j, k, weight = _corner(cells, corner)
+            for column in range(columns):
+                out[i, j, k, column] += weight * grad[n, column]

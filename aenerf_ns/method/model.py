@@ -133,7 +133,6 @@ class AENeRFModel(Model):
             if self.camera_optimizer.twists is not None
             else None
         )
-        self._observes_rays = False
         self.field, proposal_networks = make_networks(
             config.backbone,
             config.field,
@@ -194,8 +193,10 @@ class AENeRFModel(Model):
         observed_until = _OBSERVED_SHARE * trainer.config.max_num_iterations
 
         def weigh(step: int) -> None:
-            self._observes_rays = self.space is not None and step < observed_until
-            if self.space is not None and self._observes_rays and step % _WEIGHING_INTERVAL == 0:
+            if self.space is None:
+                return
+            self.space.observing = step < observed_until
+            if self.space.observing and step % _WEIGHING_INTERVAL == 0:
                 self.space.weigh()
 
         def set_anneal(step: int) -> None:
@@ -245,9 +246,8 @@ class AENeRFModel(Model):
             # A picture must not move the steps that train the proposal networks.
             self.proposal_sampler._steps_since_update = steps_since_update
         outputs: dict[str, Any] = {}
-        num_rates = 0
-        if self.training and _is_of_batch(ray_bundle):
-            num_rates = self.supervision.num_rate_rays(len(ray_bundle))
+        is_trained_on = self.training and _is_of_batch(ray_bundle)
+        num_rates = self.supervision.num_rate_rays(len(ray_bundle)) if is_trained_on else 0
         if num_rates > 0:
             within = slice(len(ray_bundle) - num_rates, None)
             moving = ray_bundle[within]
@@ -261,9 +261,9 @@ class AENeRFModel(Model):
             log_radiance, weights = torch.cat([ends, log_radiance]), torch.cat([weights_of_ends, weights])
         else:
             log_radiance, weights = self._composite(samples)
-        if self.space is not None and self.training and self._observes_rays and ray_bundle.times is not None:
-            positions = samples.frustums.get_positions().detach()
-            self.space.observe(positions, weights[..., 0].detach(), ray_bundle.times[:, 0])
+        if is_trained_on and self.space is not None and self.space.observing:
+            assert ray_bundle.times is not None
+            self.space.observe(samples.frustums.get_positions(), weights[..., 0], ray_bundle.times[:, 0])
         weights_list.append(weights)
         samples_list.append(samples)
         outputs["log_radiance"] = log_radiance

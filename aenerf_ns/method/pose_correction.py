@@ -94,12 +94,11 @@ class PoseCorrection(CameraOptimizer):
         self.has_ground_truth = ground_truth is not None
         self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
         self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
-        self.duration = (trajectory.end - trajectory.start) * 1e-9
         # A camera that only turns gives translations no unit. The unit of the scene serves instead.
         extent = trajectory.extent if trajectory.extent > _SMALLEST_EXTENT else 1.0
         # Times in every interval of the spline, at which the size of the corrections is taken.
-        count = max(64, math.ceil(self.duration / config.knot_interval))
-        sampled = torch.linspace(0, self.duration, count, dtype=torch.float64)
+        count = max(64, math.ceil(trajectory.duration / config.knot_interval))
+        sampled = torch.linspace(0, trajectory.duration, count, dtype=torch.float64)
         for name, value in (
             ("_twist_units", torch.tensor([extent] * 3 + [1.0] * 3, dtype=torch.float64)),
             ("_sampled_seconds", sampled),
@@ -113,7 +112,7 @@ class PoseCorrection(CameraOptimizer):
         if config.mode == "network":
             self.twists = TwistNetwork(trajectory, config.num_frequencies)
         elif config.mode == "spline":
-            self.twists = TwistSpline(self.duration, config.knot_interval)
+            self.twists = TwistSpline(trajectory.duration, config.knot_interval)
 
     def pose(self, seconds: Tensor) -> Tensor:
         """Return corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
@@ -264,7 +263,7 @@ class TwistNetwork(nn.Module):
 
     def __init__(self, trajectory: Trajectory, num_frequencies: int) -> None:
         super().__init__()
-        self._duration = (trajectory.end - trajectory.start) * 1e-9
+        self._duration = trajectory.duration
         width = 256
         self.pose_embedding = nn.Linear(12, width)
         self.time_embedding = nn.Linear(1, width)

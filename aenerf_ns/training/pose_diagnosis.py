@@ -168,7 +168,7 @@ def _stretches(pipeline: AENeRFPipeline) -> list[dict[str, Any]]:
         rays, batch = sampler.sample(2 * _DRAWN * _NUM_STRETCHES * _PAIRS_PER_STRETCH, training=False)
     assert rays.times is not None
     num_pairs = len(batch["channel"])
-    duration = (sampler.trajectory.end - sampler.trajectory.start) * 1e-9
+    duration = sampler.trajectory.duration
     middle = rays.times[:, 0].unflatten(0, (2, num_pairs)).mean(0)
     stretch = (middle * (_NUM_STRETCHES / duration)).long().clamp(0, _NUM_STRETCHES - 1)
     model.eval()

@@ -67,18 +67,19 @@ def pixel_errors(poses: Tensor, reference: Tensor, seconds: Tensor, camera: dict
         later = torch.searchsorted(seconds, seconds + (lag - 1e-6))
         first = (later < len(seconds)).nonzero()[:, 0]
         later = later[first]
-
-        def project(source: Tensor, first: Tensor = first, later: Tensor = later) -> tuple[Tensor, Tensor]:
-            motion = torch.linalg.inv(source[later]) @ source[first]
-            moved = points @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
-            return moved[..., :2] / moved[..., 2:] * focal, moved[..., 2] > 0.1 * depth
-
-        expected, in_front = project(true)
-        found, found_in_front = project(aligned)
-        seen = in_front & found_in_front & (expected.abs() < half).all(-1)
-        squares = (found - expected)[seen].square().sum(-1)
+        expected, found = (_moved(points, source[first], source[later]) for source in (true, aligned))
+        offset = focal * (found[..., :2] / found[..., 2:] - expected[..., :2] / expected[..., 2:])
+        in_front = torch.minimum(expected[..., 2], found[..., 2]) > 0.1 * depth
+        in_picture = (focal * expected[..., :2] / expected[..., 2:]).abs() < half
+        squares = offset[in_front & in_picture.all(-1)].square().sum(-1)
         errors[str(lag)] = float(squares.mean().sqrt()) if len(squares) else math.nan
     return errors
+
+
+def _moved(points: Tensor, poses: Tensor, later: Tensor) -> Tensor:
+    """Return points (K, 3), seen from each of (N, 4, 4) poses, as (N, K, 3) in the frames of later poses (N, 4, 4)."""
+    motion = torch.linalg.inv(later) @ poses
+    return points @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
 
 
 def _camera(data: Path) -> dict[str, float]:

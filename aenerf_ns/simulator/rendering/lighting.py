@@ -24,7 +24,7 @@ from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps, panorama
 from aenerf_ns.simulator.rendering.reflections import reflections
 from aenerf_ns.simulator.rendering.renderer import Renderer, surroundings
-from aenerf_ns.simulator.rendering.surface import MeshArrays, mesh_arrays, ray_offset
+from aenerf_ns.simulator.rendering.surface import MeshArrays, face_normal, mesh_arrays, ray_offset
 
 _CREASE = math.cos(math.radians(40.0))
 """Cosine of the angle below which adjacent faces belong to one smooth surface."""
@@ -301,10 +301,8 @@ def _face_colours(arrays, textures, colours):
         for c in range(3):
             colours[face, c] = (arrays.colour[i, c] + arrays.colour[j, c] + arrays.colour[k, c]) / 3.0
         if arrays.texture[face] >= 0:
-            v, uv = arrays.vertices, arrays.uv
-            ax, ay, az = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1], v[j, 2] - v[i, 2]
-            bx, by, bz = v[k, 0] - v[i, 0], v[k, 1] - v[i, 1], v[k, 2] - v[i, 2]
-            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            uv = arrays.uv
+            nx, ny, nz = face_normal(arrays, face)
             side = math.sqrt(0.5 * math.sqrt(nx * nx + ny * ny + nz * nz))
             r, g, b = lookup(
                 textures,
@@ -434,11 +432,8 @@ def _gather(arrays, half, rays, hits, distance, coordinates, size, sky, links, r
                 green += g
                 blue += b
                 continue
-            first, second, third = arrays.faces[face]
-            v = arrays.vertices
-            ax, ay, az = v[second, 0] - v[first, 0], v[second, 1] - v[first, 1], v[second, 2] - v[first, 2]
-            bx, by, bz = v[third, 0] - v[first, 0], v[third, 1] - v[first, 1], v[third, 2] - v[first, 2]
-            facing = dx * (ay * bz - az * by) + dy * (az * bx - ax * bz) + dz * (ax * by - ay * bx)
+            nx, ny, nz = face_normal(arrays, face)
+            facing = dx * nx + dy * ny + dz * nz
             second_weight, third_weight = coordinates[i, 0], coordinates[i, 1]
             nearest = 0
             if max(second_weight, third_weight) > 1.0 - second_weight - third_weight:

@@ -24,7 +24,7 @@ from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
 from aenerf_ns.simulator.rendering.mesh import Mesh
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, panorama
-from aenerf_ns.simulator.rendering.surface import FOOTPRINT, MeshArrays, diffuse_radiance, ray_offset
+from aenerf_ns.simulator.rendering.surface import FOOTPRINT, MeshArrays, diffuse_radiance, face_normal, ray_offset
 
 _LOWEST = 0.01
 """Least sine of the angle between a mirrored ray and its face. An interpolated normal may mirror rays into the face."""
@@ -159,11 +159,7 @@ def _mirror(
         dx, dy, dz = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         dx, dy, dz = dx / length, dy / length, dz / length
-        v = arrays.vertices
-        i, j, k = arrays.faces[face, 0], arrays.faces[face, 1], arrays.faces[face, 2]
-        ax, ay, az = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1], v[j, 2] - v[i, 2]
-        bx, by, bz = v[k, 0] - v[i, 0], v[k, 1] - v[i, 1], v[k, 2] - v[i, 2]
-        gx, gy, gz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        gx, gy, gz = face_normal(arrays, face)
         facing = gx * dx + gy * dy + gz * dz
         side = 0 if facing < 0.0 else 1
         towards = 1.0 if side == 0 else -1.0
@@ -228,11 +224,7 @@ def _reflect(
             per_radian = environment.level[0, 2] / (2.0 * math.pi)
             r, g, b = panorama(environment, dx, dy, dz, 2.0 * lobe * per_radian)
         else:
-            v = arrays.vertices
-            i, j, k = arrays.faces[face, 0], arrays.faces[face, 1], arrays.faces[face, 2]
-            ax, ay, az = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1], v[j, 2] - v[i, 2]
-            bx, by, bz = v[k, 0] - v[i, 0], v[k, 1] - v[i, 1], v[k, 2] - v[i, 2]
-            gx, gy, gz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            gx, gy, gz = face_normal(arrays, face)
             facing = gx * dx + gy * dy + gz * dz
             slant = max(abs(facing) / math.sqrt(gx * gx + gy * gy + gz * gz), 0.02)
             wj, wk = float(coordinates[n, 0]), float(coordinates[n, 1])

@@ -52,6 +52,16 @@ def ray_offset(arrays: MeshArrays) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def face_normal(arrays, face):
+    """Return the vector along a face's normal whose length is twice the face's area."""
+    v = arrays.vertices
+    i, j, k = arrays.faces[face, 0], arrays.faces[face, 1], arrays.faces[face, 2]
+    ax, ay, az = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1], v[j, 2] - v[i, 2]
+    bx, by, bz = v[k, 0] - v[i, 0], v[k, 1] - v[i, 1], v[k, 2] - v[i, 2]
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@numba.njit(cache=True, error_model="numpy")
 def diffuse_radiance(arrays, textures, light, face, side, wi, wj, wk, footprint):
     """Return the light that a point of a face reflects evenly: its albedo times the light that it receives.
 
