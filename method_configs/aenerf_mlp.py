@@ -58,5 +58,5 @@ aenerf_mlp = MethodSpecification(
         # Every ray of a batch has gradients for all weights of the poses' network.
         gradient_accumulation_steps={"camera_opt": 1},
     ),
-    description="AE-NeRF with the paper's MLPs: slow.",
+    description="AE-NeRF with the paper's MLPs. Experimental: slow, and not shown to reconstruct a scene.",
 )
