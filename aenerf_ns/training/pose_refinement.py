@@ -14,9 +14,9 @@ from aenerf_ns.method.model import AENeRFModel
 
 NUM_STEPS = 10
 _NUM_RAYS = 1024
-# Relative to the diagonal of the normal equations (Marquardt). A rejected step makes the next one ten times as cautious.
+# Relative to the diagonal of the normal equations (Marquardt), and what an accepted and a rejected step multiply it by.
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 10.0
-# Added to the diagonal: a pixel of a picture without edges tells nothing of a pose.
+# Added to the diagonal, which is zero where nothing changes with the pose, as in a picture that clips everywhere.
 _LEAST_DIAGONAL = 1e-9
 
 
