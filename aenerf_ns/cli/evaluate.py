@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -26,11 +25,8 @@ class Evaluate:
     """JSON file to write."""
     color_correction: ColorCorrectionProtocol | None = None
     """Fit this colour correction on the run's data and use it; by default the correction stored with the run."""
-    test_poses: Literal["aligned", "photometric"] = "aligned"
-    """aligned: render each test view from its pose, carried into the frame of the corrected poses. photometric: first
-    move each pose to where its rendering fits its test image best, which looks at the test images."""
     render_output: Path | None = None
-    """Folder for pictures: truth beside reconstruction, accumulation, depth."""
+    """Folder for pictures, from the test poses as placed: truth beside reconstruction, accumulation, depth."""
 
     def main(self) -> None:
         """Load the run, evaluate it and write the metrics."""
@@ -43,8 +39,6 @@ class Evaluate:
         used = self.color_correction or of_run
         if self.color_correction is not None:
             pipeline.replace_color_correction(used)
-        if self.test_poses == "photometric":
-            pipeline.refine_test_poses()
         results = pipeline.get_average_eval_image_metrics(output_path=self.render_output, get_std=True)
         evaluation = {
             "experiment_name": config.experiment_name,
@@ -53,7 +47,6 @@ class Evaluate:
             "protocol": {
                 "color_correction": used,
                 "color_correction_of_run": of_run,
-                "test_poses": self.test_poses,
             },
             "results": results,
         }
@@ -62,7 +55,11 @@ class Evaluate:
         if results["num_views"] == 0:
             CONSOLE.print(f"{self.output}: errors of the poses; there are no views to evaluate on.")
             return
+        refined = results.get("refined_test_poses")
+        figures = {"placed": results} | ({"refined": refined} if refined else {})
+        shown = "; ".join(
+            f"PSNR {one['psnr']:.2f} dB, SSIM {one['ssim']:.3f} with test poses {name}" for name, one in figures.items()
+        )
         CONSOLE.print(
-            f"{self.output}: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.3f} over {results['num_views']} "
-            f"views; colour correction {results['color_correction']}."
+            f"{self.output}: {shown}; {results['num_views']} views; colour correction {results['color_correction']}."
         )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import comms
@@ -21,7 +22,6 @@ from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.method.color_correction import ColorCorrectionProtocol, NoColorCorrection
 from aenerf_ns.method.model import AENeRFModel
-from aenerf_ns.progress import progress_bar
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
@@ -39,6 +39,9 @@ class AENeRFPipelineConfig(VanillaPipelineConfig):
     """Pipeline of an event datamanager and an AE-NeRF model."""
 
     _target: type = field(default_factory=lambda: AENeRFPipeline)
+    refine_test_poses: bool = True
+    """Evaluate a trained run a second time, with test poses that are refined photometrically. Takes more time than the
+    first evaluation."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,6 @@ class AENeRFPipeline(VanillaPipeline):
             # Once the pipeline is made, ns-render asks for a program that pip cannot install.
             provide_ffmpeg()
         super().__init__(config, device, test_mode=test_mode, **kwargs)
-        self._refined_test_poses = False
         self._pose_diagnosis: dict[str, Any] | None = None
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
@@ -293,20 +295,6 @@ class AENeRFPipeline(VanillaPipeline):
         estimated, corrected, reference = (self.in_recording(poses) for poses in correction.compared_poses())
         return {"estimated": pose_errors(estimated, reference), "corrected": pose_errors(corrected, reference)}
 
-    def refine_test_poses(self) -> None:
-        """Refine the poses of the reference views photometrically, for every evaluation from now on."""
-        self._require_reference_views()
-        views = self.datamanager.fixed_indices_eval_dataloader
-        self.eval()
-        with progress_bar() as progress:
-            refined = [
-                refine_camera(self.model, camera, batch["image"][..., :3]).camera_to_worlds
-                for camera, batch in progress.track(views, total=len(views), description="Refining test poses")
-            ]
-        self.train()
-        self.datamanager.place_reference_views(torch.cat(refined))
-        self._refined_test_poses = True
-
     def _require_reference_views(self) -> None:
         if not self.datamanager.has_reference_views:
             raise SystemExit(
@@ -316,17 +304,18 @@ class AENeRFPipeline(VanillaPipeline):
 
     @property
     def _test_poses(self) -> str:
-        """How the cameras of the reference views were placed."""
+        """How the cameras of the reference views are placed."""
         if self.model.camera_optimizer.has_ground_truth:
-            placed = "Sim(3) of the corrected to the true trajectory"
-        else:
-            placed = "corrected pose at the time of the view, else Sim(3) of the corrected to the estimated trajectory"
-        return f"photometric refinement, {NUM_STEPS} steps, from: {placed}" if self._refined_test_poses else placed
+            return "Sim(3) of the corrected to the true trajectory"
+        return "corrected pose at the time of the view, else Sim(3) of the corrected to the estimated trajectory"
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
         """Return mean metrics over the reference views, and the protocol that they were computed with.
+
+        The views are rendered from where they are placed. Of a trained run, ``refined_test_poses`` holds the metrics of
+        the views that are rendered from photometrically refined poses. No camera stays moved.
 
         Without reference views, but with known true poses, return the errors of the poses alone.
 
@@ -336,15 +325,7 @@ class AENeRFPipeline(VanillaPipeline):
         metrics: dict[str, Any] = {}
         if self.datamanager.has_reference_views or not self.model.camera_optimizer.has_ground_truth:
             self._require_reference_views()
-            metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
-            # A single view has no standard deviation, and JSON has no NaN.
-            metrics = {k: value for k, value in metrics.items() if not (k.endswith("_std") and math.isnan(value))}
-            undefined = [name for name, value in metrics.items() if math.isnan(value)]
-            if undefined and self.test_mode == "test":
-                raise SystemExit(
-                    f"Error: {', '.join(undefined)} of the {self.datamanager.test_split} views is not a number: "
-                    "the run renders values that are not finite; train it again"
-                )
+            metrics = self._checked(super().get_average_eval_image_metrics(step, output_path, get_std))
         if self.test_mode == "test":
             # In the other mode, the trainer's log takes numbers only.
             metrics["color_correction"] = self.model.color_correction.description
@@ -353,8 +334,58 @@ class AENeRFPipeline(VanillaPipeline):
             metrics["pose_errors"] = self.pose_errors()
             metrics["pose_diagnosis"] = self._pose_diagnosis
             metrics["test_poses"] = self._test_poses
+            if metrics["num_views"] and self.config.refine_test_poses:
+                metrics["refined_test_poses"] = self._metrics_of_refined_test_poses(get_std)
             metrics |= self.model.supervision.learned()
             if self.model.image_metrics.lpips_absent is not None:
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent
         return metrics
+
+    def _metrics_of_refined_test_poses(self, get_std: bool) -> dict[str, Any]:
+        """Return the metrics of the reference views from refined poses, and how the poses were refined."""
+        views = _RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader)
+        metrics = self._checked(self.get_average_image_metrics(views, "refined", get_std=get_std))
+        # The time to render includes no refinement, so it says nothing new.
+        names = {"psnr", "ssim", "lpips"}
+        metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in names}
+        if self.model.image_metrics.lpips_absent is not None:
+            metrics["lpips"] = None
+        how = f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {self._test_poses}"
+        return {**metrics, "test_poses": how}
+
+    def _checked(self, metrics: dict[str, Any]) -> dict[str, Any]:
+        """Return metrics of the reference views without standard deviations that do not exist.
+
+        Raises:
+            SystemExit: outside training, a metric is not a number.
+        """
+        # A single view has no standard deviation, and JSON has no NaN.
+        metrics = {k: value for k, value in metrics.items() if not (k.endswith("_std") and math.isnan(value))}
+        undefined = [name for name, value in metrics.items() if math.isnan(value)]
+        if undefined and self.test_mode == "test":
+            raise SystemExit(
+                f"Error: {', '.join(undefined)} of the {self.datamanager.test_split} views is not a number: "
+                "the run renders values that are not finite; train it again"
+            )
+        return metrics
+
+
+class _RefinedViews:
+    """Reference views whose cameras are refined when it is their turn, as a loader of the framework's evaluation.
+
+    Args:
+        model: in evaluation mode by then.
+        views: loader of single cameras (1,) and their batches.
+    """
+
+    def __init__(self, model: AENeRFModel, views: FixedIndicesEvalDataloader) -> None:
+        self._model = model
+        self._views = views
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+        for camera, batch in self._views:
+            yield refine_camera(self._model, camera, batch["image"][..., :3]), batch

@@ -11,6 +11,11 @@ from benchmarks.paper.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_COR
 
 Figures = dict[str, Any]
 _METRICS = ("psnr", "ssim", "lpips")
+# Why each metric has two figures.
+_TEST_POSES = (
+    "PSNR, SSIM and LPIPS: with test poses as placed / refined photometrically on the test images; - where only the "
+    "first was measured."
+)
 _METHODS = (WITHOUT_CORRECTION, OURS, TRUE_POSES, CEILING)
 
 
@@ -22,7 +27,7 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
         missing: names of the other runs with the reason, which is empty for runs that were not tried.
     """
     methods, losses = ([one for one in figures if one["table"] == table] for table in ("methods", "losses"))
-    parts = ["# Benchmark", _conditions(figures)]
+    parts = ["# Benchmark", _conditions(figures), _TEST_POSES]
     if missing:
         parts.append(f"**Not complete:** {len(missing)} of {len(missing) + len(figures)} runs are missing.")
     if methods:
@@ -89,7 +94,7 @@ def losses_table(figures: Sequence[Figures]) -> str:
 
 
 def scenes_table(figures: Sequence[Figures]) -> str:
-    """Return every row of every scene and speed, means over seeds with the standard deviation of PSNR."""
+    """Return every row of every scene and speed, means over seeds with the standard deviation of placed PSNR."""
     errors_of_poses = ("RE before", "RE after", "TE before", "TE after")
     header = ["scene", "speed", "row", "seeds", *map(str.upper, _METRICS), *errors_of_poses]
     rows = []
@@ -97,7 +102,8 @@ def scenes_table(figures: Sequence[Figures]) -> str:
         some = _of(figures, scene=scene, speed=speed, row=row)
         cells = [_mean(some, metric) for metric in _METRICS]
         if len(some) > 1:
-            cells[0] += f" ± {stdev(one['results']['psnr'] for one in some):.2f}"
+            placed, refined = cells[0].split(" / ")
+            cells[0] = f"{placed} ± {stdev(one['results']['psnr'] for one in some):.2f} / {refined}"
         errors = [one["results"].get("pose_errors") for one in some]
         poses = [
             f"{fmean(error[which][key] for error in errors):.3f}{unit}" if all(errors) else "n/a"
@@ -157,10 +163,15 @@ def _of(figures: Sequence[Figures], **wanted: str) -> list[Figures]:
 
 
 def _mean(figures: Sequence[Figures], metric: str) -> str:
-    values = [one["results"].get(metric) for one in figures]
-    if not values or None in values:
-        return "n/a"
-    return f"{fmean(values):.2f}" if metric == "psnr" else f"{fmean(values):.3f}"
+    """Return the means of a metric with test poses placed / refined."""
+    digits = 2 if metric == "psnr" else 3
+    placed = [one["results"].get(metric) for one in figures]
+    # Results of earlier versions and of nerfacto have no refined poses.
+    refined = [one["results"].get("refined_test_poses", {}).get(metric) for one in figures]
+    return " / ".join(
+        f"{fmean(values):.{digits}f}" if values and None not in values else absent
+        for values, absent in ((placed, "n/a"), (refined, "-"))
+    )
 
 
 def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -163,8 +163,13 @@ def plateau_left_at(losses: Tensor) -> int:
 def _evaluated(config: Path, refined: bool) -> dict[str, Any]:
     """Return the metrics of the test views, as ns-eval does, with their poses placed and, if wanted, refined."""
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
-    results = {"placed": pipeline.get_average_eval_image_metrics()}
-    if refined:
+    pipeline.config.refine_test_poses = refined
+    placed = pipeline.get_average_eval_image_metrics()
+    results = {"placed": placed}
+    if "refined_test_poses" in placed:
+        results["refined"] = placed.pop("refined_test_poses")
+    elif refined:
+        # Commits that refine on demand.
         pipeline.refine_test_poses()
         results["refined"] = pipeline.get_average_eval_image_metrics()
     return results

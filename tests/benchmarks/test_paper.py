@@ -177,9 +177,9 @@ def test_tables_are_means_over_scenes_and_seeds() -> None:
         one["results"]["psnr"] for one in methods if (one["row"], one["scene"], one["speed"]) == (OURS, "room", "hard")
     ]
     assert len(expected) == 2
-    assert rows[1][column] == f"{sum(expected) / 2:.2f}"
+    assert rows[1][column] == f"{sum(expected) / 2:.2f} / -"
     # LPIPS is not known, and never a number then.
-    assert rows[1][header.index("1 large scenes, hard: LPIPS")] == "n/a"
+    assert rows[1][header.index("1 large scenes, hard: LPIPS")] == "n/a / -"
     poses = cells(tables.poses_table(methods))
     assert poses[0] == ["", "easy: with ψ", "easy: without ψ", "hard: with ψ", "hard: without ψ"]
     assert poses[2:] == [
@@ -195,7 +195,21 @@ def test_tables_are_means_over_scenes_and_seeds() -> None:
     assert "- aenerf-small, 1500 steps\n- nerfacto, 1500 steps\n" in text
     assert text.count("- data: `aenerf simulate --scene SCENE --speed SPEED --width 96 --height 72 ") == 1
     # Over two seeds 24 runs apart.
-    assert f"± {24 / 2**0.5:.2f}" in text
+    assert f"± {24 / 2**0.5:.2f} / - |" in text
+
+
+def test_refined_figures_stand_beside_the_placed_ones() -> None:
+    runs = [run for run in small_plan(speeds=("hard",), tables=("losses",)) if run.dataset.scene == "room"]
+    figures = [figures_of(run, 20.0, "large", (1.0, 0.5)) for run in runs]
+    for one in figures:
+        one["results"]["refined_test_poses"] = {"psnr": 21.0 + one["seed"], "ssim": 0.25, "lpips": None}
+    _, _, *rows = cells(tables.losses_table(figures))
+    assert rows[0][1:] == ["20.00 / 22.50", "0.200 / 0.250", "n/a / -"]
+    assert "| 20.00 ± 0.00 / 22.50 | 0.200 / 0.250 |" in tables.report(figures, {})
+    # A mean of fewer runs would not stand beside the other one.
+    del figures[0]["results"]["refined_test_poses"]
+    _, _, *rows = cells(tables.losses_table(figures))
+    assert rows[0][1] == "20.00 / -"
 
 
 def test_means_are_over_what_all_rows_have() -> None:
@@ -205,11 +219,11 @@ def test_means_are_over_what_all_rows_have() -> None:
     for table, make in (("methods", tables.methods_table), ("losses", tables.losses_table)):
         of_table = [one for one in figures if one["table"] == table]
         _, _, *rows = cells(make(of_table))
-        assert {row[1] for row in rows} == {"25.00"}
+        assert {row[1] for row in rows} == {"25.00 / -"}
         # The first row lacks the easy scene, and would look worse than it is.
         partial = [one for one in of_table if one["row"] not in (OURS, "all") or one["scene"] == "room"]
         _, _, *rows = cells(make(partial))
-        assert {row[1] for row in rows} == {"20.00"}
+        assert {row[1] for row in rows} == {"20.00 / -"}
 
 
 def test_what_colmap_made_of_a_sequence_is_reported() -> None:

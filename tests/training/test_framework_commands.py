@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -66,6 +67,12 @@ def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, wo
     # The given poses are the true ones.
     assert results["pose_errors"]["estimated"]["rotation_error_degrees"] < 1e-5
     assert results["test_poses"] == "Sim(3) of the corrected to the true trajectory"
+    refined = results["refined_test_poses"]
+    assert refined.keys() == {"psnr", "psnr_std", "ssim", "ssim_std", "lpips", "test_poses"}
+    assert refined["lpips"] is None
+    assert refined["test_poses"].startswith("photometric refinement, 10 Levenberg-Marquardt steps, from: Sim(3)")
+    assert -0.1 < refined["psnr"] - results["psnr"] < 3
+    assert refined["psnr"] != results["psnr"]
     data = workspace / "room"
     (data / "events.gone").rename(data / "events.h5")
     run(
@@ -82,21 +89,18 @@ def test_a_run_is_evaluated_under_other_protocols(trained: Path, evaluated: dict
     checkpoint = next(trained.parent.rglob("*.ckpt"))
     before = (trained.read_bytes(), checkpoint.read_bytes())
     output, pictures = workspace / "network" / "metrics.json", workspace / "network" / "pictures"
-    options = ("--color-correction", "network", "--test-poses", "photometric", "--render-output", pictures)
-    run("aenerf", "evaluate", "--load-config", trained, "--output", output, *options, cwd=workspace)
+    options = ("--color-correction", "network", "--render-output", pictures)
+    said = run("aenerf", "evaluate", "--load-config", trained, "--output", output, *options, cwd=workspace)
     written = json.loads(output.read_text())
     # The layout of ns-eval, and what it was computed with.
-    assert written.pop("protocol") == {
-        "color_correction": "network",
-        "color_correction_of_run": "affine",
-        "test_poses": "photometric",
-    }
+    assert written.pop("protocol") == {"color_correction": "network", "color_correction_of_run": "affine"}
     results, of_run = written.pop("results"), evaluated["results"]
     assert written == {key: value for key, value in evaluated.items() if key != "results"}
     assert results.keys() == of_run.keys()
     assert results["color_correction"] == "network, fitted on 4 validation views"
-    assert results["test_poses"].startswith("photometric refinement, 100 steps, from: Sim(3)")
-    # The same pictures in other colours, from other places.
+    for name, figures in (("placed", results), ("refined", results["refined_test_poses"])):
+        assert re.search(rf"PSNR {figures['psnr']:.2f} dB,\s+SSIM\s+{figures['ssim']:.3f}", said), name
+    # The same pictures in other colours.
     assert 0 < abs(results["psnr"] - of_run["psnr"]) < 3
     assert len(list(pictures.glob("eval_img_*.png"))) == 3
     assert (trained.read_bytes(), checkpoint.read_bytes()) == before

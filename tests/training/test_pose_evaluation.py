@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import copy
+import json
 from dataclasses import replace
+from operator import sub
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from small_models import make_model
 from small_pipelines import make_pipeline
@@ -21,6 +24,8 @@ from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotatio
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.method.image_metrics import ImageMetrics
+from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
 from aenerf_ns.training.pose_refinement import refine_camera
 
@@ -228,26 +233,68 @@ def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tenso
     torch.testing.assert_close(estimated, reference, rtol=0, atol=1e-12)
 
 
-def test_photometric_refinement_finds_the_camera_back() -> None:
+def _known_camera() -> tuple[AENeRFModel, Cameras, torch.Tensor]:
+    """A model of a scene with texture, a camera (1,) that looks at it, and the camera's pose (4, 4)."""
     model = make_model(bounded=True, average_init_density=3.0).eval()
     torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
-    before = copy.deepcopy(model.state_dict())
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.1, -0.2, 2.5])
-    camera = EventCamera(32, 24, 30.0, 30.0, 16.0, 12.0).cameras(pose[None, :3])
+    return model, EventCamera(32, 24, 30.0, 30.0, 16.0, 12.0).cameras(pose[None, :3]), pose
+
+
+def test_photometric_refinement_finds_the_camera_back() -> None:
+    model, camera, pose = _known_camera()
+    before = copy.deepcopy(model.state_dict())
     image = model.get_outputs_for_camera(camera)["rgb"]
-    moved = pose @ motion_from_twist(torch.tensor([0.02, -0.03, 0.0, 0.01, 0.02, -0.02], dtype=torch.float64))
+    moved = pose @ motion_from_twist(torch.tensor([0.02, -0.03, 0.0, -0.01, -0.02, -0.02], dtype=torch.float64))
     wrong = replace(camera, camera_to_worlds=moved[None, :3].float())
+    # Where the camera sees points of the scene, in pixels.
+    points = torch.tensor([[x, y, z, 1.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.3, 0.3)]).double()
 
-    def error(poses: torch.Tensor) -> float:
-        rendered = model.get_outputs_for_camera(replace(camera, camera_to_worlds=poses))["rgb"]
-        return float((rendered - image).square().mean())
+    def pixels_off(poses: torch.Tensor) -> float:
+        seen = [points @ torch.linalg.inv(one).mT for one in (homogeneous(poses.double())[0], pose)]
+        places = [30 * point[:, :2] / point[:, 2:3] for point in seen]
+        return float((places[0] - places[1]).norm(dim=-1).max())
 
+    assert pixels_off(wrong.camera_to_worlds) > 0.8
     refined = refine_camera(model, wrong, image)
-    assert error(refined.camera_to_worlds) < 0.05 * error(wrong.camera_to_worlds)
+    assert pixels_off(refined.camera_to_worlds) < 0.05
     for name, value in model.state_dict().items():
         assert torch.equal(value, before[name]), name
     assert all(parameter.grad is None for parameter in model.parameters())
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_a_picture_that_says_nothing_leaves_the_camera_where_it_is(value: float) -> None:
+    model, camera, _ = _known_camera()
+    image = torch.full((24, 32, 3), value)
+    # All display values clip at the picture's own.
+    model.color_correction.offset.fill_(-1e3 if value == 0 else 1e3)
+    refined = refine_camera(model, camera, image)
+    torch.testing.assert_close(refined.camera_to_worlds, camera.camera_to_worlds, rtol=0, atol=0)
+
+
+def test_metrics_are_of_placed_and_of_refined_test_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The pictures are too small for SSIM's window.
+    monkeypatch.setattr(
+        ImageMetrics, "__call__", lambda _, *images: {"psnr": -10 * float(sub(*images).square().mean().log10())}
+    )
+    pipeline = make_pipeline(tmp_path / "made", "test")
+    placed = [camera.camera_to_worlds.clone() for camera, _ in pipeline.datamanager.fixed_indices_eval_dataloader]
+    metrics = json.loads(json.dumps(pipeline.get_average_eval_image_metrics(get_std=True)))
+    refined = metrics["refined_test_poses"]
+    assert refined.keys() == {"psnr", "psnr_std", "lpips", "test_poses"}
+    assert refined["test_poses"].endswith(f"from: {metrics['test_poses']}")
+    assert metrics["test_poses"].startswith("corrected pose at the time of the view")
+    after = [camera.camera_to_worlds for camera, _ in pipeline.datamanager.fixed_indices_eval_dataloader]
+    assert torch.equal(torch.stack(after), torch.stack(placed))
+    pipeline.config.refine_test_poses = False
+    again = pipeline.get_average_eval_image_metrics(get_std=True)
+    assert "refined_test_poses" not in again
+    assert again["psnr"] == metrics["psnr"]
+    # While training, never.
+    training = make_pipeline(tmp_path / "made", "val").get_average_eval_image_metrics()
+    assert all(isinstance(value, float) for value in training.values())
 
 
 def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor) -> None:
