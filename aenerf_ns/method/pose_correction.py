@@ -52,8 +52,8 @@ class PoseCorrectionConfig(CameraOptimizerConfig):
     calibration. It works with every mode."""
     clock_offset: float | None = None
     """Learn by how many seconds the clock of the poses is ahead of the clock of the events, beginning with this value
-    and changing it by at most 0.05 s. aenerf check finds a value to begin with. It works with every mode. None: the
-    clocks agree."""
+    and changing it by at most 0.05 s. aenerf check finds a value to begin with. Events that the offset moves beyond the
+    ends of the trajectory see the pose of the end. It works with every mode. None: the clocks agree."""
 
 
 class PoseCorrection(CameraOptimizer):

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from torch import Tensor
 
 from aenerf_ns.camera.rotation import motion_from_twist
@@ -157,3 +158,20 @@ def test_without_offsets_nothing_is_added() -> None:
     correction = _correction(mode="spline")
     assert [name for name, _ in correction.named_parameters()] == ["twists.control_twists"]
     assert correction.offsets() == {}
+
+
+@pytest.mark.parametrize("mode", ["off", "spline"])
+def test_a_model_teaches_the_offsets(mode: str) -> None:
+    model = make_model(
+        camera_optimizer=PoseCorrectionConfig(mode=mode, rigid_offset=True, clock_offset=0.0),
+        loss_coefficients=ALL_LOSSES,
+    )
+    torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
+    correction = model.camera_optimizer
+    assert set(model.get_param_groups()["camera_opt"]) == set(correction.parameters())
+    outputs, batch = model(make_rays(15, with_times=True)), make_batch(5)
+    sum(model.get_loss_dict(outputs, batch).values()).backward()
+    for parameter in (correction.rigid_offset, correction.clock_change):
+        assert parameter.grad.isfinite().all()
+        assert parameter.grad.abs().max() > 0
+    assert model.get_metrics_dict(outputs, batch)["clock_offset_seconds"] == 0
