@@ -30,6 +30,10 @@ CLOCK_OFFSETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 REFINEMENTS = (0.6, 0.7, 0.8, 0.9, 1.2, 1.4, 1.7)
 """Factors of the best clock offset, tried because :data:`CLOCK_OFFSETS` are far apart."""
 
+# Nanoseconds. Training gives events that an offset moves beyond the ends of the trajectory the pose of the end, so long
+# offsets need other times of the poses.
+_MAX_LEARNED_OFFSET = 100_000_000
+
 Value = TypeVar("Value")
 
 
@@ -116,9 +120,13 @@ ALTERNATIVES = (
 def clock_hypothesis(offset: int) -> Hypothesis:
     """Return the hypothesis that an event at time t has the pose of time t + offset, in nanoseconds."""
     seconds, is_ahead = f"{abs(offset) * 1e-9:g} s", offset > 0
+    remedy = f"{'subtract' if is_ahead else 'add'} {seconds} {'from' if is_ahead else 'to'} the times of the poses"
+    if abs(offset) <= _MAX_LEARNED_OFFSET:
+        option = f"--pipeline.model.camera-optimizer.clock-offset {offset * 1e-9:g}"
+        remedy += f", or train with {option}, which also learns what is left"
     return Hypothesis(
         f"the clock of the poses is {seconds} {'ahead of' if is_ahead else 'behind'} that of the events",
-        f"{'subtract' if is_ahead else 'add'} {seconds} {'from' if is_ahead else 'to'} the times of the poses",
+        remedy,
         clock_offset=offset,
     )
 

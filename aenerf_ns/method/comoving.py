@@ -44,7 +44,7 @@ class CoMovingSpace(nn.Module):
     neighbours move alike.
 
     Args:
-        correction: of the poses, of mode "network" or "spline". It stays the model's.
+        correction: of the poses, of which something is learned. It stays the model's.
         unit_positions: maps (N, 3) positions in the scene to the unit cube, as the fields do.
 
     Attributes:

@@ -130,7 +130,7 @@ class AENeRFModel(Model):
         )
         self.space = (
             CoMovingSpace(self.camera_optimizer, lambda positions: to_unit_cube(positions, distortion, self.field.aabb))
-            if self.camera_optimizer.twists is not None
+            if self.camera_optimizer.is_learned
             else None
         )
         self.field, proposal_networks = make_networks(

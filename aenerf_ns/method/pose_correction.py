@@ -26,6 +26,10 @@ _MAX_COMPARED = 2000
 # of a spline's. With this factor on the network's output, both move about as far at one learning rate.
 _NETWORK_OUTPUT_SCALE = 2e-3
 _SMALLEST_EXTENT = 1e-6
+_SMALLEST_SPEED = 1e-6
+# Seconds by which a learned clock offset may differ from the value it begins with. Larger errors smear the field so far
+# that it does not lead back.
+_MAX_CLOCK_CHANGE = 0.05
 
 
 @dataclass
@@ -43,10 +47,20 @@ class PoseCorrectionConfig(CameraOptimizerConfig):
     """Seconds between the knots of the spline. It corrects errors that change more slowly than that."""
     num_frequencies: int = 3
     """Frequencies of the network's sinusoidal encoding."""
+    rigid_offset: bool = False
+    """Learn one rigid motion from the given poses to the camera's, the same at all times: the error of a hand-eye
+    calibration. It works with every mode."""
+    clock_offset: float | None = None
+    """Learn by how many seconds the clock of the poses is ahead of the clock of the events, beginning with this value
+    and changing it by at most 0.05 s. aenerf check finds a value to begin with. Events that the offset moves beyond the
+    ends of the trajectory see the pose of the end. It works with every mode. None: the clocks agree."""
 
 
 class PoseCorrection(CameraOptimizer):
-    """Corrects the pose at every time t to base pose(t) · exp(ξ(t)), with a twist ξ (paper, eq. 6).
+    """Corrects the pose at every time t to base pose(t + δ) · exp(ξ(t)) · exp(χ), with a twist ξ (paper, eq. 6).
+
+    The clock offset δ and the rigid offset χ do not depend on time. They are not in the paper, and zero unless the
+    configuration asks for them. Times t + δ beyond the ends of the trajectory get the pose of the end.
 
     ξ is zero before training, but its gradients are not. Network and spline count rotation in radians and translation
     in units of the trajectory's extent (root mean square distance from its middle). So a learning rate means the same
@@ -108,26 +122,74 @@ class PoseCorrection(CameraOptimizer):
             self.register_buffer(name, value, persistent=False)
         self._exponential = TwistExponential()
         self.training_cameras_are_corrected = False
+        self.rigid_offset = nn.Parameter(torch.zeros(6)) if config.rigid_offset else None
+        self.clock_change: nn.Parameter | None = None
+        if config.clock_offset is not None:
+            self.clock_change = nn.Parameter(torch.zeros(()))
+            # The seconds in which the camera moves by a unit of the twists: a step of the optimizer then moves poses
+            # about as far by the clock as by a twist.
+            _, rate = trajectory.pose_and_rate(sampled)
+            turning, moving = rate[..., :3].square().sum((1, 2)) / 2, (rate[..., 3] / extent).square().sum(-1)
+            self._clock_unit = 1 / max(float((turning + moving).mean().sqrt()), _SMALLEST_SPEED)
         self.twists: TwistNetwork | TwistSpline | None = None
         if config.mode == "network":
             self.twists = TwistNetwork(trajectory, config.num_frequencies)
         elif config.mode == "spline":
             self.twists = TwistSpline(trajectory.duration, config.knot_interval)
 
+    @property
+    def is_learned(self) -> bool:
+        """Whether anything about the poses is learned."""
+        return self.twists is not None or self.rigid_offset is not None or self.clock_change is not None
+
+    def clock_offset(self) -> Tensor:
+        """Return δ, the float64 seconds by which the clock of the poses is ahead of the clock of the events."""
+        start = self.config.clock_offset
+        if start is None or self.clock_change is None:
+            return self._sampled_seconds.new_zeros(())
+        change = self.clock_change.double() * (self._clock_unit / _MAX_CLOCK_CHANGE)
+        return start + _MAX_CLOCK_CHANGE * torch.tanh(change)
+
     def pose(self, seconds: Tensor) -> Tensor:
         """Return corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
-        base = self.trajectory.pose(seconds)
-        if self.twists is None:
-            return base
-        return self._exponential(base, self._twist_units * self.twists(seconds, base))
+        base = self.trajectory.pose(self._on_clock_of_poses(seconds))
+        pose = base
+        if self.twists is not None:
+            pose = self._exponential(pose, self._twist_units * self.twists(seconds, base))
+        if self.rigid_offset is not None:
+            pose = self._exponential(pose, self._rigid_twists(len(pose)))
+        return pose
 
     def pose_and_rate(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of :meth:`pose` and their derivatives with respect to time, per second."""
-        base, base_rate = self.trajectory.pose_and_rate(seconds)
-        if self.twists is None:
-            return base, base_rate
-        twist, rate = self.twists.with_rate(seconds, base, base_rate)
-        return self._exponential.with_rate(base, base_rate, self._twist_units * twist, self._twist_units * rate)
+        shifted = self._on_clock_of_poses(seconds)
+        base, base_rate = self.trajectory.pose_and_rate(shifted)
+        if self.clock_change is not None:
+            # Beyond its ends the trajectory stands still.
+            moves = shifted == seconds + self.clock_offset()
+            base_rate = torch.where(moves[:, None, None], base_rate, 0.0)
+        pose, rate = base, base_rate
+        if self.twists is not None:
+            twist, twist_rate = self.twists.with_rate(seconds, base, base_rate)
+            pose, rate = self._exponential.with_rate(
+                pose, rate, self._twist_units * twist, self._twist_units * twist_rate
+            )
+        if self.rigid_offset is not None:
+            # From the right, a constant motion acts on rates as on poses.
+            both = self._exponential(torch.cat([pose, rate], -2), self._rigid_twists(len(pose)))
+            pose, rate = both.split(3, -2)
+        return pose, rate
+
+    def _on_clock_of_poses(self, seconds: Tensor) -> Tensor:
+        """Return the times on the trajectory at which base poses are looked up, for times of events."""
+        if self.clock_change is None:
+            return seconds
+        return (seconds + self.clock_offset()).clamp(0, self.trajectory.duration)
+
+    def _rigid_twists(self, count: int) -> Tensor:
+        """Return χ in scene units and radians, (count, 6) float64."""
+        assert self.rigid_offset is not None
+        return (self._twist_units * self.rigid_offset).expand(count, 6)
 
     def forward(self, indices: Tensor) -> Tensor:
         """Return (N, 3, 4) motions that the framework multiplies the training cameras' poses with.
@@ -157,10 +219,10 @@ class PoseCorrection(CameraOptimizer):
         """
         poses = camera.camera_to_worlds
         metadata = camera.metadata or {}
-        if TRAJECTORY_SECONDS in metadata and self.twists is not None:
+        if TRAJECTORY_SECONDS in metadata and self.is_learned:
             with torch.no_grad():
                 return self.pose(metadata[TRAJECTORY_SECONDS][..., 0]).to(poses)
-        if REFERENCE_SECONDS not in metadata or (self.twists is None and not self.has_ground_truth):
+        if REFERENCE_SECONDS not in metadata or (not self.is_learned and not self.has_ground_truth):
             return poses
         with torch.no_grad():
             carried = self.alignment().inverse()(poses.double())
@@ -176,15 +238,27 @@ class PoseCorrection(CameraOptimizer):
     def world_twists(self, seconds: Tensor, base: Tensor) -> Tensor:
         """Return the float64 twists (N, 6) in the world that correct poses, in scene units and radians.
 
-        The corrected pose is exp(twist) · base pose, to first order base pose + (v + ω × position).
+        The corrected pose is exp(twist) · base pose, to first order base pose + (v + ω × position). The clock offset
+        adds δ times the twist at which the base pose moves.
 
         Args:
             seconds: (N,) float64 times since the trajectory's start.
             base: (N, 3, 4) base poses at these times.
         """
-        assert self.twists is not None
-        twists = self._twist_units * self.twists(seconds, base)
+        if self.twists is not None:
+            twists = self._twist_units * self.twists(seconds, base)
+        else:
+            twists = base.new_zeros(len(base), 6)
+        if self.rigid_offset is not None:
+            twists = twists + self._rigid_twists(len(base))
         translation, rotation = (base[:, None, :, :3] @ twists.unflatten(-1, (2, 3, 1)))[..., 0].unbind(1)
+        if self.clock_change is not None:
+            _, rate = self.trajectory.pose_and_rate(seconds)
+            # The derivative of a rotation R is [ω]ₓ R.
+            turning = rate[..., :3] @ base[..., :3].mT
+            omega = torch.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], -1)
+            offset = self.clock_offset()
+            translation, rotation = translation + offset * rate[..., 3], rotation + offset * omega
         return torch.cat([translation + torch.linalg.cross(base[..., 3], rotation), rotation], -1)
 
     def alignment(self) -> Similarity:
@@ -217,13 +291,25 @@ class PoseCorrection(CameraOptimizer):
         loss_dict["pose_correction_penalty"] = penalty.float()
 
     def get_metrics_dict(self, metrics_dict: dict[str, Any]) -> None:
-        """Add the root mean square size of the corrections: scene units and degrees."""
-        if self.twists is None:
-            return
+        """Add the offsets and the root mean square size of the corrections: scene units, degrees and seconds."""
         with torch.no_grad():
-            size = (self._twist_units * self._sampled_twists()).unflatten(-1, (2, 3)).square().sum(-1).mean(0).sqrt()
-        metrics_dict["pose_correction_translation"] = size[0]
-        metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
+            metrics_dict |= self.offsets()
+            if self.twists is not None:
+                twists = (self._twist_units * self._sampled_twists()).unflatten(-1, (2, 3))
+                size = twists.square().sum(-1).mean(0).sqrt()
+                metrics_dict["pose_correction_translation"] = size[0]
+                metrics_dict["pose_correction_degrees"] = torch.rad2deg(size[1])
+
+    def offsets(self) -> dict[str, float]:
+        """Return the learned offsets by name: seconds, degrees and scene units; none where they are not learned."""
+        found = {}
+        if self.clock_change is not None:
+            found["clock_offset_seconds"] = float(self.clock_offset().detach())
+        if self.rigid_offset is not None:
+            translation, rotation = self._rigid_twists(1).detach().unflatten(-1, (2, 3)).norm(dim=-1)[0].tolist()
+            found["rigid_offset_degrees"] = math.degrees(rotation)
+            found["rigid_offset_translation"] = translation
+        return found
 
     def _sampled_twists(self) -> Tensor:
         """Return twists, in units of the trajectory's extent, at times in every interval of the spline."""
@@ -232,7 +318,7 @@ class PoseCorrection(CameraOptimizer):
 
     def get_param_groups(self, param_groups: dict[str, list[nn.Parameter]]) -> None:
         """Add the parameters as the group ``camera_opt``, where there are any."""
-        if self.twists is not None:
+        if self.is_learned:
             param_groups["camera_opt"] = list(self.parameters())
 
 

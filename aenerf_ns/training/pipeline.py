@@ -148,7 +148,7 @@ class AENeRFPipeline(VanillaPipeline):
         earlier_poses: list[Tensor] = []
 
         def diagnose_poses(step: int) -> None:
-            if self.model.camera_optimizer.twists is None or not comms.is_main_process():
+            if not self.model.camera_optimizer.is_learned or not comms.is_main_process():
                 return
             if step == max(last_step - max(round(LAST_PART * num_steps), 1), trainer._start_step):
                 earlier_poses.append(self.model.camera_optimizer.compared_poses()[1])
@@ -331,6 +331,7 @@ class AENeRFPipeline(VanillaPipeline):
             metrics["color_correction"] = self.model.color_correction.description
             metrics["num_views"] = len(self.datamanager.eval_dataset) if self.datamanager.has_reference_views else 0
             metrics["pose_correction"] = self.model.config.camera_optimizer.mode
+            metrics |= self.model.camera_optimizer.offsets()
             metrics["pose_errors"] = self.pose_errors()
             metrics["pose_diagnosis"] = self._pose_diagnosis
             metrics["test_poses"] = self._test_poses

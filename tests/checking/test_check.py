@@ -129,6 +129,13 @@ def test_a_shifted_clock_is_named_and_measured(side: str, simulated: tuple[Recor
     assert float(seconds) == pytest.approx(0.2, abs=0.05)
 
 
+def test_a_short_clock_offset_comes_with_the_option_that_learns_the_rest() -> None:
+    for offset, option in ((20_000_000, "clock-offset 0.02"), (-50_000_000, "clock-offset -0.05"), (2 * 10**9, None)):
+        remedy = clock_hypothesis(offset).remedy
+        assert ("clock-offset" in remedy) == (option is not None)
+        assert option is None or option in remedy
+
+
 def test_the_real_recording_prefers_its_poses(slider_depth: Path) -> None:
     recording = EcdDataParserConfig(data=slider_depth).setup().read_recording()
     trajectory = recording.trajectory

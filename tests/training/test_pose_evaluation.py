@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from dataclasses import replace
 from operator import sub
 from pathlib import Path
@@ -14,7 +15,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from small_models import make_model
-from small_pipelines import make_pipeline
+from small_pipelines import make_pipeline, make_pipeline_config
 
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
 from aenerf_ns.camera.lens import EventCamera
@@ -354,3 +355,15 @@ def test_in_a_known_scene_the_correction_finds_the_true_poses(mode: str) -> None
         optimizer.step()
         schedule.step()
     assert (errors() < before / 3).all(), (before, errors())
+
+
+def test_learned_offsets_are_reported(tmp_path: Path) -> None:
+    config = make_pipeline_config(tmp_path / "made", num_views=-1, true_world=lambda poses: poses)
+    config.model.camera_optimizer = PoseCorrectionConfig(rigid_offset=True, clock_offset=0.01)
+    pipeline = config.setup(device="cpu", test_mode="test")
+    correction = pipeline.model.camera_optimizer
+    torch.nn.init.constant_(correction.rigid_offset, 0.01)
+    metrics = pipeline.get_average_eval_image_metrics()
+    assert metrics["clock_offset_seconds"] == pytest.approx(0.01)
+    assert metrics["rigid_offset_degrees"] == pytest.approx(math.degrees(0.01 * 3**0.5))
+    assert metrics["rigid_offset_translation"] == pytest.approx(0.01 * 3**0.5 * correction.trajectory.extent)
