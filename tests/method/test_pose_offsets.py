@@ -17,7 +17,7 @@ _RIGID = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.03, -0.01], dtype=torch.float
 
 
 def _trajectory() -> Trajectory:
-    """A camera above the plane z = 0 that swings to and fro for two seconds, and looks down."""
+    """A camera above the plane z = 0 that swings back and forth for two seconds, and looks down."""
     seconds = torch.linspace(0, 2, 401, dtype=torch.float64)
     phase = torch.outer(seconds, torch.tensor([3.0, 4.1, 5.3, 2.9, 3.7, 4.7], dtype=torch.float64))
     twists = torch.tensor([0.5, 0.5, 0.2, 0.2, 0.2, 0.3], dtype=torch.float64) * torch.sin(phase)
