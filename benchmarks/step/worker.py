@@ -66,6 +66,8 @@ class _Worker:
     def psnr(self) -> float:
         """Return the PSNR over the validation views, with the colour correction fitted on them."""
         pipeline = self._trainer.pipeline
+        # Commits that refine the poses of the views would do it each time.
+        pipeline.config.refine_test_poses = False
         pipeline.fit_color_correction()
         return pipeline.get_average_eval_image_metrics()["psnr"]
 
