@@ -111,3 +111,5 @@ def test_every_method_config_registers_one_method() -> None:
     for path in (ROOT / "method_configs").glob("*.py"):
         if path.stem != "__init__":
             assert path.read_text(encoding="utf-8").count("MethodSpecification(") == 1, path
+            entry = f'{path.stem.replace("_", "-")} = "aenerf_ns.method_configs.{path.stem}:{path.stem}"\n'
+            assert entry in (ROOT / "pyproject.toml").read_text(encoding="utf-8")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
@@ -18,7 +17,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_table import (
     BLOCK,
@@ -35,6 +33,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision, SupervisionConfig
 from aenerf_ns.supervision.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
+from aenerf_ns.supervision.pixel_rays import PixelRays
 from aenerf_ns.supervision.sensor_parameters import SensorParameters
 
 # Share of a device's free memory that the table of pairs may take. The rest is for the model and its gradients.
@@ -234,21 +233,9 @@ class PairSampler(Sampler):
         self.max_events_per_pair = 1 if consecutive else config.max_events_per_pair
         self.share_to_moments = 0.0 if consecutive else config.share_to_moments
         self._needs_rates = supervision.needs_rates
-        scene = dataset.scene
-        self.sensor = scene.sensor
-        self.trajectory = deepcopy(scene.trajectory).to(device)
-        camera = scene.event_camera
-        directions, has_direction = camera.pixel_directions()
-        if not has_direction.all():
-            CONSOLE.print(
-                f"[yellow]The lens model gives {(~has_direction).sum()} pixels no direction; their events are left out"
-            )
-        # By pixel, row by row.
-        self._directions = torch.from_numpy(directions).reshape(-1, 3).to(device)
-        rows, columns = np.divmod(np.arange(camera.width * camera.height), camera.width)
-        self._channels = torch.from_numpy(self.sensor.channel(columns, rows)).to(device)
-        # Area of a pixel at distance one from the camera.
-        self._pixel_area = 1 / (camera.fx * camera.fy)
+        self.sensor = dataset.scene.sensor
+        self._pixel_rays = PixelRays(dataset.scene, device)
+        self.trajectory = self._pixel_rays.trajectory
 
     def prepare(self) -> None:
         """Read the events now rather than with the first batch.
@@ -280,7 +267,7 @@ class PairSampler(Sampler):
         with_time_within = training and self._needs_rates
         rays_per_pair = 3 if with_time_within else 2
         num_pairs = max(num_rays // rays_per_pair, 1)
-        device = self._directions.device
+        device = self._pixel_rays.channels.device
         num_to_moments = round(self.share_to_moments * num_pairs)
         rows = self._table.draw(num_to_moments, num_pairs - num_to_moments, self.max_events_per_pair)
         times, numbers = rows.permute(2, 1, 0)
@@ -304,16 +291,7 @@ class PairSampler(Sampler):
         # A pair that ends at a moment has not seen its last event.
         count[:, :num_to_moments] -= last_count[:, :num_to_moments]
         pixel = numbers[0] >> PIXEL_SHIFT
-        in_camera = self._directions.index_select(0, pixel).repeat(rays_per_pair, 1)
-        num_rays = len(in_camera)
-        rays = RayBundle(
-            origins=torch.zeros((num_rays, 3), device=device),
-            directions=in_camera.float(),
-            pixel_area=torch.full((num_rays, 1), self._pixel_area, device=device),
-            camera_indices=torch.zeros((num_rays, 1), dtype=torch.long, device=device),
-            times=torch.cat(seconds)[:, None],
-            metadata={CAMERA_DIRECTIONS: in_camera},
-        )
+        rays = self._pixel_rays.rays(pixel, seconds)
         batch = {
             "num_positive": count[0],
             "num_negative": count[1],
@@ -321,7 +299,7 @@ class PairSampler(Sampler):
             "last_num_positive": last_count[0],
             "last_num_negative": last_count[1],
             "last_interval": last_interval.float(),
-            "channel": self._channels.index_select(0, pixel),
+            "channel": self._pixel_rays.channels.index_select(0, pixel),
         }
         return rays, batch
 
