@@ -19,10 +19,21 @@ from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
 from aenerf_ns.method_configs.aenerf_small import aenerf_small
+from aenerf_ns.method_configs.eventnerf import eventnerf
+from aenerf_ns.method_configs.eventnerf_small import eventnerf_small
+from aenerf_ns.method_configs.evnerf import evnerf
+from aenerf_ns.method_configs.evnerf_small import evnerf_small
+from aenerf_ns.method_configs.robust_enerf import robust_enerf
+from aenerf_ns.method_configs.robust_enerf_small import robust_enerf_small
 
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 
 METHODS = {method.config.method_name: method.config for method in (aenerf, aenerf_small, aenerf_mlp)}
+# Only the options in which they differ from AE-NeRF of the same size are listed.
+PEERS = {
+    method.config.method_name: method.config
+    for method in (robust_enerf, robust_enerf_small, eventnerf, eventnerf_small, evnerf, evnerf_small)
+}
 
 # Nerfstudio's options are listed where a method changes their default. These are listed because many runs set them.
 OFTEN_SET = {"--machine.seed", "--machine.device-type", "--machine.num-devices", "--mixed-precision", "--load-dir"}
@@ -31,7 +42,7 @@ NO_CHOICE = {"--method-name", "--logging.local-writer.enable"}
 
 SECTIONS = {
     "--pipeline.model.": "The model",
-    "--pipeline.datamanager.": "Batches of pairs",
+    "--pipeline.datamanager.": "Batches",
     "--pipeline.": "The pipeline",
     "--optimizers.": "Learning rates",
     "--": "Training",
@@ -47,6 +58,13 @@ method](method.md) explains the terms. Give `True` or `False` after an option wh
 `python scripts/write_options.py` writes this page from the configurations: do not edit it by hand.
 """
 
+PEERS_INTRODUCTION = """\
+## Methods of other papers
+
+Options of `aenerf` that are not in this table have the same defaults in [these methods](peers.md), and options of
+`aenerf-small` in the small ones. The methods that have `shortest-window` have no options of pairs and of the sensor.
+"""
+
 FORMAT_INTRODUCTION = """\
 ## Dataset formats
 
@@ -57,14 +75,7 @@ Give an option of a dataset format after the format's name, at the end of the co
 
 def options_page() -> str:
     """Return the text of docs/options.md."""
-    values: dict[str, dict[str, Any]] = {}
-    meanings: dict[str, str] = {}
-    for method, config in METHODS.items():
-        offered = _offered(config)
-        for flag, value, is_listed, meaning in _options(config):
-            values.setdefault(flag, {})[method] = value
-            if is_listed and flag in offered:
-                meanings.setdefault(flag, meaning)
+    values, meanings = _values_and_meanings(METHODS)
     parts = [INTRODUCTION]
     # A flag belongs to the first section whose prefix it has.
     sections: dict[str, list[str]] = {title: [] for title in SECTIONS.values()}
@@ -76,9 +87,34 @@ def options_page() -> str:
         if rows:
             parts.append(f"## {title}\n")
             parts.append(_table(["option", *(f"`{method}`" for method in METHODS), "meaning"], rows))
+    parts += [PEERS_INTRODUCTION, _table(["option", *(f"`{name}`" for name in PEERS), "meaning"], list(_peer_rows()))]
     parts.append(FORMAT_INTRODUCTION)
     parts.append(_table(["option", "formats", "default", "meaning"], list(_format_rows())))
     return "\n".join(parts)
+
+
+def _values_and_meanings(methods: dict[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Return the default of each method by flag, and the meanings of the flags that the page lists."""
+    values: dict[str, dict[str, Any]] = {}
+    meanings: dict[str, str] = {}
+    for method, config in methods.items():
+        offered = _offered(config)
+        for flag, value, is_listed, meaning in _options(config):
+            values.setdefault(flag, {})[method] = value
+            if is_listed and flag in offered:
+                meanings.setdefault(flag, meaning)
+    return values, meanings
+
+
+def _peer_rows() -> Iterator[str]:
+    """Yield a row for each option in which a peer differs from AE-NeRF of the same size."""
+    ours, _ = _values_and_meanings(METHODS)
+    values, meanings = _values_and_meanings(PEERS)
+    for flag, meaning in meanings.items():
+        twins = {name: "aenerf-small" if name.endswith("-small") else "aenerf" for name in values[flag]}
+        if any(value != ours.get(flag, {}).get(twins[name]) for name, value in values[flag].items()):
+            cells = [_code(values[flag][name]) if name in values[flag] else "" for name in PEERS]
+            yield _row(f"`{flag}`", *cells, meaning)
 
 
 def _format_rows() -> Iterator[str]:

@@ -1,8 +1,9 @@
-"""Nerfstudio's dataset of a recording: cameras with pictures, and the pairs of events, read when first needed."""
+"""Nerfstudio's dataset of a recording: cameras with pictures, and the events, read when first needed."""
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_table import EventPairs
 from aenerf_ns.events.picture import PolaritySums, polarity_picture
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.events.windows import EventWindows, window_events
 from aenerf_ns.progress import tracked
 from aenerf_ns.recording.pair_file import PairFile
 from aenerf_ns.recording.scene import SCENE, Scene
@@ -37,6 +40,15 @@ class EventDataset(InputDataset):
             DataError: the event file is missing or malformed, or no event lies in the time window.
         """
         return self._pairs_and_pictures[0]
+
+    @property
+    def windows(self) -> EventWindows:
+        """All events in the time window, in the order of time. The first access reads the whole event file.
+
+        Raises:
+            DataError: the event file is missing or malformed, or no event lies in the time window.
+        """
+        return self._windows_and_pictures[0]
 
     @cached_property
     def _pairs_and_pictures(self) -> tuple[EventPairs, NDArray[np.int16]]:
@@ -74,10 +86,9 @@ class EventDataset(InputDataset):
 
         scene = self.scene
         events = scene.event_file
-        half = max(int(_PICTURE_DENSITY * usable.size) // 2, 1)
-        pictures = PolaritySums(scene.camera_times.tolist(), half)
+        pictures = self._new_pictures()
         pairs = pair_events(
-            pictures.passed(tracked(events.chunks(), f"Reading {events.path.name}", count)),
+            pictures.passed(self._chunks(count)),
             refractory_period=scene.sensor.refractory_period,
             window=scene.window,
             usable=usable,
@@ -91,6 +102,29 @@ class EventDataset(InputDataset):
         file.keep(pairs, sums)
         return pairs, sums
 
+    @cached_property
+    def _windows_and_pictures(self) -> tuple[EventWindows, NDArray[np.int16]]:
+        """The events, and for each camera the (height, width) sum of polarities around its time."""
+        scene = self.scene
+        scene.event_file.require()
+        _, usable = scene.event_camera.pixel_directions()
+        pictures = self._new_pictures()
+        chunks = pictures.passed(self._chunks(scene.event_file.count()))
+        windows = window_events(chunks, window=scene.window, usable=usable)
+        CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.")
+        return windows, pictures.sums(*usable.shape)
+
+    def _new_pictures(self) -> PolaritySums:
+        """Return what adds up the events around the times of the cameras."""
+        camera = self.scene.event_camera
+        half = max(int(_PICTURE_DENSITY * camera.width * camera.height) // 2, 1)
+        return PolaritySums(self.scene.camera_times.tolist(), half)
+
+    def _chunks(self, count: int | None) -> Iterable[EventStream]:
+        """Return the events in pieces, with a progress bar towards their number, if that is known."""
+        events = self.scene.event_file
+        return tracked(events.chunks(), f"Reading {events.path.name}", count)
+
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Return the (H, W, 3) image of a camera, or a picture of the events nearest in time if it has no image."""
         scene = self.scene
@@ -99,6 +133,8 @@ class EventDataset(InputDataset):
         width, height = scene.event_camera.width, scene.event_camera.height
         # A trained run may be opened where its events are not.
         has_events = scene.event_file.path.exists()
-        net = self._pairs_and_pictures[1][image_idx] if has_events else np.zeros((height, width), np.int16)
+        # Those of the events that were read for training: reading them again would take as long.
+        read = "_windows_and_pictures" if "_windows_and_pictures" in vars(self) else "_pairs_and_pictures"
+        net = getattr(self, read)[1][image_idx] if has_events else np.zeros((height, width), np.int16)
         rows, columns = np.nonzero(net)
         return polarity_picture(columns, rows, net[rows, columns], width, height)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
 def log_radiance_change(
-    num_positive: Tensor, num_negative: Tensor, positive_threshold: Tensor | float, negative_threshold: float
+    num_positive: Tensor, num_negative: Tensor, positive_threshold: Tensor | float, negative_threshold: Tensor | float
 ) -> Tensor:
-    """Return the change of log-radiance that a pair of events tells of: Δ = n+ C+ − n− C− (paper, eq. 5).
+    """Return the change of log-radiance that events of a pixel tell of: Δ = n+ C+ − n− C− (paper, eq. 5).
 
     Args:
         num_positive: (N,) positive events after the earlier time up to the later one.
         num_negative: (N,) negative events in the same time.
         positive_threshold: C+; a scalar in the graph when it is learned.
-        negative_threshold: C−.
+        negative_threshold: C−; likewise.
 
     Returns:
         (N,) changes.
@@ -73,3 +74,29 @@ def reconstruction_loss(predicted: Tensor, target: Tensor, mean_contrast_thresho
         The loss, a scalar: 1 for a constant field when every pair is one event and C+ = C−.
     """
     return (predicted - target).square().mean() / mean_contrast_threshold**2
+
+
+def dead_zone_excess(
+    predicted: Tensor, change: Tensor, positive_threshold: Tensor, negative_threshold: Tensor
+) -> Tensor:
+    """Return by how much rendered changes leave Ev-NeRF's dead zone.
+
+    A change that differs from the events' by less than a threshold triggers no event. Other than
+    :func:`silent_change`, this has gradients for the thresholds, as the edges of the zone.
+
+    Args:
+        predicted: (N,) rendered changes of log-radiance.
+        change: (N,) changes that the events tell of.
+        positive_threshold: B+, a scalar.
+        negative_threshold: B−, a scalar, positive too.
+
+    Returns:
+        (N,) max(0, e − B+) + max(0, −B− − e) for e = predicted − change.
+    """
+    error = predicted - change
+    return F.relu(error - positive_threshold) + F.relu(-negative_threshold - error)
+
+
+def threshold_bound_loss(thresholds: Tensor, least: Tensor) -> Tensor:
+    """Return by how much thresholds are below the least that they may be, summed. Both have the same shape."""
+    return F.relu(least - thresholds).sum()

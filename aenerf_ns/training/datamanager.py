@@ -25,9 +25,11 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
 
     _target: type = field(default_factory=lambda: EventDataManager)
     train_num_rays_per_batch: int = 8192
-    """The most rays of a training batch. A pair of events takes two, or three with the temporal loss."""
+    """The most rays of a training batch. A pair of events takes two, or three with the temporal loss. A pixel in a
+    window of time takes two."""
     eval_num_rays_per_batch: int = 8192
-    """The most rays of a batch on which the loss is logged without training. A pair of events takes two."""
+    """The most rays of a batch on which the loss is logged without training. A pair of events takes two, and so does a
+    pixel in a window of time."""
     sampler: SamplerConfig = field(default_factory=PairSamplerConfig)
     """How batches are drawn. The model's supervision says what their renderings are compared with."""
 

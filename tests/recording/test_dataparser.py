@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -24,6 +25,7 @@ from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.recording import Recording
@@ -151,3 +153,27 @@ def test_a_pose_gap_must_be_positive(tmp_path: Path) -> None:
     truth = write_own(tmp_path / "made")
     with pytest.raises(DataError, match="max_pose_gap_ns is 0"):
         parse(config_of("event-recording-data", truth.data, max_pose_gap_ns=0))
+
+
+def test_windows_hold_the_events_of_the_time_window_and_read_the_file_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_native(tmp_path / "made")
+    start, end = START + 500_000_000, START + 1_050_000_000
+    outputs = parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end))
+    pictures = [EventDataset(outputs).get_numpy_image(index) for index in range(3)]
+    reads = []
+    original = Hdf5EventFile.read_chunks
+    monkeypatch.setattr(Hdf5EventFile, "read_chunks", lambda file: reads.append(file) or original(file))
+    dataset = EventDataset(outputs)
+    windows = dataset.windows
+    with h5py.File(folder / "events.h5") as file:
+        times = file["events/t"][()]
+    inside = (times > start) & (times <= end)
+    assert windows.counts(start, end).sum() == inside.sum() > 20
+    assert windows.pieces == ((start, end),)
+    assert "events.h5: 200 events," in capsys.readouterr().out
+    # The pictures of the cameras are those that are made beside pairs.
+    assert all(np.array_equal(dataset.get_numpy_image(index), picture) for index, picture in enumerate(pictures))
+    assert pictures[1].std() > 0
+    assert len(reads) == 1

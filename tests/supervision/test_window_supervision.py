@@ -1,0 +1,301 @@
+"""Windows of time: what is drawn, and what EventNeRF and Ev-NeRF make of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_stream
+from small_models import CAMERA, EPOCH, make_rays, make_scene
+
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.events.windows import EventWindows, window_events
+from aenerf_ns.recording.scene import Scene
+from aenerf_ns.supervision.windows import (
+    EventNeRFSupervisionConfig,
+    EvNeRFSupervisionConfig,
+    WindowSampler,
+    WindowSamplerConfig,
+    WindowSupervision,
+)
+
+# Poses every 0.2 s; the middle interval is a gap.
+KNOTS = EPOCH + 200_000_000 * np.arange(8)
+GAP = (int(KNOTS[3]), int(KNOTS[4]))
+EVENTS = make_stream(
+    [
+        (x, y, EPOCH + t, p)
+        for x, y, t, p in [
+            (3, 1, 5_000, 1), (0, 2, 100_000_000, -1), (0, 2, 100_000_000, 1), (3, 1, 250_000_000, -1),
+            (3, 1, 400_000_000, 1), (0, 2, 600_000_000, -1), (3, 1, 700_000_000, 1), (3, 1, 1_000_000_000, 1),
+            (3, 1, 1_000_000_000, 1), (1, 1, 1_300_000_000, -1),
+        ]
+    ]
+)  # fmt: skip
+
+
+@dataclass
+class Windows:
+    """A training dataset with events at three pixels."""
+
+    scene: Scene
+    windows: EventWindows
+
+
+def make_sampler(
+    random_poses: torch.Tensor, sensor: SensorModel | None = None, camera: EventCamera = CAMERA, **options: Any
+) -> WindowSampler:
+    sensor = sensor or SensorModel()
+    window = TimeWindow(int(KNOTS[0]), int(KNOTS[-1]) - 50_000_000, (GAP,))
+    scene = replace(make_scene(sensor, Trajectory(KNOTS, random_poses), camera), window=window)
+    events = window_events([EVENTS], window=window, usable=camera.pixel_directions()[1])
+    return WindowSamplerConfig(**options).setup(
+        dataset=Windows(scene, events),
+        supervision=EventNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={}),
+        device="cpu",
+    )
+
+
+def windows_of(rays: Any) -> list[tuple[int, int]]:
+    """The two times of each pixel's window, in steps of a quarter of the poses' interval."""
+    starts, ends = torch.round(rays.times[:, 0] / 0.05).long().chunk(2)
+    return list(zip(starts.tolist(), ends.tolist(), strict=True))
+
+
+def test_a_pixel_has_the_events_of_its_window_and_rays_at_both_ends(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB"), longest_window=1.0, pixels_per_window=3)
+    rays, batch = sampler.sample(2400)
+    assert rays.origins.shape == (2400, 3)
+    directions, _ = CAMERA.pixel_directions()
+    pixels = [
+        int(np.abs(directions.reshape(-1, 3) - ray).sum(1).argmin()) for ray in rays.metadata[CAMERA_DIRECTIONS].numpy()
+    ]
+    assert pixels[:1200] == pixels[1200:]
+    seconds = np.round((rays.times[:, 0] * 1e9).numpy()).astype(np.int64) + EPOCH
+    for index, (pixel, start, end) in enumerate(zip(pixels[:1200], seconds[:1200], seconds[1200:], strict=True)):
+        y, x = divmod(pixel, 4)
+        inside = (EVENTS.x == x) & (EVENTS.y == y) & (start < EVENTS.t) & (EVENTS.t <= end)
+        inside &= (EVENTS.t <= GAP[0]) | (EVENTS.t >= GAP[1])
+        assert batch["num_positive"][index] == (EVENTS.p[inside] > 0).sum()
+        assert batch["num_negative"][index] == (EVENTS.p[inside] < 0).sum()
+        assert batch["channel"][index] == [[0, 1], [1, 2]][y % 2][x % 2]
+
+
+def test_windows_end_at_poses_cross_no_gap_and_have_all_lengths_alike(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, longest_window=1.0, pixels_per_window=1)
+    found = Counter(windows_of(sampler.sample(12_000)[0]))
+    # Three intervals before the gap, three after it; the last ends where the events' time window does.
+    steps = ([0, 4, 8, 12], [16, 20, 24, 27])
+    expected = {}
+    for edges in steps:
+        for end in (1, 2, 3):
+            for start in range(end):
+                expected[edges[start], edges[end]] = 1 / 6 / end
+    assert found.keys() == expected.keys()
+    for window, share in expected.items():
+        assert found[window] / 6000 == pytest.approx(share, abs=0.02)
+
+
+@pytest.mark.parametrize(("shortest", "longest", "lengths"), [(0.0, 0.0, {1}), (0.0, 0.34, {1, 2}), (0.3, 0.3, {2})])
+def test_windows_are_as_long_as_asked_for(
+    random_poses: torch.Tensor, shortest: float, longest: float, lengths: set[int]
+) -> None:
+    sampler = make_sampler(random_poses, shortest_window=shortest, longest_window=longest, pixels_per_window=1)
+    windows = windows_of(sampler.sample(4000)[0])
+    found = {(-(-(end - start) // 4), end in (4, 20)) for start, end in windows}
+    # A window that ends at the first pose after a start has no place for more than one interval.
+    assert found == {(length, False) for length in lengths} | {(1, True)}
+
+
+def test_most_pixels_are_active_and_the_others_any_that_the_lens_sees(random_poses: torch.Tensor) -> None:
+    # Of the pixels with events only (3, 1) has a direction.
+    camera = EventCamera(4, 3, 1.0, 1.0, 3.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.0, 0.0, 0.0))
+    _, usable = camera.pixel_directions()
+    assert usable[1].tolist() == [False, False, True, True]
+    sampler = make_sampler(random_poses, camera=camera, longest_window=0.0, share_of_all_pixels=0.25)
+    seen = set()
+    for _ in range(40):
+        rays, batch = sampler.sample(800)
+        ((start, end),) = set(windows_of(rays))
+        seen.add((start, end))
+        sums = batch["num_positive"] - batch["num_negative"]
+        directions = rays.metadata[CAMERA_DIRECTIONS][:400]
+        # Two events that cancel make no pixel active, and an event at the start is not in the window.
+        if (start, end) in ((0, 4), (16, 20)):
+            assert (sums[:300] != 0).all()
+            directions = directions[300:]
+        else:
+            assert (sums == 0).all()
+        assert len(directions.unique(dim=0)) == usable.sum()
+    assert len(seen) == 6
+
+
+def test_a_batch_has_as_many_windows_as_fill_it(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, longest_window=1.0, pixels_per_window=10)
+    rays, _ = sampler.sample(75)
+    assert len(rays) == 74
+    windows = windows_of(rays)
+    assert [len(set(windows[part])) for part in (slice(0, 10), slice(10, 19), slice(19, 28), slice(28, 37))] == [1] * 4
+    assert len(set(windows)) > 1
+    assert len(sampler.sample(1, training=False)[0]) == 2
+
+
+def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, longest_window=1.0, pixels_per_window=4)
+    torch.manual_seed(3)
+    first, _ = sampler.sample(80)
+    torch.manual_seed(3)
+    again, _ = sampler.sample(80)
+    assert torch.equal(first.times, again.times)
+    assert torch.equal(first.directions, again.directions)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"longest_window": 1.5}, "longest-window is 1.5; give a number from 0 to 1"),
+        ({"share_of_all_pixels": -0.1}, "share-of-all-pixels is -0.1; give"),
+        ({"shortest_window": 0.2}, "shortest-window is 0.2, longest-window 0.05; give"),
+        ({"pixels_per_window": 0}, "pixels-per-window is 0; give at least 1"),
+    ],
+)
+def test_options_out_of_range_are_refused(random_poses: torch.Tensor, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        make_sampler(random_poses, **options)
+
+
+def compare(
+    supervision: WindowSupervision, predicted: torch.Tensor, positive: list[float], negative: list[float]
+) -> dict[str, torch.Tensor]:
+    """The losses for rendered changes of a grey sensor's pixels."""
+    outputs = {"log_radiance": torch.cat([torch.zeros_like(predicted), predicted])[:, None]}
+    outputs |= supervision.place(make_rays(2 * len(predicted), with_times=True))
+    batch = {
+        "num_positive": torch.tensor(positive),
+        "num_negative": torch.tensor(negative),
+        "channel": torch.zeros(len(predicted), dtype=torch.long),
+    }
+    return supervision.losses(outputs, batch)
+
+
+def log_change(start: list[float], end: list[float], epsilon: float) -> torch.Tensor:
+    """The change of EventNeRF's log-radiance between display values."""
+    before, after = (torch.tensor(values, dtype=torch.float64) ** 2.2 + epsilon for values in (start, end))
+    return (after / before).log()
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "net", "epsilon", "expected"),
+    [
+        # The release divides by the three channels of each pixel, of which a mosaic's pixel sees one.
+        ([0.5, 0.8], [0.6, 0.4], [1.0, -3.0], 0.1, 3 * 0.0226387),
+        ([0.5, 0.8], [0.6, 0.4], [1.0, -3.0], 1e-5, 3 * 0.1038741),
+        ([0.5], [0.6], [0.0], 0.1, 0.0848352),
+    ],
+)
+def test_the_loss_of_eventnerf_is_the_releases_in_units_of_the_threshold(
+    start: list[float], end: list[float], net: list[float], epsilon: float, expected: float
+) -> None:
+    supervision = EventNeRFSupervisionConfig().setup(sensor=SensorModel(0.25, 0.25), loss_coefficients={})
+    counts = [max(n, 0.0) for n in net], [max(-n, 0.0) for n in net]
+    (loss,) = compare(supervision, log_change(start, end, epsilon), *counts).values()
+    assert loss.item() == pytest.approx(expected / 0.25**2, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("predicted", "positive", "negative", "excess"),
+    [
+        ([0.9, 0.1, -0.5, 0.2], [1, 0, 0, 0], [0, 0, 1, 0], [0.3, 0, 0, 0]),
+        ([-0.4, 0.4, 1.0], [0, 0, 2], [0, 0, 1], [0.15, 0.10, 0.35]),
+    ],
+)
+def test_the_loss_of_evnerf_by_hand(
+    predicted: list[float], positive: list[float], negative: list[float], excess: list[float]
+) -> None:
+    supervision = EvNeRFSupervisionConfig().setup(sensor=SensorModel(0.3, 0.25), loss_coefficients={})
+    losses = compare(supervision, torch.tensor(predicted), positive, negative)
+    assert losses["reconstruction_loss"].item() == pytest.approx(np.mean(excess) / 0.275, rel=1e-5)
+    assert losses["threshold_bound_loss"].item() == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("learned", "expected"), [((0.2, 0.25), 0.15), ((0.35, 0.4), 0.0)])
+def test_the_bound_holds_thresholds_at_the_sensors(learned: tuple[float, float], expected: float) -> None:
+    supervision = EvNeRFSupervisionConfig().setup(sensor=SensorModel(0.3, 0.3), loss_coefficients={})
+    factors = torch.tensor(learned) / 0.3
+    supervision.raw_factors.data = factors.expm1().log()
+    assert supervision.learned() == pytest.approx({"positive_threshold": learned[0], "negative_threshold": learned[1]})
+    losses = compare(supervision, torch.zeros(1), [0.0], [0.0])
+    assert losses["threshold_bound_loss"].item() == pytest.approx(expected / 0.3, rel=1e-5)
+    # The unit stays the sensor's.
+    assert supervision.unit({}) == pytest.approx(0.3)
+
+
+def test_learned_thresholds_have_gradients_from_both_losses() -> None:
+    supervision = EvNeRFSupervisionConfig().setup(sensor=SensorModel(0.3, 0.25), loss_coefficients={})
+    supervision.raw_factors.data -= 0.1
+    # Outside at the upper edge with two positive events, outside at the lower edge with three negative ones.
+    losses = compare(supervision, torch.tensor([1.5, -0.2]), [2.0, 0.0], [0.0, 3.0])
+    for name, signs in (("reconstruction_loss", [-1, 1]), ("threshold_bound_loss", [-1, -1])):
+        (gradient,) = torch.autograd.grad(losses[name], supervision.raw_factors, retain_graph=True)
+        assert gradient.sign().tolist() == signs, name
+
+
+def true_log_radiance(times: np.ndarray, pixel: int) -> np.ndarray:
+    """Log-radiance that an ideal pixel sees, at times in seconds."""
+    return np.sin((3 + pixel) * times) + 0.3 * np.cos(17 * times + pixel)
+
+
+def ideal_events(sensor: SensorModel) -> EventStream:
+    """The events of ideal pixels that see :func:`true_log_radiance`, on a fine raster of times."""
+    rows = []
+    raster = np.arange(0, 1.2e9, 2e4)
+    for pixel in range(12):
+        values = true_log_radiance(raster * 1e-9, pixel)
+        reference = values[0]
+        for time, value in zip(raster, values, strict=True):
+            if value >= reference + sensor.positive_contrast_threshold:
+                reference += sensor.positive_contrast_threshold
+                rows.append((pixel % 4, pixel // 4, int(time), 1))
+            elif value <= reference - sensor.negative_contrast_threshold:
+                reference -= sensor.negative_contrast_threshold
+                rows.append((pixel % 4, pixel // 4, int(time), -1))
+    return make_stream(sorted(rows, key=lambda row: row[2]))
+
+
+def test_the_events_of_a_window_tell_the_true_change_to_within_a_threshold_at_either_end() -> None:
+    sensor = SensorModel(0.2, 0.15)
+    stream = ideal_events(sensor)
+    events = window_events([stream], window=TimeWindow(0, 1_200_000_000), usable=np.ones((3, 4), bool))
+    eventnerf = EventNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={})
+    evnerf = EvNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={})
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        start, end = np.sort(rng.integers(0, 1_200_000_001, 2))
+        counts = events.counts(int(start), int(end))
+        pixels = np.arange(12)
+        truth = true_log_radiance(end * 1e-9, pixels) - true_log_radiance(start * 1e-9, pixels)
+        told = counts[0] * 0.2 - counts[1] * 0.15
+        assert np.abs(truth - told).max() < 0.35 + 1e-3
+        losses = compare(eventnerf, torch.from_numpy(truth), *counts.astype(float).tolist())
+        assert losses["reconstruction_loss"] < (0.35 / 0.175) ** 2
+        # The zone of a threshold leaves at most the other one.
+        losses = compare(evnerf, torch.from_numpy(truth), *counts.astype(float).tolist())
+        assert losses["reconstruction_loss"] < 0.2 / 0.175
+    # From an event of a pixel on, the truth is inside the dead zone.
+    for pixel in range(12):
+        times = stream.t[4 * stream.y.astype(int) + stream.x == pixel]
+        start, end = int(times[1]), int(times[-1]) - 10_000_000
+        counts = events.counts(start, end)[:, pixel : pixel + 1]
+        truth = torch.from_numpy(true_log_radiance(np.array([end, start]) * 1e-9, pixel)).diff().neg()
+        losses = compare(evnerf, truth, *counts.astype(float).tolist())
+        assert losses["reconstruction_loss"] < 5e-3
