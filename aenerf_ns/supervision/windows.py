@@ -213,7 +213,7 @@ class WindowSampler(Sampler):
         """
         knots = self.dataset.scene.trajectory.times.numpy()
         pieces = [
-            np.unique([first, *knots[(knots > first) & (knots < last)], last])
+            np.unique(np.r_[first, knots[(knots > first) & (knots < last)], last])
             for first, last in self.dataset.windows.pieces
         ]
         times, before = np.concatenate(pieces), np.concatenate([np.arange(len(piece)) for piece in pieces])
@@ -259,16 +259,17 @@ class WindowSampler(Sampler):
         """
         num_pixels = max(num_rays // 2, 1)
         num_windows = max(round(num_pixels / self.config.pixels_per_window), 1)
-        pixels, counts, times = [], [], []
+        drawn = []
         for part in np.array_split(np.arange(num_pixels), num_windows):
             window = self._draw_window()
-            chosen, found = self._draw_pixels(*window, len(part))
-            pixels.append(chosen)
-            counts.append(found)
-            times.append(np.tile(np.array(window)[:, None], len(part)))
-        pixel = torch.from_numpy(np.concatenate(pixels)).to(self.device)
-        positive, negative = torch.from_numpy(np.concatenate(counts, 1)).to(self.device).float()
-        seconds = self._pixel_rays.trajectory.seconds(torch.from_numpy(np.concatenate(times, 1)).to(self.device))
-        channel = self._pixel_rays.channels.index_select(0, pixel)
-        rays = self._pixel_rays.rays(pixel, list(seconds))
-        return rays, {"num_positive": positive, "num_negative": negative, "channel": channel}
+            pixels, counts = self._draw_pixels(*window, len(part))
+            drawn.append(np.stack([pixels, *counts, *(np.full_like(pixels, time) for time in window)]))
+        # In one piece, because every copy to a GPU takes its time.
+        pixel, positive, negative, *times = torch.from_numpy(np.concatenate(drawn, 1)).to(self.device)
+        rays = self._pixel_rays.rays(pixel, [self._pixel_rays.trajectory.seconds(time) for time in times])
+        batch = {
+            "num_positive": positive.float(),
+            "num_negative": negative.float(),
+            "channel": self._pixel_rays.channels.index_select(0, pixel),
+        }
+        return rays, batch

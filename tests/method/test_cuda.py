@@ -25,7 +25,9 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.encoding.hash_grid import HashEncoding
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.supervision.base import SupervisionConfig
 from aenerf_ns.supervision.pairs import PairSupervisionConfig
+from aenerf_ns.supervision.windows import EventNeRFSupervisionConfig, EvNeRFSupervisionConfig
 
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 NEEDS_SIMULATION = pytest.mark.skipif(
@@ -56,6 +58,20 @@ def test_a_step_computes_on_the_device_alone(backbone: str, bounded: bool, corre
         losses = model.get_loss_dict(model(rays), batch)
         torch.stack(list(losses.values())).sum().backward()
     assert {loss.device for loss in losses.values()} == {device()}
+    assert sum(gpu.counts.launches.values()) > 100
+    assert gpu.counts.uploads == gpu.counts.downloads == gpu.counts.waits == 0
+
+
+@NEEDS_SIMULATION
+@pytest.mark.parametrize("supervision", [EventNeRFSupervisionConfig(), EvNeRFSupervisionConfig()])
+def test_a_step_on_windows_computes_on_the_device_alone(supervision: SupervisionConfig) -> None:
+    model = make_model(camera_optimizer=PoseCorrectionConfig(mode="spline"), supervision=supervision)
+    with SimulatedCuda() as gpu:
+        to_device(model)
+        rays, batch = to_device(make_rays(10, with_times=True)), to_device(make_batch(5))
+        outputs = model(rays)
+        torch.stack(list(model.get_loss_dict(outputs, batch).values())).sum().backward()
+        assert model.supervision.metrics(outputs, batch)["polarity_agreement"].device == device()
     assert sum(gpu.counts.launches.values()) > 100
     assert gpu.counts.uploads == gpu.counts.downloads == gpu.counts.waits == 0
 

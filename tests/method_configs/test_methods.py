@@ -21,13 +21,16 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_small import aenerf_small
+from aenerf_ns.method_configs.eventnerf import eventnerf
 from aenerf_ns.method_configs.eventnerf_small import eventnerf_small
+from aenerf_ns.method_configs.evnerf import evnerf
 from aenerf_ns.method_configs.evnerf_small import evnerf_small
 from aenerf_ns.method_configs.robust_enerf import robust_enerf
 from aenerf_ns.method_configs.robust_enerf_small import robust_enerf_small
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 SMALL = [robust_enerf_small, eventnerf_small, evnerf_small]
+PEERS = [*SMALL, robust_enerf, eventnerf, evnerf]
 
 
 @pytest.fixture
@@ -108,7 +111,7 @@ def test_robust_enerf_trains_as_aenerf_does_with_its_options_to_the_bit(data: Pa
 
 
 @pytest.mark.parametrize("mode", ["off", "spline"])
-@pytest.mark.parametrize("method", SMALL, ids=lambda method: method.config.method_name)
+@pytest.mark.parametrize("method", PEERS, ids=lambda method: method.config.method_name)
 def test_every_peer_trains_with_and_without_pose_correction(method: Any, mode: str, data: Path) -> None:
     config = with_options(method.config, "--pipeline.model.camera-optimizer.mode", mode)
     history, weights = train(shrunk(config), data, 3)

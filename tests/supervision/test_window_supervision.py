@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import make_stream
+from simulated_cuda import Counts, SimulatedCuda, device
 from small_models import CAMERA, EPOCH, make_rays, make_scene
 
 from aenerf_ns.camera.lens import EventCamera
@@ -21,6 +22,7 @@ from aenerf_ns.events.stream import EventStream
 from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.events.windows import EventWindows, window_events
 from aenerf_ns.recording.scene import Scene
+from aenerf_ns.supervision.pixel_rays import PixelRays
 from aenerf_ns.supervision.windows import (
     EventNeRFSupervisionConfig,
     EvNeRFSupervisionConfig,
@@ -148,6 +150,21 @@ def test_a_batch_has_as_many_windows_as_fill_it(random_poses: torch.Tensor) -> N
     assert [len(set(windows[part])) for part in (slice(0, 10), slice(10, 19), slice(19, 28), slice(28, 37))] == [1] * 4
     assert len(set(windows)) > 1
     assert len(sampler.sample(1, training=False)[0]) == 2
+
+
+@pytest.mark.skipif(
+    not hasattr(torch.utils.backend_registration, "_setup_privateuseone_for_python_backend"),
+    reason="this version of torch has no devices that are written in Python",
+)
+def test_a_batch_goes_to_the_device_in_one_copy(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, pixels_per_window=5)
+    with SimulatedCuda() as gpu:
+        sampler.device = device()
+        sampler._pixel_rays = PixelRays(sampler.dataset.scene, device())
+        gpu.counts = Counts()
+        rays, batch = sampler.sample(40)
+    assert {value.device for value in (rays.times, rays.directions, *batch.values())} == {device()}
+    assert (gpu.counts.uploads, gpu.counts.downloads, gpu.counts.waits) == (1, 0, 0)
 
 
 def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
