@@ -22,6 +22,7 @@ from aenerf_ns.events.stream import EventStream
 from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.events.windows import EventWindows, window_events
 from aenerf_ns.recording.scene import Scene
+from aenerf_ns.supervision.base import SupervisionConfig
 from aenerf_ns.supervision.pixel_rays import PixelRays
 from aenerf_ns.supervision.windows import (
     EventNeRFSupervisionConfig,
@@ -191,6 +192,15 @@ def test_options_out_of_range_are_refused(random_poses: torch.Tensor, options: d
         make_sampler(random_poses, **options)
 
 
+def test_poses_with_gaps_alone_are_refused(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses)
+    at_poses = make_stream([(0, 0, int(time), 1) for time in KNOTS[:2]])
+    window = TimeWindow(int(KNOTS[0]), int(KNOTS[1]), ((int(KNOTS[0]), int(KNOTS[1])),))
+    sampler.dataset.windows = window_events([at_poses], window=window, usable=np.ones((3, 4), bool))
+    with pytest.raises(DataError, match="the poses: no two of them follow each other without a gap; give --max-pose"):
+        sampler.prepare()
+
+
 def compare(
     supervision: WindowSupervision, predicted: torch.Tensor, positive: list[float], negative: list[float]
 ) -> dict[str, torch.Tensor]:
@@ -265,6 +275,18 @@ def test_learned_thresholds_have_gradients_from_both_losses() -> None:
     for name, signs in (("reconstruction_loss", [-1, 1]), ("threshold_bound_loss", [-1, -1])):
         (gradient,) = torch.autograd.grad(losses[name], supervision.raw_factors, retain_graph=True)
         assert gradient.sign().tolist() == signs, name
+
+
+@pytest.mark.parametrize("config", [EventNeRFSupervisionConfig(), EvNeRFSupervisionConfig()])
+def test_gradients_are_finite_where_events_cancel_or_come_in_crowds(config: SupervisionConfig) -> None:
+    supervision = config.setup(sensor=SensorModel(0.3, 0.25), loss_coefficients={})
+    predicted = torch.tensor([0.0, 0.0, 40.0, -0.25], requires_grad=True)
+    losses = compare(supervision, predicted, [0.0, 3.0, 1000.0, 0.0], [0.0, 3.0, 0.0, 1.0])
+    inputs = [predicted, *supervision.parameters()]
+    gradients = torch.autograd.grad(sum(losses.values()), inputs, allow_unused=True)
+    assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
+    # A single pixel, as in the smallest batch.
+    assert all(loss.isfinite() for loss in compare(supervision, predicted[:1], [1.0], [0.0]).values())
 
 
 def true_log_radiance(times: np.ndarray, pixel: int) -> np.ndarray:
