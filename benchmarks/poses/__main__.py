@@ -2,7 +2,7 @@
 
     python -m benchmarks.scenes.build --output scenes
     python -m benchmarks.poses --scenes-folder scenes --work work --output benchmarks/results/poses_cpu2.json
-    python -m benchmarks.poses --split choose --variants directions="--pipeline.model.field.view-directions True" ...
+    python -m benchmarks.poses --split choose --variants density="--pipeline.model.average-init-density 3" ...
 
 Each recording is trained with its wrong poses and, as a control, with its true poses. Every variant of the settings is
 trained on the same recordings with the same seeds. A finished training is found again in the folder ``--work``, so a
