@@ -11,11 +11,11 @@ from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipelineConfig
 from aenerf_ns.training.schedules import (
-    AENeRFTrainerConfig,
     FusedAdamOptimizerConfig,
     RelativeCosineSchedulerConfig,
     RelativeMultiStepSchedulerConfig,
 )
+from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
 aenerf = MethodSpecification(
     config=AENeRFTrainerConfig(

@@ -190,7 +190,7 @@ class AENeRFModel(Model):
         """Return the callbacks that schedule the proposal sampler, as the framework's own methods do, and the space."""
         trainer = training_callback_attributes.trainer
         assert trainer is not None
-        observed_until = _OBSERVED_SHARE * trainer.config.max_num_iterations
+        observed_until = _OBSERVED_SHARE * trainer.config.schedule_length
 
         def weigh(step: int) -> None:
             if self.space is None:

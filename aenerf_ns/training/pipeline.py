@@ -26,6 +26,7 @@ from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
 from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
+from aenerf_ns.training.training_state import TrainingState
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
@@ -80,6 +81,7 @@ class AENeRFPipeline(VanillaPipeline):
             provide_ffmpeg()
         super().__init__(config, device, test_mode=test_mode, **kwargs)
         self._pose_diagnosis: dict[str, Any] | None = None
+        self.training_state = TrainingState()
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
         # Chosen once: otherwise every fit would read the images again.
@@ -143,6 +145,7 @@ class AENeRFPipeline(VanillaPipeline):
             trainer.config.save_config()
         num_steps = trainer.config.max_num_iterations
         last_step = trainer._start_step + num_steps - 1
+        self.training_state.go_on(trainer, self.model.proposal_sampler)
         # A run that goes on from a checkpoint is diagnosed anew at its own end.
         self._pose_diagnosis = None
         earlier_poses: list[Tensor] = []

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import tyro
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
@@ -119,13 +118,3 @@ class RelativeCosineScheduler(Scheduler):
         """Return the schedule of an optimizer whose learning rate is ``lr_init``."""
         config = self.config
         return LambdaLR(optimizer, _CosineFactor(config.delay, config.warm_up, config.max_steps, config.final_factor))
-
-
-@dataclass
-class AENeRFTrainerConfig(TrainerConfig):
-    """Nerfstudio's trainer, which tells the schedules how long the run is."""
-
-    def __post_init__(self) -> None:
-        for group in self.optimizers.values():
-            if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, RelativeCosineSchedulerConfig)):
-                group["scheduler"].max_steps = self.max_num_iterations

@@ -112,6 +112,7 @@ def make_trainer(folder: Path, narrow: bool, temporal: bool) -> Trainer:
         config.pipeline.datamanager.train_num_rays_per_batch = 60
         model.field.log2_hashmap_size, model.field.num_samples_per_ray = 10, 6
         model.proposal.log2_hashmap_size, model.proposal.num_samples_per_ray = 8, (16, 8)
+    config.schedule_length = config.max_num_iterations
     trainer = Trainer.__new__(Trainer)
     trainer.config, trainer.device, trainer.mixed_precision = config, device().type, False
     trainer.local_rank, trainer._start_step = 1, 0

@@ -19,6 +19,7 @@ from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method.temporal import log_radiance_rate
 from aenerf_ns.training.pipeline import AENeRFPipeline
+from aenerf_ns.training.training_state import TrainingState
 
 
 def set_output(network: nn.Module, value: float) -> None:
@@ -236,12 +237,13 @@ def make_pipeline(model: AENeRFModel, rays: RayBundle, mixed: bool = False) -> t
     pipeline = AENeRFPipeline.__new__(AENeRFPipeline)
     nn.Module.__init__(pipeline)
     pipeline._model = model
+    pipeline.training_state = TrainingState()
     batches = SimpleNamespace(
         next_train=lambda step: (rays, make_batch(len(rays) // 2)), get_training_callbacks=lambda attributes: []
     )
     pipeline.__dict__["datamanager"] = batches
     optimizer = torch.optim.Adam(model.parameters())
-    config = SimpleNamespace(max_num_iterations=10, logging=SimpleNamespace(steps_per_log=2))
+    config = SimpleNamespace(max_num_iterations=10, schedule_length=10, logging=SimpleNamespace(steps_per_log=2))
     trainer = SimpleNamespace(
         local_rank=1, _start_step=0, step=7, config=config, grad_scaler=torch.amp.GradScaler("cpu", enabled=mixed),
         optimizers=SimpleNamespace(optimizers={"all": optimizer}),

@@ -1,0 +1,79 @@
+"""The state of a training beyond weights, optimizers and schedules, which the framework's checkpoints lack."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
+from nerfstudio.utils import comms
+from torch import nn
+
+if TYPE_CHECKING:
+    from aenerf_ns.training.trainer import AENeRFTrainer
+
+
+class TrainingState(nn.Module):
+    """Carries the state of a training in checkpoints, so that 100 steps and 100 more are the steps of a run of 200.
+
+    The state holds torch's random generators, the gradients that are being accumulated over steps
+    (``gradient_accumulation_steps``), the step at which the proposal networks were last trained, and the number of
+    steps that the schedules are made for.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._training: tuple[AENeRFTrainer, ProposalNetworkSampler] | None = None
+        self._loaded: dict[str, Any] | None = None
+
+    def get_extra_state(self) -> dict[str, Any] | None:
+        """Return the state now, in tensors and plain values; None of a pipeline that is not training."""
+        if self._training is None:
+            return None
+        trainer, sampler = self._training
+        accumulating = {
+            group: [parameter.grad for parameter in parameters]
+            for group, parameters in trainer.optimizers.parameters.items()
+            # The gradients of the other groups have been used, and are cleared before the next step.
+            if (trainer.step + 1) % trainer.gradient_accumulation_steps[group] != 0
+        }
+        return {
+            "random_generator": torch.get_rng_state(),
+            "cuda_random_generator": torch.cuda.get_rng_state(trainer.device) if _is_on_gpu(trainer) else None,
+            "gradients": accumulating,
+            "proposal_sampler": {"step": sampler._step, "steps_since_update": sampler._steps_since_update},
+            "schedule_length": trainer.config.schedule_length,
+        }
+
+    def set_extra_state(self, state: dict[str, Any] | None) -> None:
+        """Take a checkpoint's state. It has an effect when :meth:`go_on` is called, because evaluations load it too."""
+        self._loaded = state
+
+    def go_on(self, trainer: AENeRFTrainer, sampler: ProposalNetworkSampler) -> None:
+        """Follow a training from now on, which goes on from the loaded state if there is one.
+
+        Args:
+            trainer: that is set up and has loaded its checkpoint.
+            sampler: of the model that is trained.
+        """
+        self._training = (trainer, sampler)
+        state, self._loaded = self._loaded, None
+        if state is None:
+            return
+        for group, gradients in state["gradients"].items():
+            for parameter, gradient in zip(trainer.optimizers.parameters[group], gradients, strict=True):
+                parameter.grad = None if gradient is None else gradient.to(parameter)
+        sampler._step = state["proposal_sampler"]["step"]
+        sampler._steps_since_update = state["proposal_sampler"]["steps_since_update"]
+        if trainer.config.load_scheduler:
+            trainer.config.schedule_length = state["schedule_length"]
+        torch.set_rng_state(state["random_generator"])
+        if state["cuda_random_generator"] is not None and _is_on_gpu(trainer):
+            torch.cuda.set_rng_state(state["cuda_random_generator"], trainer.device)
+        if not comms.is_main_process():
+            # The main process alone writes checkpoints. The others must draw batches of their own.
+            torch.manual_seed(int(torch.randint(1 << 62, ())) + comms.get_rank())
+
+
+def _is_on_gpu(trainer: AENeRFTrainer) -> bool:
+    return torch.device(trainer.device).type == "cuda"
