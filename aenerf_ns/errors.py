@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -18,3 +20,12 @@ class DataError(ValueError):
         message = f"{source}: {problem}; {remedy}"
         # A value from a file may hold line breaks.
         super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in message))
+
+
+@contextmanager
+def errors_as_one_line() -> Iterator[None]:
+    """Turn a :class:`DataError` into a :class:`SystemExit` with one clear line, within commands of the framework."""
+    try:
+        yield
+    except DataError as error:
+        raise SystemExit(f"Error: {error}") from None

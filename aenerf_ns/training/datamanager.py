@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -13,7 +11,7 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from torch import Tensor
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision
 from aenerf_ns.supervision.pairs import PairSamplerConfig
@@ -52,7 +50,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         test_mode: Literal["test", "val", "inference"] = "val",
         **kwargs: Any,
     ) -> None:
-        with _errors_as_one_line():
+        with errors_as_one_line():
             super().__init__(config, device=device, test_mode=test_mode, **kwargs)
         # A run is opened with the options that the dataparser resolved, such as the format it recognised.
         config.dataparser = self.dataparser.config
@@ -86,7 +84,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         Raises:
             SystemExit: with one clear line, when events, sampler and supervision do not fit each other.
         """
-        with _errors_as_one_line():
+        with errors_as_one_line():
             self.train_pixel_sampler = self.config.sampler.setup(
                 dataset=self.train_dataset, supervision=supervision, device=self.device
             )
@@ -128,17 +126,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     def _sample(self, num_rays: int, training: bool) -> tuple[RayBundle, dict[str, Any]]:
         assert self.train_pixel_sampler is not None
-        with _errors_as_one_line():
+        with errors_as_one_line():
             return self.train_pixel_sampler.sample(num_rays, training)
-
-
-@contextmanager
-def _errors_as_one_line() -> Iterator[None]:
-    """Turn a :class:`DataError` into a :class:`SystemExit` with one clear line."""
-    try:
-        yield
-    except DataError as error:
-        raise SystemExit(f"Error: {error}") from None
 
 
 def _place(dataset: EventDataset, poses: Tensor) -> None:

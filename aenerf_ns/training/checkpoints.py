@@ -1,0 +1,104 @@
+"""Checkpoint files: which of them can be loaded, and how they are written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import zipfile
+from pathlib import Path
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.errors import DataError
+
+# What a checkpoint of the framework's trainer holds at least.
+_ENTRIES = {"step", "pipeline", "optimizers", "schedulers", "scalers"}
+
+
+def checkpoint_to_load(folder: Path, step: int | None = None) -> Path:
+    """Return the checkpoint of a step, or the newest whole one. Newer ones that are broken are named on the console.
+
+    Args:
+        folder: the folder of a run's checkpoints.
+        step: the step in the checkpoint's name, or None.
+
+    Raises:
+        DataError: there is no such checkpoint, or it is broken.
+    """
+    if not folder.is_dir():
+        raise DataError(folder, "there is no such folder", "give the folder nerfstudio_models of a trained run")
+    if step is not None:
+        path = folder / f"step-{step:09d}.ckpt"
+        require_whole(path)
+        return path
+    broken = []
+    for path in _newest_first(folder):
+        fault = _fault(path)
+        if fault is None:
+            if broken:
+                CONSOLE.print(f"[yellow]Broken checkpoints: {'; '.join(broken)}. {path.name} is loaded", soft_wrap=True)
+            return path
+        broken.append(f"{path} ({fault})")
+    problem = f"none of its checkpoints is whole: {'; '.join(broken)}" if broken else "it holds no checkpoint"
+    raise DataError(folder, problem, "remove it and train again")
+
+
+def require_whole(path: Path) -> None:
+    """Raise a DataError that names the newest whole checkpoint beside a checkpoint, unless this one is whole."""
+    fault = _fault(path)
+    if fault is None:
+        return
+    whole = next((other for other in _newest_first(path.parent) if _fault(other) is None), None)
+    remedy = "train again" if whole is None else f"load {whole.name} (--load-step {step_of(whole)})"
+    raise DataError(path, f"the checkpoint cannot be loaded ({fault})", remedy)
+
+
+def step_of(path: Path) -> int:
+    """Return the step in a checkpoint's name."""
+    return int(path.stem.removeprefix("step-"))
+
+
+def _newest_first(folder: Path) -> list[Path]:
+    names = [path for path in folder.glob("step-*.ckpt") if path.stem.removeprefix("step-").isdecimal()]
+    return sorted(names, key=step_of, reverse=True)
+
+
+def _fault(path: Path) -> str | None:
+    """Return in one line why a checkpoint cannot be loaded, or None if it can."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            # torch.load does not compare the checksums.
+            damaged = archive.testzip()
+        if damaged is not None:
+            return f"{damaged} is damaged"
+        # Without reading the tensors.
+        entries = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (OSError, RuntimeError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
+        return (error.strerror if isinstance(error, OSError) else None) or str(error).partition("\n")[0]
+    if not isinstance(entries, dict) or not entries.keys() >= _ENTRIES:
+        return "it is no checkpoint of a training"
+    return None
+
+
+def move_whole(source: Path, destination: Path) -> None:
+    """Give a complete file its final name, which is there after a crash of the machine only if the contents are.
+
+    Args:
+        source: the complete file.
+        destination: its final name, on the same file system.
+
+    Raises:
+        OSError: the disk is full or fails.
+    """
+    _sync(source)
+    source.replace(destination)
+    _sync(destination.parent)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,198 @@
+"""Checkpoints: whole or not at all, and a broken one blocks nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import resource
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from nerfstudio.utils.eval_utils import eval_setup
+from small_trainings import train_small_model
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.training.checkpoints import checkpoint_to_load
+from aenerf_ns.training.trainer import AENeRFTrainer
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> AENeRFTrainer:
+    """A run with the checkpoints of steps 2 and 3."""
+    folder = tmp_path_factory.mktemp("trained")
+    return train_small_model(folder, "run", 4, steps_per_save=2, save_only_latest_checkpoint=False)
+
+
+@pytest.fixture
+def run(trained: AENeRFTrainer, tmp_path: Path) -> Path:
+    """A copy of the run's folder."""
+    shutil.copytree(trained.base_dir, tmp_path / "run" / "aenerf" / "now")
+    config = yaml.load((trained.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
+    config.output_dir = tmp_path
+    config.save_config()
+    return tmp_path / "run" / "aenerf" / "now"
+
+
+class _Code:
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, ("touch executed",)
+
+
+def _truncated(share: float) -> Callable[[Path], None]:
+    return lambda path: os.truncate(path, int(share * path.stat().st_size))
+
+
+def _flip(path: Path) -> None:
+    contents = bytearray(path.read_bytes())
+    contents[len(contents) // 2] ^= 1
+    path.write_bytes(contents)
+
+
+def _replace_by_folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+FAULTS: dict[str, Callable[[Path], Any]] = {
+    "empty": _truncated(0),
+    "half": _truncated(0.5),
+    "nearly whole": _truncated(0.999),
+    "a flipped bit": _flip,
+    "text": lambda path: path.write_text("a checkpoint"),
+    "a folder": _replace_by_folder,
+    "a pickle": lambda path: path.write_bytes(pickle.dumps({"step": 3})),
+    "something else's": lambda path: torch.save({"weights": torch.zeros(3)}, path),
+    "code": lambda path: torch.save({"step": _Code(), "pipeline": {}}, path),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_broken_newest_checkpoint_is_named_and_passed_over(
+    run: Path, fault: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run)
+    folder = run / "nerfstudio_models"
+    newest = folder / "step-000000003.ckpt"
+    assert checkpoint_to_load(folder) == newest
+    assert capsys.readouterr().out == ""
+    FAULTS[fault](newest)
+    assert checkpoint_to_load(folder) == folder / "step-000000002.ckpt"
+    said = capsys.readouterr().out
+    assert said.count("\n") == 1
+    assert said.startswith(f"Broken checkpoints: {newest} (")
+    assert said.endswith("). step-000000002.ckpt is loaded\n")
+    with pytest.raises(DataError, match=r"step-000000003.ckpt: .*; load step-000000002.ckpt \(--load-step 2\)"):
+        checkpoint_to_load(folder, 3)
+    assert not (run / "executed").exists()
+
+
+def test_a_checkpoint_that_is_not_there_is_one_line(run: Path, tmp_path: Path) -> None:
+    folder = run / "nerfstudio_models"
+    with pytest.raises(DataError, match=r"step-000000009.ckpt: .*No such file.*--load-step 3"):
+        checkpoint_to_load(folder, 9)
+    with pytest.raises(DataError, match="nothing: there is no such folder"):
+        checkpoint_to_load(tmp_path / "nothing")
+    for path in folder.iterdir():
+        _truncated(0.5)(path)
+    with pytest.raises(DataError, match=r"none of its checkpoints is whole: .*3.ckpt \(.*; .*2.ckpt \("):
+        checkpoint_to_load(folder)
+    shutil.rmtree(folder)
+    folder.mkdir()
+    with pytest.raises(DataError, match="it holds no checkpoint"):
+        checkpoint_to_load(folder)
+
+
+def test_a_run_is_opened_with_its_newest_whole_checkpoint(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # What ns-eval, ns-render, ns-export and ns-viewer call.
+    assert eval_setup(run / "config.yml")[3] == 3
+    (run / "nerfstudio_models" / "notes.txt").write_text("of no interest")
+    _truncated(0.5)(run / "nerfstudio_models" / "step-000000003.ckpt")
+    assert eval_setup(run / "config.yml")[3] == 2
+    assert "step-000000002.ckpt is loaded" in capsys.readouterr().out
+    _truncated(0.5)(run / "nerfstudio_models" / "step-000000002.ckpt")
+    with pytest.raises(SystemExit, match=r"^Error: \S+nerfstudio_models: none of its checkpoints is whole: .*again$"):
+        eval_setup(run / "config.yml")
+
+
+def test_a_run_goes_on_from_the_newest_whole_checkpoint(
+    run: Path, tmp_path: Path, trained: AENeRFTrainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = run / "nerfstudio_models"
+    (tmp_path / "data").symlink_to(trained.config.output_dir / "data")
+    _truncated(0.5)(folder / "step-000000003.ckpt")
+    resumed = train_small_model(tmp_path, "resumed", 2, load_dir=folder)
+    assert "step-000000002.ckpt is loaded" in capsys.readouterr().out
+    assert [path.name for path in resumed.checkpoint_dir.iterdir()] == ["step-000000004.ckpt"]
+    with pytest.raises(SystemExit, match=r"^Error: .*step-000000003.ckpt: .*--load-step 2\)$"):
+        train_small_model(tmp_path, "refused", 2, load_checkpoint=folder / "step-000000003.ckpt")
+    # A run that was told the step opens as every other.
+    told = train_small_model(tmp_path, "told", 2, load_dir=folder, load_step=2)
+    assert eval_setup(told.base_dir / "config.yml")[3] == 4
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """Let no file grow beyond ``size`` bytes, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_older_one(trained: AENeRFTrainer, run: Path) -> None:
+    folder = run / "nerfstudio_models"
+    trained.checkpoint_dir, kept = folder, trained.checkpoint_dir
+    files = sorted(run.rglob("*"))
+    size = (folder / "step-000000003.ckpt").stat().st_size
+    # From the first bytes to the last ones of the archive's directory.
+    for limit in (0, 100, size // 3, size - 10_000, size - 1):
+        with files_of_at_most(limit), pytest.raises(SystemExit, match=r"^Error: \S+step-000000009.ckpt: .*again$"):
+            trained.save_checkpoint(9)
+        assert sorted(run.rglob("*")) == files
+    assert trained.checkpoint_dir == folder
+    trained.save_checkpoint(9)
+    assert checkpoint_to_load(folder).name == "step-000000009.ckpt"
+    trained.checkpoint_dir = kept
+
+
+def test_a_configuration_that_cannot_be_written_leaves_the_older_one(run: Path) -> None:
+    config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
+    before = (run / "config.yml").read_bytes()
+    with (
+        files_of_at_most(len(before) // 2),
+        pytest.raises(SystemExit, match=r"^Error: \S+config.yml: .*File too large"),
+    ):
+        config.save_config()
+    assert (run / "config.yml").read_bytes() == before
+    assert not list(run.glob("*.partial"))
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_at_any_moment_leaves_whole_checkpoints(tmp_path: Path) -> None:
+    train_small_model(tmp_path, "first", 1)
+    found = set()
+    for attempt, delay in enumerate(np.linspace(0.3, 3, 20)):
+        child = os.fork()
+        if child == 0:
+            train_small_model(tmp_path, f"killed{attempt}", 10_000, steps_per_save=1)
+        time.sleep(delay)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        folder = tmp_path / f"killed{attempt}" / "aenerf" / "now" / "nerfstudio_models"
+        for path in folder.glob("*"):
+            found.add(checkpoint_to_load(folder, int(path.stem.removeprefix("step-"))))
+        if folder.exists():
+            resumed = train_small_model(tmp_path, f"resumed{attempt}", 1, load_dir=folder)
+            assert resumed._start_step > 1
+    assert len(found) > 10
