@@ -32,7 +32,7 @@ def checkpoint_to_load(folder: Path, step: int | None = None) -> Path:
         path = folder / f"step-{step:09d}.ckpt"
         require_whole(path)
         return path
-    broken = []
+    broken: list[str] = []
     for path in _newest_first(folder):
         fault = _fault(path)
         if fault is None:

@@ -75,6 +75,7 @@ class AENeRFTrainer(Trainer):
     """
 
     config: AENeRFTrainerConfig
+    checkpoint_dir: Path
 
     def __init__(self, config: AENeRFTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         config.schedule_length = config.schedule_length or config.max_num_iterations
