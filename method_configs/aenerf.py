@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.dataparsers.formats import AutomaticDataParserConfig
 from aenerf_ns.method.model import AENeRFModelConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+from aenerf_ns.training.console import ConsoleWriter
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipelineConfig
 from aenerf_ns.training.schedules import (
@@ -49,6 +50,7 @@ aenerf = MethodSpecification(
         # A batch has few rays for each knot of the spline. If poses follow every single batch, the field stays blurred,
         # at lower rates and in longer runs too (docs/experiments.md).
         gradient_accumulation_steps={"camera_opt": 8},
+        logging=LoggingConfig(local_writer=LocalWriterConfig(_target=ConsoleWriter, enable=True)),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
         vis="viewer",
     ),

@@ -26,6 +26,7 @@ def train_small_model(folder: Path, name: str, num_steps: int, seed: int = 42, *
         pipeline=make_pipeline_config(folder / "data", pose_correction="spline"),
         optimizers=deepcopy(aenerf.config.optimizers),
         gradient_accumulation_steps=aenerf.config.gradient_accumulation_steps,
+        logging=aenerf.config.logging,
         **options,
     )
     config.pipeline.datamanager.train_num_rays_per_batch = 64

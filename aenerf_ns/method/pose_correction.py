@@ -77,6 +77,9 @@ class PoseCorrection(CameraOptimizer):
         trajectory: the estimated trajectory, camera-to-world, OpenGL camera axes, in scene units.
         camera_times: (num_cameras,) times of the training cameras in nanoseconds, for :meth:`forward`.
         ground_truth: the true trajectory with the same conventions, or None. It never enters a loss.
+
+    Attributes:
+        translation_unit: the trajectory's extent, by which translations are counted, in scene units.
     """
 
     config: PoseCorrectionConfig
@@ -109,7 +112,7 @@ class PoseCorrection(CameraOptimizer):
         self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
         self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
         # A camera that only turns gives translations no unit. The unit of the scene serves instead.
-        extent = trajectory.extent if trajectory.extent > _SMALLEST_EXTENT else 1.0
+        self.translation_unit = extent = trajectory.extent if trajectory.extent > _SMALLEST_EXTENT else 1.0
         # Times in every interval of the spline, at which the size of the corrections is taken.
         count = max(64, math.ceil(trajectory.duration / config.knot_interval))
         sampled = torch.linspace(0, trajectory.duration, count, dtype=torch.float64)
@@ -147,8 +150,13 @@ class PoseCorrection(CameraOptimizer):
         start = self.config.clock_offset
         if start is None or self.clock_change is None:
             return self._sampled_seconds.new_zeros(())
-        change = self.clock_change.double() * (self._clock_unit / _MAX_CLOCK_CHANGE)
-        return start + _MAX_CLOCK_CHANGE * torch.tanh(change)
+        return start + _MAX_CLOCK_CHANGE * self.clock_change_share()
+
+    def clock_change_share(self) -> Tensor:
+        """Return the learned change of the clock offset as a share of the largest one, between -1 and 1."""
+        if self.clock_change is None:
+            return self._sampled_seconds.new_zeros(())
+        return torch.tanh(self.clock_change.double() * (self._clock_unit / _MAX_CLOCK_CHANGE))
 
     def pose(self, seconds: Tensor) -> Tensor:
         """Return corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""

@@ -50,6 +50,11 @@ _HIGH_SHARE, _HIGH_FACTOR = 0.1, 3.0
 _HIGH_MEDIAN = 0.15
 # Poses still move if the last part of the run turns them by so many pixels, and by such a share of the correction.
 _MOVING_PIXELS, _MOVING_SHARE = 0.25, 0.1
+# The correction barely moves poses if it turns them by less than so many pixels, and shifts them by less than such a
+# part of the trajectory's extent. In the runs of docs/method.md, noisy batches alone moved exact poses further.
+_BARELY_PIXELS, _BARELY_EXTENTS = 0.05, 1e-3
+# The clock offset is at its limit if its change is such a share of the largest one.
+_CLOCK_SHARE = 0.9
 # The penalty holds corrections back if it is such a share of the reconstruction loss.
 _PENALTY_SHARE = 0.1
 
@@ -71,9 +76,12 @@ def diagnose(pipeline: AENeRFPipeline, earlier: Tensor) -> dict[str, Any]:
     size = pose_errors(corrected, estimated)
     movement = pose_errors(pipeline.in_recording(earlier), corrected)
     stretches = _stretches(pipeline)
+    extent = correction.translation_unit / pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     figures = {
         "correction_rotation_degrees": size["rotation_error_degrees"],
         "correction_translation_recording_units": size["translation_error"],
+        "correction_translation_extents": size["translation_error"] / extent,
+        "clock_change_share_of_limit": abs(float(correction.clock_change_share())),
         "last_tenth_rotation_degrees": movement["rotation_error_degrees"],
         "last_tenth_translation_recording_units": movement["translation_error"],
         "penalty_share_of_loss": _penalty_share(correction, stretches),
@@ -95,6 +103,17 @@ def summary(figures: dict[str, Any], focal: float) -> str:
     length = round(figures["correction_translation_recording_units"], 6)
     line = f"Pose correction: {degrees:.2f} degrees and {length:.2g} units of the recording on average"
     signs = []
+    turned = math.radians(degrees) * focal
+    if turned < _BARELY_PIXELS and figures["correction_translation_extents"] < _BARELY_EXTENTS:
+        signs.append(
+            f"the correction barely moved the poses ({turned:.1g} pixels): train longer, or with a higher "
+            "--optimizers.camera-opt.optimizer.lr"
+        )
+    if figures["clock_change_share_of_limit"] > _CLOCK_SHARE:
+        signs.append(
+            "the clock offset is at its limit of 0.05 s from where it began: begin with "
+            "--pipeline.model.camera-optimizer.clock-offset and a value that aenerf check finds"
+        )
     if figures["contrast_corrected"] is not None:
         before, after = figures["contrast_estimated"], figures["contrast_corrected"]
         line += f"; contrast of warped events {before:.3f} before, {after:.3f} after"

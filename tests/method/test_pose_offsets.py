@@ -88,6 +88,7 @@ def test_the_clock_offset_is_bounded() -> None:
     for raw, expected in ((1e6, 0.06), (-1e6, -0.04)):
         correction.clock_change.data.fill_(raw)
         assert correction.offsets()["clock_offset_seconds"] == pytest.approx(expected)
+        assert float(correction.clock_change_share()) == pytest.approx((expected - 0.01) / 0.05)
 
 
 def test_a_camera_that_stands_still_has_finite_offsets() -> None:

@@ -91,7 +91,8 @@ def test_right_poses_have_no_sign_of_failure_in_the_events(dots: Path) -> None:
     for stretch in figures["stretches"]:
         assert stretch["num_pairs"] >= 64
         assert stretch["loss"] == pytest.approx(stretch["loss_of_constant_field"], rel=0.05)
-    assert "Undecided, because 101% of the loss" in figures["summary"]
+    assert "the correction barely moved the poses" in figures["summary"]
+    assert "Undecided, because 101% of the loss" in summary({**figures, "correction_translation_extents": 0.01}, 60.0)
     assert diagnosed(pipeline) == figures
 
 
@@ -103,6 +104,11 @@ def test_corrections_that_spoil_the_poses_are_seen_in_the_events(dots: Path) -> 
     assert figures["contrast_is_clearly_lower"]
     assert figures["turned_slices_sharper"] >= 2
     assert figures["correction_rotation_degrees"] > 2
+    extent = pipeline.datamanager.train_dataset.scene.trajectory.extent
+    shift = figures["correction_translation_recording_units"]
+    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    assert scale != 1
+    assert figures["correction_translation_extents"] == pytest.approx(shift * scale / extent)
     assert "--pipeline.model.camera-optimizer.mode off" in figures["summary"]
     assert f"in {figures['turned_slices_sharper']} of 3 slices" in figures["summary"]
 
@@ -177,6 +183,8 @@ def test_the_last_step_is_diagnosed_and_the_checkpoint_keeps_it(
 GOOD: dict[str, Any] = {
     "correction_rotation_degrees": 0.5,
     "correction_translation_recording_units": 0.02,
+    "correction_translation_extents": 0.01,
+    "clock_change_share_of_limit": 0.0,
     "last_tenth_rotation_degrees": 0.01,
     "last_tenth_translation_recording_units": 0.001,
     "penalty_share_of_loss": 1e-5,
@@ -212,6 +220,15 @@ def with_loss(index: int, loss: float | None) -> dict[str, Any]:
         ({"last_tenth_rotation_degrees": 0.3}, "the poses still moved by 0.3 degrees"),
         # A tenth of a pixel.
         ({"correction_rotation_degrees": 0.1, "last_tenth_rotation_degrees": 0.05}, "No sign of failure"),
+        (
+            {"correction_rotation_degrees": 0.02, "correction_translation_extents": 5e-4},
+            "the correction barely moved the poses (0.03 pixels)",
+        ),
+        # Turned or shifted alone.
+        ({"correction_rotation_degrees": 0.02}, "No sign of failure"),
+        ({"correction_translation_extents": 5e-4}, "No sign of failure"),
+        ({"clock_change_share_of_limit": 0.95}, "the clock offset is at its limit of 0.05 s"),
+        ({"clock_change_share_of_limit": 0.5}, "No sign of failure"),
         ({"penalty_share_of_loss": 0.3}, "the penalty on corrections is 30% of the reconstruction loss"),
         ({"stretches": [{**s, "loss": 8 * s["loss"]} for s in GOOD["stretches"]]}, "Undecided, because 40% of the"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from types import ModuleType
 
 import numba
 import numpy as np
@@ -30,7 +31,7 @@ class RayCaster:
     """
 
     def __init__(self, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> None:
-        open3d = _open3d()
+        open3d = load_open3d()
         self._tensor = open3d.core.Tensor.from_numpy
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
@@ -66,8 +67,8 @@ class RayCaster:
         return self._scene.compute_distance(self._tensor(query), nthreads=numba.get_num_threads()).numpy()
 
 
-def _open3d():
-    """Import Open3D lazily, because its import takes seconds.
+def load_open3d() -> ModuleType:
+    """Import Open3D and the libusb that it needs. Called late, because that takes seconds.
 
     Raises:
         DataError: a system library that Open3D needs is missing.
