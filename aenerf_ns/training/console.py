@@ -27,6 +27,8 @@ class ConsoleWriter(LocalWriter):
         banner_messages: lines at the bottom of the table.
     """
 
+    stats_to_track: list[str]
+
     def __init__(self, config: LocalWriterConfig, banner_messages: list[str] | None = None) -> None:
         super().__init__(config, banner_messages)
         self.stats_to_track = [_LOSS, *_HEADINGS.values(), *self.stats_to_track]
