@@ -16,7 +16,7 @@ aenerf simulate --output demo/room --width 128 --height 96 --validation-views 10
 echo "2/4 Training from its events alone (watch it at http://localhost:7007) ..."
 device=$(python -c "import torch; print('cuda' if torch.cuda.is_available() else 'cpu')")
 ns-train aenerf-small --machine.device-type "$device" --max-num-iterations 800 --output-dir demo/outputs \
-  --viewer.quit-on-train-completion True --data demo/room
+  --viewer.quit-on-train-completion True --viewer.websocket-host 127.0.0.1 --data demo/room
 config=$(ls -t demo/outputs/room/aenerf-small/*/config.yml | head -n 1)
 
 echo "3/4 Evaluating on novel views ..."

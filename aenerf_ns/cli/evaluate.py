@@ -6,13 +6,11 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.cli.operands import RunConfig
-from aenerf_ns.errors import DataError
+from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.method.color_correction import ColorCorrectionProtocol
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 
 @dataclass
@@ -30,11 +28,7 @@ class Evaluate:
 
     def main(self) -> None:
         """Load the run, evaluate it and write the metrics."""
-        if not self.load_config.is_file():
-            raise DataError(self.load_config, "there is no such file", "give the config.yml of a trained run")
-        config, pipeline, checkpoint, _ = eval_setup(self.load_config)
-        if not isinstance(pipeline, AENeRFPipeline):
-            raise DataError(self.load_config, f"the run is of method {config.method_name}", "use ns-eval")
+        config, pipeline, checkpoint = open_run(self.load_config)
         of_run = pipeline.model.color_correction.protocol
         used = self.color_correction or of_run
         if self.color_correction is not None:

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.operands import RunConfig
+from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 
 @dataclass
@@ -35,12 +34,7 @@ class ExportTrajectory:
         """Load the run and write its poses."""
         if self.rate is not None and not 0 < self.rate <= 1e9:
             raise DataError("aenerf export-trajectory", f"a rate of {self.rate}", "give one above 0 and up to 1e9")
-        if not self.load_config.is_file():
-            raise DataError(self.load_config, "there is no such file", "give the config.yml of a trained run")
-        config, pipeline, _, _ = eval_setup(self.load_config, test_mode="inference")
-        if not isinstance(pipeline, AENeRFPipeline):
-            remedy = "give one of this package's"
-            raise DataError(self.load_config, f"the run is of method {config.method_name}", remedy)
+        _, pipeline, _ = open_run(self.load_config, test_mode="inference")
         correction = pipeline.model.camera_optimizer
         estimated = correction.trajectory
         trajectory = estimated

@@ -1,0 +1,86 @@
+"""What a config.yml may name, before it is opened."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from aenerf_ns.cli.evaluate import Evaluate
+from aenerf_ns.cli.export_trajectory import ExportTrajectory
+from aenerf_ns.cli.trained_run import require_known_tags
+from aenerf_ns.dataparsers.formats import FORMATS
+from aenerf_ns.errors import DataError
+from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
+from aenerf_ns.method_configs.aenerf_small import aenerf_small
+
+
+@pytest.mark.parametrize("method", [aenerf, aenerf_mlp, aenerf_small], ids=lambda m: m.config.method_name)
+def test_the_configurations_of_the_methods_are_known(method: object, tmp_path: Path) -> None:
+    (tmp_path / "config.yml").write_text(yaml.dump(replace(method.config, data=tmp_path)))
+    require_known_tags(tmp_path / "config.yml")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_configurations_of_the_formats_are_known(name: str, tmp_path: Path) -> None:
+    (tmp_path / "config.yml").write_text(yaml.dump(type(FORMATS[name])(data=tmp_path)))
+    require_known_tags(tmp_path / "config.yml")
+
+
+TOUCH = "!!python/object/apply:os.system ['touch executed']"
+HOSTILE = {
+    "a call": TOUCH,
+    "a call within a run": f"!!python/object:aenerf_ns.training.trainer.AENeRFTrainerConfig\ndata: {TOUCH}",
+    "a key": f"? {TOUCH}\n: 1",
+    "another handle": "%TAG !h! tag:yaml.org,2002:python/object/apply:\n--- !h!os.system ['touch executed']",
+    "a verbatim tag": "!<tag:yaml.org,2002:python/object/apply:os.system> ['touch executed']",
+    "new": "!!python/object/new:os.system ['touch executed']",
+    "a second document": f"a: 1\n--- {TOUCH}",
+    "a function": "!!python/name:os.system",
+    "a module": "!!python/module:antigravity",
+    "a function of the framework": "!!python/object/apply:nerfstudio.utils.scripts.run_command ['touch executed']",
+    "its name": "!!python/name:nerfstudio.utils.scripts.run_command",
+    "a module of the framework": "!!python/name:nerfstudio.utils.scripts.subprocess",
+    "another's class in the framework": "!!python/name:nerfstudio.configs.base_config.Path",
+    "a class that is called": "!!python/object/apply:nerfstudio.engine.trainer.TrainerConfig {}",
+    "torch": "!!python/object/apply:torch.load ['executed']",
+    "a package that only begins alike": "!!python/name:nerfstudio_evil.Config",
+    "a nameless one": "!!python/object:nerfstudio. {}",
+    "what is not there": "!!python/object:nerfstudio.engine.trainer.Nothing {}",
+    "a tag of its own": "!run {}",
+}
+
+
+@pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
+@pytest.mark.parametrize("command", [Evaluate, ExportTrajectory])
+def test_what_could_run_is_refused_before_the_file_is_opened(
+    command: type[Evaluate | ExportTrajectory], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("config.yml").write_text(text)
+    with pytest.raises(DataError, match=r"^config.yml: line \d names .*; give the config.yml of a trained run"):
+        command(load_config=Path("config.yml"), output=Path("out")).main()
+    assert not Path("executed").exists()
+
+
+@pytest.mark.parametrize(
+    ("contents", "problem"),
+    [
+        (b"", "it is no configuration of a run"),
+        (b"a: 1", "it is no configuration of a run"),
+        (b"a: [1", "it cannot be read"),
+        (b"\xff\xfe\xff", "it cannot be read"),
+        (b"a: \x00", "it cannot be read"),
+        (b"[" * 10_000, "it cannot be read"),
+    ],
+)
+def test_what_is_no_configuration_is_one_line(contents: bytes, problem: str, tmp_path: Path) -> None:
+    (tmp_path / "config.yml").write_bytes(contents)
+    with pytest.raises(DataError, match=problem) as refused:
+        require_known_tags(tmp_path / "config.yml")
+    assert "\n" not in str(refused.value)
+    with pytest.raises(DataError, match="there is no such file"):
+        Evaluate(load_config=tmp_path / "nothing.yml", output=tmp_path / "out").main()
