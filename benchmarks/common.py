@@ -17,6 +17,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 
 from benchmarks.environment import environment
+from benchmarks.owned import owned
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -43,8 +44,9 @@ def run_script(folder: Path, name: str, *arguments: str) -> float:
     """
     begin = time.perf_counter()
     done = subprocess.run(
-        [script(name), *arguments], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
-    )
+        owned([script(name), *arguments]),
+        cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
+    )  # fmt: skip
     if done.returncode:
         sys.exit(f"{name} {' '.join(arguments)} ended with status {done.returncode}:\n{done.stdout[-3000:]}")
     return time.perf_counter() - begin

@@ -20,6 +20,7 @@ from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.progress import tracked
 from aenerf_ns.recording.images import check_image
+from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import FrameSequence, Recording
 from aenerf_ns.recording.structure_from_motion import compare_with_truth, estimate_poses
 from aenerf_ns.recording.views import thinned, views_on_trajectory
@@ -70,8 +71,10 @@ class Convert:
 
     def main(self) -> None:
         """Read the dataset and write it."""
-        if self.output.exists():
-            raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
+        with ended_by_exception(), OutputLock(self.output) as lock:
+            self._convert(lock)
+
+    def _convert(self, lock: OutputLock) -> None:
         try:
             filters = EventFilters(
                 start=self.start_time_ns,
@@ -112,18 +115,15 @@ class Convert:
                     "begin it at an even column and row, so that its first pixel is red",
                 )
         try:
-            with (
-                ended_by_exception(),
-                NativeDatasetWriter(
-                    self.output,
-                    camera,
-                    recording.sensor,
-                    recording.image_encoding,
-                    scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
-                    max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
-                    frame_camera=recording.frame_camera,
-                ) as writer,
-            ):
+            with NativeDatasetWriter(
+                lock,
+                camera,
+                recording.sensor,
+                recording.image_encoding,
+                scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
+                max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
+                frame_camera=recording.frame_camera,
+            ) as writer:
                 writer.add_trajectories(trajectory, recording.ground_truth)
                 if report is not None:
                     writer.add_poses_report(report)

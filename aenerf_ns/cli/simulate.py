@@ -14,8 +14,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import Split
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.simulator.esim import SensorNoise
@@ -79,8 +81,10 @@ class Simulate:
 
     def main(self) -> None:
         """Render the scene along its path and write the dataset."""
-        if self.output.exists():
-            raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
+        with ended_by_exception(), OutputLock(self.output) as lock:
+            self._simulate(lock)
+
+    def _simulate(self, lock: OutputLock) -> None:
         counts = (self.train_images, self.validation_views, self.test_views)
         if min(counts) < 0:
             raise DataError("aenerf simulate", f"numbers of images {counts}", "they must not be negative")
@@ -116,7 +120,7 @@ class Simulate:
         except ValueError as error:
             raise DataError("aenerf simulate", str(error), "see aenerf simulate --help") from error
         num_events = 0
-        with NativeDatasetWriter(self.output, camera, sensor, "srgb", scene.aabb) as writer:
+        with NativeDatasetWriter(lock, camera, sensor, "srgb", scene.aabb) as writer:
             writer.add_trajectories(estimated, truth)
             if report is not None:
                 writer.add_poses_report(report)

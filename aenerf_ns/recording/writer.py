@@ -23,16 +23,18 @@ from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.json_object import LENS_MODELS
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
+from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import SPLITS, Split
 
 
 class NativeDatasetWriter:
     """Write a dataset folder, completely or not at all. Use it as a context manager.
 
-    The folder gets its name when the last file is complete. If anything fails, nothing is left behind.
+    The folder gets its name when the last file is complete. If anything fails, nothing is left behind. As long as the
+    writer lives, no other process can write the folder.
 
     Args:
-        folder: the dataset folder to create.
+        folder: the dataset folder to create, or the lock on it that the caller holds.
         event_camera: the event camera's lens.
         sensor: its contrast thresholds, refractory period and Bayer pattern.
         image_encoding: whether the images' values are sRGB or linear in radiance.
@@ -42,7 +44,7 @@ class NativeDatasetWriter:
         frame_camera: the lens of the camera that took the images; by default the event camera's.
 
     Raises:
-        DataError: the folder exists or cannot be created.
+        DataError: the folder exists, cannot be created, or is being written by another process.
 
     Attributes:
         events: its method ``append`` takes the events, piece by piece in the order of time.
@@ -50,7 +52,7 @@ class NativeDatasetWriter:
 
     def __init__(
         self,
-        folder: Path,
+        folder: Path | OutputLock,
         event_camera: EventCamera,
         sensor: SensorModel,
         image_encoding: ImageEncoding,
@@ -59,16 +61,18 @@ class NativeDatasetWriter:
         frame_camera: EventCamera | None = None,
     ) -> None:
         frame_camera = event_camera if frame_camera is None else frame_camera
-        if folder.exists():
-            raise DataError(folder, "the folder exists already", "remove it or choose another --output")
-        self._folder = folder
+        self._own_lock = OutputLock(folder) if isinstance(folder, Path) else None
+        self._folder = folder = folder if isinstance(folder, Path) else folder.output
         self._partial = folder.with_name(f".{folder.name}.partial")
+        # Of a process that was killed, because the lock is held.
         shutil.rmtree(self._partial, ignore_errors=True)
         try:
-            self._partial.mkdir(parents=True)
+            self._partial.mkdir()
+            self.events = Hdf5EventWriter(self._partial / "events.h5")
         except OSError as error:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            self._unlock()
             raise DataError(folder, f"it cannot be created ({error})", "choose another --output") from None
-        self.events = Hdf5EventWriter(self._partial / "events.h5")
         self._files: dict[Path, dict[str, Any]] = {}
         self._meta: dict[str, Any] = {
             "w": frame_camera.width,
@@ -109,6 +113,11 @@ class NativeDatasetWriter:
                 self._partial.rename(self._folder)
         finally:
             shutil.rmtree(self._partial, ignore_errors=True)
+            self._unlock()
+
+    def _unlock(self) -> None:
+        if self._own_lock is not None:
+            self._own_lock.release()
 
     def add_trajectories(self, estimated: Trajectory, ground_truth: Trajectory | None = None) -> None:
         """Write the estimated and, if it is known, the true trajectory (OpenCV camera axes)."""

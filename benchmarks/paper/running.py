@@ -32,6 +32,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from benchmarks.common import script
 from benchmarks.environment import environment
+from benchmarks.owned import owned
 from benchmarks.paper.plan import CEILING, OURS, Dataset, Run, scene_name
 
 # A training has so many parts. The framework evaluates the validation views after each part but the last, because it
@@ -193,7 +194,7 @@ class Runner:
             output.write(f"$ {shlex.join(command)}\n")
             output.flush()
             with subprocess.Popen(
-                command, cwd=self._folder, env={**os.environ, **hidden}, stdout=output, stderr=subprocess.STDOUT
+                owned(command), cwd=self._folder, env={**os.environ, **hidden}, stdout=output, stderr=subprocess.STDOUT
             ) as process:
                 try:
                     status = process.wait()

@@ -27,6 +27,7 @@ import tyro
 
 from aenerf_ns.progress import progress_bar
 from benchmarks.common import run_script, write_result
+from benchmarks.owned import owned
 from benchmarks.poses.scenes import SCENES, Split, scene_argument
 
 _WORKER = Path(__file__).with_name("worker.py")
@@ -146,7 +147,7 @@ class Poses:
             threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
             with log.open("w", encoding="utf8") as output:
                 done = subprocess.run(
-                    command, stdout=output, stderr=subprocess.STDOUT, env={**os.environ, **threads}, check=False
+                    owned(command), stdout=output, stderr=subprocess.STDOUT, env={**os.environ, **threads}, check=False
                 )
             if done.returncode:
                 sys.exit(f"a training ended with status {done.returncode}; see the end of {log}")

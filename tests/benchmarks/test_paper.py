@@ -310,6 +310,29 @@ def test_a_benchmark_that_is_ended_leaves_no_command_at_work(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+def test_a_benchmark_that_is_killed_alone_takes_its_command_along_and_starts_again(tmp_path: Path) -> None:
+    command = small_bench(tmp_path, "losses")
+    process = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True)
+    while not list(tmp_path.glob("bench/datasets/.*.partial/events.h5")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    process.kill()
+    process.wait()
+    # Its command is killed in the same moment, and is gone when the system has taken notice.
+    time.sleep(1)
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+    # The dataset is not there yet, and nobody is waited for.
+    again = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True)
+    while not list(tmp_path.glob("bench/datasets/*/transforms.json")):
+        assert again.poll() is None
+        time.sleep(0.1)
+    again.terminate()
+    assert again.wait() == 128 + signal.SIGTERM
+    assert not list(tmp_path.glob("bench/datasets/.*.partial*"))
+
+
+@pytest.mark.slow
 def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path) -> None:
     command = small_bench(tmp_path, "methods", "losses")
     environment = {**ENVIRONMENT, "OMP_NUM_THREADS": "1"}

@@ -1,0 +1,93 @@
+"""One command at a time for an output."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import socket
+from pathlib import Path
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.errors import DataError
+
+_NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP}
+
+
+class OutputLock:
+    """Keep an output that does not exist yet to this process. Use it as a context manager.
+
+    The lock is a file beside the output, which names its owner. The system releases it when the owner ends, in whatever
+    way. A file that a killed owner left locks nothing, and the next owner takes it over.
+
+    Args:
+        output: the folder that will be written.
+
+    Raises:
+        DataError: the output exists, another process holds the lock, or the file cannot be written.
+
+    Attributes:
+        output: the folder.
+    """
+
+    def __init__(self, output: Path) -> None:
+        self.output = output
+        self._file = output.with_name(f".{output.name}.partial.lock")
+        try:
+            self._require_free()
+            output.parent.mkdir(parents=True, exist_ok=True)
+            self._descriptor = self._locked()
+            os.ftruncate(self._descriptor, 0)
+            os.pwrite(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        except OSError as error:
+            raise DataError(output, f"it cannot be created ({error})", "choose another --output") from None
+        try:
+            # The owner before may have finished in the meantime.
+            self._require_free()
+        except DataError:
+            self.release()
+            raise
+
+    def _require_free(self) -> None:
+        if self.output.exists():
+            raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
+
+    def _locked(self) -> int:
+        """Return the descriptor of the file, which this process has locked."""
+        while True:
+            descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                owner = os.pread(descriptor, 200, 0).decode("utf8", "replace").strip()
+                os.close(descriptor)
+                problem = f"another command is writing it ({owner or 'its process is unknown'})"
+                raise DataError(self.output, problem, "wait for its end or choose another --output") from None
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                CONSOLE.print(
+                    f"[yellow]{self.output}: its file system has no locks ({error.strerror}): start no second command "
+                    "with this output",
+                    soft_wrap=True,
+                )
+                return descriptor
+            # Its owner may have removed the file after it was opened here. Somebody else may then have made a new one.
+            try:
+                if os.path.samestat(os.fstat(descriptor), self._file.stat()):
+                    return descriptor
+            except FileNotFoundError:
+                pass
+            os.close(descriptor)
+
+    def release(self) -> None:
+        """Let others write the output."""
+        self._file.unlink(missing_ok=True)
+        os.close(self._descriptor)
+
+    def __enter__(self) -> OutputLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()

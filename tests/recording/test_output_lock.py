@@ -1,0 +1,136 @@
+"""One command at a time for an output."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from small_datasets import CAMERA, SENSOR, write_native
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.recording.output_lock import OutputLock
+from aenerf_ns.recording.writer import NativeDatasetWriter
+
+# Without the framework's imports, which take seconds.
+_OWNER = """
+import fcntl, os, sys
+file = open(sys.argv[1], "w")
+fcntl.flock(file, fcntl.LOCK_EX)
+print("process 7 on elsewhere", file=file, flush=True)
+print(flush=True)
+sys.stdin.read()
+"""
+
+
+@contextmanager
+def another_owner(output: Path) -> Iterator[subprocess.Popen]:
+    """Have another process hold the lock."""
+    command = [sys.executable, "-c", _OWNER, output.with_name(f".{output.name}.partial.lock")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as owner:
+        assert owner.stdout is not None
+        owner.stdout.readline()
+        yield owner
+        owner.kill()
+
+
+def test_the_second_is_refused_while_the_first_lives(tmp_path: Path) -> None:
+    output = tmp_path / "made"
+    in_use = tmp_path / ".made.partial" / "events.h5"
+    in_use.parent.mkdir()
+    in_use.write_text("half written")
+    with another_owner(output) as owner:
+        for attempt in (lambda: OutputLock(output), lambda: NativeDatasetWriter(output, CAMERA, SENSOR, "srgb")):
+            with pytest.raises(
+                DataError, match=r"made: another command is writing it \(process 7 on elsewhere\); wait"
+            ):
+                attempt()
+        assert in_use.read_text() == "half written"
+        owner.send_signal(signal.SIGKILL)
+        owner.wait()
+        # What a killed owner leaves hinders nobody.
+        write_native(output)
+    assert (output / "transforms.json").exists()
+    assert list(tmp_path.iterdir()) == [output]
+
+
+def test_the_owner_is_named(tmp_path: Path) -> None:
+    with OutputLock(tmp_path / "a" / "made"):
+        (file,) = (tmp_path / "a").iterdir()
+        assert file.read_text().startswith(f"process {os.getpid()} on ")
+        # The lock is of its own descriptor, so another one in the same process is another owner.
+        with pytest.raises(DataError, match=f"process {os.getpid()} on "):
+            OutputLock(tmp_path / "a" / "made")
+    assert not list((tmp_path / "a").iterdir())
+    with OutputLock(tmp_path / "a" / "made"):
+        pass
+
+
+def test_a_writer_uses_the_lock_of_its_caller(tmp_path: Path) -> None:
+    with OutputLock(tmp_path / "made") as lock:
+        with pytest.raises(RuntimeError), NativeDatasetWriter(lock, CAMERA, SENSOR, "srgb"):
+            raise RuntimeError
+        # Still held.
+        with pytest.raises(DataError, match="another command is writing it"):
+            OutputLock(tmp_path / "made")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_whose_file_was_removed_meanwhile_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first owner ends between the second's opening of the file and its locking."""
+    first = OutputLock(tmp_path / "made")
+    flock, third = fcntl.flock, []
+
+    def late(descriptor: int, operation: int) -> None:
+        monkeypatch.setattr(fcntl, "flock", flock)
+        first.release()
+        third.append(OutputLock(tmp_path / "made"))
+        flock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with pytest.raises(DataError, match="another command is writing it"):
+        OutputLock(tmp_path / "made")
+    third[0].release()
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_that_was_finished_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flock = fcntl.flock
+
+    def late(descriptor: int, operation: int) -> None:
+        (tmp_path / "made").mkdir()
+        flock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with pytest.raises(DataError, match="the folder exists already"):
+        OutputLock(tmp_path / "made")
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def test_a_file_system_without_locks_is_named_and_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def none(*_: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    write_native(tmp_path / "made")
+    assert "its file system has no locks (No locks available): start no second command" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [tmp_path / "made"]
+
+
+def test_an_output_that_cannot_be_created_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match=r"it cannot be created \(.*\); choose another --output"):
+        OutputLock(tmp_path / "file" / "made")
+    with pytest.raises(DataError, match=r"it cannot be created \(.*name too long.*"):
+        OutputLock(tmp_path / ("a" * 250))
+    with pytest.raises(DataError, match=r"it cannot be created \(.*name too long.*"):
+        OutputLock(tmp_path / ("a" * 300))
