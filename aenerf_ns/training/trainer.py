@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 import yaml
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import Trainer, TrainerConfig, writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -92,6 +92,8 @@ class AENeRFTrainer(Trainer):
         """Set up the training."""
         with _full_disk_as_one_line(self.base_dir):
             super().setup(test_mode)
+        # The framework counts its percentages and its time left from step 0, also in a run that goes on.
+        writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
 
     def train(self) -> None:
         """Train the model."""
