@@ -55,5 +55,6 @@ class Evaluate:
             f"PSNR {one['psnr']:.2f} dB, SSIM {one['ssim']:.3f} with test poses {name}" for name, one in figures.items()
         )
         CONSOLE.print(
-            f"{self.output}: {shown}; {results['num_views']} views; colour correction {results['color_correction']}."
+            f"{self.output}: {shown}; {results['num_views']} views; colour correction {results['color_correction']}.",
+            soft_wrap=True,
         )
