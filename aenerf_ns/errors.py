@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+# A longer part of a message is cut in the middle: names and values from files may have any length.
+_MAX_LENGTH = 300
+
 
 class DataError(ValueError):
     """Input that cannot be used. The message is one line that names the file, the value and the remedy.
@@ -17,7 +20,7 @@ class DataError(ValueError):
     """
 
     def __init__(self, source: str | Path, problem: str, remedy: str) -> None:
-        message = f"{source}: {problem}; {remedy}"
+        message = f"{_shortened(str(source))}: {_shortened(problem)}; {remedy}"
         # A value from a file may hold line breaks.
         super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in message))
 
@@ -29,3 +32,24 @@ def errors_as_one_line() -> Iterator[None]:
         yield
     except DataError as error:
         raise SystemExit(f"Error: {error}") from None
+
+
+def _shortened(text: str) -> str:
+    half = (_MAX_LENGTH - 3) // 2
+    return text if len(text) <= _MAX_LENGTH else f"{text[:half]}...{text[-half:]}"
+
+
+@contextmanager
+def reading(source: str | Path) -> Iterator[None]:
+    """Turn an error of the operating system within the context into a :class:`DataError`.
+
+    A file may be missing, a name too long, a link circular or a right not given. The error names the file.
+
+    Args:
+        source: the file or folder that is read, for errors that name none.
+    """
+    try:
+        yield
+    except OSError as error:
+        place, reason = error.filename or source, error.strerror or str(error)
+        raise DataError(place, f"it cannot be read ({reason})", "check its name and its rights") from None

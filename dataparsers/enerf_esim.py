@@ -95,8 +95,6 @@ class ENeRFEsimDataParser(EventDataParser):
 
 def _read_camera(path: Path) -> EventCamera:
     """Read the lens in LLFF's poses_bounds.npy: no distortion, and the principal point in the middle of the image."""
-    if not path.is_file():
-        raise DataError(path, "there is no such file", "copy the whole scene")
     bounds = load_npy(path)
     if bounds.ndim != 2 or bounds.shape[1] != 17 or len(bounds) == 0 or bounds.dtype.kind != "f":
         raise DataError(path, f"it has type {bounds.dtype} and shape {bounds.shape}", "it must be N x 17 decimals")
@@ -104,8 +102,8 @@ def _read_camera(path: Path) -> EventCamera:
     height, width, focal = np.asarray(bounds[0, :15], dtype=np.float64).reshape(3, 5)[:, 4].tolist()
     try:
         # ESIM counts pixels from the centre of the first pixel.
-        return EventCamera(int(width), int(height), focal, focal, width / 2 + 0.5, height / 2 + 0.5)
-    except (ValueError, OverflowError) as error:
+        return EventCamera(width, height, focal, focal, width / 2 + 0.5, height / 2 + 0.5)
+    except ValueError as error:
         raise DataError(path, str(error), "its fifth column must hold height, width and focal length") from None
 
 

@@ -18,6 +18,7 @@ from aenerf_ns.camera.trajectory import Trajectory, require_rigid
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.boundary import read_text
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.recording.dataparser import EventDataParser
@@ -29,6 +30,8 @@ from aenerf_ns.recording.views import MAX_VIEWS, image_files, image_files_of_pos
 _WIDTH, _HEIGHT = 346, 260
 # NeRF++ scales the cameras of a scene into the unit sphere.
 UNIT_SPHERE = 1.0
+# A matrix has 20 numbers.
+_MAX_BYTES = 1 << 16
 
 
 @dataclass
@@ -171,9 +174,7 @@ def read_matrix(path: Path, *num_rows: int) -> np.ndarray:
     Raises:
         DataError: the file is missing or malformed, or a number is not finite.
     """
-    if not path.is_file():
-        raise DataError(path, "there is no such file", "copy the whole dataset")
-    fields = path.read_text(encoding="utf-8", errors="replace").split()
+    fields = read_text(path, _MAX_BYTES).split()
     if len(fields) not in [4 * rows for rows in num_rows]:
         raise DataError(
             path, f"it holds {len(fields)} numbers", f"it must hold {' or '.join(f'{rows} x 4' for rows in num_rows)}"

@@ -20,7 +20,7 @@ from aenerf_ns.dataparsers.own_recording import own_recording_dataparser
 from aenerf_ns.dataparsers.paev3d import paev3d_dataparser
 from aenerf_ns.dataparsers.robust_enerf import robust_enerf_dataparser
 from aenerf_ns.dataparsers.tum_vie import tum_vie_dataparser
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
 
@@ -45,11 +45,12 @@ def recognise(data: Path) -> str:
         DataError: the folder does not exist, or has none of the formats.
     """
     parsers: dict[str, type[EventDataParser]] = {name: config._target for name, config in FORMATS.items()}
-    for name, parser in parsers.items():
-        if parser.recognises(data):
-            return name
-    if not data.exists():
-        raise DataError(data, "there is no such folder", "give the folder of a dataset as --data")
+    with reading(data):
+        for name, parser in parsers.items():
+            if parser.recognises(data):
+                return name
+        if not data.exists():
+            raise DataError(data, "there is no such folder", "give the folder of a dataset as --data")
     known = "; ".join(f"{name}: {parser.layout}" for name, parser in parsers.items())
     raise DataError(data, "no known format of recordings", f"looked for {known}")
 

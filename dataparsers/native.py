@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -58,7 +57,7 @@ class NativeDataParser(EventDataParser):
         if max_pose_gap is not None and max_pose_gap <= 0:
             raise meta.error("max_pose_gap_ns", f"is {max_pose_gap}, not a positive number of nanoseconds")
         return Recording(
-            event_file=Hdf5EventFile(folder / block.get("file", str), event_camera.width, event_camera.height),
+            event_file=Hdf5EventFile(block.file("file"), event_camera.width, event_camera.height),
             event_camera=event_camera,
             sensor=sensor,
             trajectory=trajectory,
@@ -107,19 +106,16 @@ def _reference_views(
     views: dict[str, ReferenceView] = {}
     known: set[str] = set()
     num_without_pose = 0
-    for index, values in enumerate(frames):
-        if not isinstance(values, dict):
-            raise meta.error("frames", f"holds {values!r}")
-        frame = JsonObject(meta.path, values, f"frames[{index}].")
+    for index in range(len(frames)):
+        frame = meta.entry_block("frames", index)
         name = frame.get("file_path", str)
         if name in known:
             raise frame.error("file_path", f"names {name} again")
         known.add(name)
-        file = meta.path.parent / name
+        file = frame.file("file_path")
         if not file.is_file():
             raise frame.error("file_path", f"names {name}, which does not exist")
-        stamp = frame.get("timestamp", float, None)
-        time = None if stamp is None else int((Decimal(values["timestamp"]) * 1_000_000_000).to_integral_value())
+        time = frame.time("timestamp")
         pose = frame.rigid_motion("transform_matrix")
         if pose is None and time is not None and has_ground_truth and not trajectory.start <= time <= trajectory.end:
             num_without_pose += 1
@@ -137,7 +133,7 @@ def _reference_views(
         )
     splits: dict[Split, list[ReferenceView]] = {}
     for split in SPLITS:
-        names = meta.get(f"{split}_filenames", list, [])
+        names = meta.names(f"{split}_filenames")
         unknown = [name for name in names if name not in known]
         if unknown:
             raise meta.error(f"{split}_filenames", f"names {unknown[0]}, which is not among the frames")

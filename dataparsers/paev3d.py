@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 import pickle
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from numpy.typing import NDArray
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, require_rigid
 from aenerf_ns.dataparsers.eventnerf import UNIT_SPHERE, EvenPosesDataParserConfig, read_intrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.event_arrays import NPZ_ERRORS, read_npy_header
+from aenerf_ns.files.event_arrays import open_npz_member, read_npy_header
 from aenerf_ns.files.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, image_files_of_poses, views_on_trajectory
 
 _WIDTH, _HEIGHT = 640, 480
-# The names that NumPy's arrays and numbers need. All others are refused, because a pickle may run any code.
-_HARMLESS = {("_reconstruct", "multiarray"), ("scalar", "multiarray"), ("ndarray", "numpy"), ("dtype", "numpy")}
+# The names that the pickles of NumPy's arrays and numbers hold. All others are refused: a pickle may run any code.
+_KNOWN = {("_reconstruct", "multiarray"), ("scalar", "multiarray"), ("ndarray", "numpy"), ("dtype", "numpy")}
+# The file of a frame names some hundred objects at most.
+_MAX_BYTES = 1 << 20
 
 
 @dataclass
@@ -86,35 +88,72 @@ def _scenes(data: Path) -> list[Path]:
     return sorted(path for path in data.glob("H5_Files/*") if path.is_dir())
 
 
-class _HarmlessUnpickler(pickle.Unpickler):
+class _Call:
+    """A call that a pickle asks for, with its arguments and its state: noted, and not made."""
+
+    def __init__(self, args: tuple) -> None:
+        self.args = args
+        self.state: Any = None
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+# In Python, because the unpickler in C reserves as much memory as a pickle asks for.
+class _NotingUnpickler(pickle._Unpickler):
+    """Read a pickle of NumPy's arrays, and call nothing that it names."""
+
     def find_class(self, module: str, name: str) -> Any:
-        if (name, module.split(".")[-1]) not in _HARMLESS or module.split(".")[0] != "numpy":
+        if (name, module.split(".")[-1]) not in _KNOWN or module.split(".")[0] != "numpy":
             raise pickle.UnpicklingError(f"it asks for {module}.{name}")
-        return super().find_class(module, name)
+        return lambda *args: _Call(args)
+
+
+def _objects(stream: IO[bytes]) -> list[dict]:
+    """Return the dictionaries in a pickled array of objects."""
+    array = _NotingUnpickler(stream).load()
+    # The state of an array: version, shape, type, whether the order is Fortran's, and values.
+    return [item for item in array.state[-1] if isinstance(item, dict)]
+
+
+def _text(value: Any) -> str:
+    """Return a text, which may be a scalar of NumPy: type and bytes."""
+    if isinstance(value, _Call):
+        dtype, content = value.args
+        return str(np.frombuffer(content, dtype.args[0])[0])
+    return str(value)
+
+
+def _pose(value: Any) -> NDArray[np.float64] | None:
+    """Return the (4, 4) matrix of numbers that a noted array stands for, or None if it is none."""
+    if not isinstance(value, _Call) or not isinstance(value.state, tuple):
+        return None
+    _, shape, dtype, is_fortran, content = value.state
+    kind = np.dtype(dtype.args[0])
+    if shape != (4, 4) or kind.kind not in "iuf":
+        return None
+    values = np.frombuffer(content, kind.newbyteorder(dtype.state[1]))
+    return values.reshape(4, 4, order="F" if is_fortran else "C").astype(np.float64)
 
 
 def _camera_pose(path: Path) -> Tensor:
     """Read the camera's pose in VisionBlender's object_poses: (4, 4) float64, camera-to-world, OpenGL camera axes."""
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open("object_poses.npy") as member:
-            _, _, dtype = read_npy_header(member)
-            # An array of dictionaries. NumPy would unpickle it without looking at the names in it.
-            objects = _HarmlessUnpickler(member).load() if dtype.hasobject else None
-    except (*NPZ_ERRORS, KeyError, pickle.UnpicklingError, AttributeError, ImportError, IndexError, TypeError) as error:
-        raise DataError(path, f"its object_poses cannot be read ({error})", "copy it again") from None
-    for entry in np.asarray(objects, dtype=object).ravel().tolist():
-        if isinstance(entry, dict) and str(entry.get("name")) == "Camera":
-            pose = np.asarray(entry.get("pose"))
-            if pose.shape != (4, 4) or pose.dtype.kind not in "iuf":
-                raise DataError(
-                    path, f"its camera's pose has type {pose.dtype} and shape {pose.shape}", "copy it again"
-                )
-            matrix = torch.from_numpy(pose.astype(np.float64))
-            if not matrix.isfinite().all():
-                raise DataError(path, "its camera's pose is not finite", "drop it, and its image")
-            require_rigid(matrix[None], path)
-            return matrix
-    raise DataError(path, "its object_poses hold no 'Camera'", "render it with VisionBlender again")
+    with open_npz_member(path, "object_poses") as (member, entry):
+        if entry.file_size > _MAX_BYTES:
+            raise ValueError(f"it has {entry.file_size:,} bytes")
+        _, _, dtype = read_npy_header(member)
+        objects = _objects(member) if dtype.hasobject else []
+        camera = next((item for item in objects if _text(item.get("name")) == "Camera"), None)
+        pose = None if camera is None else _pose(camera.get("pose"))
+    if camera is None:
+        raise DataError(path, "its object_poses hold no 'Camera'", "render it with VisionBlender again")
+    if pose is None:
+        raise DataError(path, "its camera's pose is not an array of 4 x 4 numbers", "copy it again")
+    if not np.isfinite(pose).all():
+        raise DataError(path, "its camera's pose is not finite", "drop it, and its image")
+    matrix = torch.from_numpy(pose)
+    require_rigid(matrix[None], path)
+    return matrix
 
 
 paev3d_dataparser = DataParserSpecification(

@@ -108,8 +108,8 @@ def _read_calibration(path: Path) -> tuple[EventCamera, SensorModel]:
         raise DataError(path, f"a value of {single} is not finite", "calibrate the camera")
     try:
         camera = EventCamera(
-            int(single["img_width"]),
-            int(single["img_height"]),
+            single["img_width"],  # type: ignore[arg-type]
+            single["img_height"],  # type: ignore[arg-type]
             float(matrix[0, 0]),
             float(matrix[1, 1]),
             float(matrix[0, 2]) + 0.5,
@@ -155,7 +155,7 @@ def _read_views(folder: Path) -> tuple[EventCamera | None, dict[Split, list[Refe
         if path.is_file():
             meta = JsonObject.read(path)
             for index in range(len(meta.get("frames", list))):
-                views.append(_read_view(meta.entry_block("frames", index), path.parent))
+                views.append(_read_view(meta.entry_block("frames", index)))
         if views:
             own = _view_camera(meta, views[0].file)
             if camera not in (None, own):
@@ -165,10 +165,11 @@ def _read_views(folder: Path) -> tuple[EventCamera | None, dict[Split, list[Refe
     return camera, splits  # type: ignore[return-value]
 
 
-def _read_view(frame: JsonObject, folder: Path) -> ReferenceView:
+def _read_view(frame: JsonObject) -> ReferenceView:
     name = frame.get("file_path", str)
     # The dataset leaves the suffix out.
-    files = [folder / f"{name}{suffix}" for suffix in ("", *IMAGE_SUFFIXES)]
+    inside = frame.file("file_path")
+    files = [inside.with_name(f"{inside.name}{suffix}") for suffix in ("", *IMAGE_SUFFIXES)]
     file = next((file for file in files if file.is_file()), None)
     if file is None:
         raise frame.error("file_path", f"names {name}, which is no PNG or JPEG image")

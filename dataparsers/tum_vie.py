@@ -139,8 +139,8 @@ def _camera(meta: JsonObject, index: int) -> EventCamera:
     width, height = meta.numbers(f"resolution[{index}]", meta.entry("resolution", index), (2,)).tolist()
     try:
         return EventCamera(
-            int(width),
-            int(height),
+            width,
+            height,
             fx=values.get("fx", float),
             fy=values.get("fy", float),
             cx=values.get("cx", float) + 0.5,

@@ -51,7 +51,7 @@ def replace_line(name: str, index: int, line: str) -> Callable[[Path], object]:
     return change
 
 
-def _read_everything(config: EventDataParserConfig) -> None:
+def read_everything(config: EventDataParserConfig) -> None:
     config.setup().get_dataparser_outputs("val")
     assert len(EventDataset(config.setup().get_dataparser_outputs("train")).pairs)
 
@@ -60,6 +60,6 @@ def assert_one_clear_line(change: Callable[[Path], object], message: str, config
     """Damage the dataset, read all of it, and expect a message of one line that names the dataset's folder."""
     change(config.data)
     with pytest.raises(DataError, match=message) as error:
-        _read_everything(config)
+        read_everything(config)
     assert "\n" not in str(error.value)
     assert str(config.data) in str(error.value)

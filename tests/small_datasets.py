@@ -109,7 +109,7 @@ ECD_FAULTS = {
         "calib.txt: line 1 has 4 fields; .* the 9: fx",
     ),
     "empty calibration": (write_text("calib.txt", ""), "calib.txt: the file is empty"),
-    "no focal length": (write_text("calib.txt", "0 5 2 1 0 0 0 0 0\n"), "calib.txt: fx must be positive"),
+    "no focal length": (write_text("calib.txt", "0 5 2 1 0 0 0 0 0\n"), "calib.txt: fx must be from 0.01"),
 }
 
 
@@ -160,7 +160,7 @@ NATIVE_FAULTS = {
     ),
     "negative threshold": (
         edit_transforms(lambda m: m["event_camera"].update(negative_contrast_threshold=-1)),
-        "negative_contrast_threshold must be a positive number",
+        "negative_contrast_threshold must be from 0.0001",
     ),
     "unknown Bayer pattern": (edit_transforms(lambda m: m["event_camera"].update(bayer_pattern="GRBG")), '"GRBG"'),
     "unknown lens": (

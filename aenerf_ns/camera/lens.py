@@ -17,6 +17,13 @@ LensModel = Literal["radial_tangential", "fisheye"]
 # A pixel whose undistorted direction projects back this far off, in pixels, lies where the lens model folds over.
 _MAX_ROUND_TRIP_ERROR = 1e-3
 
+# A side in pixels; pixels, of a camera for films in 8K; focal lengths and principal points in pixels.
+_MAX_SIDE, _MAX_PIXELS = 1 << 14, 1 << 25
+_FOCAL_LENGTHS = (1e-2, 1e6)
+_MAX_PRINCIPAL_POINT = 1e6
+# Along each side, the pixels that :meth:`EventCamera.sees` looks at.
+_SAMPLES = 24
+
 
 @dataclass(frozen=True)
 class EventCamera:
@@ -35,8 +42,9 @@ class EventCamera:
         distortion: in OpenCV's order: k1, k2, p1, p2, k3 ("radial_tangential") or k1, k2, k3, k4 ("fisheye").
 
     Raises:
-        ValueError: a focal length or a size is not positive, a value is not finite, or the number of distortion
-            parameters does not fit the model.
+        ValueError: a size is not a whole number of pixels or too large, a focal length or the principal point is not
+            one that a camera can have, a value is not finite, or the number of distortion parameters does not fit the
+            model.
 
     Example:
         >>> camera = EventCamera(width=346, height=260, fx=330.0, fy=330.0, cx=172.5, cy=129.5)
@@ -57,11 +65,23 @@ class EventCamera:
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name in ("width", "height", "fx", "fy"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
-        if not np.isfinite([self.cx, self.cy, *self.distortion]).all():
-            raise ValueError("principal point and distortion must be finite")
+        for name in ("width", "height"):
+            size = getattr(self, name)
+            if not 0 < size <= _MAX_SIDE or size != int(size):
+                raise ValueError(f"{name} must be a whole number from 1 to {_MAX_SIDE}, not {size:.12g}")
+            # Some formats store it as a decimal number.
+            object.__setattr__(self, name, int(size))
+        if self.width * self.height > _MAX_PIXELS:
+            raise ValueError(f"{self.width} x {self.height} pixels are more than {_MAX_PIXELS:,}")
+        for name in ("fx", "fy"):
+            low, high = _FOCAL_LENGTHS
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} must be from {low:g} to {high:g} pixels, not {getattr(self, name):g}")
+        for name in ("cx", "cy"):
+            if not abs(getattr(self, name)) <= _MAX_PRINCIPAL_POINT:
+                raise ValueError(f"{name} must be within {_MAX_PRINCIPAL_POINT:g} pixels, not {getattr(self, name):g}")
+        if not np.isfinite(self.distortion).all():
+            raise ValueError("the distortion must be finite")
         expected = {"radial_tangential": 5, "fisheye": 4}
         if self.lens_model not in expected:
             raise ValueError(f'lens_model must be one of {sorted(expected)}, not "{self.lens_model}"')
@@ -82,7 +102,21 @@ class EventCamera:
             z backward), and (height, width) whether the pixel has a direction. A pixel beyond the range in which the
             distortion model can be inverted has none.
         """
-        columns, rows = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
+        return self._directions(np.arange(self.width), np.arange(self.height))
+
+    def sees(self) -> bool:
+        """Return whether any of some pixels, evenly spread over the sensor, has a direction."""
+        columns, rows = (
+            np.linspace(0, side - 1, min(side, _SAMPLES)).astype(int) for side in (self.width, self.height)
+        )
+        return bool(self._directions(columns, rows)[1].any())
+
+    def _directions(
+        self, columns: NDArray[np.integer], rows: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the directions through the pixels of (W,) columns and (H,) rows, as :meth:`pixel_directions` does."""
+        shape = len(rows), len(columns)
+        columns, rows = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
         pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
         matrix, distortion = self._opencv_matrix, np.array(self.distortion)
         if self.lens_model == "fisheye":
@@ -94,8 +128,8 @@ class EventCamera:
             plane = cv2.undistortPointsIter(pixels, matrix, distortion, np.eye(3), np.eye(3), criteria)
             points = np.concatenate([plane, np.ones_like(plane[..., :1])], -1)
             projected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0]
-        error = np.linalg.norm(projected - pixels, axis=-1).reshape(self.height, self.width)
-        plane = plane.reshape(self.height, self.width, 2)
+        error = np.linalg.norm(projected - pixels, axis=-1).reshape(shape)
+        plane = plane.reshape(*shape, 2)
         directions = np.stack([plane[..., 0], -plane[..., 1], np.full(plane.shape[:2], -1.0)], -1)
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         return directions, error < _MAX_ROUND_TRIP_ERROR

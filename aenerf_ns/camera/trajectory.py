@@ -19,6 +19,8 @@ OPENCV_TO_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.f
 
 # Matrices printed with five digits pass.
 _MAX_RIGIDITY_ERROR = 1e-4
+# Positions beyond it, in any unit, have no digits left for the motion.
+_MAX_POSITION = 1e12
 
 
 class Trajectory(nn.Module):
@@ -38,8 +40,8 @@ class Trajectory(nn.Module):
         source: the file or folder of the poses, for messages.
 
     Raises:
-        DataError: fewer than two poses, times that do not increase, a value that is not finite, or a matrix that is
-            not a rotation.
+        DataError: fewer than two poses, times that do not increase, a value that is not finite or a position beyond
+            1e12, or a matrix that is not a rotation.
 
     Example:
         A camera that moves one unit along x within a second, seen after half of it:
@@ -76,6 +78,9 @@ class Trajectory(nn.Module):
         bad = ~poses.isfinite().flatten(1).all(1)
         if bad.any():
             raise DataError(source, f"pose {int(bad.nonzero()[0])} is not finite", "drop it or interpolate it")
+        distance = poses[..., 3].abs().max()
+        if distance > _MAX_POSITION:
+            raise DataError(source, f"a pose is {float(distance):g} away from the origin", "check the columns")
         require_rigid(poses, source)
         seconds = (times - times[0]).to(torch.float64) * 1e-9
         for name, value in (

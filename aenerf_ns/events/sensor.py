@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aenerf_ns.errors import DataError
+
 BayerPattern = Literal["", "RGGB"]
 
 # A monochrome sensor sees the Rec. 709 luminance of linear RGB.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+# The largest event sensors have 1 million pixels. The directions of so many pixels take 0.5 GB for a moment.
+_MAX_PIXELS = 1 << 22
+# Real thresholds are 0.05 to 1. Only their ratio matters, so other units than log-radiance are accepted too.
+_THRESHOLDS = (1e-4, 1e3)
+# Nanoseconds. Refractory periods are microseconds to milliseconds long.
+_MAX_REFRACTORY_PERIOD = 10**12
 
 # Colour filter (0 red, 1 green, 2 blue) of the 2 x 2 pixels that repeat: [row % 2, column % 2].
 RGGB = np.array([[0, 1], [1, 2]], dtype=np.uint8)
@@ -28,7 +38,8 @@ class SensorModel:
         bayer_pattern: "RGGB" for a colour sensor whose pixel (0, 0) is red, "" for a monochrome one.
 
     Raises:
-        ValueError: a threshold is not positive, the refractory period is negative, or the pattern is unknown.
+        ValueError: a threshold is below 1e-4 or above 1e3, the refractory period is negative or beyond 1000 s, or the
+            pattern is unknown.
     """
 
     positive_contrast_threshold: float = 0.25
@@ -38,10 +49,13 @@ class SensorModel:
 
     def __post_init__(self) -> None:
         for name in ("positive_contrast_threshold", "negative_contrast_threshold"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be a positive number, not {getattr(self, name)}")
-        if self.refractory_period < 0:
-            raise ValueError(f"refractory_period must not be negative, not {self.refractory_period} ns")
+            low, high = _THRESHOLDS
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} must be from {low:g} to {high:g}, not {getattr(self, name):g}")
+        if not 0 <= self.refractory_period <= _MAX_REFRACTORY_PERIOD:
+            raise ValueError(
+                f"refractory_period must be from 0 to {_MAX_REFRACTORY_PERIOD:g} ns, not {self.refractory_period:g}"
+            )
         if self.bayer_pattern not in ("", "RGGB"):
             raise ValueError(f'bayer_pattern must be "" or "RGGB", not "{self.bayer_pattern}"')
 
@@ -63,3 +77,13 @@ class SensorModel:
         if not self.bayer_pattern:
             return np.zeros(len(x), dtype=np.int64)
         return RGGB[y % 2, x % 2].astype(np.int64)
+
+
+def require_event_sensor_size(width: int, height: int, source: str | Path) -> None:
+    """Raise a DataError for a number of pixels that no event sensor has, before anything of that size is allocated."""
+    if width * height > _MAX_PIXELS:
+        raise DataError(
+            source,
+            f"an event sensor of {width} x {height} pixels is too large",
+            f"give the size of the sensor, at most {_MAX_PIXELS:,} pixels",
+        )

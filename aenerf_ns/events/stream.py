@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
+from aenerf_ns.events.sensor import require_event_sensor_size
 
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 
@@ -102,8 +103,9 @@ def _unsorted(source: str | Path, index: int, time: int, previous: int) -> DataE
 
 def require_event_file(path: Path) -> None:
     """Raise a DataError if the file does not exist."""
-    if not path.is_file():
-        raise DataError(path, "there is no such event file", "check the path of the dataset")
+    with reading(path):
+        if not path.is_file():
+            raise DataError(path, "there is no such event file", "check the path of the dataset")
 
 
 class EventFile(ABC):
@@ -116,9 +118,13 @@ class EventFile(ABC):
         path: the file.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
+
+    Raises:
+        DataError: no event sensor has so many pixels.
     """
 
     def __init__(self, path: Path, width: int, height: int) -> None:
+        require_event_sensor_size(width, height, path)
         self.path = path
         self.width = width
         self.height = height

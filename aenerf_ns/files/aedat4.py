@@ -22,7 +22,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.sensor_size import sensor_size
 
@@ -30,6 +30,8 @@ _CHUNK = 1 << 20
 _MAGIC = b"#!AER-DAT4.0\r\n"
 # Microseconds.
 _EVENT = np.dtype([("time", "<i8"), ("x", "<u2"), ("y", "<u2"), ("on", "u1"), ("padding", "V3")])
+# DV writes headers of some kilobytes, and packets of at most some megabytes, as they are and compressed.
+_MAX_HEADER, _MAX_PACKET = 1 << 20, 1 << 28
 _MAX_MICROSECONDS = np.iinfo(np.int64).max // 1000
 _COMPRESSIONS = ("none", "lz4", "lz4", "zstd", "zstd")
 # Indices of the fields in their tables.
@@ -87,13 +89,15 @@ class Aedat4File(EventFile):
     def _read_header(self) -> _Header:
         self.require()
         file_size = self.path.stat().st_size
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise DataError(self.path, "it does not begin as an AEDAT4 file does", "convert older ones with DV")
             length = int.from_bytes(file.read(4), "little")
             begin = file.tell() + length
             if begin > file_size:
                 self._fail("it ends within its header")
+            if length > _MAX_HEADER:
+                self._fail(f"its header has {length:,} bytes")
             data = file.read(length)
         try:
             root = _root(data, 0)
@@ -127,11 +131,11 @@ class Aedat4File(EventFile):
         """Return a function that decompresses a packet or raises a DataError."""
         try:
             if compression == "lz4":
-                from lz4.frame import decompress
+                from lz4.frame import LZ4FrameDecompressor as Decompressor
             elif compression == "zstd":
-                from backports.zstd import decompress
+                from backports.zstd import ZstdDecompressor as Decompressor
             else:
-                decompress = bytes
+                return bytes
         except ImportError as error:
             raise DataError(
                 self.path,
@@ -140,11 +144,15 @@ class Aedat4File(EventFile):
             ) from None
 
         def checked(data: bytes) -> bytes:
+            decompressor = Decompressor()
             try:
-                return decompress(data)
+                unpacked = decompressor.decompress(data, max_length=_MAX_PACKET)
             # Each library raises its own errors.
             except Exception as error:
                 self._fail(f"a packet cannot be decompressed ({error})")
+            if not decompressor.eof:
+                self._fail(f"a packet is cut, or has more than {_MAX_PACKET:,} bytes when decompressed")
+            return unpacked
 
         return checked
 
@@ -155,7 +163,7 @@ class Aedat4File(EventFile):
             file.seek(position)
             head = file.read(8)
             stream, length = struct.unpack("<2i", head) if len(head) == 8 else (0, -1)
-            if length < 0 or position + 8 + length > header.end:
+            if not 0 <= length <= _MAX_PACKET or position + 8 + length > header.end:
                 self._fail(f"it ends within the packet at byte {position}, or is damaged there")
             if stream == header.stream and length:
                 yield position + 8, length
@@ -165,7 +173,7 @@ class Aedat4File(EventFile):
         """Yield the (N,) events of each packet that has any."""
         header = self._checked_header()
         decompress = self._decompressor(header.compression)
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             packets: Iterable[tuple[int, int]] = self._packets(file, header)
             for position, length in reversed(list(packets)) if backwards else packets:
                 file.seek(position)
@@ -219,7 +227,7 @@ class Aedat4File(EventFile):
         header = self._checked_header()
         if header.table is None:
             return None
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             file.seek(header.table)
             data = self._decompressor(header.compression)(file.read())
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
+from aenerf_ns.files.boundary import require_unpacked_size
 from aenerf_ns.files.event_table import EventLayout, EventTableFile
-from aenerf_ns.files.text import NANOSECONDS, TimeUnit
+from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
 
 if TYPE_CHECKING:
     import h5py
@@ -23,6 +24,10 @@ _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 _UNITS: tuple[TimeUnit, ...] = ("ns", "us", "ms")
 # The number of the HDF5 filter of Prophesee's compression of events.
 _ECF = 0x8ECF
+# Bytes of an event, with columns that are not read.
+_MAX_ROW = 1 << 10
+# Bytes that are decompressed as one piece.
+_MAX_PIECE = 1 << 27
 # Events read at once: 50 MB.
 _CHUNK = 1 << 22
 # Events collected before they are written: many small writes are slow.
@@ -46,9 +51,10 @@ class Hdf5EventFile(EventFile):
 
     def _columns(self, file: h5py.File) -> tuple[dict[str, h5py.Dataset], int, int]:
         """Return the four columns, the nanoseconds of a tick, and the offset in nanoseconds."""
-        columns = {name: file.get(f"events/{name}") for name in _DTYPES}
+        found = _datasets(self.path, file, [f"events/{name}" for name in _DTYPES])
+        columns: dict[str, Any] = {name: found[f"events/{name}"] for name in _DTYPES}
         for name, column in columns.items():
-            if not hasattr(column, "dtype"):
+            if column is None:
                 raise DataError(self.path, f"there is no dataset /events/{name}", "see the dataset format in the docs")
             if column.dtype != _DTYPES[name] or column.ndim != 1:
                 raise DataError(
@@ -62,17 +68,29 @@ class Hdf5EventFile(EventFile):
         attributes = file["events"].attrs
         default = self._time_unit or "ns"
         unit, offset = (_scalar(attributes.get(*item)) for item in (("time_unit", default), ("time_offset", 0)))
-        unit = unit.decode() if isinstance(unit, bytes) else unit
+        unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
+        if not isinstance(unit, str) or unit not in _UNITS:
+            raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
         if self._time_unit not in (None, unit):
             raise DataError(
                 self.path, f"it states its time unit, {unit!r}, but {self._time_unit} was given", "leave it out"
             )
-        if unit not in _UNITS:
-            raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
-        if not isinstance(offset, (int, np.integer)):
-            raise DataError(self.path, f"its time offset is {offset!r}", "use an integer in the unit of the times")
         tick = NANOSECONDS[unit]
+        if not isinstance(offset, (int, np.integer)) or abs(int(offset)) * tick > MAX_TIME:
+            raise DataError(self.path, f"its time offset is {offset!r}", "use an integer in the unit of the times")
         return columns, tick, int(offset) * tick
+
+    def _times(self, times: NDArray[np.int64], tick: int, offset: int) -> NDArray[np.int64]:
+        """Return the nanoseconds of the times of a column."""
+        limit = (MAX_TIME - abs(offset)) // tick
+        bad = (times < -limit) | (times > limit)
+        if bad.any():
+            raise DataError(
+                self.path,
+                f"an event has the time {times[np.argmax(bad)]}",
+                "check the unit and the offset of the times",
+            )
+        return times * tick + offset
 
     def read_chunks(self) -> Iterator[EventStream]:
         with _open(self.path) as file:
@@ -80,7 +98,7 @@ class Hdf5EventFile(EventFile):
             for begin in range(0, len(columns["t"]), _CHUNK):
                 piece = slice(begin, begin + _CHUNK)
                 part = {name: _read(self.path, column, piece) for name, column in columns.items()}
-                part["t"] = part["t"] * tick + offset
+                part["t"] = self._times(part["t"], tick, offset)
                 yield EventStream(**part, width=self.width, height=self.height, source=self.path)
 
     def time_span(self) -> tuple[int, int]:
@@ -88,8 +106,9 @@ class Hdf5EventFile(EventFile):
             columns, tick, offset = self._columns(file)
             if len(columns["t"]) == 0:
                 raise self.empty_error()
-            first, last = (int(_read(self.path, columns["t"], index)) for index in (0, -1))
-            return first * tick + offset, last * tick + offset
+            first, last = (_read(self.path, columns["t"], slice(i, i + 1)) for i in (0, len(columns["t"]) - 1))
+            start, end = self._times(np.concatenate([first, last]), tick, offset).tolist()
+            return start, end
 
     def count(self) -> int:
         with _open(self.path) as file:
@@ -118,14 +137,14 @@ class Hdf5TableFile(EventTableFile):
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, Any]]:
         with _open(self.path) as file:
-            arrays = {name: file.get(name) for name in self._layout.arrays}
+            arrays: dict[str, Any] = _datasets(self.path, file, self._layout.arrays)
             for name, array in arrays.items():
-                if not hasattr(array, "dtype"):
+                if array is None:
                     raise DataError(self.path, f"there is no dataset /{name}", "see the formats in the docs")
             offset_name = self._layout.time_offset
-            offset = None if offset_name is None else file.get(offset_name)
-            if offset_name is not None and offset is not None:
-                value = _scalar(offset[()]) if hasattr(offset, "dtype") else None
+            if offset_name is not None and offset_name in file:
+                offset = _datasets(self.path, file, [offset_name])[offset_name]
+                value = None if offset is None or offset.size != 1 else _scalar(offset[()])
                 if not isinstance(value, (int, np.integer)):
                     raise DataError(self.path, f"its {offset_name} is {value!r}", "store an integer")
                 arrays[offset_name] = int(value)
@@ -148,14 +167,15 @@ def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | 
         DataError: the file is missing or not HDF5, or holds no events in a known layout.
     """
     with _open(path) as file:
-        columns = [file.get(f"events/{name}") for name in _DTYPES]
+        columns = _datasets(path, file, [f"events/{name}" for name in _DTYPES])
         native = all(
-            getattr(column, "dtype", None) == dtype for column, dtype in zip(columns, _DTYPES.values(), strict=True)
+            column is not None and column.dtype == dtype
+            for column, dtype in zip(columns.values(), _DTYPES.values(), strict=True)
         )
         if native and not {"ms_to_idx", "t_offset"} & set(file):
             return Hdf5EventFile(path, width, height, time_unit)
         for layout in _LAYOUTS:
-            if all(hasattr(file.get(name), "dtype") for name in layout.arrays):
+            if None not in _datasets(path, file, layout.arrays).values():
                 return Hdf5TableFile(path, width, height, layout, time_unit)
         raise DataError(
             path,
@@ -164,7 +184,13 @@ def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | 
         )
 
 
-def _open(path: Path) -> h5py.File:
+@contextmanager
+def _open(path: Path) -> Iterator[h5py.File]:
+    """Open a file. Errors of HDF5 within the context become a DataError.
+
+    Raises:
+        DataError: the file is missing, cannot be read or is damaged.
+    """
     # Imported lazily: every command of every method imports this module.
     import h5py
 
@@ -172,16 +198,54 @@ def _open(path: Path) -> h5py.File:
         # The import registers Blosc and other compression filters, where the extra is installed.
         import hdf5plugin  # noqa: F401
     require_event_file(path)
+    # h5py's message for a missing right does not name it.
+    with reading(path):
+        path.open("rb").close()
     try:
-        return h5py.File(path, "r")
-    except OSError as error:
+        with h5py.File(path, "r") as file:
+            yield file
+    except DataError:
+        raise
+    # h5py raises each of them for a file that is damaged or made to be.
+    except (KeyError, MemoryError, OSError, RuntimeError, TypeError, ValueError) as error:
         raise DataError(path, f"not a readable HDF5 file ({error})", "write or copy it again") from None
 
 
-def _read(path: Path, array: h5py.Dataset, index: slice | int) -> Any:
+def _datasets(path: Path, file: h5py.File, names: Iterable[str]) -> dict[str, h5py.Dataset | None]:
+    """Return the datasets of a file by their names, or None where there is none of a name.
+
+    Raises:
+        DataError: a dataset has no values, has them in other files, or is larger than the file can explain.
+    """
+    import h5py
+
+    found: dict[str, h5py.Dataset | None] = {}
+    for name in names:
+        item = file.get(name)
+        found[name] = item if isinstance(item, h5py.Dataset) else None
+    datasets = [dataset for dataset in found.values() if dataset is not None]
+    for dataset in datasets:
+        if dataset.file.filename != file.filename or dataset.external or dataset.is_virtual:
+            raise DataError(path, f"{dataset.name} is a link to another file", "copy its values into this file")
+        if dataset.shape is None:
+            raise DataError(path, f"{dataset.name} has no values", "write it again")
+        row = int(np.prod(dataset.shape[1:], dtype=object)) * dataset.dtype.itemsize
+        piece = int(np.prod(dataset.chunks or (), dtype=object)) * dataset.dtype.itemsize
+        if row > _MAX_ROW or piece > _MAX_PIECE:
+            raise DataError(
+                path,
+                f"{dataset.name} has rows of {row:,} bytes in pieces of {piece:,}",
+                f"write pieces of at most {_MAX_PIECE:,} bytes",
+            )
+    num_bytes = sum(int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize for dataset in datasets)
+    require_unpacked_size(path, "its events", num_bytes, sum(dataset.id.get_storage_size() for dataset in datasets))
+    return found
+
+
+def _read(path: Path, array: h5py.Dataset, index: slice) -> NDArray:
     try:
         return array[index]
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise DataError(path, f"{array.name} cannot be read ({error})", _filter_remedy(array)) from None
 
 

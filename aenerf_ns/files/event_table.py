@@ -99,6 +99,8 @@ class EventTableFile(EventFile):
         lengths = {}
         for column, (name, place) in self._layout.columns.items():
             array = arrays[name]
+            if array.dtype.kind not in ("V" if isinstance(place, str) else "iufb"):
+                raise DataError(self.path, f"column {column} has type {array.dtype}", "store numbers")
             expected = 2 if isinstance(place, int) else 1
             if array.ndim != expected:
                 raise DataError(

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.event_table import SAMPLE, events_from_columns
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit, is_row, last_row
@@ -20,6 +20,8 @@ from aenerf_ns.files.text import NANOSECONDS, TimeUnit, is_row, last_row
 _COLUMNS = "xytp"
 # Bytes read at once: about 150,000 events.
 _BLOCK = 1 << 22
+# Longer than any line of numbers.
+_MAX_LINE = 1 << 16
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
@@ -68,14 +70,14 @@ class _EventLines(EventFile):
 
     def read_chunks(self) -> Iterator[EventStream]:
         tick = None
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
                 tick = tick or self._tick(lines.fraction[2, :SAMPLE])
                 yield self._events(lines, tick)
 
     def time_span(self) -> tuple[int, int]:
         self.require()
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             names = self._names(file)
             beginning = next(self._lines(file, names), None)
         if beginning is None:
@@ -92,12 +94,21 @@ class _EventLines(EventFile):
         file.seek(0)
         num_before = file.read(header_end).count(b"\n")
         while text := file.read(_BLOCK):
-            text += file.readline()
+            text += self._line(file)
             text += b"" if text.endswith(b"\n") else b"\n"
             lines = self._parse(text, num_before, names)
             if lines.whole.shape[1]:
                 yield lines
             num_before += text.count(b"\n")
+
+    def _line(self, file: BinaryIO) -> bytes:
+        """Read the rest of a line."""
+        line = file.readline(_MAX_LINE)
+        if len(line) == _MAX_LINE:
+            raise DataError(
+                self.path, f"a line has more than {_MAX_LINE:,} bytes", "write one event a line, as plain text"
+            )
+        return line
 
     def _parse(self, text: bytes, num_before: int | None, names: list[str]) -> _Lines:
         # Imported lazily: every command of every method imports this module, and numba is slow to import.
@@ -173,7 +184,9 @@ class CsvEventFile(_EventLines):
         self._time_unit = time_unit
 
     def _names(self, file: BinaryIO) -> list[str]:
-        header = next((line for line in iter(file.readline, b"") if is_row(line)), b"").decode("utf-8", "replace")
+        header = next((line for line in iter(lambda: self._line(file), b"") if is_row(line)), b"").decode(
+            "utf-8", "replace"
+        )
         names = [name.strip().strip('"').lower() for name in header.split(",")]
         if not set(_COLUMNS) <= set(names):
             raise DataError(

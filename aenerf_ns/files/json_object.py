@@ -7,7 +7,7 @@ import math
 from collections.abc import Collection, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -15,7 +15,9 @@ from torch import Tensor
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.lens import EventCamera, LensModel
 from aenerf_ns.camera.trajectory import require_rigid
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
+from aenerf_ns.files.boundary import file_inside, read_text
+from aenerf_ns.files.text import MAX_TIME
 
 # For each camera model of Nerfstudio: the lens, and the names of its distortion parameters in OpenCV's order.
 LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
@@ -25,6 +27,15 @@ LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
 
 
 DATASET_REMEDY = "see the dataset format in the docs"
+
+# 50,000 frames of a dataset.
+_MAX_BYTES = 1 << 25
+# Matrices in an object in a list in an object have a depth of 5.
+_MAX_DEPTH = 16
+# Digits of a whole number: int64 has 19.
+_MAX_DIGITS = 18
+# The largest power of ten of a decimal number: float64 holds 10^308.
+_MAX_POWER = 300
 
 
 class JsonObject:
@@ -48,19 +59,24 @@ class JsonObject:
         """Read the object in a file.
 
         Raises:
-            DataError: the file is missing, is not JSON, or holds something else than an object.
+            DataError: the file is missing or too large, is not JSON, holds something else than an object, is nested too
+                deeply, or holds a number that is too large.
         """
-        if not path.is_file():
-            raise DataError(
-                path, "there is no such file", "give a dataset folder as --data, or name its format after the options"
-            )
+        with reading(path):
+            if not path.is_file():
+                raise DataError(
+                    path,
+                    "there is no such file",
+                    "give a dataset folder as --data, or name its format after the options",
+                )
+        text = read_text(path, _MAX_BYTES)
         try:
-            # Decimal keeps every digit of a time stamp; float would drop nanoseconds of the Unix time.
-            values = json.loads(path.read_text(encoding="utf-8"), parse_float=Decimal)
-        except ValueError as error:
+            values = json.loads(text, parse_float=_decimal, parse_int=_integer, parse_constant=_no_number)
+        except (ValueError, RecursionError) as error:
             raise DataError(path, f"not valid JSON ({error})", "correct it there") from None
         if not isinstance(values, dict):
             raise DataError(path, "not a JSON object", remedy)
+        require_shallow(path, values)
         return cls(path, values, remedy=remedy)
 
     def __contains__(self, name: str) -> bool:
@@ -93,6 +109,27 @@ class JsonObject:
         if not isinstance(value, accepted) or isinstance(value, bool):
             raise self.error(name, f"is {_told(value)}, not of type {kind.__name__}")
         return kind(value)
+
+    def names(self, name: str) -> list[str]:
+        """Return the list of texts ``name``, which is empty by default."""
+        values = self.get(name, list, [])
+        for value in values:
+            if not isinstance(value, str):
+                raise self.error(name, f"holds {_told(value)}, not a name")
+        return values
+
+    def file(self, name: str) -> Path:
+        """Return the path of the file that ``name`` names, which lies in the folder of this file."""
+        return file_inside(self.path.parent, self.get(name, str), self.path)
+
+    def time(self, name: str) -> int | None:
+        """Return the seconds ``name`` in exact nanoseconds, or None if they are absent."""
+        if self.get(name, float, None) is None:
+            return None
+        seconds = Decimal(self._values[name])
+        if abs(seconds) * 1_000_000_000 > MAX_TIME:
+            raise self.error(name, f"is {seconds:g}, which is no time in seconds")
+        return int((seconds * 1_000_000_000).to_integral_value())
 
     def holds(self, name: str, kind: type) -> bool:
         """Tell whether there is a value of ``name`` that has this type."""
@@ -146,7 +183,7 @@ class JsonObject:
         """
         try:
             array = torch.tensor(_floats(value), dtype=torch.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self.error(name, f"is not a table of numbers: {_told(value)}") from None
         fits = len(array.shape) == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
         if not fits or not array.isfinite().all():
@@ -155,14 +192,57 @@ class JsonObject:
         return array
 
 
+def _decimal(text: str) -> Decimal:
+    """Keep every digit: float would drop nanoseconds of the Unix time.
+
+    Raises:
+        ValueError: float64 could not hold the number.
+    """
+    try:
+        value = Decimal(text)
+    except ArithmeticError:
+        value = None
+    if value is None or value.adjusted() > _MAX_POWER:
+        raise ValueError(f"the number {text[:40]} is too large")
+    return value
+
+
+def _integer(text: str) -> int:
+    if len(text.lstrip("-")) > _MAX_DIGITS:
+        raise ValueError(f"the number {text[:40]} is too large")
+    return int(text)
+
+
+def _no_number(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no number of JSON")
+
+
+def require_shallow(path: Path, values: Any) -> None:
+    """Raise a DataError for lists and objects in one another beyond the depth of 16, which no dataset has."""
+    level = [values]
+    for _ in range(_MAX_DEPTH):
+        level = [
+            item
+            for value in level
+            if isinstance(value, (dict, list))
+            for item in (value.values() if isinstance(value, dict) else value)
+        ]
+    if any(isinstance(value, (dict, list)) for value in level):
+        raise DataError(path, f"its lists and objects are nested more than {_MAX_DEPTH} deep", "correct it there")
+
+
 def _floats(value: Any) -> Any:
     return [_floats(item) for item in value] if isinstance(value, list) else float(value)
 
 
 def _told(value: Any) -> str:
     """Return the text of a value for a message, shortened."""
-    text = repr(value) if isinstance(value, str) else json.dumps(value, default=float, ensure_ascii=False)
+    text = repr(value) if isinstance(value, str) else json.dumps(value, default=_number_or_text, ensure_ascii=False)
     return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _number_or_text(value: Any) -> float | str:
+    return float(value) if isinstance(value, Decimal) else str(value)
 
 
 def read_camera(meta: JsonObject, width: str, height: str) -> EventCamera:

@@ -10,14 +10,28 @@ import yaml
 from torch import Tensor
 
 from aenerf_ns.camera.lens import EventCamera, LensModel
-from aenerf_ns.errors import DataError
-from aenerf_ns.files.json_object import JsonObject
+from aenerf_ns.errors import DataError, reading
+from aenerf_ns.files.boundary import read_text
+from aenerf_ns.files.json_object import JsonObject, require_shallow
 
 _LENS_MODELS: dict[str, LensModel] = {
     "radtan": "radial_tangential",
     "equidistant": "fisheye",
     "none": "radial_tangential",
 }
+
+
+# A camchain has 1 kB a camera. PyYAML reads 0.1 MB in a second.
+_MAX_BYTES = 1 << 17
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuse aliases. Kalibr writes none, and a few of them make a value of any size or one that holds itself."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it has aliases, which Kalibr does not write")
+        return super().compose_node(parent, index)
 
 
 def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
@@ -30,17 +44,22 @@ def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
     Raises:
         DataError: the file is missing or malformed, or a camera model is not supported.
     """
-    if not path.is_file():
-        raise DataError(path, "there is no such file", "give the camchain that Kalibr wrote")
+    with reading(path):
+        if not path.is_file():
+            raise DataError(path, "there is no such file", "give the camchain that Kalibr wrote")
+    text = read_text(path, _MAX_BYTES)
     try:
-        chain: Any = yaml.safe_load(path.read_text(encoding="utf-8", errors="replace"))
+        # A safe loader, which makes no objects but lists, dictionaries, texts and numbers.
+        chain: Any = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "copy it again") from None
-    if not isinstance(chain, dict) or not all(isinstance(block, dict) for block in chain.values()) or not chain:
+    is_chain = isinstance(chain, dict) and all(isinstance(value, dict) for value in chain.values())
+    if not chain or not is_chain or not all(isinstance(name, str) for name in chain):
         raise DataError(path, "not a list of cameras", "give the camchain that Kalibr wrote")
+    require_shallow(path, chain)
     cameras: dict[str, tuple[EventCamera, Tensor]] = {}
     from_first = torch.eye(4, dtype=torch.float64)
-    for name in sorted(map(str, chain)):
+    for name in sorted(chain):
         meta = JsonObject(path, chain[name], f"{name}.")
         step = meta.rigid_motion("T_cn_cnm1")
         if cameras and step is not None:
@@ -65,6 +84,6 @@ def _camera(meta: JsonObject) -> EventCamera:
         distortion.append(0.0)
     try:
         # Kalibr puts the origin at the centre of the first pixel, this project at its corner.
-        return EventCamera(int(width), int(height), fx, fy, cx + 0.5, cy + 0.5, lens, tuple(distortion))
+        return EventCamera(width, height, fx, fy, cx + 0.5, cy + 0.5, lens, tuple(distortion))
     except ValueError as error:
         raise meta.error("intrinsics:", str(error)) from None

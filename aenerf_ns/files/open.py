@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
 from aenerf_ns.files.aedat4 import Aedat4File
 from aenerf_ns.files.event_arrays import open_array_events
@@ -112,7 +112,7 @@ def _format(path: Path) -> str:
         raise DataError(path, "it is a folder without the metadata.yaml of a bag of ROS 2", "name the event file in it")
     require_event_file(path)
     suffix = path.suffix.lower()
-    with path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
         beginning = file.read(16)
     if not beginning:
         raise DataError(path, "the file is empty", "record or copy it again")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.prophesee_header import read_header
 from aenerf_ns.files.sensor_size import sensor_size
@@ -51,7 +51,7 @@ class PropheseeDatFile(EventFile):
         version = header.fields.get("version", "none")
         if version != "2":
             raise DataError(self.path, f"its version is {version}; version 2 is read", "convert it with Metavision")
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             file.seek(header.end)
             kind = file.read(2)
         if len(kind) < 2 or kind[0] not in _EVENT_TYPES or kind[1] != _RECORD.itemsize:
@@ -70,7 +70,7 @@ class PropheseeDatFile(EventFile):
     def read_chunks(self) -> Iterator[EventStream]:
         previous = None
         begin, count = self._records()
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             file.seek(begin)
             for _ in range(0, count, _CHUNK):
                 records = np.fromfile(file, _RECORD, _CHUNK)

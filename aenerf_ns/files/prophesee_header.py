@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import require_event_file
 
 # Far more bytes than any header has.
@@ -55,7 +55,7 @@ def read_header(path: Path) -> PropheseeHeader:
         DataError: the file is missing or has no such header.
     """
     require_event_file(path)
-    with path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
         text = file.read(_MAX_BYTES)
     fields: dict[str, str] = {}
     end = 0

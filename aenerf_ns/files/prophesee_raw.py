@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.prophesee_header import PropheseeHeader, read_header
 from aenerf_ns.files.sensor_size import sensor_size
@@ -57,7 +57,7 @@ class PropheseeRawFile(EventFile):
     def _blocks(self, begin: int, dtype: np.dtype) -> Iterator[NDArray]:
         if (self.path.stat().st_size - begin) % dtype.itemsize:
             raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             file.seek(begin)
             while len(block := np.fromfile(file, dtype, _BLOCK)):
                 yield block

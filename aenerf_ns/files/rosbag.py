@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.sensor_size import sensor_size
 
@@ -139,7 +139,7 @@ class RosbagEventFile(EventFile):
     def _is_ros2(self) -> bool:
         if self.path.is_dir():
             return True
-        with self.path.open("rb") as file:
+        with reading(self.path), self.path.open("rb") as file:
             return file.read(len(_ROS1_MAGIC)) != _ROS1_MAGIC
 
     def _damaged(self, error: Exception) -> DataError:

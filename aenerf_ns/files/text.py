@@ -9,17 +9,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
+from aenerf_ns.files.boundary import require_at_most
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 _UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
-# In nanoseconds: 285 years, just below the largest int64.
-MAX_TIME = 9 * 10**18
+# In nanoseconds: 126 years. The difference of two such times fits int64.
+MAX_TIME = 4 * 10**18
 
 # Longer than any line of a file of events.
 _TAIL_BYTES = 4096
+
+# Of a table of rows, which is read as a whole: poses at 1000 Hz for a quarter of an hour.
+_MAX_BYTES, _MAX_ROWS = 1 << 27, 1_000_000
 
 
 def read_rows(path: Path, columns: str) -> list[list[str]]:
@@ -30,13 +34,15 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
         columns: names of the columns, for the check and the message.
 
     Raises:
-        DataError: the file is missing, or a row has another number of fields.
+        DataError: the file is missing, cannot be read or has too many rows, or a row has another number of fields.
     """
-    if not path.is_file():
-        raise DataError(path, "there is no such file", "check the path of the dataset")
     expected = len(columns.split())
-    rows = []
-    with path.open(encoding="utf-8", errors="replace") as file:
+    rows: list[list[str]] = []
+    with reading(path):
+        if not path.is_file():
+            raise DataError(path, "there is no such file", "check the path of the dataset")
+        require_at_most(path, _MAX_BYTES)
+    with reading(path), path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, start=1):
             fields = line.split("#", 1)[0].split()
             if not fields:
@@ -45,13 +51,15 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
                 raise DataError(
                     path, f"line {number} has {len(fields)} fields", f"each line must hold the {expected}: {columns}"
                 )
+            if len(rows) == _MAX_ROWS:
+                raise DataError(path, f"it has more than {_MAX_ROWS:,} rows", "cut the recording, or leave rows out")
             rows.append(fields)
     return rows
 
 
 def last_row(path: Path) -> bytes:
     """Return the last line of a file that is neither empty nor a comment, b"" where the end of the file has none."""
-    with path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
         file.seek(0, 2)
         file.seek(max(file.tell() - _TAIL_BYTES, 0))
         return next((line for line in reversed(file.read().splitlines()) if is_row(line)), b"")

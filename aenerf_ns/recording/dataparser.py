@@ -14,9 +14,10 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.options import EventDataParserConfig
@@ -26,6 +27,8 @@ from aenerf_ns.recording.views import seconds_on_trajectory, thinned, viewer_cam
 
 # In extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
 _MAX_REFERENCE_DISTANCE = 1e4
+# Half the side and the corners of a scene box, in the units of the poses, whatever these are.
+_MIN_BOX, _MAX_BOX = 1e-6, 1e6
 
 
 class EventDataParser(DataParser):
@@ -67,12 +70,37 @@ class EventDataParser(DataParser):
 
     @cached_property
     def recording(self) -> Recording:
-        """The recording, read once."""
-        return self.read_recording()
+        """The recording, read once.
+
+        Raises:
+            DataError: a file is missing or its content cannot be used.
+        """
+        with reading(Path(self.config.data)):
+            recording = self.read_recording()
+        self._check_lens(recording.event_camera, "event camera")
+        if any(recording.reference_views.values()):
+            self._check_lens(recording.frame_camera, "camera of the images")
+        return recording
+
+    def _check_lens(self, camera: EventCamera, name: str) -> None:
+        """Raise a DataError for a lens whose distortion cannot be inverted at any pixel."""
+        if not camera.sees():
+            raise DataError(
+                str(self.config.data),
+                f"the {name} sees nothing: its distortion {list(camera.distortion)} can be inverted at no pixel",
+                "check the order and the model of its parameters",
+            )
 
     def _generate_dataparser_outputs(self, split: Split = "train", **kwargs: object) -> DataparserOutputs:
         recording = self.recording
         window = self._time_window(recording, say=split == "train")
+        refractory = recording.sensor.refractory_period
+        if refractory >= window.end - window.start:
+            raise DataError(
+                str(self.config.data),
+                f"the refractory period of {refractory} ns is longer than the recording",
+                "give it in nanoseconds",
+            )
         trajectory = recording.trajectory.mapped(lambda poses: poses @ OPENCV_TO_OPENGL)
         transform, scale, scene_box = self._world_transform(
             trajectory.between(window.start, window.end), recording.scene_box
@@ -89,6 +117,8 @@ class EventDataParser(DataParser):
             trajectory.knots_covered_by(ground_truth)
         if split == "train":
             times, images = viewer_cameras(trajectory, recording.reference_views["train"])
+            for file in images.values():
+                check_image(file, recording.frame_camera)
             cameras = recording.event_camera.cameras(trajectory.interpolate(times))
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
         else:
@@ -172,6 +202,12 @@ class EventDataParser(DataParser):
         poses = homogeneous(trajectory.camera_to_worlds)
         if box is not None:
             center, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
+            if not (half > _MIN_BOX).all() or not (box.abs() < _MAX_BOX).all():
+                raise DataError(
+                    str(self.config.data),
+                    f"the scene box has the corners {box.tolist()}",
+                    f"give a box that holds the scene, with sides of {_MIN_BOX:g} to {_MAX_BOX:g}",
+                )
             transform = torch.cat([torch.eye(3, dtype=torch.float64), -center[:, None]], -1)
             scale = self.config.scale_factor / float(half.max())
             return transform, scale, torch.stack([-half, half]) * scale

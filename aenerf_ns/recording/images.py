@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from PIL import Image
 
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.errors import DataError
+
+# PIL reads many more formats. Some run other programs, such as Ghostscript.
+_FORMATS = ("PNG", "JPEG")
 
 
 def check_image(file: Path, camera: EventCamera) -> None:
@@ -21,16 +26,25 @@ def check_image(file: Path, camera: EventCamera) -> None:
         )
     if mode not in ("L", "RGB", "RGBA"):
         raise DataError(file, f"the image is of PIL's mode {mode}", "store 8 bits of grey or RGB")
+    with _opened(file) as image:
+        image.load()
 
 
 def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:
     """Return width and height in pixels, and PIL's name of the pixels' format (such as "RGB").
 
     Raises:
-        DataError: the file is missing or is not an image.
+        DataError: the file is missing or is not a PNG or JPEG image.
     """
+    with _opened(file) as image:
+        return image.size, image.mode
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Image.Image]:
     try:
-        with Image.open(file) as image:
-            return image.size, image.mode
-    except OSError as error:
-        raise DataError(file, f"not an image that can be read ({error})", "copy it again") from None
+        with Image.open(file, formats=_FORMATS) as image:
+            yield image
+    # PIL's readers raise whatever they stumble over.
+    except Exception as error:
+        raise DataError(file, f"not a PNG or JPEG image that can be read ({error})", "copy it again") from None

@@ -11,8 +11,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.files.boundary import file_inside
 from aenerf_ns.files.text import TimeUnit, parse_times, read_rows
 from aenerf_ns.recording.recording import ReferenceView, Split
 
@@ -55,11 +56,13 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
         DataError: the list or an image is missing, or a line does not hold the two.
     """
     rows = read_rows(path, "t file")
-    for _, name in rows:
-        if not (path.parent / name).is_file():
-            raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
+    files = [file_inside(path.parent, name, path) for _, name in rows]
+    for file, (_, name) in zip(files, rows, strict=True):
+        with reading(file):
+            if not file.is_file():
+                raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
     times = parse_times(path, [row[0] for row in rows])
-    return [(int(time), path.parent / name) for time, (_, name) in zip(times, rows, strict=True)]
+    return list(zip(times.tolist(), files, strict=True))
 
 
 def read_image_times(folder: Path, path: Path, unit: TimeUnit) -> list[tuple[int, Path]]:

@@ -65,9 +65,9 @@ def test_pixels_beyond_the_lens_model_have_no_direction() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fx": 0.0}, "fx must be positive, not 0.0"),
-        ({"width": -1}, "width must be positive"),
-        ({"cx": float("nan")}, "must be finite"),
+        ({"fx": 0.0}, "fx must be from 0.01 to 1e[+]06 pixels, not 0"),
+        ({"width": -1}, "width must be a whole number from 1 to 16384, not -1"),
+        ({"cx": float("nan")}, "cx must be within"),
         ({"distortion": (0.1, 0.2)}, "takes 5 numbers, not 2"),
         ({"lens_model": "kb4"}, "lens_model must be one of"),
     ],

@@ -21,10 +21,13 @@ FAULTS = {
         lambda folder: np.save(folder / "poses_bounds.npy", np.zeros((12, 4))),
         r"poses_bounds.npy: it has type float64 and shape \(12, 4\)",
     ),
-    "empty bounds": (lambda folder: np.save(folder / "poses_bounds.npy", np.zeros((12, 17))), "must be positive"),
+    "empty bounds": (
+        lambda folder: np.save(folder / "poses_bounds.npy", np.zeros((12, 17))),
+        "width must be a whole number from 1",
+    ),
     "NaN bounds": (
         lambda folder: np.save(folder / "poses_bounds.npy", np.full((12, 17), np.nan)),
-        "poses_bounds.npy: cannot convert",
+        "poses_bounds.npy: width must be a whole number",
     ),
     "unsorted files": (lambda folder: (folder / "events/2.npy").rename(folder / "events/20.npy"), "sort the ev"),
     "text": (write_text("events/2.npy", "x y t p"), "2.npy: not a readable .npy file"),

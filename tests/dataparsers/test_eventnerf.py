@@ -71,7 +71,7 @@ FAULTS = {
         write_text("train/pose/r_00003.txt", "1 0 0 0  0 1 0 0  0 0 -1 0  0 0 0 1"),
         "train/pose: pose 3 is not a rigid motion",
     ),
-    "no focal length": (write_text("train/intrinsics/r_00000.txt", "0 " * 16), "fx must be positive"),
+    "no focal length": (write_text("train/intrinsics/r_00000.txt", "0 " * 16), "fx must be from 0.01"),
     "lost image": (remove("train/rgb/00003.png"), "train/rgb: it holds 20 images for 21 poses"),
     "lost test image": (remove("test/rgb/00001.png"), "test/rgb: it holds 1 images for 2 poses"),
     "one event time": (

@@ -83,7 +83,7 @@ def test_options_take_the_place_of_the_sensors_values(tmp_path: Path) -> None:
     assert parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE].sensor == SensorModel(
         0.7, 0.2, 0, "RGGB"
     )
-    with pytest.raises(DataError, match=r"positive_contrast_threshold must be a positive number, not 0\.0; .*options"):
+    with pytest.raises(DataError, match=r"positive_contrast_threshold must be from 0.0001 to 1000, not 0; .*options"):
         parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
 
 

@@ -30,7 +30,7 @@ def test_poses_of_paev3d_run_no_code(tmp_path: Path) -> None:
             return os.mkdir, (str(tmp_path / "harm"),)
 
     np.savez(file, object_poses=np.array([Harm()], dtype=object))
-    with pytest.raises(DataError, match=r"0003.npz: its object_poses cannot be read .it asks for posix.mkdir"):
+    with pytest.raises(DataError, match=r"0003.npz: its array object_poses cannot be read .it asks for posix.mkdir"):
         recording_of(PAEv3DDataParserConfig(data=truth.data))
     assert not (tmp_path / "harm").exists()
 
@@ -56,13 +56,13 @@ FAULTS = {
     ),
     "no pose": (
         lambda folder: np.savez(folder / "Render_info/Bunny/0002.npz", object_poses=[{"name": "Camera"}]),
-        "0002.npz: its camera's pose has type object",
+        "0002.npz: its camera's pose is not an array of 4 x 4 numbers",
     ),
     "no object_poses": (
         lambda folder: np.savez(folder / "Render_info/Bunny/0002.npz", depth=np.zeros(3)),
-        "0002.npz: its object_poses cannot be read",
+        "0002.npz: it has no array object_poses",
     ),
-    "text": (write_text("Render_info/Bunny/0002.npz", "pose"), "0002.npz: its object_poses cannot be read"),
+    "text": (write_text("Render_info/Bunny/0002.npz", "pose"), "0002.npz: not a readable .npz file"),
     "lost image": (remove("Render_info/Bunny/00003.png"), "it holds 20 images for 21 poses"),
     "columns": (
         lambda folder: (
