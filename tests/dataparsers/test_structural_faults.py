@@ -1,0 +1,347 @@
+"""Whole data sets in which one value, type, size or link is broken at a time: read, or refused in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from bounded_reading import little_memory, without_rights_of_root
+from dataset_faults import read_everything
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from malformed_inputs import FORMAT_WRITERS, camchain, npy_header
+from published_datasets import config_of
+from test_own_recording import CAMCHAIN
+
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
+
+# Seconds that the search takes, and that reading one data set may take: a large lens alone takes some.
+SHORT, LONG, MAX_SECONDS = 12.0, 900.0, 10.0
+
+WORDS = [
+    "",
+    ".",
+    "..",
+    "../x",
+    "/",
+    "/etc/passwd",
+    "\0",
+    "a" * 300,
+    "a" * 5000,
+    "é\n",
+    "nan",
+    "inf",
+    "-1",
+    "1e999",
+    "{}",
+    "%s",
+]
+NUMBERS = [
+    "0", "-0", "1", "-1", "0.5", "64.7", "1e-320", "-1e-30", "1e30", "1e300", "-1e300", "1e308", "1e400", "1e999999999",
+    "1e-999999999", "9" * 18, "9" * 19, "9" * 400, "9" * 5000, "-9223372036854775808", "65535", "65536",
+    "NaN", "Infinity",
+]  # fmt: skip
+VALUES = [
+    *NUMBERS, "null", "true", "[]", "{}", "[[]]", "[1, [2, [3]]]", '"x"', '[["x"]]', '{"a": 1}', "[" * 40 + "]" * 40,
+    *map(json.dumps, WORDS),
+]  # fmt: skip
+DTYPES = ["i1", "u1", "u2", "i4", "i8", "u8", "f2", "f4", "f8", "?", "S3", "c16", "U2", "m8[ns]"]
+EXTREMES = [0, 1, -1, 2, 255, 256, 65535, 2**31, 2**53, 2**62, 2**63 - 1, -(2**63), 1e-320, 1e30, 1e300, np.inf, np.nan]
+
+Draw = Callable[[st.SearchStrategy], Any]
+
+
+def places(tree: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield each list or object in a tree with each of its keys."""
+    keys = tree.keys() if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ()
+    for key in list(keys):
+        yield tree, key
+        yield from places(tree[key])
+
+
+def break_tree(draw: Draw, tree: Any) -> Any:
+    """Replace, drop or repeat one value in a tree. Numbers stay texts that :func:`written` writes without quotes."""
+    parent, key = draw(st.sampled_from(list(places(tree))))
+    way = draw(st.sampled_from(["replace"] * 6 + ["drop", "repeat", "swap"]))
+    if way == "replace":
+        parent[key] = f"RAW:{draw(st.sampled_from(VALUES))}"
+    elif way == "drop":
+        del parent[key]
+    elif way == "repeat" and isinstance(parent, list):
+        parent.insert(key, parent[key])
+    else:
+        parent[key] = {"a": parent[key]} if way == "swap" else [parent[key]]
+    return tree
+
+
+def written(tree: Any) -> str:
+    if isinstance(tree, dict):
+        return "{" + ", ".join(f"{json.dumps(key)}: {written(value)}" for key, value in tree.items()) + "}"
+    if isinstance(tree, list):
+        return "[" + ", ".join(map(written, tree)) + "]"
+    return tree[4:] if isinstance(tree, str) and tree.startswith("RAW:") else json.dumps(tree)
+
+
+def break_json(draw: Draw, path: Path) -> None:
+    tree = json.loads(path.read_text(), parse_float=lambda text: f"RAW:{text}")
+    path.write_text(written(break_tree(draw, tree)))
+
+
+def break_yaml(draw: Draw, path: Path) -> None:
+    # JSON is YAML, but for the exponents of numbers.
+    path.write_text(written(break_tree(draw, yaml.safe_load(path.read_text()))))
+
+
+def break_text(draw: Draw, path: Path) -> None:
+    """Break one field or line of a table."""
+    lines = path.read_text().splitlines()
+    line = draw(st.integers(0, len(lines) - 1))
+    fields = lines[line].split()
+    way = draw(st.sampled_from(["value"] * 6 + ["drop", "repeat", "swap", "join", "long"]))
+    if way == "value" and fields:
+        fields[draw(st.integers(0, len(fields) - 1))] = draw(st.sampled_from([*NUMBERS, *WORDS, "x", "0x1", "1_0"]))
+    elif way == "drop":
+        fields = fields[:-1]
+    elif way == "long":
+        fields *= 20_000
+    lines[line] = " ".join(fields)
+    if way in ("repeat", "swap"):
+        lines.insert(0 if way == "swap" else line, lines[line])
+    path.write_text((" " if way == "join" else "\n").join(lines) + "\n")
+
+
+def broken_array(draw: Draw, values: np.ndarray) -> np.ndarray:
+    """Change one value, the type, the length or the shape of an array."""
+    way = draw(st.sampled_from(["value"] * 3 + ["type", "shorter", "flat", "deeper", "scalar", "reversed", "records"]))
+    if way == "value" and values.size and values.dtype.kind in "iuf":
+        changed = values.copy()
+        index = draw(st.integers(0, values.size - 1))
+        kind = values.dtype
+        with np.errstate(all="ignore"):
+            value = np.float64(draw(st.sampled_from(EXTREMES)))
+            changed.ravel()[index] = value.astype(kind)
+        return changed
+    if way == "type":
+        with np.errstate(all="ignore"):
+            try:
+                return values.astype(draw(st.sampled_from(DTYPES)))
+            except (TypeError, ValueError):
+                return values
+    if way == "records":
+        return np.zeros(values.shape[:1], [("x", "u2"), ("t", "i8"), ("s", "S2")])
+    changes = {
+        "shorter": values[:-1] if values.ndim else values,
+        "flat": values.ravel(),
+        "deeper": values[..., None],
+        "scalar": values.ravel()[0] if values.size else values,
+        "reversed": values[::-1] if values.ndim else values,
+    }
+    return np.asarray(changes.get(way, values))
+
+
+HEADER_SHAPES = [
+    "(3,)",
+    "()",
+    "(10000000000000,)",
+    "(-1,)",
+    "(3",
+    "(3.5,)",
+    "(2, 4)",
+    f"({2**70},)",
+    "(True,)",
+    "3",
+    "None",
+]
+HEADER_TYPES = ["'<i8'", "'|O'", "'<f8'", "'<U1000000000'", "'<q99'", "[('a', '<i8', (9, 9))]", "'<f8", "0"]
+
+
+def broken_npy(draw: Draw, content: bytes) -> bytes:
+    """Break the array, the header or the bytes of an .npy file."""
+    way = draw(st.sampled_from(["array"] * 4 + ["header", "cut", "extend", "flip"]))
+    if way == "array" and b"|O" not in content[:128]:
+        stream = BytesIO()
+        np.save(stream, broken_array(draw, np.load(BytesIO(content))))
+        return stream.getvalue()
+    if way == "header":
+        shape, kind = draw(st.sampled_from(HEADER_SHAPES)), draw(st.sampled_from(HEADER_TYPES))
+        return npy_header(shape, kind, draw(st.sampled_from([", }", "", "}", ", 'x': 1}"]))) + content[128:]
+    place = draw(st.integers(0, max(len(content) - 1, 0)))
+    if way == "flip" and content:
+        return content[:place] + bytes([content[place] ^ 1 << draw(st.integers(0, 7))]) + content[place + 1 :]
+    return content[:place] if way == "cut" else content + bytes(place)
+
+
+def break_npy(draw: Draw, path: Path) -> None:
+    path.write_bytes(broken_npy(draw, path.read_bytes()))
+
+
+def break_npz(draw: Draw, path: Path) -> None:
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = draw(st.sampled_from(sorted(members)))
+    if draw(st.integers(0, 5)) == 0:
+        del members[name]
+    else:
+        members[name] = broken_npy(draw, members[name])
+    kind = draw(st.sampled_from([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]))
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        for member, content in members.items():
+            archive.writestr(member, content)
+
+
+def break_hdf5(draw: Draw, path: Path) -> None:
+    """Break one column, group, attribute or link of an HDF5 file."""
+    with h5py.File(path, "r+") as file:
+        names: list[str] = []
+        file.visit(names.append)
+        name = draw(st.sampled_from(names))
+        item = file[name]
+        way = draw(
+            st.sampled_from(["array"] * 4 + ["link", "attribute", "empty", "huge", "group", "type", "drop", "text"])
+        )
+        values = item[()] if isinstance(item, h5py.Dataset) else None
+        if way == "attribute":
+            key = draw(st.sampled_from(["time_unit", "time_offset"]))
+            value: Any = draw(
+                st.sampled_from([0, 0.5, 2**62, -(2**63), "us", b"\xff", [1, 2], ["ns"], h5py.Empty("i8"), "x"])
+            )
+            (item if isinstance(item, h5py.Group) else item.parent).attrs[key] = value
+            return
+        del file[name]
+        if way == "array" and values is not None:
+            array = broken_array(draw, np.asarray(values))
+            file[name] = array.astype("S") if array.dtype.kind == "U" else array if array.dtype.kind != "m" else 3
+        elif way == "link":
+            targets: list[Any] = [
+                h5py.SoftLink(f"/{name}"),
+                h5py.SoftLink("/none"),
+                h5py.SoftLink("/"),
+                h5py.SoftLink(".."),
+            ]
+            targets += [h5py.ExternalLink(str(path.parent / "none.h5"), "/"), h5py.ExternalLink(str(path), f"/{name}")]
+            file[name] = targets[draw(st.integers(0, len(targets) - 1))]
+        elif way == "huge":
+            shape = draw(st.sampled_from([(10**12,), (10**12, 4), (4, 10**9), (200, 10**6)]))
+            file.create_dataset(name, shape, draw(st.sampled_from(["i8", "u2", "f8"])), chunks=(1,) * len(shape))
+        elif way == "empty":
+            file[name] = h5py.Empty("i8")
+        elif way == "type":
+            file[name] = np.dtype("i8")
+        elif way == "group":
+            file.create_group(name)
+        elif way == "text":
+            file[name] = ["a", "b"]
+
+
+def break_any(draw: Draw, path: Path) -> None:
+    """Break a file as a whole: cut it, empty it, or put something else in its place."""
+    way = draw(st.sampled_from(["cut", "flip", "empty", "missing", "folder", "loop", "locked", "zeros"]))
+    content = path.read_bytes()
+    place = draw(st.integers(0, max(len(content) - 1, 0)))
+    if way == "locked":
+        path.chmod(0)
+        return
+    if way == "zeros":
+        os.truncate(path, 4 << 30)
+        return
+    path.unlink()
+    if way == "cut":
+        path.write_bytes(content[:place])
+    elif way == "flip":
+        path.write_bytes(
+            content[:place] + bytes([content[place] ^ 1 << draw(st.integers(0, 7))]) + content[place + 1 :]
+        )
+    elif way == "empty":
+        path.touch()
+    elif way == "folder":
+        path.mkdir()
+    elif way == "loop":
+        path.symlink_to(path.name)
+
+
+BREAKS = {
+    ".json": break_json, ".yaml": break_yaml, ".txt": break_text,
+    ".npy": break_npy, ".npz": break_npz, ".h5": break_hdf5,
+}  # fmt: skip
+WRITERS: dict[str, Callable[[Path], object]] = {
+    **FORMAT_WRITERS,
+    "camchain": lambda folder: (
+        FORMAT_WRITERS["event-recording-data"](folder),
+        camchain(yaml.dump({"cam0": {**CAMCHAIN["cam1"], "T_cn_cnm1": np.eye(4).tolist()}}))(folder),
+    ),
+}
+
+
+def search(folder: Path, seconds: float) -> int:
+    """Break data sets until the time is over, and return their number."""
+    folder.chmod(0o777)
+    for parent in folder.parents[:2]:
+        parent.chmod(0o755)
+    for name, write in WRITERS.items():
+        write(folder / name)
+        read_everything(config_of(FORMAT_OF.get(name, name), folder / name))
+    end, count = time.monotonic() + seconds, 0
+
+    @settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @given(st.data())
+    def check(data: st.DataObject) -> None:
+        nonlocal count
+        count += 1
+        name = data.draw(st.sampled_from(sorted(WRITERS)))
+        made = folder / "case"
+        shutil.rmtree(made, ignore_errors=True)
+        shutil.copytree(folder / name, made)
+        for path in (made, *made.rglob("*")):
+            path.chmod(0o777)
+        # Of many files of a kind, such as poses, each stands for all.
+        files = sorted(path for path in made.rglob("*") if path.is_file())
+        kinds = sorted({(path.parent.name, path.suffix) for path in files})
+        kind = data.draw(st.sampled_from(kinds))
+        path = data.draw(st.sampled_from([path for path in files if (path.parent.name, path.suffix) == kind]))
+        change = BREAKS.get(path.suffix, break_any) if data.draw(st.integers(0, 4)) else break_any
+        change(data.draw, path)
+        begin = time.perf_counter()
+        try:
+            with little_memory(), without_rights_of_root():
+                read_everything(config_of(FORMAT_OF.get(name, name), made))
+            message = ""
+        except DataError as error:
+            message = str(error)
+        assert "\n" not in message
+        assert len(message) < 800
+        assert time.perf_counter() - begin < MAX_SECONDS
+
+    while time.monotonic() < end:
+        check()
+    return count
+
+
+FORMAT_OF = {"camchain": "event-recording-data"}
+
+
+@pytest.fixture(autouse=True)
+def lenses_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compute the directions of each lens once: they take most of the time."""
+    monkeypatch.setattr(EventCamera, "pixel_directions", lru_cache(maxsize=16)(EventCamera.pixel_directions))
+
+
+def test_a_broken_dataset_is_read_or_refused(tmp_path: Path) -> None:
+    assert search(tmp_path, SHORT) > 20
+
+
+@pytest.mark.slow
+def test_broken_datasets_are_read_or_refused_for_long(tmp_path: Path) -> None:
+    assert search(tmp_path, float(os.environ.get("AENERF_FUZZ_SECONDS", LONG))) > 20
