@@ -31,6 +31,8 @@ _GAP_FACTOR = 5
 _MAX_GAP_SHARE = 0.01
 _MIN_IN_BOX_SHARE = 0.5
 
+# Contrast above that of the shuffled events by so many standard deviations and by this factor is not noise.
+_NOISE_DEVIATIONS, _NOISE_FACTOR = 4.0, 1.5
 # Fewer events give no contrast.
 _MIN_EVENTS = 2_000
 # The depth of a tile with less than this share of the mean contrast is not trusted.
@@ -72,7 +74,8 @@ class Report:
             progress.add_task("Warping events", total=None)
             self.warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
             still, alternatives = self.warped.without_motion(), self.warped.comparisons()
-        fits = self._report_contrast(self.warped, still, alternatives)
+            shuffled = self.warped.shuffled()
+        fits = self._report_contrast(self.warped, still, alternatives, shuffled)
         # Poses that do not fit give wrong depths.
         self._report_motion(statistics, self._report_depth(self.warped) if fits else None)
 
@@ -184,13 +187,21 @@ class Report:
                     "missing poses, or leave the gaps out (--max-pose-gap-ns of the dataparser)"
                 )
 
-    def _report_contrast(self, warped: WarpedEvents, still: Comparison, alternatives: list[Comparison]) -> bool:
-        """Compare the given poses with the alternatives, and return whether the poses fit the events."""
+    def _report_contrast(
+        self, warped: WarpedEvents, still: Comparison, alternatives: list[Comparison], shuffled: np.ndarray
+    ) -> bool:
+        """Compare the given poses with the alternatives and with shuffled events.
+
+        Returns:
+            Whether the poses fit the events.
+        """
         seconds = warped.seconds
+        mean, deviation = float(shuffled.mean()), float(shuffled.std())
         self._say(
             f"Contrast of events warped by the poses (slices: {len(seconds)} of {np.median(seconds):.3f} s): "
-            f"{still.given:.3f}; not warped: {still.contrast:.3f}"
+            f"{still.given:.3f}; not warped: {still.contrast:.3f}; shuffled: {mean:.3f} +/- {deviation:.3f}"
         )
+        noise = max(mean + _NOISE_DEVIATIONS * deviation, _NOISE_FACTOR * mean)
         for c in alternatives:
             if not c.hypothesis.clock_offset or c.is_clearly_better:
                 self._say(f"  {c.contrast:.3f} (given {c.given:.3f}) if {c.hypothesis.name}")
@@ -198,7 +209,7 @@ class Report:
         if clocks:
             least = min(abs(c.hypothesis.clock_offset) for c in clocks) * 1e-9
             self._say(f"  clearly less if the clock of the poses is off by {least:g} s")
-        better = [c for c in alternatives if c.is_clearly_better]
+        better = [c for c in alternatives if c.is_clearly_better and c.contrast > noise]
         if better:
             best = better[0]
             same = [c for c in better[1:] if best.is_like(c) and not c.hypothesis.clock_offset]
@@ -215,6 +226,13 @@ class Report:
             self.problems.append(
                 "the poses do not sharpen the events, nor does any usual mistake explain it: check the intrinsics and "
                 "the clock; or the camera moves too little to tell"
+            )
+            return False
+        if still.given <= noise:
+            self.problems.append(
+                f"the events are hardly sharper than the same events in a random order (contrast {still.given:.3f}, "
+                f"shuffled {mean:.3f} +/- {deviation:.3f}): they are noise, or the poses are of another recording: "
+                "check the polarities, the order of the columns and the poses"
             )
             return False
         return True

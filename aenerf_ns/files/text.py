@@ -97,7 +97,9 @@ def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[
             good = False
         if not good:
             name = _UNIT_NAMES[unit]
-            raise DataError(path, f"{field[:40]} is not a time in {name}", f"write plain decimal {name}")
+            raise DataError(
+                path, f"{field[:40]} is not a time in {name}", f"write plain decimal {name}, not another unit"
+            )
         times[index] = int(time.to_integral_value())
     return times
 

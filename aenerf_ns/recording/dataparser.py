@@ -27,6 +27,9 @@ from aenerf_ns.recording.views import seconds_on_trajectory, thinned, viewer_cam
 
 # In extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
 _MAX_REFERENCE_DISTANCE = 1e4
+# Units that times may have had that were read as seconds. In the right unit more than a few poses lie among the events.
+_UNITS = {"milliseconds": 1_000, "microseconds": 1_000_000, "nanoseconds": 1_000_000_000}
+_FEW_POSES = 5
 # Half the side and the corners of a scene box, in the units of the poses, whatever these are.
 _MIN_BOX, _MAX_BOX = 1e-6, 1e6
 
@@ -162,6 +165,7 @@ class EventDataParser(DataParser):
         start, end = config.start_time_ns, config.end_time_ns
         if start is None or end is None:
             first, last = recording.event_file.ordered_time_span()
+            _require_seconds(recording.trajectory, first, last)
             start, end = first if start is None else start, last if end is None else end
         if start >= end:
             raise DataError(
@@ -226,6 +230,26 @@ class EventDataParser(DataParser):
                 )
             scale /= extent
         return transform, scale, torch.tensor([[-1.0] * 3, [1.0] * 3])
+
+
+def _require_seconds(trajectory: Trajectory, first: int, last: int) -> None:
+    """Raise a DataError if the poses fit the span of the events only if their times have another unit.
+
+    Args:
+        trajectory: the estimated trajectory.
+        first, last: times of the first and the last event in nanoseconds.
+    """
+    times = trajectory.times
+    for unit, factor in _UNITS.items():
+        scaled = times // factor
+        fitting = int(((scaled >= first) & (scaled <= last)).sum())
+        if len(trajectory.knots_between(first, last)) < _FEW_POSES <= fitting and 2 * fitting > len(times):
+            raise DataError(
+                trajectory.source,
+                f"its poses last {trajectory.duration:g} s and the events {(last - first) * 1e-9:g} s, as if the times "
+                f"of the poses were in {unit}",
+                "write them in seconds",
+            )
 
 
 def _check_distance(poses: Tensor, reference: Trajectory) -> None:

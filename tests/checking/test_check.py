@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from small_datasets import write_native
+from small_datasets import START, write_native
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory
@@ -24,6 +26,7 @@ from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
+from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.recording.recording import Recording
 
@@ -172,6 +175,89 @@ def run(folder: Path, **options: Path) -> tuple[int, str]:
         except SystemExit as end:
             status = int(end.code or 0)
     return status, output.get()
+
+
+Order = Callable[[EventStream, np.random.Generator], EventStream]
+
+
+def shuffled(*columns: str) -> Order:
+    def change(events: EventStream, rng: np.random.Generator) -> EventStream:
+        order = rng.permutation(len(events))
+        return replace(events, **{name: getattr(events, name)[order] for name in columns})
+
+    return change
+
+
+# What is left of each column is that of the recording. To permute all but the times is to permute the times.
+SHUFFLES = {"polarities": shuffled("p"), "pixels": shuffled("x", "y"), "times": shuffled("x", "y", "p")}
+
+
+def random_events(events: EventStream, rng: np.random.Generator) -> EventStream:
+    x, y = (rng.integers(0, size, len(events)).astype(np.uint16) for size in (events.width, events.height))
+    return replace(events, x=x, y=y, p=rng.choice(np.array([-1, 1], np.int8), len(events)))
+
+
+def assert_noise_is_named(folder: Path, whole: Path, change: Order) -> None:
+    """Check a native data set whose events are in another order."""
+    recording = NativeDataParserConfig(data=whole).setup().read_recording()
+    rewrite(folder, change(all_events(recording), np.random.default_rng(0)))
+    status, output = run(folder)
+    assert status == 1, output
+    assert "hardly sharper than the same events in a random order" in output
+    assert "noise" in output
+
+
+@pytest.mark.parametrize("change", [*SHUFFLES.values(), random_events], ids=[*SHUFFLES, "random"])
+def test_noise_is_not_blessed(change: Order, room: Path, shorter: Path) -> None:
+    assert_noise_is_named(shorter, room, change)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"scene": "object"}, {"speed": "hard"}, {"scene": "shiny_object"}], ids=str)
+def test_noise_of_other_simulations_is_not_blessed(options: dict, tmp_path: Path) -> None:
+    size = {"width": 64, "height": 48, "max_displacement": 1.0}
+    whole = tmp_path / "whole"
+    Simulate(whole, train_images=2, validation_views=1, test_views=1, **size, **options).main()
+    status, output = run(whole)
+    assert status == 0, output
+    folder = shutil.copytree(whole, tmp_path / "changed")
+    for change in (*SHUFFLES.values(), random_events):
+        assert_noise_is_named(folder, whole, change)
+
+
+@pytest.mark.parametrize("order", SHUFFLES)
+def test_the_real_recording_is_told_from_its_noise(order: str, slider_depth: Path, tmp_path: Path) -> None:
+    events = all_events(EcdDataParserConfig(data=slider_depth).setup().read_recording())
+    folder = shutil.copytree(slider_depth, tmp_path / "made", copy_function=link)
+    (folder / "events.txt").unlink()
+    for change, expected in ((None, 0), (SHUFFLES[order], 1)):
+        kept = events if change is None else change(events, np.random.default_rng(0))
+        columns = np.stack([kept.t * 1e-9, kept.x, kept.y, kept.p > 0], 1)
+        np.savetxt(folder / "events.txt", columns, fmt="%.9f %d %d %d")
+        status, output = run(folder)
+        assert status == expected, output
+        assert ("hardly sharper" in output) == bool(expected)
+
+
+def link(source: str, target: str) -> None:
+    Path(target).symlink_to(source)
+
+
+@pytest.mark.parametrize("unit", ["milliseconds", "microseconds", "nanoseconds"])
+def test_poses_in_another_unit_are_named(unit: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = write_native(tmp_path / "made")
+    factor = {"milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}[unit]
+    events = all_events(NativeDataParserConfig(data=folder).setup().read_recording())
+    # Since the beginning of the recording; since 1970 no clock counts so far.
+    rewrite(folder, replace(events, t=events.t - START))
+    lines = (folder / "trajectory_estimated.txt").read_text().splitlines()
+    for name in ("trajectory_estimated.txt", "trajectory_ground_truth.txt"):
+        rows = [line.split() for line in lines[1:]]
+        times = [int(Decimal(row[0]) * 10**9 - START) * factor // 10 for row in rows]
+        text = "".join(f"{format_seconds(t)} {' '.join(row[1:])}\n" for t, row in zip(times, rows, strict=True))
+        (folder / name).write_text(text)
+    assert run(folder)[0] == 2
+    assert f"as if the times of the poses were in {unit}" in capsys.readouterr().err
 
 
 @pytest.fixture
