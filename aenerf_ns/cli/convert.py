@@ -114,26 +114,23 @@ class Convert:
                     f"a region of interest from pixel {self.region[0]} {self.region[1]} of a colour sensor",
                     "begin it at an even column and row, so that its first pixel is red",
                 )
-        try:
-            with NativeDatasetWriter(
-                lock,
-                camera,
-                recording.sensor,
-                recording.image_encoding,
-                scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
-                max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
-                frame_camera=recording.frame_camera,
-            ) as writer:
-                writer.add_trajectories(trajectory, recording.ground_truth)
-                if report is not None:
-                    writer.add_poses_report(report)
-                for split, kept in views.items():
-                    for view in kept:
-                        background = recording.image_background
-                        writer.add_image_file(split, view.file, view.camera_to_world, view.time, background)
-                num_read, num_written = _copy_events(recording.event_file, events, writer)
-        except OSError as error:
-            raise DataError(self.output, f"it cannot be written ({error})", "check the space and the rights") from None
+        with NativeDatasetWriter(
+            lock,
+            camera,
+            recording.sensor,
+            recording.image_encoding,
+            scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
+            max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
+            frame_camera=recording.frame_camera,
+        ) as writer:
+            writer.add_trajectories(trajectory, recording.ground_truth)
+            if report is not None:
+                writer.add_poses_report(report)
+            for split, kept in views.items():
+                for view in kept:
+                    background = recording.image_background
+                    writer.add_image_file(split, view.file, view.camera_to_world, view.time, background)
+            num_read, num_written = _copy_events(recording.event_file, events, writer)
         # Poses that the format does not scale by default are not scaled in the converted dataset either.
         keeps_scale = not parser.config.auto_scale_poses and recording.scene_box is None
         unscaled = "aenerf-data --auto-scale-poses False " if keeps_scale else ""

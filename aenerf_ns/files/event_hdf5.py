@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -32,6 +33,8 @@ _MAX_PIECE = 1 << 27
 _CHUNK = 1 << 22
 # Events collected before they are written: many small writes are slow.
 _WRITE_CHUNK = 1 << 18
+# More than HDF5 holds back: pieces of four columns that are not full, and its tables.
+_HELD_BYTES = 1 << 22
 
 
 class Hdf5EventFile(EventFile):
@@ -274,16 +277,45 @@ class Hdf5EventWriter:
 
     Args:
         path: the file to create.
+
+    Raises:
+        OSError: the file cannot be written, such as on a full disk.
     """
 
     def __init__(self, path: Path) -> None:
         import h5py
 
+        self._path = path
         self._file = h5py.File(path, "w")
+        self._reserved = 0
+        self._waiting: list[EventStream] = []
+        self._last_time: int | None = None
+        try:
+            self._reserve(0)
+            self._columns = self._create_columns()
+        except OSError:
+            self._file.close()
+            raise
+
+    def _reserve(self, num_bytes: int) -> None:
+        """Take room on the disk for what HDF5 is about to write, and for all that it holds until the file is closed.
+
+        HDF5 can neither go on nor close a file after a write that failed, and the process ends with a segmentation
+        fault. So a full disk is found here.
+
+        Raises:
+            OSError: there is no such room.
+        """
+        end = self._file.id.get_filesize() + num_bytes + _HELD_BYTES
+        if end > self._reserved:
+            os.posix_fallocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
+            self._reserved = end
+
+    def _create_columns(self) -> dict[str, h5py.Dataset]:
         group = self._file.create_group("events")
         group.attrs["time_unit"] = "ns"
         group.attrs["time_offset"] = 0
-        self._columns = {
+        return {
             name: group.create_dataset(
                 name,
                 shape=(0,),
@@ -298,15 +330,20 @@ class Hdf5EventWriter:
             )
             for name, dtype in _DTYPES.items()
         }
-        self._waiting: list[EventStream] = []
-        self._last_time: int | None = None
 
     def __enter__(self) -> Hdf5EventWriter:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._flush()
-        self._file.close()
+    def __exit__(self, error_type: type[BaseException] | None = None, *_: object) -> None:
+        try:
+            if error_type is None:
+                self._flush()
+        finally:
+            self._file.flush()
+            size = self._file.id.get_filesize()
+            self._file.close()
+            # Gives back what was reserved and not used.
+            os.truncate(self._path, size)
 
     def append(self, events: EventStream) -> None:
         """Append events.
@@ -328,6 +365,7 @@ class Hdf5EventWriter:
     def _flush(self) -> None:
         if not self._waiting:
             return
+        self._reserve(sum(map(len, self._waiting)) * sum(np.dtype(dtype).itemsize for dtype in _DTYPES.values()))
         for name, column in self._columns.items():
             values = np.concatenate([getattr(events, name) for events in self._waiting])
             column.resize(len(column) + len(values), axis=0)

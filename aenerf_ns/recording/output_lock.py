@@ -38,8 +38,12 @@ class OutputLock:
             self._require_free()
             output.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = self._locked()
-            os.ftruncate(self._descriptor, 0)
-            os.pwrite(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+            try:
+                os.ftruncate(self._descriptor, 0)
+                os.pwrite(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+            except OSError:
+                self.release()
+                raise
         except OSError as error:
             raise DataError(output, f"it cannot be created ({error})", "choose another --output") from None
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -30,8 +31,9 @@ from aenerf_ns.recording.recording import SPLITS, Split
 class NativeDatasetWriter:
     """Write a dataset folder, completely or not at all. Use it as a context manager.
 
-    The folder gets its name when the last file is complete. If anything fails, nothing is left behind. As long as the
-    writer lives, no other process can write the folder.
+    The folder gets its name when the last file is complete. If anything fails, nothing is left behind. An OSError
+    within the context, such as on a full disk, becomes a DataError. As long as the writer lives, no other process can
+    write the folder.
 
     Args:
         folder: the dataset folder to create, or the lock on it that the caller holds.
@@ -72,7 +74,7 @@ class NativeDatasetWriter:
         except OSError as error:
             shutil.rmtree(self._partial, ignore_errors=True)
             self._unlock()
-            raise DataError(folder, f"it cannot be created ({error})", "choose another --output") from None
+            raise DataError(folder, f"it cannot be created ({_reason(error)})", "choose another --output") from None
         self._files: dict[Path, dict[str, Any]] = {}
         self._meta: dict[str, Any] = {
             "w": frame_camera.width,
@@ -100,9 +102,11 @@ class NativeDatasetWriter:
     def __enter__(self) -> NativeDatasetWriter:
         return self
 
-    def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, error_type: type[BaseException] | None, error: BaseException | None, *_: object) -> None:
         try:
-            self.events.__exit__()
+            self.events.__exit__(error_type)
+            if isinstance(error, OSError):
+                raise error
             if error_type is None and not (self._partial / "trajectory_estimated.txt").exists():
                 raise ValueError("the dataset has no trajectory: call add_trajectories before leaving the block")
             if error_type is None:
@@ -111,6 +115,10 @@ class NativeDatasetWriter:
                 text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(self._meta, indent=2))
                 (self._partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
                 self._partial.rename(self._folder)
+        except OSError as problem:
+            raise DataError(
+                self._folder, f"it cannot be written ({_reason(problem)})", "check the space and the rights"
+            ) from None
         finally:
             shutil.rmtree(self._partial, ignore_errors=True)
             self._unlock()
@@ -216,9 +224,13 @@ class NativeDatasetWriter:
 
 
 def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
-    # OpenCV returns false on failure.
-    if not cv2.imwrite(str(path), values):
-        raise OSError(f"{path} cannot be written")
+    # OpenCV's own writing does not tell when the disk is full.
+    path.write_bytes(cv2.imencode(".png", values)[1].tobytes())
+
+
+def _reason(error: OSError) -> str:
+    # HDF5's text has several lines.
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def _lens(camera: EventCamera) -> dict[str, Any]:
