@@ -14,6 +14,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.event_table import CHECK_SIZE
 from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.text import parse_numbers, read_rows
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
@@ -23,12 +24,20 @@ from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
 from aenerf_ns.recording.views import read_image_list, views_on_trajectory
 
+# The camera that recorded the dataset.
+_DAVIS240C = 240, 180
+_GUESSED = "the size 240 x 180 was guessed, because there are no images: give ecd-data --width and --height"
+
 
 @dataclass
 class EcdDataParserConfig(PublishedDataParserConfig):
     """Event Camera Dataset (text files)."""
 
     _target: type = field(default_factory=lambda: EcdDataParser)
+    width: int | None = None
+    """Pixel columns of the sensor. By default those of the images, or 240 (DAVIS240C) where there are none."""
+    height: int | None = None
+    """Pixel rows of the sensor. By default those of the images, or 180 (DAVIS240C) where there are none."""
 
 
 class EcdDataParser(EventDataParser):
@@ -58,22 +67,19 @@ class EcdDataParser(EventDataParser):
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
         images = read_image_list(folder / "images.txt") if (folder / "images.txt").exists() else []
-        camera = _read_calibration(folder / "calib.txt", _image_size(images[0][1] if images else None))
+        stated = (self.config.width, self.config.height)
+        size = image_size_and_mode(images[0][1])[0] if images else _DAVIS240C
+        width, height = (own if given is None else given for given, own in zip(stated, size, strict=True))
+        camera = _read_calibration(folder / "calib.txt", (width, height))
+        remedy = _GUESSED if not images and None in stated else CHECK_SIZE
         capture = Capture(
-            event_file=TextEventFile(folder / "events.txt", camera.width, camera.height),
+            event_file=TextEventFile(folder / "events.txt", width, height, remedy),
             event_camera=camera,
             sensor=self.config.sensor(SensorModel(0.5, 0.5)),
             frame_camera=camera,
             image_encoding="linear",
         )
         return capture, images
-
-
-def _image_size(image: Path | None) -> tuple[int, int]:
-    """Return the size of the sensor: the size of its frames, or of the DAVIS240C, which recorded the dataset."""
-    if image is None:
-        return 240, 180
-    return image_size_and_mode(image)[0]
 
 
 def _read_calibration(path: Path, size: tuple[int, int]) -> EventCamera:

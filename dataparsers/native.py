@@ -27,6 +27,10 @@ class NativeDataParserConfig(SensorOptions, EventDataParserConfig):
     """aenerf-ns dataset folder."""
 
     _target: type = field(default_factory=lambda: NativeDataParser)
+    auto_scale_poses: bool | None = None
+    """Scale the estimated poses to fit in a box of +/- 1. By default as the dataset states: aenerf convert keeps the
+    default of the format that it reads, and other datasets are scaled. Where the poses are not scaled, choose a
+    scale_factor that brings the scene to a size of about 1 instead."""
     poses: Literal["estimated", "ground-truth"] = "estimated"
     """Which trajectory to train on. Training on the true one shows how much the errors of the estimated one cost."""
 
@@ -44,6 +48,8 @@ class NativeDataParser(EventDataParser):
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)
         meta = JsonObject.read(folder / "transforms.json")
+        if self.config.auto_scale_poses is None:
+            self.config.auto_scale_poses = meta.get("auto_scale_poses", bool, True)
         block = meta.block("event_camera")
         event_camera = read_camera(block, "width", "height")
         true_poses = folder / "trajectory_ground_truth.txt"

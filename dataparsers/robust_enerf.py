@@ -33,6 +33,9 @@ class RobustENeRFDataParserConfig(ObjectDataParserConfig):
     """Robust e-NeRF (raw_events.npz)."""
 
     _target: type = field(default_factory=lambda: RobustENeRFDataParser)
+    auto_scale_poses: bool | None = True
+    """Scale the estimated poses to fit in a box of +/- 1, where the scene has no box. The cameras of an object of 1.5
+    units are further out, where the contraction of unbounded space would begin."""
 
 
 class RobustENeRFDataParser(EventDataParser):

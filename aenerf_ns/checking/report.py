@@ -50,6 +50,8 @@ class Report:
 
     Attributes:
         problems: what is wrong with the recording and what to do about it, a line for each problem.
+        planes: options of training, by name: a near and a far plane in scene units for a camera that stays as far from
+            everything. Empty for a scene with a box, and where no depth is known.
         warped: the warped events, or None if too few events have a pose.
 
     Raises:
@@ -62,6 +64,7 @@ class Report:
         self._scale = scale
         self._say = say
         self.problems: list[str] = []
+        self.planes: dict[str, str] = {}
         self.warped: WarpedEvents | None = None
         statistics, num_covered = self._count()
         self._report_events(statistics)
@@ -261,10 +264,11 @@ class Report:
         )
         box, scale = self._recording.scene_box, self._scale
         if box is None:
-            self._say(
-                f"Suggested for a camera that stays that close: --pipeline.model.near-plane {0.7 * near * scale:.2g} "
-                f"--pipeline.model.far-plane {10 * far * scale:.2g} (scene units: {scale:.3g} times those of the poses)"
-            )
+            self.planes = {
+                "pipeline.model.near-plane": f"{0.7 * near * scale:.2g}",
+                "pipeline.model.far-plane": f"{10 * far * scale:.2g}",
+            }
+            self._say(f"Scene units: {scale:.3g} times those of the poses")
         else:
             inside = ((point >= box[0].numpy()) & (point <= box[1].numpy())).all(1)
             share = weight[inside].sum() / weight.sum()

@@ -12,7 +12,7 @@ from PIL import Image
 
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.report import Report
-from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
+from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset, training_command
 from aenerf_ns.cli.operands import Dataset
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.picture import polarity_picture
@@ -52,6 +52,9 @@ class Check:
         # Training and evaluation will ask for all three splits.
         outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
         report = Report(parser.recording, outputs[0].metadata[SCENE].window, outputs[0].dataparser_scale, _print)
+        command = training_command(self.data, self.format, report.planes)
+        remark = " (near and far plane for a camera that stays that close)" if report.planes else ""
+        _print(f"Train with{remark}: {command}")
         if self.picture is not None:
             if report.warped is None:
                 _print(f"{self.picture}: not written, because too few events have a pose")

@@ -11,7 +11,7 @@ import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
+from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset, training_command
 from aenerf_ns.cli.operands import Dataset
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
@@ -122,6 +122,8 @@ class Convert:
             scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
             max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
             frame_camera=recording.frame_camera,
+            # Near and far planes keep their units.
+            auto_scale_poses=bool(parser.config.auto_scale_poses) or recording.scene_box is not None,
         ) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is not None:
@@ -131,14 +133,11 @@ class Convert:
                     background = recording.image_background
                     writer.add_image_file(split, view.file, view.camera_to_world, view.time, background)
             num_read, num_written = _copy_events(recording.event_file, events, writer)
-        # Poses that the format does not scale by default are not scaled in the converted dataset either.
-        keeps_scale = not parser.config.auto_scale_poses and recording.scene_box is None
-        unscaled = "aenerf-data --auto-scale-poses False " if keeps_scale else ""
         counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
         CONSOLE.print(
             f"{self.output}: {num_written:,} of {num_read:,} events, {len(trajectory)} poses, images: {counts}.\n"
             f"Look it over with: aenerf check {self.output}\n"
-            f"Train with: ns-train aenerf {unscaled}--data {self.output}",
+            f"Train with: {training_command(self.output)}",
             highlight=False,
             soft_wrap=True,
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
@@ -49,6 +51,29 @@ else:
             prefix_names=False,
         )
     ]
+
+
+def training_command(
+    data: Path, dataset_format: DatasetFormat | None = None, options: Mapping[str, object] | None = None
+) -> str:
+    """Return the whole command that trains on a dataset.
+
+    Args:
+        data: the dataset.
+        dataset_format: its format with its options, where it is not recognised or its options are not the default.
+        options: options of the method, by name.
+    """
+    words = ["ns-train", "aenerf"]
+    for name, value in (options or {}).items():
+        words += [f"--{name}", str(value)]
+    if isinstance(dataset_format, EventDataParserConfig):
+        name, default = next(item for item in FORMATS.items() if isinstance(dataset_format, type(item[1])))
+        words.append(name)
+        for option in fields(default):
+            value = getattr(dataset_format, option.name)
+            if option.name != "data" and value != getattr(default, option.name):
+                words += [f"--{option.name.replace('_', '-')}", str(value)]
+    return shlex.join([*words, "--data", str(data)])
 
 
 def open_dataset(data: Path, dataset_format: DatasetFormat) -> EventDataParser:

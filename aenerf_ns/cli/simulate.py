@@ -14,6 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.cli.dataset_format import training_command
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
@@ -139,7 +140,7 @@ class Simulate:
         CONSOLE.print(
             f"{self.output}: {num_events:,} events in {truth.duration:.2f} s, {len(estimated)} poses, "
             f"{self.train_images} train, {self.validation_views} validation and {self.test_views} test images.\n"
-            f"Train with: ns-train aenerf --data {self.output}"
+            f"Train with: {training_command(self.output)}"
         )
 
     def _estimate(

@@ -19,6 +19,8 @@ from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
 _COLUMNS = ("x", "y", "t", "p")
 # Events read at once: 32 MB of a matrix of float64.
 _CHUNK = 1 << 20
+CHECK_SIZE = "check the sensor size and the order of the columns"
+"""What to do about a pixel outside the sensor."""
 # Number of events that tell the unit of the times.
 SAMPLE = 4096
 
@@ -172,6 +174,7 @@ def events_from_columns(
     fraction: NDArray[np.float64] | None = None,
     source: str | Path,
     place: Callable[[int], str] = "event {}".format,
+    size_remedy: str = CHECK_SIZE,
 ) -> EventStream:
     """Return the events of columns of any numeric type.
 
@@ -184,6 +187,7 @@ def events_from_columns(
         fraction: (N,) added to the times, in their unit, where the times are integers; between −1 and 1.
         source: names the origin of the columns, for messages.
         place: names the place of an event in the source, for messages.
+        size_remedy: what to do about a pixel outside the sensor.
 
     Raises:
         DataError: a value is not one that an event can have.
@@ -203,7 +207,7 @@ def events_from_columns(
         if values.dtype.kind == "f":
             good &= values == np.floor(values)
         if not good.all():
-            remedy = f"it must be a whole number below {size}: check the sensor size and the order of the columns"
+            remedy = f"it must be a whole number below {size}: {size_remedy}"
             raise error(name, ~good, remedy)
         pixels[name] = values.astype(np.uint16)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files.event_table import SAMPLE, events_from_columns
+from aenerf_ns.files.event_table import CHECK_SIZE, SAMPLE, events_from_columns
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit, is_row, last_row
 
 _COLUMNS = "xytp"
@@ -55,6 +55,7 @@ class _EventLines(EventFile):
     """A text file with one event a line. Formats implement :meth:`_names` and :meth:`_tick`."""
 
     with_commas = False
+    _size_remedy = CHECK_SIZE
 
     @abstractmethod
     def _names(self, file: BinaryIO) -> list[str]:
@@ -143,11 +144,23 @@ class _EventLines(EventFile):
             fraction=lines.fraction[2],
             source=self.path,
             place=lines.place,
+            size_remedy=self._size_remedy,
         )
 
 
 class TextEventFile(_EventLines):
-    """Read events.txt: lines of t in seconds, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017)."""
+    """Read events.txt: lines of t in seconds, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017).
+
+    Args:
+        path: the file.
+        width: number of pixel columns of the sensor.
+        height: number of pixel rows of the sensor.
+        size_remedy: what to do about a pixel outside the sensor.
+    """
+
+    def __init__(self, path: Path, width: int, height: int, size_remedy: str = CHECK_SIZE) -> None:
+        super().__init__(path, width, height)
+        self._size_remedy = size_remedy
 
     def _names(self, file: BinaryIO) -> list[str]:
         return ["t", "x", "y", "p"]

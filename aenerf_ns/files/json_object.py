@@ -106,7 +106,7 @@ class JsonObject:
             raise self.error(name, "is missing")
         value = self._values[name]
         accepted = (int, Decimal) if kind is float else kind
-        if not isinstance(value, accepted) or isinstance(value, bool):
+        if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
             raise self.error(name, f"is {_told(value)}, not of type {kind.__name__}")
         return kind(value)
 

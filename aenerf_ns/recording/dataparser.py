@@ -243,7 +243,9 @@ def _require_seconds(trajectory: Trajectory, first: int, last: int) -> None:
     for unit, factor in _UNITS.items():
         scaled = times // factor
         fitting = int(((scaled >= first) & (scaled <= last)).sum())
-        if len(trajectory.knots_between(first, last)) < _FEW_POSES <= fitting and 2 * fitting > len(times):
+        lasts_as_long = 10 * int(scaled[-1] - scaled[0]) > last - first
+        few = len(trajectory.knots_between(first, last)) < _FEW_POSES
+        if few and lasts_as_long and fitting >= max(_FEW_POSES, len(times) / 2):
             raise DataError(
                 trajectory.source,
                 f"its poses last {trajectory.duration:g} s and the events {(last - first) * 1e-9:g} s, as if the times "

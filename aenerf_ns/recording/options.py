@@ -22,7 +22,7 @@ class EventDataParserConfig(DataParserConfig):
 
     scale_factor: float = 1.0
     """Factor on the camera positions, after the automatic scale."""
-    auto_scale_poses: bool = True
+    auto_scale_poses: bool | None = True
     """Scale the estimated poses to fit in a box of +/- 1. Turn it off where the camera moves little compared to the
     distance of the scene, and choose a scale_factor that brings the scene to a size of about 1 instead."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
@@ -74,7 +74,7 @@ class SensorOptions:
 class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
     """The options that the formats of other projects have in common."""
 
-    auto_scale_poses: bool = False
+    auto_scale_poses: bool | None = False
     """Scale the estimated poses to fit in a box of +/- 1. Off by default: poses are in metres, and slow recordings move
     little compared to the distance of the scene. Choose a scale_factor instead."""
     trajectory: Path | None = None

@@ -44,6 +44,7 @@ class NativeDatasetWriter:
         max_pose_gap: nanoseconds. Between poses that are further apart, the camera's way is not known. None: it is
             known everywhere.
         frame_camera: the lens of the camera that took the images; by default the event camera's.
+        auto_scale_poses: whether training scales the poses by default.
 
     Raises:
         DataError: the folder exists, cannot be created, or is being written by another process.
@@ -61,6 +62,7 @@ class NativeDatasetWriter:
         scene_box: NDArray[np.float64] | None = None,
         max_pose_gap: int | None = None,
         frame_camera: EventCamera | None = None,
+        auto_scale_poses: bool = True,
     ) -> None:
         frame_camera = event_camera if frame_camera is None else frame_camera
         self._own_lock = OutputLock(folder) if isinstance(folder, Path) else None
@@ -94,6 +96,8 @@ class NativeDatasetWriter:
             "frames": [],
             **{f"{split}_filenames": [] for split in SPLITS},
         }
+        if not auto_scale_poses:
+            self._meta["auto_scale_poses"] = False
         if scene_box is not None:
             self._meta["scene_box"] = scene_box.tolist()
         if max_pose_gap is not None:

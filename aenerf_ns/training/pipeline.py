@@ -310,6 +310,8 @@ class AENeRFPipeline(VanillaPipeline):
         """How the cameras of the reference views are placed."""
         if self.model.camera_optimizer.has_ground_truth:
             return "Sim(3) of the corrected to the true trajectory"
+        if not self.model.camera_optimizer.is_learned:
+            return "as the dataset gives them"
         return "corrected pose at the time of the view, else Sim(3) of the corrected to the estimated trajectory"
 
     def get_average_eval_image_metrics(

@@ -10,11 +10,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from small_datasets import (
     ECD_FAULTS,
@@ -30,7 +32,9 @@ from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import convert as command
 from aenerf_ns.cli.convert import Convert
+from aenerf_ns.cli.dataset_format import Automatic, training_command
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
+from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
@@ -309,6 +313,29 @@ def test_the_command_converts_and_says_what_is_wrong_on_stderr(tmp_path: Path) -
     assert "Traceback" not in complaint
     assert complaint.strip().splitlines()[-1].startswith(f"Error: {data / 'broken'}: ")
     assert not (tmp_path / "bad").exists()
+
+
+def test_commands_print_one_command_to_train_with(tmp_path: Path) -> None:
+    metric, scaled = write_ecd(tmp_path / "metric"), write_native(tmp_path / "scaled")
+    for source, scale in ((metric, False), (scaled, True)):
+        folder = tmp_path / f"made {source.name}"
+        with CONSOLE.capture() as output:
+            Convert(source, folder).main()
+        assert f"Train with: ns-train aenerf --data '{folder}'" in output.get()
+        # The dataset states the scale, so that every command takes the same.
+        parser = NativeDataParserConfig(data=folder).setup()
+        parser.get_dataparser_outputs("train")
+        assert parser.config.auto_scale_poses is scale
+
+
+def test_the_command_to_train_with_has_the_options_that_were_given() -> None:
+    options = replace(FORMATS["ecd-data"], width=346, height=260)
+    planes = {"pipeline.model.near-plane": "0.3", "pipeline.model.far-plane": "20"}
+    assert training_command(Path("my data"), options, planes) == (
+        "ns-train aenerf --pipeline.model.near-plane 0.3 --pipeline.model.far-plane 20 ecd-data --width 346 "
+        "--height 260 --data 'my data'"
+    )
+    assert training_command(Path("data"), Automatic()) == "ns-train aenerf --data data"
 
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])

@@ -25,6 +25,19 @@ from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE
 
 
+def test_a_guessed_size_is_told_and_can_be_given(tmp_path: Path) -> None:
+    folder = write_ecd(tmp_path / "made")
+    (folder / "images.txt").unlink()
+    (folder / "events.txt").write_text("0.01 300 2 1\n0.02 300 2 0\n0.31 1 2 1\n")
+    config = EcdDataParserConfig(data=folder, width=346, height=260)
+    assert len(next(config.setup().recording.event_file.chunks())) == 3
+    for given in ({}, {"width": 346}):
+        recording = EcdDataParserConfig(data=folder, **given).setup().recording
+        assert (recording.event_camera.width, recording.event_camera.height) == (given.get("width", 240), 180)
+    with pytest.raises(DataError, match=r"line 1 has x = 300; .* guessed, .* give ecd-data --width and --height"):
+        list(EcdDataParserConfig(data=folder).setup().recording.event_file.chunks())
+
+
 def test_ecd_text_reads(tmp_path: Path) -> None:
     config = EcdDataParserConfig(data=write_ecd(tmp_path / "made"))
     dataset = EventDataset(parse(config))
