@@ -20,6 +20,7 @@ class DataError(ValueError):
     """
 
     def __init__(self, source: str | Path, problem: str, remedy: str) -> None:
+        self.source, self.problem, self.remedy = source, problem, remedy
         message = f"{_shortened(str(source))}: {_shortened(problem)}; {remedy}"
         # A value from a file may hold line breaks.
         super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in message))

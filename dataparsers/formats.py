@@ -71,7 +71,9 @@ class AutomaticDataParserConfig(DataParserConfig):
         config = deepcopy(FORMATS[name])
         config.data = self.data
         CONSOLE.print(f"{self.data} is in the format {name}.")
-        return config.setup(**kwargs)
+        parser = config.setup(**kwargs)
+        parser.guessed_format = name
+        return parser
 
 
 automatic_dataparser = DataParserSpecification(

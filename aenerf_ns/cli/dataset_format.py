@@ -82,6 +82,12 @@ def open_dataset(data: Path, dataset_format: DatasetFormat) -> EventDataParser:
     Raises:
         DataError: the format is not recognised.
     """
-    config = copy(FORMATS[recognise(data)] if isinstance(dataset_format, Automatic) else dataset_format)
+    guessed = None
+    if isinstance(dataset_format, Automatic):
+        guessed = recognise(data)
+        dataset_format = FORMATS[guessed]
+    config = copy(dataset_format)
     config.data = data
-    return config.setup()
+    parser = config.setup()
+    parser.guessed_format = guessed
+    return parser

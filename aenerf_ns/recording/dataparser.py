@@ -45,6 +45,8 @@ class EventDataParser(DataParser):
     config: EventDataParserConfig
     layout: ClassVar[str] = ""
     """The files that :meth:`recognises` looks for, as messages name them."""
+    guessed_format: str | None = None
+    """The name of this format, where it was recognised and not named: an error may mean that it is another."""
 
     @classmethod
     def recognises(cls, data: Path) -> bool:
@@ -78,8 +80,14 @@ class EventDataParser(DataParser):
         Raises:
             DataError: a file is missing or its content cannot be used.
         """
-        with reading(Path(self.config.data)):
-            recording = self.read_recording()
+        try:
+            with reading(Path(self.config.data)):
+                recording = self.read_recording()
+        except DataError as error:
+            if self.guessed_format is None:
+                raise
+            remark = f"the format {self.guessed_format} was guessed: where it is another, name it before --data"
+            raise DataError(error.source, error.problem, f"{error.remedy} ({remark})") from None
         self._check_lens(recording.event_camera, "event camera")
         if any(recording.reference_views.values()):
             self._check_lens(recording.frame_camera, "camera of the images")

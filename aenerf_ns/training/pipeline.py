@@ -76,6 +76,11 @@ class AENeRFPipeline(VanillaPipeline):
         test_mode: Literal["test", "val", "inference"] = "val",
         **kwargs: Any,
     ) -> None:
+        if device.startswith("cuda") and not torch.cuda.is_available():
+            raise SystemExit(
+                "Error: --machine.device-type cuda: no GPU can be used; train on the CPU with: ns-train aenerf-small "
+                "--machine.device-type cpu ..., or install a driver that fits the CUDA of PyTorch"
+            )
         if test_mode != "val":
             # Once the pipeline is made, ns-render asks for a program that pip cannot install.
             provide_ffmpeg()

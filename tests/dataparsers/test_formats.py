@@ -32,6 +32,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE
 from aenerf_ns.training.datamanager import EventDataManagerConfig
+from aenerf_ns.training.pipeline import AENeRFPipelineConfig
 
 
 @pytest.fixture(params=[*WRITERS, "tum-vie-data"])
@@ -153,6 +154,23 @@ def test_a_folder_of_no_known_format_says_what_was_looked_for(tmp_path: Path) ->
         recognise(tmp_path / "nowhere")
     with pytest.raises(SystemExit, match=r"^Error: .*no known format"):
         EventDataManagerConfig(dataparser=AutomaticDataParserConfig(data=tmp_path)).setup(device="cpu")
+
+
+def test_errors_say_that_the_format_was_guessed(tmp_path: Path) -> None:
+    # Another recording's folders, of the names that PAEv3D has.
+    (tmp_path / "H5_Files" / "mine").mkdir(parents=True)
+    guessed = AutomaticDataParserConfig(data=tmp_path).setup()
+    with pytest.raises(DataError, match=r"Intrinsics: .*the format paev3d-data was guessed: .* name it before --data"):
+        guessed.get_dataparser_outputs("train")
+    with pytest.raises(DataError) as error:
+        config_of("paev3d-data", tmp_path).setup().get_dataparser_outputs("train")
+    assert "guessed" not in str(error.value)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_gpu_is_one_line() -> None:
+    with pytest.raises(SystemExit, match=r"^Error: .*no GPU can be used; .*aenerf-small --machine.device-type cpu"):
+        AENeRFPipelineConfig().setup(device="cuda:0")
 
 
 def test_estimated_poses_may_take_the_place_of_the_datasets(written: tuple[str, Truth], tmp_path: Path) -> None:
