@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import os
 import resource
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 # What a refusal may take, above what the process has.
 MAX_BYTES, MAX_SECONDS = 1 << 30, 2.0
+
+
+@contextmanager
+def readable_folder() -> Iterator[Path]:
+    """Make a folder that others than root may read too, unlike pytest's."""
+    with TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        yield Path(name)
 
 
 @contextmanager
@@ -34,3 +43,10 @@ def without_rights_of_root() -> Iterator[None]:
         yield
     finally:
         os.seteuid(user)
+
+
+def read_whole(read: Callable[[], object]) -> None:
+    """Read a whole data set with the rights of root, because numba compiles meanwhile, and then without them."""
+    read()
+    with without_rights_of_root():
+        read()
