@@ -32,8 +32,8 @@ DATASET_REMEDY = "see the dataset format in the docs"
 _MAX_BYTES = 1 << 25
 # Matrices in an object in a list in an object have a depth of 5.
 _MAX_DEPTH = 16
-# Digits of a whole number: int64 has 19.
-_MAX_DIGITS = 18
+# The largest whole number: nanoseconds since 1970 have 19 digits.
+_MAX_INTEGER = 2**63 - 1
 # The largest power of ten of a decimal number: float64 holds 10^308.
 _MAX_POWER = 300
 
@@ -208,7 +208,8 @@ def _decimal(text: str) -> Decimal:
 
 
 def _integer(text: str) -> int:
-    if len(text.lstrip("-")) > _MAX_DIGITS:
+    # Python refuses to read numbers of thousands of digits with an error of its own.
+    if len(text) > 20 or abs(int(text)) > _MAX_INTEGER:
         raise ValueError(f"the number {text[:40]} is too large")
     return int(text)
 
