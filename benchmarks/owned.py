@@ -20,9 +20,13 @@ _SET_SIGNAL_OF_PARENTS_END = 1
 def owned(command: Sequence[str]) -> list[str]:
     """Return a command that runs a command and is killed when this process, or its thread that starts it, ends.
 
+    Only Linux tells a process that its parent ends. Elsewhere the command is returned as it is.
+
     Args:
         command: the path of a program, and its arguments.
     """
+    if sys.platform != "linux":
+        return list(command)
     return [sys.executable, "-I", str(Path(__file__).resolve()), str(os.getpid()), *command]
 
 

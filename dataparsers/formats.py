@@ -21,6 +21,7 @@ from aenerf_ns.dataparsers.paev3d import paev3d_dataparser
 from aenerf_ns.dataparsers.robust_enerf import robust_enerf_dataparser
 from aenerf_ns.dataparsers.tum_vie import tum_vie_dataparser
 from aenerf_ns.errors import DataError, reading
+from aenerf_ns.files.given_paths import require_dataset
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
 
@@ -49,8 +50,7 @@ def recognise(data: Path) -> str:
         for name, parser in parsers.items():
             if parser.recognises(data):
                 return name
-        if not data.exists():
-            raise DataError(data, "there is no such folder", "give the folder of a dataset as --data")
+    require_dataset(data)
     known = "; ".join(f"{name}: {parser.layout}" for name, parser in parsers.items())
     raise DataError(data, "no known format of recordings", f"looked for {known}")
 

@@ -6,11 +6,7 @@ import sys
 
 import tyro
 
-from aenerf_ns.cli.check import Check
-from aenerf_ns.cli.convert import Convert
-from aenerf_ns.cli.evaluate import Evaluate
-from aenerf_ns.cli.export_trajectory import ExportTrajectory
-from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.cli.first_look import judge_paths
 from aenerf_ns.errors import DataError
 
 
@@ -19,6 +15,18 @@ def main() -> None:
 
     Bad input ends the process with one line and exit status 1, bad arguments with exit status 2.
     """
+    try:
+        judge_paths(sys.argv[1:])
+    except DataError as error:
+        print(f"Error: {error}", file=sys.stderr)
+        sys.exit(2 if sys.argv[1] == "check" else 1)
+    # Not before, because these imports take a quarter of a minute.
+    from aenerf_ns.cli.check import Check
+    from aenerf_ns.cli.convert import Convert
+    from aenerf_ns.cli.evaluate import Evaluate
+    from aenerf_ns.cli.export_trajectory import ExportTrajectory
+    from aenerf_ns.cli.simulate import Simulate
+
     try:
         command = tyro.extras.subcommand_cli_from_dict(
             {

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import yaml
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.files.given_paths import require_run
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -47,8 +48,7 @@ def open_run(
     Raises:
         DataError: there is no such file, opening it could run foreign code, or the run is of another method.
     """
-    if not config.is_file():
-        raise DataError(config, "there is no such file", "give the config.yml of a trained run")
+    require_run(config)
     require_known_tags(config)
     # Imported lazily, because these imports take seconds.
     from nerfstudio.utils.eval_utils import eval_setup

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import socket
 from pathlib import Path
@@ -11,6 +10,12 @@ from pathlib import Path
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.files.given_paths import require_new
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP}
 
@@ -35,12 +40,12 @@ class OutputLock:
         self.output = output
         self._file = output.with_name(f".{output.name}.partial.lock")
         try:
-            self._require_free()
+            require_new(self.output)
             output.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = self._locked()
             try:
                 os.ftruncate(self._descriptor, 0)
-                os.pwrite(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+                os.write(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
             except OSError:
                 self.release()
                 raise
@@ -48,20 +53,18 @@ class OutputLock:
             raise DataError(output, f"it cannot be created ({error})", "choose another --output") from None
         try:
             # The owner before may have finished in the meantime.
-            self._require_free()
+            require_new(self.output)
         except DataError:
             self.release()
             raise
-
-    def _require_free(self) -> None:
-        if self.output.exists():
-            raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
 
     def _locked(self) -> int:
         """Return the descriptor of the file, which this process has locked."""
         while True:
             descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o666)
             try:
+                if fcntl is None:
+                    raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 owner = os.pread(descriptor, 200, 0).decode("utf8", "replace").strip()
@@ -87,6 +90,11 @@ class OutputLock:
 
     def release(self) -> None:
         """Let others write the output."""
+        if fcntl is None:
+            # Windows removes no file that is open.
+            os.close(self._descriptor)
+            self._file.unlink(missing_ok=True)
+            return
         self._file.unlink(missing_ok=True)
         os.close(self._descriptor)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +19,14 @@ from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.formats import FORMATS
 
 Command = Check | Convert | Evaluate | ExportTrajectory
+
+
+@pytest.fixture(autouse=True)
+def what_commands_work_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Paths that the command lines name, because commands look for them first."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("F", "G", "C", "ecd-data"):
+        (tmp_path / name).touch()
 
 
 def parsed(line: str, monkeypatch: pytest.MonkeyPatch) -> Command:
@@ -179,3 +188,26 @@ def test_the_help_names_both_ways(
 def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
     printed = run_command("aenerf", "check", tmp_path / "nothing", cwd=tmp_path, fails=True)
     assert printed.strip().splitlines()[-1].startswith(f"Error: {tmp_path / 'nothing'}: there is no such folder")
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "complaint"),
+    [
+        ("check nothing", 2, "nothing: there is no such folder"),
+        ("check --picture P --data=nothing ecd-data", 2, "nothing: there is no such folder"),
+        ("convert nothing --output O", 1, "nothing: there is no such folder"),
+        ("convert F --output G", 1, "G: the folder exists already"),
+        ("simulate --scene room --output G", 1, "G: the folder exists already"),
+        ("evaluate nothing.yml --output O", 1, "nothing.yml: there is no such file"),
+        ("export-trajectory --load_config nothing.yml --output O", 1, "nothing.yml: there is no such file"),
+    ],
+)
+def test_wrong_paths_are_named_before_slow_imports(line: str, status: int, complaint: str) -> None:
+    program = (
+        "import sys; sys.argv[1:] = sys.argv[1].split(); from aenerf_ns.cli.main import main\n"
+        "try: main()\nfinally: print('torch' in sys.modules, 'nerfstudio' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, line], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()) == (status, ["False", "False"])
+    assert done.stderr.startswith(f"Error: {complaint}")
+    assert done.stderr.count("\n") == 1
