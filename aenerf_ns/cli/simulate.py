@@ -52,9 +52,9 @@ class Simulate:
     video: Path | None = None
     """A video in place of a scene: a file, or a folder of images with the list images.txt of their times (on each line:
     t[s] file). Without --trajectory and without --poses colmap, only events and images are written."""
-    interpolation: Interpolation = "linear"
-    """What happens between the frames of the video. linear: log-radiance is linear in time at each pixel. flow: it
-    moves along optical flow."""
+    interpolation: Interpolation = "flow"
+    """What happens between the frames of the video. flow: log-radiance moves along optical flow. linear: it is linear
+    in time at each pixel, which is faster, and wrong where the picture moves by pixels from frame to frame."""
     trajectory: Path | None = None
     """Poses of the video's camera, as t tx ty tz qx qy qz qw in seconds on the clock of the video, camera-to-world,
     OpenCV camera axes. Needs the camera's intrinsics."""
@@ -299,7 +299,8 @@ class Simulate:
     ) -> str:
         """Write a dataset folder, and return a line about it."""
         reference = poses.estimated if poses.truth is None else poses.truth
-        taken = [time for time in video.times.tolist() if reference.start <= time <= reference.end]
+        # The first frame lies before all events.
+        taken = [time for time in video.times[1:].tolist() if reference.start <= time <= reference.end]
         chosen: dict[Split, list[int]] = {
             "train": evenly_spread(taken, self.train_images),
             "val": evenly_spread(taken[::2], self.validation_views),

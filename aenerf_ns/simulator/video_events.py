@@ -54,7 +54,7 @@ def video_events(
     video: Video,
     sensor: SensorModel,
     noise: SensorNoise = NOISELESS,
-    interpolation: Interpolation = "linear",
+    interpolation: Interpolation = "flow",
     max_displacement: float = 0.5,
     seed: int = 0,
 ) -> Iterator[VideoInterval]:

@@ -86,7 +86,7 @@ def test_the_command_makes_a_dataset_of_a_video_with_its_poses(
     output = tmp_path / "dataset"
     arguments = (
         f"aenerf simulate --output {output} --video {frames} --trajectory {poses} --intrinsics 20 21 11.5 7.5 "
-        "--interpolation flow --positive-contrast-threshold 0.3 --leak-rate 2 --seed 4"
+        "--interpolation linear --positive-contrast-threshold 0.3 --leak-rate 2 --seed 4"
     )
     monkeypatch.setattr(sys, "argv", arguments.split())
     with command.CONSOLE.capture() as printed:
@@ -100,7 +100,7 @@ def test_the_command_makes_a_dataset_of_a_video_with_its_poses(
     assert recording.ground_truth is None
     torch.testing.assert_close(recording.trajectory.camera_to_worlds, make_poses().camera_to_worlds)
     # The events are those of the sensor that the options describe.
-    intervals = video_events(open_video(frames), recording.sensor, command.SensorNoise(leak_rate=2.0), "flow", seed=4)
+    intervals = video_events(open_video(frames), recording.sensor, command.SensorNoise(leak_rate=2.0), "linear", seed=4)
     expected = np.concatenate([interval.events.t for interval in intervals])
     assert len(expected) > 500
     np.testing.assert_array_equal(times_of(recording), expected)
@@ -129,14 +129,14 @@ def test_noise_is_added_to_the_given_poses(frames: Path, poses: Path, camchain: 
 
 
 def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # COLMAP itself is tested elsewhere. This stand-in places all frames but the first two.
+    # COLMAP itself is tested elsewhere. This stand-in places all frames but the last two.
     def place(
         video: Video, times: NDArray[np.int64], camera: EventCamera | tuple[int, int], source: Path, seed: int
     ) -> EstimatedPoses:
         assert len(list(video)) == len(times) == 10
         if not isinstance(camera, EventCamera):
             camera = EventCamera(*camera, 22.0, 22.0, 12.0, 8.0, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))
-        placed = Trajectory(times[2:], torch.eye(4, dtype=torch.float64).repeat(8, 1, 1), source)
+        placed = Trajectory(times[:8], torch.eye(4, dtype=torch.float64).repeat(8, 1, 1), source)
         return EstimatedPoses(times, placed, camera, [8], 9, 0.5, 100.0, 1.0)
 
     monkeypatch.setattr(command, "estimate_poses", place)
@@ -145,8 +145,9 @@ def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: 
     assert "COLMAP estimates the lens: focal length 22.0 pixels, radial distortion 0.01" in printed
     recording = NativeDataParserConfig(data=tmp_path / "dataset").setup().recording
     assert (recording.event_camera.fx, recording.event_camera.distortion[0]) == (22.0, 0.01)
-    assert recording.trajectory.times.tolist() == [FRAME * index for index in range(2, 10)]
-    assert len(recording.reference_views["train"]) == 8
+    assert recording.trajectory.times.tolist() == [FRAME * index for index in range(8)]
+    # The last two frames have no pose, and the first one lies before all events.
+    assert [view.time for view in recording.reference_views["train"]] == [FRAME * index for index in range(1, 8)]
     report = json.loads((tmp_path / "dataset" / "poses_report.json").read_text())
     assert report["registered_frames"] == 8
     printed = simulate(tmp_path / "given", video=frames, poses="colmap", intrinsics=(20.0, 21.0, 11.5, 7.5))
@@ -198,7 +199,7 @@ LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
         ((), {"intrinsics": (0.0, 21.0, 11.5, 7.5)}, "--intrinsics: fx must be from"),
         ((), {"pose_noise_degrees": 1.0}, "without poses to add it to; give --trajectory"),
         ((), {"positive_contrast_threshold": 0.0}, "positive_contrast_threshold must be from"),
-        ((), {"interpolation": "flow", "max_displacement": 0.0}, "max_displacement must be positive"),
+        ((), {"max_displacement": 0.0}, "max_displacement must be positive"),
         ((), {"positive_contrast_threshold": 9.0, "negative_contrast_threshold": 9.0}, "no pixel changes by a"),
         ((), {"frame_rate": 0.0}, "a frame rate of 0.0; give a positive"),
     ],
@@ -228,4 +229,4 @@ def test_poses_of_another_clock_are_refused(frames: Path, tmp_path: Path) -> Non
 
 def test_options_for_videos_are_refused_for_scenes(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="--interpolation has no meaning for a scene; leave the option out"):
-        simulate(tmp_path / "out", interpolation="flow")
+        simulate(tmp_path / "out", interpolation="linear")

@@ -74,7 +74,9 @@ def test_events_come_when_the_closed_form_crosses_the_thresholds(rising: bool, t
         lines.append(f"0.{time:09d} {index}.png\n")
     (tmp_path / "images.txt").write_text("".join(lines))
     sensor = SensorModel(0.21, 0.17)
-    events = joined([interval.events for interval in video_events(open_video(tmp_path), sensor)])
+    events = joined(
+        [interval.events for interval in video_events(open_video(tmp_path), sensor, interpolation="linear")]
+    )
     # As stated in the docs: the step from grey level 0 to 2 is the smaller threshold.
     epsilon = 2 / 255 / 12.92 / (math.exp(0.17) - 1)
     log_radiance = np.log(LEVELS[levels] + epsilon)
