@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
@@ -113,6 +114,12 @@ class _VideoFile(Video):
         frame = next(self._read(), None)
         if frame is None:
             raise DataError(source, "no frame of it can be decoded", "convert it to another format")
+        stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if len(milliseconds) < stated:
+            # No error, because some containers only state a guess.
+            CONSOLE.print(
+                f"{source}: {len(milliseconds)} of the {stated} frames that it states can be decoded.", soft_wrap=True
+            )
         times = np.rint(np.array(milliseconds) * 1e6).astype(np.int64)
         super().__init__(source, (frame.shape[1], frame.shape[0]), times, frame_rate)
 

@@ -80,6 +80,16 @@ def test_frames_are_read_when_they_are_needed(tmp_path: Path) -> None:
         next(frames)
 
 
+def test_a_video_that_is_cut_off_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_video(tmp_path / "video.avi", make_frames(20))
+    open_video(path)
+    assert "can be decoded" not in capsys.readouterr().out
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    found = len(open_video(path).times)
+    assert 2 <= found < 20
+    assert f"video.avi: {found} of the 20 frames that it states can be decoded" in capsys.readouterr().out
+
+
 def folder_with(times: list[str], change: Callable[[Path], object] = lambda folder: None) -> Callable[[Path], Path]:
     def write(path: Path) -> Path:
         folder = write_folder(path / "frames", make_frames(len(times)), times)
