@@ -12,14 +12,11 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.files.json_object import JsonObject, read_camera, read_image_encoding
-from aenerf_ns.files.kalibr import read_camchain
+from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
@@ -107,7 +104,7 @@ class OwnRecordingDataParser(EventDataParser):
         folder, config = Path(self.config.data), self.config
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder of the recording as --data")
-        calibration = _read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
+        calibration = read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
         images = self._image_list(folder)
         timed = read_image_list(images) if config.images is not None or images.is_file() else []
         capture = Capture(
@@ -150,58 +147,6 @@ class OwnRecordingDataParser(EventDataParser):
         self.config.events = path
         config = self.config
         return open_event_file(path, camera.width, camera.height, config.event_topic, config.event_time_unit)
-
-
-@dataclass(frozen=True)
-class _Calibration:
-    """Both cameras and the sensor. ``frame_from_event`` takes points from the event camera's to the frame camera's
-    coordinates, OpenCV axes in both."""
-
-    event_camera: EventCamera
-    frame_camera: EventCamera
-    frame_from_event: Tensor
-    sensor: SensorModel
-    image_encoding: ImageEncoding
-
-
-def _read_calibration(path: Path, event_camera: str | None, frame_camera: str | None) -> _Calibration:
-    if path.suffix == ".json":
-        return _read_json(path)
-    cameras = read_camchain(path)
-    if event_camera is None and len(cameras) > 1:
-        raise DataError(path, f"its cameras are {', '.join(cameras)}", "name that of the events as --event-camera")
-    event_name = next(iter(cameras)) if event_camera is None else event_camera
-    frame_name = event_name if frame_camera is None else frame_camera
-    for name in (event_name, frame_name):
-        if name not in cameras:
-            raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
-    event, event_from_first = cameras[event_name]
-    frame, frame_from_first = cameras[frame_name]
-    return _Calibration(event, frame, frame_from_first @ torch.linalg.inv(event_from_first), SensorModel(), "linear")
-
-
-def _read_json(path: Path) -> _Calibration:
-    """Read calibration.json, which has the names of the native dataset's transforms.json."""
-    meta = JsonObject.read(path)
-    block = meta.block("event_camera")
-    event = read_camera(block, "width", "height")
-    frame_from_event = block.rigid_motion("T_frame_event")
-    if frame_from_event is None:
-        frame_from_event = torch.eye(4, dtype=torch.float64)
-    default = SensorModel()
-    try:
-        sensor = SensorModel(
-            block.get("positive_contrast_threshold", float, default.positive_contrast_threshold),
-            block.get("negative_contrast_threshold", float, default.negative_contrast_threshold),
-            block.get("refractory_period_ns", int, 0),
-            block.get("bayer_pattern", str, ""),
-        )
-    except DataError:
-        raise
-    except ValueError as error:
-        raise block.error("sensor:", str(error)) from None
-    frame = read_camera(meta, "w", "h") if "w" in meta else event
-    return _Calibration(event, frame, frame_from_event, sensor, read_image_encoding(meta))
 
 
 def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:

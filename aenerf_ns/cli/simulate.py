@@ -1,8 +1,9 @@
-"""``aenerf simulate``: make a dataset of a built-in scene or of a mesh."""
+"""``aenerf simulate``: make a dataset of a built-in scene, of a mesh or of a video."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,18 +19,29 @@ from aenerf_ns.cli.dataset_format import training_command
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.files.calibration import read_calibration
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import Split
-from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.recording.structure_from_motion import estimate_poses
+from aenerf_ns.recording.video import Video, open_video
+from aenerf_ns.recording.views import evenly_spread
+from aenerf_ns.recording.writer import NativeDatasetWriter, PoselessRecordingWriter
 from aenerf_ns.simulator.esim import SensorNoise
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.simulated_poses import poses_from_frames
 from aenerf_ns.simulator.simulation import Simulation
+from aenerf_ns.simulator.video_events import Interpolation, VideoInterval, video_events
+
+_FOR_SCENES = ("scene", "speed", "width", "height", "duration", "pose_rate", "exposure")
+_FOR_VIDEOS = ("interpolation", "trajectory", "intrinsics", "calibration", "event_camera")
+_FRAME_RATE = 25.0
 
 
 @dataclass
 class Simulate:
-    """Simulate an event camera that moves through a scene, and write a dataset for ns-train aenerf."""
+    """Simulate an event camera that moves through a scene, or that stands in for the camera of a video, and write a
+    dataset for ns-train aenerf."""
 
     output: Path
     """Dataset folder to create."""
@@ -37,6 +49,23 @@ class Simulate:
     """room: a furnished room seen from inside. object: a toy locomotive seen from around it. shiny_object: the
     same, varnished and polished. A .glb, .obj or .ply file: a mesh seen from around it. A .json file: a mesh, its light
     and the camera's path (docs/simulator.md)."""
+    video: Path | None = None
+    """A video in place of a scene: a file, or a folder of images with the list images.txt of their times (on each line:
+    t[s] file). Without --trajectory and without --poses colmap, only events and images are written."""
+    interpolation: Interpolation = "flow"
+    """What happens between the frames of the video. flow: log-radiance moves along optical flow. linear: it is linear
+    in time at each pixel, which is faster, and wrong where the picture moves by pixels from frame to frame."""
+    trajectory: Path | None = None
+    """Poses of the video's camera, as t tx ty tz qx qy qz qw in seconds on the clock of the video, camera-to-world,
+    OpenCV camera axes. Needs the camera's intrinsics."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """Intrinsics of the video's camera without distortion: fl_x fl_y cx cy in pixels. cx and cy count from the edge of
+    the image."""
+    calibration: Path | None = None
+    """The video's camera: calibration.json, or the camchain.yaml that Kalibr writes. Without this option and without
+    --intrinsics, --poses colmap estimates the lens."""
+    event_camera: str | None = None
+    """Name of the video's camera in a camchain of several cameras, such as cam1."""
     speed: Literal["easy", "hard"] = "easy"
     """easy: constant speed. hard: the same path at 8^sin(2 pi t) times that speed."""
     width: int = 346
@@ -48,10 +77,12 @@ class Simulate:
     pose_rate: float = 250.0
     """Poses a second in the trajectories; with --poses colmap, in the true trajectory."""
     poses: Literal["noise", "colmap"] = "noise"
-    """Source of the estimated poses. noise: the true poses with noise. colmap: COLMAP estimates a pose for each frame
-    of a camera at the event sensor's place, as in a DAVIS, and may lose or misplace frames."""
-    frame_rate: float = 25.0
-    """Frames a second for COLMAP."""
+    """Source of the estimated poses. noise: the true poses, or those of --trajectory, with noise. colmap: COLMAP
+    estimates a pose for each frame of a camera at the event sensor's place, as in a DAVIS, or for each frame of the
+    video, and may lose or misplace frames."""
+    frame_rate: float | None = None
+    """Frames a second for COLMAP, 25 by default. With --video: the rate at which the camera took the frames, in place
+    of the times that the video states, as for slow motion."""
     exposure: float = 0.003
     """Seconds for which a frame is exposed. Motion blurs the frame meanwhile."""
     pose_noise_degrees: float = 0.0
@@ -70,25 +101,44 @@ class Simulate:
     bayer_pattern: BayerPattern = ""
     """RGGB for a colour sensor."""
     max_displacement: float = 0.5
-    """Pixels that 99 % of the picture may move between two rendered frames."""
+    """Pixels that 99 % of the picture may move between two rendered frames, or between two frames along the flow."""
     train_images: int = 50
     """Reference images along the trajectory. They are not used for training."""
     validation_views: int = 20
-    """Reference views around the trajectory, for colour correction."""
+    """Reference views around the trajectory, or frames of the video, for colour correction."""
     test_views: int = 20
-    """Reference views from other places, for evaluation."""
+    """Reference views from other places, or other frames of the video, for evaluation."""
     seed: int = 0
     """Seed of everything random: the scene, the sensor, the pose noise and the test views."""
 
     def main(self) -> None:
-        """Render the scene along its path and write the dataset."""
-        with ended_by_exception(), OutputLock(self.output) as lock:
-            self._simulate(lock)
-
-    def _simulate(self, lock: OutputLock) -> None:
+        """Render the scene along its path, or read the video, and write the dataset."""
         counts = (self.train_images, self.validation_views, self.test_views)
         if min(counts) < 0:
             raise DataError("aenerf simulate", f"numbers of images {counts}", "they must not be negative")
+        self._refuse_options_without_effect()
+        with ended_by_exception(), OutputLock(self.output) as lock:
+            if self.video is None:
+                self._simulate_scene(lock)
+            else:
+                self._simulate_video(self.video, lock)
+
+    def _refuse_options_without_effect(self) -> None:
+        unused, subject = (_FOR_VIDEOS, "a scene") if self.video is None else (_FOR_SCENES, "a video")
+        for option in fields(self):
+            if option.name in unused and getattr(self, option.name) != option.default:
+                name = option.name.replace("_", "-")
+                raise DataError("aenerf simulate", f"--{name} has no meaning for {subject}", "leave the option out")
+
+    def _sensor(self) -> SensorModel:
+        return SensorModel(
+            self.positive_contrast_threshold,
+            self.negative_contrast_threshold,
+            self.refractory_period_ns,
+            self.bayer_pattern,
+        )
+
+    def _simulate_scene(self, lock: OutputLock) -> None:
         scene = open_scene(self.scene, self.seed)
         for note in scene.notes:
             CONSOLE.print(note, highlight=False, markup=False)
@@ -98,12 +148,7 @@ class Simulate:
         }
         try:
             camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
-            sensor = SensorModel(
-                self.positive_contrast_threshold,
-                self.negative_contrast_threshold,
-                self.refractory_period_ns,
-                self.bayer_pattern,
-            )
+            sensor = self._sensor()
             simulation = Simulation(
                 scene,
                 camera,
@@ -157,7 +202,163 @@ class Simulate:
                 "leave the pose noise out, because COLMAP makes errors of its own",
             )
         estimated, report, summary = poses_from_frames(
-            simulation, camera, truth, self.frame_rate, self.exposure, self.seed
+            simulation,
+            camera,
+            truth,
+            _FRAME_RATE if self.frame_rate is None else self.frame_rate,
+            self.exposure,
+            self.seed,
         )
         CONSOLE.print(summary)
         return estimated, report
+
+    def _simulate_video(self, source: Path, lock: OutputLock) -> None:
+        video = open_video(source, self.frame_rate)
+        camera = self._video_camera(video)
+        try:
+            sensor = self._sensor()
+            poses = self._video_poses(video, camera)
+            intervals = video_events(video, sensor, self.noise, self.interpolation, self.max_displacement, self.seed)
+            if poses is None:
+                written = self._write_events(lock, video, camera, sensor, intervals)
+            else:
+                written = self._write_dataset(lock, video, sensor, poses, intervals)
+        except DataError:
+            raise
+        except ValueError as error:
+            raise DataError("aenerf simulate", str(error), "see aenerf simulate --help") from error
+        longest = np.diff(video.times).max() * 1e-6
+        CONSOLE.print(
+            f"{written}\nEvents between two frames, up to {longest:.3g} ms apart, are interpolated. What moves faster "
+            "than the frames follow, what blur smears, and what is clipped to white or black in the video is lost.",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+    def _video_camera(self, video: Video) -> EventCamera | None:
+        """Return the lens of the video's camera, or None where no option states it."""
+        if self.calibration is not None and self.intrinsics is not None:
+            raise DataError("aenerf simulate", "--calibration and --intrinsics are both given", "leave out one of them")
+        if self.calibration is not None:
+            camera = read_calibration(self.calibration, self.event_camera).event_camera
+            if (camera.width, camera.height) != (video.width, video.height):
+                raise DataError(
+                    self.calibration,
+                    f"its camera has {camera.width} x {camera.height} pixels, the frames of {video.source} "
+                    f"{video.width} x {video.height}",
+                    "give the calibration of the frames as they are",
+                )
+            return camera
+        if self.intrinsics is not None:
+            try:
+                return EventCamera(video.width, video.height, *self.intrinsics)
+            except ValueError as error:
+                raise DataError("aenerf simulate", f"--intrinsics: {error}", "give fl_x fl_y cx cy in pixels") from None
+        return None
+
+    def _video_poses(self, video: Video, camera: EventCamera | None) -> _VideoPoses | None:
+        """Return where the video's camera was, or None where no option tells."""
+        noise = (self.pose_noise_degrees, self.pose_noise_translation)
+        if any(noise) and self.trajectory is None:
+            raise DataError("aenerf simulate", f"pose noise {noise} without poses to add it to", "give --trajectory")
+        if self.trajectory is not None:
+            if self.poses == "colmap":
+                raise DataError("aenerf simulate", "--trajectory with --poses colmap", "leave out one of them")
+            if camera is None:
+                raise DataError(
+                    "aenerf simulate",
+                    "--trajectory without the intrinsics of the camera",
+                    "give --calibration or --intrinsics, or let COLMAP estimate lens and poses with --poses colmap",
+                )
+            given = read_tum_trajectory(self.trajectory)
+            given.between(int(video.times[0]), int(video.times[-1]))
+            if not any(noise):
+                return _VideoPoses(camera, given)
+            return _VideoPoses(camera, perturb(given, *noise, self.pose_noise_correlation_time, self.seed), given)
+        if self.poses == "colmap":
+            lens = (video.width, video.height) if camera is None else camera
+            found = estimate_poses(video, video.times, lens, video.source, self.seed)
+            CONSOLE.print(found.summary(), highlight=False, soft_wrap=True)
+            if camera is None:
+                CONSOLE.print(
+                    f"COLMAP estimates the lens: focal length {found.camera.fx:.1f} pixels, radial distortion "
+                    f"{found.camera.distortion[0]:.3g}.",
+                    highlight=False,
+                    soft_wrap=True,
+                )
+            return _VideoPoses(found.camera, found.trajectory, report=found.report())
+        return None
+
+    def _write_dataset(
+        self,
+        lock: OutputLock,
+        video: Video,
+        sensor: SensorModel,
+        poses: _VideoPoses,
+        intervals: Iterable[VideoInterval],
+    ) -> str:
+        """Write a dataset folder, and return a line about it."""
+        reference = poses.estimated if poses.truth is None else poses.truth
+        # The first frame lies before all events.
+        taken = [time for time in video.times[1:].tolist() if reference.start <= time <= reference.end]
+        chosen: dict[Split, list[int]] = {
+            "train": evenly_spread(taken, self.train_images),
+            "val": evenly_spread(taken[::2], self.validation_views),
+            "test": evenly_spread(taken[1::2], self.test_views),
+        }
+        with NativeDatasetWriter(lock, poses.camera, sensor, "srgb") as writer:
+            writer.add_trajectories(poses.estimated, poses.truth)
+            if poses.report is not None:
+                writer.add_poses_report(poses.report)
+            num_events = 0
+            for frame, time, events in intervals:
+                writer.events.append(events)
+                num_events += len(events)
+                for split, times in chosen.items():
+                    if time in times:
+                        writer.add_image(split, frame, homogeneous(reference.interpolate(time)), time)
+            _require_events(num_events, video)
+        counts = ", ".join(f"{len(times)} {split}" for split, times in chosen.items())
+        return (
+            f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(poses.estimated)} poses, images: "
+            f"{counts}.\nTrain with: {training_command(self.output)}"
+        )
+
+    def _write_events(
+        self,
+        lock: OutputLock,
+        video: Video,
+        camera: EventCamera | None,
+        sensor: SensorModel,
+        intervals: Iterable[VideoInterval],
+    ) -> str:
+        """Write the events and images of a video without poses, and return a line about them."""
+        kept = evenly_spread(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
+        with PoselessRecordingWriter(lock, camera, sensor) as writer:
+            num_events = 0
+            for frame, time, events in intervals:
+                writer.events.append(events)
+                num_events += len(events)
+                if time in kept:
+                    writer.add_image(frame, time)
+            _require_events(num_events, video)
+        missing = "trajectory.txt" if camera is not None else "calibration.json and trajectory.txt"
+        return (
+            f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(kept)} images, no poses.\n"
+            f"To train on them, add {missing} (docs/datasets/own_recording.md)."
+        )
+
+
+@dataclass(frozen=True)
+class _VideoPoses:
+    """The lens and the poses of a video's camera, the true poses if others are estimated, and COLMAP's report."""
+
+    camera: EventCamera
+    estimated: Trajectory
+    truth: Trajectory | None = None
+    report: dict[str, Any] | None = None
+
+
+def _require_events(num_events: int, video: Video) -> None:
+    if num_events == 0:
+        raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")

@@ -1,4 +1,4 @@
-"""Checks of reference images, made before Nerfstudio reads them."""
+"""Checks of images: of those that are used as frames, and of reference images before Nerfstudio reads them."""
 
 from __future__ import annotations
 
@@ -24,10 +24,25 @@ def check_image(file: Path, camera: EventCamera) -> None:
             f"the image has {size[0]} x {size[1]} pixels, its camera {camera.width} x {camera.height}",
             "give the intrinsics of the images as they are",
         )
+    require_8_bits(mode, file)
+    read_image(file)
+
+
+def require_8_bits(mode: str, source: str | Path) -> None:
+    """Raise a DataError unless PIL's mode of an image is 8 bits of grey or RGB, with or without an alpha channel."""
     if mode not in ("L", "RGB", "RGBA"):
-        raise DataError(file, f"the image is of PIL's mode {mode}", "store 8 bits of grey or RGB")
+        raise DataError(source, f"the image is of PIL's mode {mode}", "store 8 bits of grey or RGB")
+
+
+def read_image(file: Path) -> Image.Image:
+    """Return an image with its pixels.
+
+    Raises:
+        DataError: the file is missing, incomplete, or not a PNG or JPEG image.
+    """
     with _opened(file) as image:
         image.load()
+        return image
 
 
 def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:

@@ -24,6 +24,7 @@ from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.progress import progress_bar
+from aenerf_ns.recording.images import read_image, require_8_bits
 
 # Each frame is matched with this number of frames after it, and with the frames 16, 32, ... 1024 after it.
 _NEIGHBOURS = 10
@@ -52,6 +53,7 @@ class EstimatedPoses:
         frame_times: (N,) times of all frames in nanoseconds.
         trajectory: poses of the frames that the largest model places, camera-to-world, OpenCV camera axes, in a world
             of arbitrary position, orientation and scale.
+        camera: the lens of the frames, as it was given or as COLMAP estimates it.
         model_sizes: numbers of frames that the models place, the largest first. More than one model means that the
             video fell apart into pieces whose relative poses are not known. COLMAP drops pieces of less than 10 frames.
         num_points: 3D points of the largest model.
@@ -62,6 +64,7 @@ class EstimatedPoses:
 
     frame_times: NDArray[np.int64]
     trajectory: Trajectory
+    camera: EventCamera
     model_sizes: list[int]
     num_points: int
     reprojection_error: float
@@ -113,21 +116,22 @@ class EstimatedPoses:
 def estimate_poses(
     frames: Iterable[Path | NDArray[np.uint8]],
     times: ArrayLike,
-    camera: EventCamera,
+    camera: EventCamera | tuple[int, int],
     source: str | Path,
     seed: int = 0,
 ) -> EstimatedPoses:
     """Run COLMAP's incremental structure from motion on a video, on the CPU.
 
-    Intrinsics and distortion stay as given. Every frame is matched with its neighbours, and a hundred frames with each
-    other. COLMAP runs on one thread, because its results depend on the order in which threads end. So a seed gives the
-    same poses again, to the last bit on one machine with one version of COLMAP.
+    Intrinsics and distortion that are given stay as given. Every frame is matched with its neighbours, and a hundred
+    frames with each other. COLMAP runs on one thread, because its results depend on the order in which threads end. So
+    a seed gives the same poses again, to the last bit on one machine with one version of COLMAP.
 
     Args:
         frames: (height, width) grey or (height, width, 3) RGB arrays, or files that hold such pictures, in the order of
             time.
         times: (N,) times in nanoseconds, increasing.
-        camera: the lens of the frames.
+        camera: the lens of the frames. Or width and height of the frames in pixels: COLMAP then estimates one focal
+            length and the radial distortion k1, and the principal point is the middle of the image.
         source: the file or folder of the frames, for messages.
         seed: of COLMAP's random samples.
 
@@ -144,10 +148,11 @@ def estimate_poses(
     begin = time.perf_counter()
     with TemporaryDirectory() as folder, progress_bar() as progress:
         workspace = _Workspace(Path(folder), len(times), seed, progress)
-        workspace.add_frames(frames, camera, source)
-        workspace.find_features(camera)
+        size = (camera.width, camera.height) if isinstance(camera, EventCamera) else camera
+        workspace.add_frames(frames, size, source)
+        workspace.find_features(camera if isinstance(camera, EventCamera) else None)
         workspace.match()
-        models = workspace.reconstruct()
+        models = workspace.reconstruct(refine_lens=not isinstance(camera, EventCamera))
         features, pairs = workspace.num_features(), workspace.num_matched_pairs()
     if not models:
         raise DataError(
@@ -162,10 +167,15 @@ def estimate_poses(
         for image in model.images.values()
         if image.has_pose
     }
+    if not isinstance(camera, EventCamera):
+        (lens,) = model.cameras.values()
+        focal_length, cx, cy, k1 = (float(value) for value in lens.params)
+        camera = EventCamera(*size, focal_length, focal_length, cx, cy, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
     indices = sorted(poses)
     return EstimatedPoses(
         frame_times=times,
         trajectory=Trajectory(times[indices], torch.from_numpy(np.stack([poses[i] for i in indices])), source),
+        camera=camera,
         model_sizes=[model.num_reg_images() for model in models],
         num_points=model.num_points3D(),
         reprojection_error=model.compute_mean_reprojection_error(),
@@ -233,29 +243,30 @@ class _Workspace:
         self._seed = seed
         self._progress = progress
 
-    def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], camera: EventCamera, source: str | Path) -> None:
+    def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
         """Write the frames as image files for COLMAP."""
         named = zip(self._names, frames, strict=True)
         for name, frame in self._progress.track(named, total=len(self._names), description="Collecting frames"):
             origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
-            with _read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
-                if image.size != (camera.width, camera.height):
+            with read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
+                if image.size != size:
                     raise DataError(
                         origin,
-                        f"the frame has {image.width} x {image.height} pixels, its camera {camera.width} x "
-                        f"{camera.height}",
+                        f"the frame has {image.width} x {image.height} pixels, its camera {size[0]} x {size[1]}",
                         "give the intrinsics of the frames as they are",
                     )
-                if image.mode not in ("L", "RGB", "RGBA"):
-                    raise DataError(origin, f"the frame is of PIL's mode {image.mode}", "store 8 bits of grey or RGB")
+                require_8_bits(image.mode, origin)
                 image.convert("L" if image.mode == "L" else "RGB").save(self._images / name)
 
-    def find_features(self, camera: EventCamera) -> None:
+    def find_features(self, camera: EventCamera | None) -> None:
         import pycolmap
 
         reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
-        reader.camera_model, parameters = colmap_camera(camera)
-        reader.camera_params = ", ".join(map(repr, parameters))
+        if camera is None:
+            reader.camera_model = "SIMPLE_RADIAL"
+        else:
+            reader.camera_model, parameters = colmap_camera(camera)
+            reader.camera_params = ", ".join(map(repr, parameters))
         extraction.use_gpu, extraction.num_threads = False, 1
         extraction.sift.peak_threshold = _PEAK_THRESHOLD
         with self._step("Finding features"):
@@ -281,15 +292,15 @@ class _Workspace:
         with self._step("Matching frames"):
             pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
 
-    def reconstruct(self) -> list[Any]:
+    def reconstruct(self, refine_lens: bool) -> list[Any]:
         """Return the models, in the order of the number of frames that they place, the largest first."""
         import pycolmap
 
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self._seed
         options.num_threads = options.mapper.num_threads = 1
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        options.ba_refine_focal_length = options.ba_refine_extra_params = refine_lens
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_lens
         options.mapper.abs_pose_min_num_inliers = _MIN_POSE_INLIERS
         options.mapper.init_min_num_inliers = _MIN_INITIAL_INLIERS
         options.extract_colors = False
@@ -328,15 +339,6 @@ class _Workspace:
         finally:
             pycolmap.logging.minloglevel = level
             self._progress.update(task, total=len(self._names), completed=len(self._names))
-
-
-def _read_image(file: Path) -> Image.Image:
-    try:
-        with Image.open(file) as image:
-            image.load()
-            return image
-    except OSError as error:
-        raise DataError(file, f"not an image that can be read ({error})", "copy it again, or leave it out") from None
 
 
 def _pairs(num_frames: int) -> list[tuple[int, int]]:

@@ -143,7 +143,7 @@ def thinned(views: list[ReferenceView], max_views: int | None) -> list[Reference
     timed = [view for view in views if view.time is not None]
     if max_views is None or len(timed) <= max_views:
         return views
-    return [*_evenly_spread(timed, max_views), *(view for view in views if view.time is None)]
+    return [*evenly_spread(timed, max_views), *(view for view in views if view.time is None)]
 
 
 def viewer_cameras(trajectory: Trajectory, views: list[ReferenceView]) -> tuple[Tensor, dict[int, Path]]:
@@ -153,8 +153,8 @@ def viewer_cameras(trajectory: Trajectory, views: list[ReferenceView]) -> tuple[
         (N,) int64 times in nanoseconds, and the images among them by index.
     """
     taken = {v.time: v.file for v in views if v.time is not None and trajectory.start <= v.time <= trajectory.end}
-    shown = _evenly_spread(sorted(taken), _MAX_SHOWN)
-    times = sorted({*_evenly_spread(trajectory.times.tolist(), _MAX_SHOWN), *shown})
+    shown = evenly_spread(sorted(taken), _MAX_SHOWN)
+    times = sorted({*evenly_spread(trajectory.times.tolist(), _MAX_SHOWN), *shown})
     return torch.tensor(times), {times.index(time): taken[time] for time in shown}
 
 
@@ -166,7 +166,7 @@ def seconds_on_trajectory(views: list[ReferenceView], trajectory: Trajectory) ->
     return seconds
 
 
-def _evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
+def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
     """Return at most so many of the items, evenly spread from the first to the last."""
     count = min(len(items), most)
     return [items[round(i * (len(items) - 1) / max(count - 1, 1))] for i in range(count)]

@@ -1,4 +1,4 @@
-"""Writing the native dataset format (docs/dataset_format.md)."""
+"""Writing the native dataset format (docs/dataset_format.md), or a recording whose poses are not known."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import json
 import os
 import re
 import shutil
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -27,8 +28,69 @@ from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import SPLITS, Split
 
+_Writer = TypeVar("_Writer", bound="_FolderWriter")
 
-class NativeDatasetWriter:
+
+class _FolderWriter(ABC):
+    """Write a folder with events, completely or not at all. Use it as a context manager.
+
+    The folder gets its name when the last file is complete. If anything fails, nothing is left behind. An OSError
+    within the context, such as on a full disk, becomes a DataError. As long as the writer lives, no other process can
+    write the folder.
+
+    Args:
+        folder: the folder to create, or the lock on it that the caller holds.
+
+    Raises:
+        DataError: the folder exists, cannot be created, or is being written by another process.
+
+    Attributes:
+        events: its method ``append`` takes the events, piece by piece in the order of time.
+    """
+
+    def __init__(self, folder: Path | OutputLock) -> None:
+        self._own_lock = OutputLock(folder) if isinstance(folder, Path) else None
+        self._folder = folder = folder if isinstance(folder, Path) else folder.output
+        self._partial = folder.with_name(f".{folder.name}.partial")
+        # Of a process that was killed, because the lock is held.
+        shutil.rmtree(self._partial, ignore_errors=True)
+        try:
+            self._partial.mkdir()
+            self.events = Hdf5EventWriter(self._partial / "events.h5")
+        except OSError as error:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            self._unlock()
+            raise DataError(folder, f"it cannot be created ({_reason(error)})", "choose another --output") from None
+
+    def __enter__(self: _Writer) -> _Writer:
+        return self
+
+    def __exit__(self, error_type: type[BaseException] | None, error: BaseException | None, *_: object) -> None:
+        try:
+            self.events.__exit__(error_type)
+            if isinstance(error, OSError):
+                raise error
+            if error_type is None:
+                self._finish()
+                self._partial.rename(self._folder)
+        except OSError as problem:
+            raise DataError(
+                self._folder, f"it cannot be written ({_reason(problem)})", "check the space and the rights"
+            ) from None
+        finally:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            self._unlock()
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """Write what is known when all events and images are written."""
+
+    def _unlock(self) -> None:
+        if self._own_lock is not None:
+            self._own_lock.release()
+
+
+class NativeDatasetWriter(_FolderWriter):
     """Write a dataset folder, completely or not at all. Use it as a context manager.
 
     The folder gets its name when the last file is complete. If anything fails, nothing is left behind. An OSError
@@ -64,35 +126,15 @@ class NativeDatasetWriter:
         frame_camera: EventCamera | None = None,
         auto_scale_poses: bool = True,
     ) -> None:
+        super().__init__(folder)
         frame_camera = event_camera if frame_camera is None else frame_camera
-        self._own_lock = OutputLock(folder) if isinstance(folder, Path) else None
-        self._folder = folder = folder if isinstance(folder, Path) else folder.output
-        self._partial = folder.with_name(f".{folder.name}.partial")
-        # Of a process that was killed, because the lock is held.
-        shutil.rmtree(self._partial, ignore_errors=True)
-        try:
-            self._partial.mkdir()
-            self.events = Hdf5EventWriter(self._partial / "events.h5")
-        except OSError as error:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            self._unlock()
-            raise DataError(folder, f"it cannot be created ({_reason(error)})", "choose another --output") from None
         self._files: dict[Path, dict[str, Any]] = {}
         self._meta: dict[str, Any] = {
             "w": frame_camera.width,
             "h": frame_camera.height,
             **_lens(frame_camera),
             "image_encoding": image_encoding,
-            "event_camera": {
-                "file": "events.h5",
-                "width": event_camera.width,
-                "height": event_camera.height,
-                **_lens(event_camera),
-                "positive_contrast_threshold": sensor.positive_contrast_threshold,
-                "negative_contrast_threshold": sensor.negative_contrast_threshold,
-                "refractory_period_ns": sensor.refractory_period,
-                "bayer_pattern": sensor.bayer_pattern,
-            },
+            "event_camera": {"file": "events.h5", **_event_camera(event_camera, sensor)},
             "frames": [],
             **{f"{split}_filenames": [] for split in SPLITS},
         }
@@ -103,33 +145,13 @@ class NativeDatasetWriter:
         if max_pose_gap is not None:
             self._meta["max_pose_gap_ns"] = max_pose_gap
 
-    def __enter__(self) -> NativeDatasetWriter:
-        return self
-
-    def __exit__(self, error_type: type[BaseException] | None, error: BaseException | None, *_: object) -> None:
-        try:
-            self.events.__exit__(error_type)
-            if isinstance(error, OSError):
-                raise error
-            if error_type is None and not (self._partial / "trajectory_estimated.txt").exists():
-                raise ValueError("the dataset has no trajectory: call add_trajectories before leaving the block")
-            if error_type is None:
-                # A JSON number may have any number of digits, but Python's json cannot write an exact decimal: times
-                # are stored as strings, and their quotes are removed here.
-                text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(self._meta, indent=2))
-                (self._partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
-                self._partial.rename(self._folder)
-        except OSError as problem:
-            raise DataError(
-                self._folder, f"it cannot be written ({_reason(problem)})", "check the space and the rights"
-            ) from None
-        finally:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            self._unlock()
-
-    def _unlock(self) -> None:
-        if self._own_lock is not None:
-            self._own_lock.release()
+    def _finish(self) -> None:
+        if not (self._partial / "trajectory_estimated.txt").exists():
+            raise ValueError("the dataset has no trajectory: call add_trajectories before leaving the block")
+        # A JSON number may have any number of digits, but Python's json cannot write an exact decimal: times are stored
+        # as strings, and their quotes are removed here.
+        text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(self._meta, indent=2))
+        (self._partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
 
     def add_trajectories(self, estimated: Trajectory, ground_truth: Trajectory | None = None) -> None:
         """Write the estimated and, if it is known, the true trajectory (OpenCV camera axes)."""
@@ -227,6 +249,46 @@ class NativeDatasetWriter:
         return frame
 
 
+class PoselessRecordingWriter(_FolderWriter):
+    """Write a folder of events and images whose poses are not known, completely or not at all.
+
+    Use it as a context manager. With a trajectory.txt beside them, the files are a recording of the format
+    ``event-recording-data`` (docs/datasets/own_recording.md).
+
+    Args:
+        folder: the folder to create, or the lock on it that the caller holds.
+        camera: the lens of the sensor that took events and images, or None where it is not known. The folder then has
+            no calibration.json.
+        sensor: its contrast thresholds, refractory period and Bayer pattern.
+
+    Raises:
+        DataError: the folder exists, cannot be created, or is being written by another process.
+
+    Attributes:
+        events: its method ``append`` takes the events, piece by piece in the order of time.
+    """
+
+    def __init__(self, folder: Path | OutputLock, camera: EventCamera | None, sensor: SensorModel) -> None:
+        super().__init__(folder)
+        self._camera, self._sensor = camera, sensor
+        self._images: list[str] = []
+
+    def _finish(self) -> None:
+        lines = ["# t[s] file", *self._images]
+        (self._partial / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        if self._camera is not None:
+            calibration = {"image_encoding": "srgb", "event_camera": _event_camera(self._camera, self._sensor)}
+            text = json.dumps(calibration, indent=2)
+            (self._partial / "calibration.json").write_text(text + "\n", encoding="utf-8")
+
+    def add_image(self, image: NDArray[np.uint8], time: int) -> None:
+        """Add an sRGB image (height, width, 3) that was taken at a time in nanoseconds, later than the one before."""
+        name = f"images/{len(self._images):05d}.png"
+        (self._partial / "images").mkdir(exist_ok=True)
+        Image.fromarray(image).save(self._partial / name)
+        self._images.append(f"{format_seconds(time)} {name}")
+
+
 def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
     # OpenCV's own writing does not tell when the disk is full.
     path.write_bytes(cv2.imencode(".png", values)[1].tobytes())
@@ -235,6 +297,18 @@ def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
 def _reason(error: OSError) -> str:
     # HDF5's text has several lines.
     return os.strerror(error.errno) if error.errno else str(error)
+
+
+def _event_camera(camera: EventCamera, sensor: SensorModel) -> dict[str, Any]:
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        **_lens(camera),
+        "positive_contrast_threshold": sensor.positive_contrast_threshold,
+        "negative_contrast_threshold": sensor.negative_contrast_threshold,
+        "refractory_period_ns": sensor.refractory_period,
+        "bayer_pattern": sensor.bayer_pattern,
+    }
 
 
 def _lens(camera: EventCamera) -> dict[str, Any]:

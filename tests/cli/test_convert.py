@@ -28,6 +28,7 @@ from small_datasets import (
     write_native,
 )
 
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import convert as command
@@ -197,12 +198,12 @@ def test_hot_pixels_are_named(tmp_path: Path) -> None:
 
 def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # COLMAP itself is tested elsewhere. This stand-in places all frames but the last.
-    def place(files: list[Path], times: list[int], camera: object, source: Path, seed: int) -> EstimatedPoses:
+    def place(files: list[Path], times: list[int], camera: EventCamera, source: Path, seed: int) -> EstimatedPoses:
         assert [file.name for file in files] == ["0.png", "1.png", "2.png", "3.png"]
         poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
         poses[:, 0, 3] = torch.arange(3)
         trajectory = Trajectory(times[:3], poses, source)
-        return EstimatedPoses(np.array(times), trajectory, [3], 9, 0.5, 100.0, 1.0)
+        return EstimatedPoses(np.array(times), trajectory, camera, [3], 9, 0.5, 100.0, 1.0)
 
     monkeypatch.setattr(command, "estimate_poses", place)
     data = write_ecd(tmp_path / "made")

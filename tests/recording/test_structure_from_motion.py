@@ -85,6 +85,19 @@ def test_the_estimated_poses_are_in_the_dataset_in_metres(dataset: tuple[Path, s
     assert estimated.start <= window.start < window.end == estimated.end < truth.end
 
 
+def test_colmap_estimates_the_lens_where_none_is_given(room: SimulationScene) -> None:
+    camera = EventCamera(160, 120, *room.intrinsics(160, 120))
+    simulation = Simulation(room, camera, SensorModel(), "easy", 14 / 25 - 0.03, 2.0, 0)
+    times = simulation.frame_times(25.0, 0.003)
+    frames = [simulation.blurred_frame(int(time), 0.003) for time in times]
+    found = estimate_poses(frames, times, (160, 120), "frames")
+    assert len(found.trajectory) == len(frames)
+    assert found.camera.fx == found.camera.fy == pytest.approx(camera.fx, rel=0.05)
+    assert (found.camera.cx, found.camera.cy) == (80, 60)
+    assert abs(found.camera.distortion[0]) < 0.05
+    assert found.camera.distortion[1:] == (0.0,) * 4
+
+
 def test_frames_without_texture_are_told() -> None:
     frames = np.full((4, 60, 80), 128, np.uint8)
     with pytest.raises(DataError, match=r"^flat: COLMAP places none of 4 frames: they have 0 .*; .*textured") as told:
@@ -101,7 +114,7 @@ def test_unusable_frames_are_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="video, frame 0: the frame has 60 x 80 pixels"):
         estimate_poses(frames.transpose(0, 2, 1), [0, 1], camera, "video")
     Image.fromarray(frames[0].astype(np.uint16)).save(tmp_path / "deep.png")
-    with pytest.raises(DataError, match=r"deep\.png: the frame is of PIL's mode I;16"):
+    with pytest.raises(DataError, match=r"deep\.png: the image is of PIL's mode I;16"):
         estimate_poses([tmp_path / "deep.png"] * 2, [0, 1], camera, "video")
 
 
@@ -214,7 +227,8 @@ def test_without_a_majority_all_frames_count(truth: torch.Tensor) -> None:
 
 def test_lost_frames_and_fragments_are_told(truth: torch.Tensor) -> None:
     times = FRAME * np.arange(10)
-    found = EstimatedPoses(times, Trajectory(times[[1, 2, 5, 6, 8]], truth[:5]), [5, 3], 100, 0.5, 200.0, 1.0)
+    camera = EventCamera(80, 60, 70.0, 70.0, 40.0, 30.0)
+    found = EstimatedPoses(times, Trajectory(times[[1, 2, 5, 6, 8]], truth[:5]), camera, [5, 3], 100, 0.5, 200.0, 1.0)
     assert found.gaps() == [(0, 0, 1), (3 * FRAME, 4 * FRAME, 2), (7 * FRAME, 7 * FRAME, 1), (9 * FRAME, 9 * FRAME, 1)]
     report = found.report()
     assert json.loads(json.dumps(report)) == report
@@ -237,7 +251,7 @@ def test_a_frame_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     cut = tmp_path / "cut.png"
     cut.write_bytes(whole.read_bytes()[:-100])
     camera = EventCamera(16, 12, 10.0, 10.0, 8.0, 6.0)
-    with pytest.raises(DataError, match=r"cut.png: not an image that can be read"):
+    with pytest.raises(DataError, match=r"cut.png: not a PNG or JPEG image that can be read"):
         estimate_poses([whole, cut], FRAME * np.arange(2), camera, "frames", 0)
 
 

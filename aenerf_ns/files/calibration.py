@@ -1,0 +1,86 @@
+"""The calibration of a recording: calibration.json, which has the names of transforms.json, or Kalibr's camchain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from aenerf_ns.camera.image_encoding import ImageEncoding
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.json_object import JsonObject, read_camera, read_image_encoding
+from aenerf_ns.files.kalibr import read_camchain
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Both cameras and the sensor.
+
+    Attributes:
+        event_camera: the event camera's lens.
+        frame_camera: the lens of the camera that took the images.
+        frame_from_event: (4, 4) float64, takes points from the event camera's to the frame camera's coordinates, OpenCV
+            axes in both.
+        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
+        image_encoding: whether the images' values are sRGB or linear in radiance.
+    """
+
+    event_camera: EventCamera
+    frame_camera: EventCamera
+    frame_from_event: Tensor
+    sensor: SensorModel
+    image_encoding: ImageEncoding
+
+
+def read_calibration(path: Path, event_camera: str | None = None, frame_camera: str | None = None) -> Calibration:
+    """Read calibration.json, or the camchain that Kalibr writes.
+
+    Args:
+        path: the file, which is JSON if its suffix is .json.
+        event_camera: name of the event camera in a camchain. None: the only camera.
+        frame_camera: name in the camchain of the camera that took the images. None: the event camera.
+
+    Raises:
+        DataError: the file is missing or malformed, or it does not tell which camera is meant.
+    """
+    if path.suffix == ".json":
+        return _read_json(path)
+    cameras = read_camchain(path)
+    if event_camera is None and len(cameras) > 1:
+        raise DataError(path, f"its cameras are {', '.join(cameras)}", "name that of the events as --event-camera")
+    event_name = next(iter(cameras)) if event_camera is None else event_camera
+    frame_name = event_name if frame_camera is None else frame_camera
+    for name in (event_name, frame_name):
+        if name not in cameras:
+            raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
+    event, event_from_first = cameras[event_name]
+    frame, frame_from_first = cameras[frame_name]
+    return Calibration(event, frame, frame_from_first @ torch.linalg.inv(event_from_first), SensorModel(), "linear")
+
+
+def _read_json(path: Path) -> Calibration:
+    """Read calibration.json, which has the names of the native dataset's transforms.json."""
+    meta = JsonObject.read(path)
+    block = meta.block("event_camera")
+    event = read_camera(block, "width", "height")
+    frame_from_event = block.rigid_motion("T_frame_event")
+    if frame_from_event is None:
+        frame_from_event = torch.eye(4, dtype=torch.float64)
+    default = SensorModel()
+    try:
+        sensor = SensorModel(
+            block.get("positive_contrast_threshold", float, default.positive_contrast_threshold),
+            block.get("negative_contrast_threshold", float, default.negative_contrast_threshold),
+            block.get("refractory_period_ns", int, 0),
+            block.get("bayer_pattern", str, ""),
+        )
+    except DataError:
+        raise
+    except ValueError as error:
+        raise block.error("sensor:", str(error)) from None
+    frame = read_camera(meta, "w", "h") if "w" in meta else event
+    return Calibration(event, frame, frame_from_event, sensor, read_image_encoding(meta))

@@ -1,0 +1,157 @@
+"""Turn a video into events: what an event sensor in the place of the camera would have seen between the frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from aenerf_ns.camera.image_encoding import decode, to_channels
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.recording.video import Video
+from aenerf_ns.simulator.esim import NOISELESS, EventSimulator, SensorNoise
+
+Interpolation = Literal["linear", "flow"]
+
+_GREY_LEVELS = decode(np.arange(256) / 255, "srgb")
+_PERCENTILE = 99.0
+
+
+class VideoInterval(NamedTuple):
+    """A frame of a video, and what the sensor fires since the frame before it.
+
+    Attributes:
+        frame: (height, width, 3) uint8, sRGB.
+        time: of the frame in nanoseconds.
+        events: in (time of the frame before, time of this frame]; none for the first frame.
+    """
+
+    frame: NDArray[np.uint8]
+    time: int
+    events: EventStream
+
+
+def quantisation_epsilon(sensor: SensorModel) -> float:
+    """Return the radiance that is added before the logarithm, because 8 bits of sRGB are coarse near black.
+
+    Without it, the step from black to the first grey level would be infinite in log-radiance. With it, the step from
+    grey level 0 to 2 of 255 is exactly the smaller contrast threshold C: log((L(2) + ε) / ε) = C, where L is linear
+    radiance. For C of 0.1 or more, any other two levels that are 2 apart differ by less. So a pixel that flickers by
+    one grey level does not keep firing.
+    """
+    threshold = min(sensor.positive_contrast_threshold, sensor.negative_contrast_threshold)
+    return float(_GREY_LEVELS[2]) / math.expm1(threshold)
+
+
+def video_events(
+    video: Video,
+    sensor: SensorModel,
+    noise: SensorNoise = NOISELESS,
+    interpolation: Interpolation = "flow",
+    max_displacement: float = 0.5,
+    seed: int = 0,
+) -> Iterator[VideoInterval]:
+    """Simulate an event sensor that sees a video. One frame after the other is read, so memory does not grow.
+
+    sRGB values are decoded to linear radiance, and :func:`quantisation_epsilon` is added before the logarithm. The
+    sensor is that of :class:`~aenerf_ns.simulator.esim.EventSimulator`.
+
+    Args:
+        video: the frames.
+        sensor: thresholds, refractory period and Bayer pattern.
+        noise: how the sensor differs from an ideal one.
+        interpolation: "linear": log-radiance is linear in time between two frames. "flow": frames along the optical
+            flow are put between them (:class:`FlowInterpolation`), and log-radiance is linear between all of these.
+        max_displacement: pixels that 99 % of the picture may move between two frames that "flow" puts in.
+        seed: seed of the sensor's thresholds and noise.
+
+    Raises:
+        DataError: a frame cannot be read or has another size than the first one.
+        ValueError: the displacement is not positive, a value of the noise is out of range, or the frames are too small
+            for optical flow.
+    """
+    epsilon = quantisation_epsilon(sensor)
+    simulator = EventSimulator(video.width, video.height, sensor, noise, log_epsilon=epsilon, seed=seed)
+    flow = FlowInterpolation(video.width, video.height, max_displacement) if interpolation == "flow" else None
+    before: tuple[NDArray[np.uint8], NDArray[np.float64], int] | None = None
+    with progress_bar() as progress:
+        frames = zip(video, video.times.tolist(), strict=True)
+        for frame, time in progress.track(frames, total=len(video.times), description="Simulating events"):
+            seen = to_channels(torch.from_numpy(_GREY_LEVELS[frame]), sensor.num_channels).squeeze(-1).numpy()
+            pieces = []
+            if flow is not None and before is not None:
+                first_frame, first_seen, start = before
+                logs = (np.log(picture + epsilon) for picture in (first_seen, seen))
+                for fraction, log_between in flow.between(first_frame, frame, *logs):
+                    radiance = np.maximum(np.exp(log_between) - epsilon, 0)
+                    pieces.append(simulator(radiance, start + round(fraction * (time - start))))
+            pieces.append(simulator(seen, time))
+            x, y, t, p = (np.concatenate(column) for column in zip(*pieces, strict=True))
+            yield VideoInterval(frame, time, EventStream(x, y, t, p, video.width, video.height, video.source))
+            before = frame, seen, time
+
+
+class FlowInterpolation:
+    """Put pictures between two frames, along OpenCV's DIS optical flow (Kroeger et al., ECCV 2016).
+
+    At the fraction s of the interval, a pixel looks back to the first frame along s² B − s(1 − s) F and ahead to the
+    second frame along (1 − s)² F − s(1 − s) B, where F is the flow from the first frame to the second, and B the flow
+    back (Super SloMo, Jiang et al., CVPR 2018, eq. 4). For a translation this is exact. The two looks are blended
+    linearly in log-radiance, so that without motion the picture is linear in time.
+
+    Args:
+        width: pixel columns.
+        height: pixel rows.
+        max_displacement: pixels that 99 % of the picture may move between two pictures.
+
+    Raises:
+        ValueError: the displacement is not positive, or the frames are too small for optical flow.
+    """
+
+    def __init__(self, width: int, height: int, max_displacement: float) -> None:
+        if not max_displacement > 0:
+            raise ValueError(f"max_displacement must be positive, got {max_displacement}")
+        # Smaller pictures than the patches of the flow fail, or have no flow.
+        if min(width, height) < 12:
+            raise ValueError(f"optical flow needs frames of 12 x 12 pixels or more, not {width} x {height}")
+        self._max_displacement = max_displacement
+        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._columns, self._rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+
+    def between(
+        self,
+        first_frame: NDArray[np.uint8],
+        second_frame: NDArray[np.uint8],
+        first_log: NDArray[np.float64],
+        second_log: NDArray[np.float64],
+    ) -> Iterator[tuple[float, NDArray[np.float64]]]:
+        """Yield fractions of the interval, increasing in (0, 1), and the log-radiance at these.
+
+        Args:
+            first_frame, second_frame: (height, width, 3) RGB, from which the flow is found.
+            first_log, second_log: (height, width) or (height, width, 3) log-radiance, which moves along the flow.
+        """
+        first_grey, second_grey = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (first_frame, second_frame))
+        # Without a guess of the flow to start from.
+        forward = self._flow.calc(first_grey, second_grey, np.empty(0))
+        backward = self._flow.calc(second_grey, first_grey, np.empty(0))
+        displacement = max(np.percentile(np.linalg.norm(flow, axis=-1), _PERCENTILE) for flow in (forward, backward))
+        steps = math.ceil(displacement / self._max_displacement)
+        for fraction in np.arange(1, steps, dtype=np.float32) / np.float32(steps):
+            rest = 1 - fraction
+            back = self._look(first_log, fraction * (fraction * backward - rest * forward))
+            ahead = self._look(second_log, rest * (rest * forward - fraction * backward))
+            yield float(fraction), rest * back + fraction * ahead
+
+    def _look(self, log_radiance: NDArray[np.float64], offsets: NDArray[np.float32]) -> NDArray[np.float64]:
+        # Linear interpolation would blur the picture by an amount that changes with the fraction, which fires events.
+        columns, rows = self._columns + offsets[..., 0], self._rows + offsets[..., 1]
+        looked = cv2.remap(log_radiance, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(looked, np.float64)

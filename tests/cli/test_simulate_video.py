@@ -1,0 +1,232 @@
+"""``aenerf simulate --video``: the dataset that a video becomes with poses, with COLMAP's, and without any."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.cli import main as program
+from aenerf_ns.cli import simulate as command
+from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.tum_trajectory import write_tum_trajectory
+from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.structure_from_motion import EstimatedPoses
+from aenerf_ns.recording.video import Video, open_video
+from aenerf_ns.simulator.video_events import video_events
+
+WIDTH, HEIGHT, FRAME = 24, 16, 40_000_000
+CAMCHAIN = """
+cam0: {camera_model: pinhole, intrinsics: [20.0, 21.0, 11.0, 7.0], distortion_model: radtan,
+       distortion_coeffs: [-0.1, 0.02, 0.0, 0.0], resolution: [24, 16]}
+cam1: {camera_model: pinhole, intrinsics: [20.0, 21.0, 11.0, 7.0], distortion_model: radtan,
+       distortion_coeffs: [-0.1, 0.02, 0.0, 0.0], resolution: [25, 16]}
+"""
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    """Ten frames of a pattern that moves by a pixel from frame to frame."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    pattern = np.kron(np.random.default_rng(0).integers(20, 250, (4, 9)), np.ones((4, 4))).astype(np.uint8)
+    lines = []
+    for index in range(10):
+        Image.fromarray(pattern[:, index : index + WIDTH]).save(folder / f"{index}.png")
+        lines.append(f"{0.04 * index:.2f} {index}.png\n")
+    (folder / "images.txt").write_text("".join(lines))
+    return folder
+
+
+def make_poses(count: int = 6) -> Trajectory:
+    """Poses from 0.04 s on, every 0.05 s."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    poses[:, 0, 3] = 0.1 * torch.arange(count)
+    return Trajectory(FRAME + 50_000_000 * np.arange(count), poses)
+
+
+@pytest.fixture
+def poses(tmp_path: Path) -> Path:
+    write_tum_trajectory(tmp_path / "poses.txt", make_poses())
+    return tmp_path / "poses.txt"
+
+
+@pytest.fixture
+def camchain(tmp_path: Path) -> Path:
+    (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
+    return tmp_path / "camchain.yaml"
+
+
+def simulate(output: Path, **options: Any) -> str:
+    with command.CONSOLE.capture() as printed:
+        Simulate(output, **options).main()
+    return printed.get()
+
+
+def times_of(recording: Recording) -> NDArray[np.int64]:
+    return np.concatenate([chunk.t for chunk in recording.event_file.chunks()])
+
+
+def test_the_command_makes_a_dataset_of_a_video_with_its_poses(
+    frames: Path, poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "dataset"
+    arguments = (
+        f"aenerf simulate --output {output} --video {frames} --trajectory {poses} --intrinsics 20 21 11.5 7.5 "
+        "--interpolation linear --positive-contrast-threshold 0.3 --leak-rate 2 --seed 4"
+    )
+    monkeypatch.setattr(sys, "argv", arguments.split())
+    with command.CONSOLE.capture() as printed:
+        program.main()
+    assert "up to 40 ms apart, are interpolated. What moves faster" in printed.get()
+    assert f"ns-train aenerf --data {output}" in printed.get()
+    parser = NativeDataParserConfig(data=output).setup()
+    recording = parser.recording
+    assert recording.event_camera == recording.frame_camera == EventCamera(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 7.5)
+    assert recording.sensor == SensorModel(0.3, 0.25)
+    assert recording.ground_truth is None
+    torch.testing.assert_close(recording.trajectory.camera_to_worlds, make_poses().camera_to_worlds)
+    # The events are those of the sensor that the options describe.
+    intervals = video_events(open_video(frames), recording.sensor, command.SensorNoise(leak_rate=2.0), "linear", seed=4)
+    expected = np.concatenate([interval.events.t for interval in intervals])
+    assert len(expected) > 500
+    np.testing.assert_array_equal(times_of(recording), expected)
+    # Frames within the poses are reference views at the poses of their times.
+    views = recording.reference_views
+    assert [len(views[split]) for split in ("train", "val", "test")] == [7, 4, 3]
+    for split in ("train", "val", "test"):
+        for view in views[split]:
+            assert view.time is not None
+            np.testing.assert_allclose(view.camera_to_world[:3], make_poses().interpolate(view.time), atol=1e-9)
+            original = Image.open(frames / f"{view.time // FRAME}.png").convert("RGB")
+            np.testing.assert_array_equal(np.asarray(Image.open(view.file)), np.asarray(original))
+        parser.get_dataparser_outputs(split)
+    assert not {view.time for view in views["val"]} & {view.time for view in views["test"]}
+
+
+def test_noise_is_added_to_the_given_poses(frames: Path, poses: Path, camchain: Path, tmp_path: Path) -> None:
+    options = {"video": frames, "trajectory": poses, "calibration": camchain, "event_camera": "cam0"}
+    simulate(tmp_path / "dataset", **options, pose_noise_degrees=1.0)
+    recording = NativeDataParserConfig(data=tmp_path / "dataset").setup().recording
+    # Kalibr counts from the centre of the first pixel.
+    assert (recording.event_camera.cx, recording.event_camera.distortion[0]) == (11.5, -0.1)
+    assert recording.ground_truth is not None
+    torch.testing.assert_close(recording.ground_truth.camera_to_worlds, make_poses().camera_to_worlds)
+    assert (recording.trajectory.camera_to_worlds - make_poses().camera_to_worlds).abs().max() > 1e-3
+
+
+def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # COLMAP itself is tested elsewhere. This stand-in places all frames but the last two.
+    def place(
+        video: Video, times: NDArray[np.int64], camera: EventCamera | tuple[int, int], source: Path, seed: int
+    ) -> EstimatedPoses:
+        assert len(list(video)) == len(times) == 10
+        if not isinstance(camera, EventCamera):
+            camera = EventCamera(*camera, 22.0, 22.0, 12.0, 8.0, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))
+        placed = Trajectory(times[:8], torch.eye(4, dtype=torch.float64).repeat(8, 1, 1), source)
+        return EstimatedPoses(times, placed, camera, [8], 9, 0.5, 100.0, 1.0)
+
+    monkeypatch.setattr(command, "estimate_poses", place)
+    printed = simulate(tmp_path / "dataset", video=frames, poses="colmap")
+    assert "8 of 10 frames registered" in printed
+    assert "COLMAP estimates the lens: focal length 22.0 pixels, radial distortion 0.01" in printed
+    recording = NativeDataParserConfig(data=tmp_path / "dataset").setup().recording
+    assert (recording.event_camera.fx, recording.event_camera.distortion[0]) == (22.0, 0.01)
+    assert recording.trajectory.times.tolist() == [FRAME * index for index in range(8)]
+    # The last two frames have no pose, and the first one lies before all events.
+    assert [view.time for view in recording.reference_views["train"]] == [FRAME * index for index in range(1, 8)]
+    report = json.loads((tmp_path / "dataset" / "poses_report.json").read_text())
+    assert report["registered_frames"] == 8
+    printed = simulate(tmp_path / "given", video=frames, poses="colmap", intrinsics=(20.0, 21.0, 11.5, 7.5))
+    assert "estimates the lens" not in printed
+    assert NativeDataParserConfig(data=tmp_path / "given").setup().recording.event_camera.fy == 21.0
+
+
+def test_without_poses_a_recording_is_written_that_only_lacks_them(
+    frames: Path, camchain: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "recording"
+    printed = simulate(output, video=frames, calibration=camchain, event_camera="cam0", train_images=1, test_views=3)
+    assert "10 images, no poses" in printed
+    assert "add trajectory.txt (docs" in printed
+    write_tum_trajectory(output / "trajectory.txt", make_poses())
+    recording = OwnRecordingDataParserConfig(data=output).setup().recording
+    assert recording.event_camera.distortion[:2] == (-0.1, 0.02)
+    assert recording.sensor == SensorModel(0.25, 0.25)
+    assert recording.image_encoding == "srgb"
+    assert [view.time for view in recording.reference_views["train"]] == [FRAME * index for index in range(1, 8)]
+    intervals = video_events(open_video(frames), recording.sensor)
+    np.testing.assert_array_equal(times_of(recording), np.concatenate([interval.events.t for interval in intervals]))
+    printed = simulate(tmp_path / "no_lens", video=frames, validation_views=0, test_views=0, train_images=4)
+    assert "4 images, no poses" in printed
+    assert "add calibration.json and trajectory.txt" in printed
+    assert sorted(path.name for path in (tmp_path / "no_lens").iterdir()) == ["events.h5", "images", "images.txt"]
+
+
+def test_a_frame_of_another_size_leaves_nothing_behind(frames: Path, tmp_path: Path) -> None:
+    Image.fromarray(np.zeros((5, 5), np.uint8)).save(frames / "7.png")
+    with pytest.raises(DataError, match="frame 7 has 5 x 5 pixels"):
+        simulate(tmp_path / "made" / "dataset", video=frames)
+    assert list((tmp_path / "made").iterdir()) == []
+
+
+LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
+
+
+@pytest.mark.parametrize(
+    ("files", "options", "message"),
+    [
+        ((), {"speed": "hard"}, "--speed has no meaning for a video; leave"),
+        ((), {"duration": 2.0}, "--duration has no meaning for a video; leave"),
+        (("trajectory",), {}, "--trajectory without the intrinsics of the camera; give --calibration"),
+        (("trajectory",), {**LENS, "poses": "colmap"}, "--trajectory with --poses colmap; leave out one"),
+        (("calibration",), LENS, "--calibration and --intrinsics are both given; leave out one"),
+        (("calibration",), {}, "its cameras are cam0, cam1; name that of the events as --event-camera"),
+        (("calibration",), {"event_camera": "cam1"}, "its camera has 25 x 16 pixels, the frames of .* 24 x 16; give"),
+        ((), {"intrinsics": (0.0, 21.0, 11.5, 7.5)}, "--intrinsics: fx must be from"),
+        ((), {"pose_noise_degrees": 1.0}, "without poses to add it to; give --trajectory"),
+        ((), {"positive_contrast_threshold": 0.0}, "positive_contrast_threshold must be from"),
+        ((), {"max_displacement": 0.0}, "max_displacement must be positive"),
+        ((), {"positive_contrast_threshold": 9.0, "negative_contrast_threshold": 9.0}, "no pixel changes by a"),
+        ((), {"frame_rate": 0.0}, "a frame rate of 0.0; give a positive"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(
+    files: tuple[str, ...],
+    options: dict[str, Any],
+    message: str,
+    frames: Path,
+    poses: Path,
+    camchain: Path,
+    tmp_path: Path,
+) -> None:
+    paths = {"trajectory": poses, "calibration": camchain}
+    with pytest.raises(DataError, match=message) as told:
+        simulate(tmp_path / "out", video=frames, **{name: paths[name] for name in files}, **options)
+    assert "\n" not in str(told.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_poses_of_another_clock_are_refused(frames: Path, tmp_path: Path) -> None:
+    late = make_poses()
+    write_tum_trajectory(tmp_path / "late.txt", Trajectory(late.times + 10**9, late.camera_to_worlds))
+    with pytest.raises(DataError, match=r"late\.txt: its poses from 1040000000 .* do not overlap"):
+        simulate(tmp_path / "out", video=frames, trajectory=tmp_path / "late.txt", **LENS)
+
+
+def test_options_for_videos_are_refused_for_scenes(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="--interpolation has no meaning for a scene; leave the option out"):
+        simulate(tmp_path / "out", interpolation="linear")

@@ -1,0 +1,210 @@
+"""Events of videos, against closed forms and against the exact simulation of the scene between the frames."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from aenerf_ns.camera.image_encoding import decode, encode
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.recording.video import Video, open_video
+from aenerf_ns.simulator.esim import EventSimulator, SensorNoise
+from aenerf_ns.simulator.textures import spectral_noise
+from aenerf_ns.simulator.video_events import Interpolation, quantisation_epsilon, video_events
+
+FRAME = 33_333_333
+LEVELS = decode(np.arange(256) / 255, "srgb")
+
+
+class StoredVideo:
+    """The frames of a list at regular times."""
+
+    source = Path("stored")
+
+    def __init__(self, frames: list[NDArray[np.uint8]]) -> None:
+        self._frames = frames
+        self.height, self.width = frames[0].shape[:2]
+        self.times = FRAME * np.arange(len(frames), dtype=np.int64)
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        return iter(self._frames)
+
+
+def events_of(
+    frames: list[NDArray[np.uint8]],
+    sensor: SensorModel,
+    interpolation: Interpolation = "linear",
+    noise: SensorNoise = SensorNoise(),  # noqa: B008
+    seed: int = 0,
+) -> EventStream:
+    video = cast(Video, StoredVideo(frames))
+    return joined([interval.events for interval in video_events(video, sensor, noise, interpolation, seed=seed)])
+
+
+def joined(pieces: list[EventStream]) -> EventStream:
+    columns = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in "xytp")
+    return EventStream(*columns, pieces[0].width, pieces[0].height)
+
+
+def grey(levels: NDArray[np.integer]) -> NDArray[np.uint8]:
+    return np.repeat(levels.astype(np.uint8)[..., None], 3, axis=-1)
+
+
+@pytest.mark.parametrize("rising", [True, False])
+def test_events_come_when_the_closed_form_crosses_the_thresholds(rising: bool, tmp_path: Path) -> None:
+    # Grey levels that rise or fall from frame to frame: every crossing is at a known place of a polyline.
+    rng = np.random.default_rng(0)
+    levels = np.sort(rng.integers(0, 256, (6, 5, 4)), axis=0)
+    levels = levels if rising else levels[::-1]
+    times = np.cumsum(rng.integers(10_000_000, 50_000_000, 6))
+    lines = []
+    for index, (level, time) in enumerate(zip(levels, times.tolist(), strict=True)):
+        Image.fromarray(level.astype(np.uint8)).save(tmp_path / f"{index}.png")
+        lines.append(f"0.{time:09d} {index}.png\n")
+    (tmp_path / "images.txt").write_text("".join(lines))
+    sensor = SensorModel(0.21, 0.17)
+    events = joined(
+        [interval.events for interval in video_events(open_video(tmp_path), sensor, interpolation="linear")]
+    )
+    # As stated in the docs: the step from grey level 0 to 2 is the smaller threshold.
+    epsilon = 2 / 255 / 12.92 / (math.exp(0.17) - 1)
+    log_radiance = np.log(LEVELS[levels] + epsilon)
+    threshold = 0.21 if rising else 0.17
+    total = 0
+    for y in range(5):
+        for x in range(4):
+            change = np.abs(log_radiance[:, y, x] - log_radiance[0, y, x])
+            crossings = threshold * np.arange(1, int(change[-1] / threshold) + 1)
+            expected = np.interp(crossings, change, times)
+            mine = (events.x == x) & (events.y == y)
+            # Times are whole nanoseconds.
+            np.testing.assert_allclose(events.t[mine], expected, rtol=0, atol=0.6)
+            total += len(expected)
+    assert len(events) == total > 100
+    assert set(events.p) == {1 if rising else -1}
+
+
+@pytest.mark.parametrize("threshold", [0.1, 0.25, 0.5])
+def test_two_grey_levels_never_differ_by_more_than_a_threshold(threshold: float) -> None:
+    epsilon = quantisation_epsilon(SensorModel(2 * threshold, threshold))
+    steps = np.log((LEVELS[2:] + epsilon) / (LEVELS[:-2] + epsilon))
+    assert steps[0] == pytest.approx(threshold)
+    assert steps.argmax() == 0
+
+
+def test_a_dark_pixel_that_flickers_by_a_grey_level_does_not_keep_firing() -> None:
+    rng = np.random.default_rng(0)
+    flicker = [grey(rng.integers(0, 2, (16, 16))) for _ in range(100)]
+    assert len(events_of(flicker, SensorModel(0.25, 0.25))) == 0
+
+
+def test_a_colour_sensor_sees_each_colour_through_its_filter() -> None:
+    frames = [np.full((4, 6, 3), 100, np.uint8) for _ in range(2)]
+    frames[1][..., 0] = 200
+    for interpolation in ("linear", "flow"):
+        pictures = [np.tile(frame, (4, 4, 1)) for frame in frames]
+        events = events_of(pictures, SensorModel(0.25, 0.25, bayer_pattern="RGGB"), interpolation)
+        epsilon = quantisation_epsilon(SensorModel(0.25, 0.25))
+        rise = math.log((LEVELS[200] + epsilon) / (LEVELS[100] + epsilon))
+        assert len(events) == int(rise / 0.25) * (16 * 24) // 4
+        assert not (events.x % 2).any()
+        assert not (events.y % 2).any()
+
+
+def test_a_seed_gives_the_same_events_again() -> None:
+    rng = np.random.default_rng(0)
+    frames = [grey(rng.integers(50, 80, (24, 32))) for _ in range(4)]
+    sensor, noise = SensorModel(0.2, 0.25, 1_000_000), SensorNoise(0.02, 1.0, 5.0)
+    for interpolation in ("linear", "flow"):
+        first, again, other = (events_of(frames, sensor, interpolation, noise, seed) for seed in (1, 1, 2))
+        np.testing.assert_array_equal(first.t, again.t)
+        assert len(first) != len(other) or (first.t != other.t).any()
+
+
+def texture(seed: int) -> Callable[[float, float], NDArray[np.float64]]:
+    """A picture of 72 x 96 pixels of a texture that has moved by (x, y)."""
+    noise = spectral_noise(256, np.random.default_rng(seed), 1.6).astype(np.float32)
+    columns, rows = np.meshgrid(np.arange(96, dtype=np.float32), np.arange(72, dtype=np.float32))
+
+    def picture(x: float, y: float) -> NDArray[np.float64]:
+        moved = cv2.remap(
+            noise, columns + 60 - np.float32(x), rows + 60 - np.float32(y), cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP
+        )
+        return 0.25 * np.exp(0.35 * moved.astype(np.float64).clip(-2.5, 2.5))
+
+    return picture
+
+
+def net_polarity(events: EventStream, times: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(len(times), H, W): sums of the polarities of all events before the times."""
+    changes = np.zeros((len(times) + 1, events.height, events.width), np.int64)
+    np.add.at(changes, (np.searchsorted(times, events.t), events.y, events.x), events.p)
+    return changes.cumsum(0)[:-1]
+
+
+def test_optical_flow_places_events_nearer_to_the_truth() -> None:
+    moving, sensor = texture(1), SensorModel(0.2, 0.2)
+    exact = EventSimulator(96, 72, sensor, log_epsilon=quantisation_epsilon(sensor))
+    steps, intervals = 40, 4
+
+    def seen(frame: float) -> NDArray[np.float64]:
+        return moving(3.3 * frame, 1.2 * frame)
+
+    truth = joined(
+        [
+            EventStream(*exact(seen(step / steps), round(step * FRAME / steps)), 96, 72)
+            for step in range(intervals * steps + 1)
+        ]
+    )
+    frames = [
+        grey((encode(torch.from_numpy(seen(index)), "srgb") * 255).round().numpy()) for index in range(intervals + 1)
+    ]
+    times = np.linspace(0, intervals * FRAME, 200)[1:]
+    expected = net_polarity(truth, times)
+    displaced = {}
+    for interpolation in ("linear", "flow"):
+        events = events_of(frames, sensor, interpolation)
+        # Every event that comes too early or too late counts for as long as that.
+        wrong = np.abs(net_polarity(events, times) - expected).sum() * (times[1] - times[0])
+        displaced[interpolation] = wrong / len(truth) / FRAME
+    # Measured: 0.31 and 0.10 frame intervals.
+    assert displaced["flow"] < 0.5 * displaced["linear"]
+    assert displaced["flow"] < 0.15
+
+
+def test_frames_too_small_for_optical_flow_are_refused() -> None:
+    frames = [np.zeros((11, 20, 3), np.uint8)] * 2
+    with pytest.raises(ValueError, match="12 x 12 pixels or more, not 20 x 11"):
+        events_of(frames, SensorModel(), "flow")
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "flow"])
+def test_memory_does_not_grow_with_the_length_of_the_video(interpolation: Interpolation) -> None:
+    alive: list[weakref.ref] = []
+
+    class LongVideo(StoredVideo):
+        def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+            for index in range(len(self.times)):
+                frame = grey(np.full((16, 16), 20 * (index % 2)))
+                alive.append(weakref.ref(frame))
+                yield frame
+                del frame
+
+    video = LongVideo([np.zeros((16, 16, 3), np.uint8)] * 40)
+    most = 0
+    for interval in video_events(cast(Video, video), SensorModel(), interpolation=interpolation):
+        del interval
+        most = max(most, sum(frame() is not None for frame in alive))
+    assert len(alive) == 40
+    assert most <= 3
