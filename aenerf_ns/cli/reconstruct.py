@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -11,7 +12,7 @@ import imageio_ffmpeg
 import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from PIL import Image
+from numpy.typing import NDArray
 
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
@@ -23,11 +24,12 @@ from aenerf_ns.progress import tracked
 from aenerf_ns.reconstruction.images import EVENTS_PER_PIXEL, FilteredImages, ImageSource, NetworkImages, images_of
 from aenerf_ns.reconstruction.weights import load_network
 from aenerf_ns.recording.images import check_image
+from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import SPLITS, Recording
-from aenerf_ns.recording.views import image_files, thinned
+from aenerf_ns.recording.views import thinned
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
-_VIDEO_RATE = 25
+_VIDEO, _VIDEO_RATE = "reconstruction.mp4", 25
 
 
 @dataclass
@@ -51,36 +53,42 @@ class Reconstruct:
 
     def main(self) -> None:
         """Read the dataset, reconstruct the images and write them."""
-        if self.output.exists():
-            raise DataError(self.output, "the folder exists already", "remove it or choose another --output")
+        with ended_by_exception(), OutputLock(self.output) as lock:
+            self._reconstruct(lock)
+
+    def _reconstruct(self, lock: OutputLock) -> None:
         if not 0 < self.events_per_pixel < np.inf:
             remedy = "give a positive --events-per-pixel"
             raise DataError("aenerf reconstruct", f"{self.events_per_pixel} events a pixel", remedy)
         parser = open_dataset(self.data, self.format)
         recording = parser.recording
         source = self._source(recording)
-        longest_gap = parser.config.max_pose_gap_ns
+        camera, longest_gap = recording.event_camera, parser.config.max_pose_gap_ns
         longest_gap = recording.max_pose_gap if longest_gap is None else longest_gap
         try:
             with (
-                ended_by_exception(),
                 NativeDatasetWriter(
-                    self.output,
-                    recording.event_camera,
+                    lock,
+                    camera,
                     recording.sensor,
                     recording.image_encoding,
                     scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
                     max_pose_gap=longest_gap,
                 ) as writer,
+                closing(_new_video(writer.other_file(_VIDEO), camera.width, camera.height)) as video,
             ):
                 writer.add_trajectories(recording.trajectory, recording.ground_truth)
                 _add_reference_views(recording, writer)
-                num_images = self._reconstruct(recording, source, longest_gap, writer)
+                num_images = 0
+                for time, image in self._images(recording, source, longest_gap, writer):
+                    pose = homogeneous(recording.trajectory.interpolate(time))
+                    writer.add_image("train", image, pose, time)
+                    video.send(image.tobytes())
+                    num_images += 1
         except OSError as error:
             raise DataError(self.output, f"it cannot be written ({error})", "check the space and the rights") from None
-        _write_video(self.output)
         CONSOLE.print(
-            f"{self.output}: {num_images} images reconstructed by {self.method}, and reconstruction.mp4.\n"
+            f"{self.output}: {num_images} images reconstructed by {self.method}, and {_VIDEO}.\n"
             f"Train on them with: ns-train e2vid-nerf --data {self.output}",
             highlight=False,
             soft_wrap=True,
@@ -95,12 +103,12 @@ class Reconstruct:
         device = "cuda" if torch.cuda.is_available() else "cpu"
         return NetworkImages(load_network(self.method, self.weights), sensor, device)
 
-    def _reconstruct(
+    def _images(
         self, recording: Recording, source: ImageSource, longest_gap: int | None, writer: NativeDatasetWriter
-    ) -> int:
-        """Write the events, and an image after each batch of them; return the number of images."""
-        events, trajectory = recording.event_file, recording.trajectory
-        known = trajectory.window(longest_gap)
+    ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Write the events, and yield time and image of each batch of them that ends at a time with a pose."""
+        events = recording.event_file
+        known = recording.trajectory.window(longest_gap)
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
 
         def copied() -> Iterator[EventStream]:
@@ -108,23 +116,22 @@ class Reconstruct:
                 writer.events.append(chunk)
                 yield chunk
 
-        num_made = num_written = 0
+        num_made = num_placed = 0
         for time, image in images_of(copied(), num_events, source):
             num_made += 1
             if known.contains(time):
-                writer.add_image("train", image, homogeneous(trajectory.interpolate(time)), time)
-                num_written += 1
-        if num_written == 0:
+                num_placed += 1
+                yield time, image
+        if num_placed == 0:
             raise DataError(
                 events.path,
                 f"its events make {num_made} images of {num_events} events each, none at a time with a pose",
                 "give a smaller --events-per-pixel, or poses that cover the events",
             )
-        if num_written < num_made:
+        if num_placed < num_made:
             CONSOLE.print(
-                f"{num_made - num_written} of {num_made} images are left out: no pose is known at their times."
+                f"{num_made - num_placed} of {num_made} images are left out: no pose is known at their times."
             )
-        return num_written
 
 
 def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> None:
@@ -141,22 +148,16 @@ def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> N
             writer.add_image_file(split, view.file, view.camera_to_world, view.time, recording.image_background)
 
 
-def _write_video(folder: Path) -> None:
-    """Write reconstruction.mp4, with one picture for each training image of a dataset folder."""
-    path = folder / "reconstruction.mp4"
-    files = image_files(folder / "images" / "train")
-    with Image.open(files[0]) as first:
-        size = first.size
+def _new_video(path: Path, width: int, height: int) -> Generator[None, bytes | None, None]:
+    """Return a video that takes (height, width, 3) RGB pictures, as bytes."""
     try:
-        # H.264 stores colours for blocks of 2 x 2 pixels: an odd size is scaled by a fraction of a pixel.
-        video = imageio_ffmpeg.write_frames(
-            str(path), size, fps=_VIDEO_RATE, macro_block_size=2, ffmpeg_log_level="error"
-        )
-        video.send(None)
-        for file in files:
-            with Image.open(file) as image:
-                video.send(image.convert("RGB").tobytes())
-        video.close()
-    except (OSError, RuntimeError) as error:
-        remedy = "install ffmpeg; the dataset itself is complete"
-        raise DataError(path, f"the video cannot be written ({error})", remedy) from None
+        # Fails if there is no ffmpeg, before any work is done.
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise DataError(path.name, f"there is no ffmpeg to write it ({error})", "install ffmpeg") from None
+    # H.264 stores colours for blocks of 2 x 2 pixels: an odd size is scaled by a fraction of a pixel.
+    video = imageio_ffmpeg.write_frames(
+        str(path), (width, height), fps=_VIDEO_RATE, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    video.send(None)
+    return video
