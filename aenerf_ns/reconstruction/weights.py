@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.reconstruction.networks import E2VID, FireNet, ReconstructionNetwork
 
 NetworkName = Literal["e2vid", "firenet"]
@@ -37,8 +37,9 @@ def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwo
     remedy = f"{_WHERE[name]}, and give it with --weights"
     if weights is None:
         raise DataError(f"--method {name}", "no weights are given", remedy)
-    if not weights.is_file():
-        raise DataError(weights, "there is no such file", remedy)
+    with reading(weights):
+        if not weights.is_file():
+            raise DataError(weights, "there is no such file", remedy)
     try:
         content = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as error:
@@ -51,5 +52,5 @@ def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwo
         network.load_state_dict(content["state_dict"], strict=True)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines()]
-        raise DataError(weights, f"its weights are not {name}'s ({' '.join(lines)[:300]})", remedy) from None
+        raise DataError(weights, f"its weights are not {name}'s ({' '.join(lines)})", remedy) from None
     return network.eval()

@@ -120,6 +120,7 @@ def test_a_file_that_cannot_be_used_ends_with_one_line(name: NetworkName, tmp_pa
     faults: list[tuple[Path | None, str]] = [
         (None, f"--method {name}: no weights are given"),
         (tmp_path / "none.pth", "none.pth: there is no such file"),
+        (tmp_path / ("n" * 300), "n: it cannot be read"),
         (save(tmp_path / "code.pth", name, config=Foreign()), "code.pth: not a file of plain weights"),
         (save(tmp_path / "empty.pth", name, state_dict=None), "empty.pth: it holds no state_dict"),
         (
@@ -138,7 +139,7 @@ def test_a_file_that_cannot_be_used_ends_with_one_line(name: NetworkName, tmp_pa
     for path, complaint in faults:
         with pytest.raises(DataError, match=complaint) as raised:
             load_network(name, path)
-        assert where in str(raised.value)
+        assert where in str(raised.value) or "cannot be read" in complaint
         assert str(raised.value).isprintable()
 
 
