@@ -19,6 +19,8 @@ from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
 from aenerf_ns.method_configs.aenerf_small import aenerf_small
+from aenerf_ns.method_configs.e2vid_nerf import e2vid_nerf
+from aenerf_ns.method_configs.e2vid_nerf_small import e2vid_nerf_small
 from aenerf_ns.method_configs.eventnerf import eventnerf
 from aenerf_ns.method_configs.eventnerf_small import eventnerf_small
 from aenerf_ns.method_configs.evnerf import evnerf
@@ -32,7 +34,16 @@ METHODS = {method.config.method_name: method.config for method in (aenerf, aener
 # Only the options in which they differ from AE-NeRF of the same size are listed.
 PEERS = {
     method.config.method_name: method.config
-    for method in (robust_enerf, robust_enerf_small, eventnerf, eventnerf_small, evnerf, evnerf_small)
+    for method in (
+        robust_enerf,
+        robust_enerf_small,
+        eventnerf,
+        eventnerf_small,
+        evnerf,
+        evnerf_small,
+        e2vid_nerf,
+        e2vid_nerf_small,
+    )
 }
 
 # Nerfstudio's options are listed where a method changes their default. These are listed because many runs set them.
@@ -62,7 +73,8 @@ PEERS_INTRODUCTION = """\
 ## Methods of other papers
 
 Options of `aenerf` that are not in this table have the same defaults in [these methods](peers.md), and options of
-`aenerf-small` in the small ones. The methods that have `shortest-window` have no options of pairs and of the sensor.
+`aenerf-small` in the small ones. Only `robust-enerf` has
+options of pairs and of the sensor.
 """
 
 FORMAT_INTRODUCTION = """\

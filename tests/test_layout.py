@@ -15,6 +15,8 @@ MAY_USE = {
     "errors": set(),
     "progress": set(),
     "events": {"errors"},
+    # Events in, images out: where the camera was, and what the images are for, is not its business.
+    "reconstruction": {"errors", "events"},
     "camera": {"errors", "events"},
     "files": {"errors", "events", "camera"},
     "recording": {"errors", "progress", "events", "camera", "files"},
@@ -29,6 +31,7 @@ MAY_USE = {
         "errors",
         "progress",
         "events",
+        "reconstruction",
         "camera",
         "files",
         "recording",

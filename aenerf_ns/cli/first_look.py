@@ -12,10 +12,11 @@ from aenerf_ns.files.given_paths import require_dataset, require_new, require_ru
 _WORKS_ON: dict[str, tuple[str, Callable[[Path], None]]] = {
     "check": ("--data", require_dataset),
     "convert": ("--data", require_dataset),
+    "reconstruct": ("--data", require_dataset),
     "evaluate": ("--load-config", require_run),
     "export-trajectory": ("--load-config", require_run),
 }
-_WRITES_FOLDER = {"simulate", "convert"}
+_WRITES_FOLDER = {"simulate", "convert", "reconstruct"}
 
 
 def judge_paths(words: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""The ``aenerf`` command: simulate, convert and check datasets, evaluate and export trained runs."""
+"""The ``aenerf`` command: simulate, convert, check and reconstruct datasets, evaluate and export trained runs."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ def main() -> None:
     from aenerf_ns.cli.convert import Convert
     from aenerf_ns.cli.evaluate import Evaluate
     from aenerf_ns.cli.export_trajectory import ExportTrajectory
+    from aenerf_ns.cli.reconstruct import Reconstruct
     from aenerf_ns.cli.simulate import Simulate
 
     try:
@@ -33,6 +34,7 @@ def main() -> None:
                 "simulate": Simulate,
                 "convert": Convert,
                 "check": Check,
+                "reconstruct": Reconstruct,
                 "evaluate": Evaluate,
                 "export-trajectory": ExportTrajectory,
             },

@@ -132,6 +132,7 @@ class EventDataParser(DataParser):
                 check_image(file, recording.frame_camera)
             cameras = recording.event_camera.cameras(trajectory.interpolate(times))
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
+            frames = _frames(recording, window)
         else:
             views = thinned(views_within(recording.reference_views[split], window), recording.max_views)
             for view in views:
@@ -142,6 +143,7 @@ class EventDataParser(DataParser):
             cameras = recording.frame_camera.cameras(poses)
             cameras.metadata[REFERENCE_SECONDS] = seconds_on_trajectory(views, trajectory)
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
+            frames = ()
         # Nerfstudio wants a file name for every camera, also for one without an image.
         names = [images.get(index, Path(self.config.data) / f"camera_{index:05d}") for index in range(len(cameras))]
         return DataparserOutputs(
@@ -163,6 +165,7 @@ class EventDataParser(DataParser):
                     has_image=[index in images for index in range(len(cameras))],
                     image_encoding=recording.image_encoding,
                     bounded=recording.scene_box is not None,
+                    frames=frames,
                 )
             },
         )
@@ -260,6 +263,14 @@ def _require_seconds(trajectory: Trajectory, first: int, last: int) -> None:
                 f"of the poses were in {unit}",
                 "write them in seconds",
             )
+
+
+def _frames(recording: Recording, window: TimeWindow) -> tuple[tuple[int, Path], ...]:
+    """Return times and files of the training images that were taken in a time window, by the event camera."""
+    if recording.frame_camera != recording.event_camera:
+        return ()
+    views = recording.reference_views["train"]
+    return tuple((view.time, view.file) for view in views if view.time is not None and window.contains(view.time))
 
 
 def _check_distance(poses: Tensor, reference: Trajectory) -> None:

@@ -20,7 +20,9 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class ReferenceView:
-    """An image with its pose. Reference images serve evaluation, colour correction and the viewer, never training.
+    """An image with its pose. Reference images serve evaluation, colour correction and the viewer.
+
+    Only ``e2vid-nerf`` trains on images, those of the train split, which ``aenerf reconstruct`` makes of the events.
 
     Attributes:
         file: the image.

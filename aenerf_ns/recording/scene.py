@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from torch import Tensor
 
@@ -33,6 +34,8 @@ class Scene:
         has_image: whether each camera of the split has an image.
         image_encoding: whether the images' values are sRGB or linear in radiance.
         bounded: whether the dataset states a box that holds the whole scene.
+        frames: times in nanoseconds within the window, and files, of the train split's images that the event camera's
+            lens took at known times; none for the other splits. Only a method that says so trains on them.
     """
 
     trajectory: Trajectory
@@ -45,3 +48,4 @@ class Scene:
     has_image: list[bool]
     image_encoding: ImageEncoding
     bounded: bool
+    frames: tuple[tuple[int, Path], ...] = ()

@@ -164,6 +164,10 @@ class NativeDatasetWriter(_FolderWriter):
         text = json.dumps(report, indent=2)
         (self._partial / "poses_report.json").write_text(text + "\n", encoding="utf-8")
 
+    def other_file(self, name: str) -> Path:
+        """Return the path at which another file of the folder can be written until the block ends."""
+        return self._partial / name
+
     def add_image(
         self,
         split: Split,

@@ -19,15 +19,15 @@ from aenerf_ns.supervision.pairs import PairSamplerConfig
 
 @dataclass
 class EventDataManagerConfig(VanillaDataManagerConfig):
-    """Events to train on. Inherited options about sampling pixels of images have no effect: no image is trained on."""
+    """Events to train on. Inherited options about sampling pixels of images have no effect."""
 
     _target: type = field(default_factory=lambda: EventDataManager)
     train_num_rays_per_batch: int = 8192
     """The most rays of a training batch. A pair of events takes two, or three with the temporal loss. A pixel in a
-    window of time takes two."""
+    window of time takes two, a pixel of an image one."""
     eval_num_rays_per_batch: int = 8192
     """The most rays of a batch on which the loss is logged without training. A pair of events takes two, and so does a
-    pixel in a window of time."""
+    pixel in a window of time. A pixel of an image takes one."""
     sampler: SamplerConfig = field(default_factory=PairSamplerConfig)
     """How batches are drawn. The model's supervision says what their renderings are compared with."""
 

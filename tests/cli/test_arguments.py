@@ -15,10 +15,11 @@ from aenerf_ns.cli.dataset_format import Automatic
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.main import main
+from aenerf_ns.cli.reconstruct import Reconstruct
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.formats import FORMATS
 
-Command = Check | Convert | Evaluate | ExportTrajectory
+Command = Check | Convert | Evaluate | ExportTrajectory | Reconstruct
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +33,7 @@ def what_commands_work_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def parsed(line: str, monkeypatch: pytest.MonkeyPatch) -> Command:
     """Return the command made of the words after ``aenerf``, without running it."""
     made: list[Command] = []
-    for kind in (Check, Convert, Evaluate, ExportTrajectory):
+    for kind in (Check, Convert, Evaluate, ExportTrajectory, Reconstruct):
         monkeypatch.setattr(kind, "main", lambda command: made.append(command))
     monkeypatch.setattr(sys, "argv", ["aenerf", *line.split()])
     main()
@@ -109,6 +110,22 @@ def test_a_dataset_is_converted(line: str, monkeypatch: pytest.MonkeyPatch) -> N
     assert command.format.refractory_period_ns == 7
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "reconstruct --data F --output O --method e2vid --weights W ecd-data --refractory-period-ns 7",
+        "reconstruct F --method e2vid --weights W --output O ecd-data --refractory-period-ns 7",
+    ],
+)
+def test_images_of_a_dataset_are_reconstructed(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = parsed(line, monkeypatch)
+    assert isinstance(command, Reconstruct)
+    assert (command.data, command.output) == (Path("F"), Path("O"))
+    assert (command.method, command.weights) == ("e2vid", Path("W"))
+    assert isinstance(command.format, EcdDataParserConfig)
+    assert command.format.refractory_period_ns == 7
+
+
 def test_an_option_after_the_name_of_a_format_is_that_of_the_format(monkeypatch: pytest.MonkeyPatch) -> None:
     command = parsed("convert F --output O event-recording-data --poses poses.txt", monkeypatch)
     assert isinstance(command, Convert)
@@ -167,6 +184,7 @@ def test_other_words_are_refused(
     [
         ("check", "DATA", "--data DATA"),
         ("convert", "DATA", "--data DATA"),
+        ("reconstruct", "DATA", "--data DATA"),
         ("evaluate", "CONFIG", "--load-config CONFIG"),
         ("export-trajectory", "CONFIG", "--load-config CONFIG"),
     ],

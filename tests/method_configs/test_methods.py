@@ -21,6 +21,8 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_small import aenerf_small
+from aenerf_ns.method_configs.e2vid_nerf import e2vid_nerf
+from aenerf_ns.method_configs.e2vid_nerf_small import e2vid_nerf_small
 from aenerf_ns.method_configs.eventnerf import eventnerf
 from aenerf_ns.method_configs.eventnerf_small import eventnerf_small
 from aenerf_ns.method_configs.evnerf import evnerf
@@ -29,8 +31,8 @@ from aenerf_ns.method_configs.robust_enerf import robust_enerf
 from aenerf_ns.method_configs.robust_enerf_small import robust_enerf_small
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
-SMALL = [robust_enerf_small, eventnerf_small, evnerf_small]
-PEERS = [*SMALL, robust_enerf, eventnerf, evnerf]
+SMALL = [robust_enerf_small, eventnerf_small, evnerf_small, e2vid_nerf_small]
+PEERS = [*SMALL, robust_enerf, eventnerf, evnerf, e2vid_nerf]
 
 
 @pytest.fixture
@@ -131,7 +133,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory, small_work: None) -> Pat
         width=64,
         height=48,
         max_displacement=1.0,
-        train_images=2,
+        train_images=16,
         validation_views=8,
         test_views=2,
         pose_noise_degrees=0.5,
@@ -144,6 +146,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory, small_work: None) -> Pat
 @pytest.mark.parametrize("mode", ["off", "spline"])
 @pytest.mark.parametrize("method", SMALL, ids=lambda method: method.config.method_name)
 def test_every_peer_reconstructs_a_simulated_scene(method: Any, mode: str, simulated: Path) -> None:
+    # E2VID + NeRF trains on the dataset's true images, because this is a test of the training.
     config = with_options(method.config, "--pipeline.model.camera-optimizer.mode", mode)
     psnr = []
     train(config, simulated, 250, lambda pipeline: psnr.append(evaluated(pipeline)))

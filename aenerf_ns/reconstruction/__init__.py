@@ -1,0 +1,1 @@
+"""Intensity images from events alone: a filter, and networks whose weights the user has."""

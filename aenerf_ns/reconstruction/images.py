@@ -1,0 +1,121 @@
+"""Images of a stream of events, one for each batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.reconstruction.batches import batches_of
+from aenerf_ns.reconstruction.color import demosaiced, with_lightness
+from aenerf_ns.reconstruction.high_pass import HighPassFilter
+from aenerf_ns.reconstruction.networks import NUM_BINS, ReconstructionNetwork
+from aenerf_ns.reconstruction.voxels import normalized, voxel_grid
+
+EVENTS_PER_PIXEL = 0.35
+"""Events in a batch, as a share of the sensor's pixels, with which the authors of E2VID run it."""
+
+# The authors sharpen images: by this amount, with a blur of this standard deviation and size in pixels.
+_SHARPENING, _BLUR, _BLUR_SIZE = 0.3, 1.0, 5
+
+
+class ImageSource(Protocol):
+    """What makes images of batches of events."""
+
+    def image(self, events: EventStream) -> NDArray[np.uint8]:
+        """Take the next batch of the stream, and return the image at its last event.
+
+        Returns:
+            (height, width, 3) RGB display values; grey for a monochrome sensor.
+        """
+
+
+class FilteredImages:
+    """Images of the high-pass filter.
+
+    Args:
+        width: number of pixel columns.
+        height: number of pixel rows.
+        sensor: contrast thresholds and Bayer pattern.
+    """
+
+    def __init__(self, width: int, height: int, sensor: SensorModel) -> None:
+        self._filter = HighPassFilter(width, height, sensor)
+        self._is_colored = bool(sensor.bayer_pattern)
+
+    def image(self, events: EventStream) -> NDArray[np.uint8]:
+        """Return the next image; see :class:`ImageSource`."""
+        values = self._filter.image(events)
+        return demosaiced(values) if self._is_colored else _grey(values)
+
+
+class NetworkImages:
+    """Images of a network, which sees a normalised voxel grid of each batch.
+
+    The events of a colour sensor go through the network five times, each time with a state of its own: the four
+    half-resolution grids of its filters, whose images give the colours, and the whole grid, which gives the lightness.
+
+    Args:
+        network: with its weights.
+        sensor: the Bayer pattern.
+        device: that the network runs on.
+    """
+
+    def __init__(self, network: ReconstructionNetwork, sensor: SensorModel, device: torch.device | str) -> None:
+        self._network = network.to(device)
+        self._is_colored = bool(sensor.bayer_pattern)
+        self._device = device
+        self._states: dict[str, Any] = {}
+
+    def image(self, events: EventStream) -> NDArray[np.uint8]:
+        """Return the next image; see :class:`ImageSource`."""
+        voxels = normalized(voxel_grid(events, NUM_BINS))
+        grey = self._run("all", voxels)
+        if not self._is_colored:
+            return _grey(grey)
+        mosaic = np.empty_like(grey)
+        for row in range(2):
+            for column in range(2):
+                mosaic[row::2, column::2] = self._run(f"{row}{column}", voxels[:, row::2, column::2])
+        return with_lightness(demosaiced(mosaic), grey)
+
+    @torch.no_grad()
+    def _run(self, name: str, voxels: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Return the (height, width) image of the (bins, height, width) voxels, after those before of that name."""
+        height, width = voxels.shape[1:]
+        lacking = [-size % self._network.multiple for size in (height, width)]
+        # Of an odd number, the authors put the larger part in front.
+        padding = [(number - number // 2, number // 2) for number in lacking]
+        padded = torch.from_numpy(np.pad(voxels, [(0, 0), *padding], mode="reflect"))[None].to(self._device)
+        image, self._states[name] = self._network(padded, self._states.get(name))
+        (top, _), (left, _) = padding
+        values = image[0, 0, top : top + height, left : left + width].float().cpu().numpy()
+        blurred = cv2.GaussianBlur(values, (_BLUR_SIZE, _BLUR_SIZE), _BLUR)
+        sharpened = (1 + _SHARPENING) * values - _SHARPENING * blurred
+        return np.rint(np.clip(sharpened, 0, 1) * 255).astype(np.uint8)
+
+
+def images_of(
+    chunks: Iterable[EventStream], num_events: int, source: ImageSource
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield the time in nanoseconds and the (height, width, 3) image of each batch of a stream.
+
+    The time is that of the batch's last event.
+
+    Args:
+        chunks: the stream in pieces, in the order of time.
+        num_events: events in a batch.
+        source: of the images; it has not seen an event before.
+    """
+    for batch in batches_of(chunks, num_events):
+        yield int(batch.t[-1]), source.image(batch)
+
+
+def _grey(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.repeat(values[..., None], 3, -1)

@@ -1,0 +1,131 @@
+"""``aenerf reconstruct``: a dataset of reconstructed images, which this project and Nerfstudio read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from small_datasets import START, parse, write_native
+
+from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
+from aenerf_ns.cli.reconstruct import Reconstruct
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.reconstruction.networks import E2VID, FireNet
+from aenerf_ns.recording.recording import Recording
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    folder = write_native(tmp_path / "made", np.array([[-1.0, -2.0, 0.0], [3.0, 4.0, 5.0]]))
+    estimated = perturb(read_tum_trajectory(folder / "trajectory_ground_truth.txt"), 1.0, 0.02, 0.2, 0)
+    write_tum_trajectory(folder / "trajectory_estimated.txt", estimated)
+    return folder
+
+
+def opened(folder: Path) -> Recording:
+    return NativeDataParserConfig(data=folder).setup().recording
+
+
+def test_images_are_written_at_the_estimated_poses_of_their_times(data: Path, tmp_path: Path) -> None:
+    Reconstruct(data, tmp_path / "out").main()
+    before, after = opened(data), opened(tmp_path / "out")
+    # 200 events in batches of int(0.35 * 6 * 4).
+    views = after.reference_views["train"]
+    assert len(views) == 25
+    (events,) = before.event_file.chunks()
+    assert [view.time for view in views] == events.t[7::8].tolist()
+    for view in views:
+        pose = homogeneous(before.trajectory.interpolate(view.time))
+        torch.testing.assert_close(view.camera_to_world, pose, rtol=0, atol=1e-9)
+        with Image.open(view.file) as image:
+            assert (image.size, image.mode) == ((6, 4), "RGB")
+    assert len({view.file.read_bytes() for view in views}) == 25
+    # All else is that of the recording.
+    (copied,) = after.event_file.chunks()
+    for name in "xytp":
+        np.testing.assert_array_equal(getattr(copied, name), getattr(events, name))
+    assert after.ground_truth is not None
+    assert torch.equal(after.trajectory.times, before.trajectory.times)
+    assert (after.event_camera, after.sensor) == (before.event_camera, before.sensor)
+    assert after.scene_box is not None
+    for split in ("val", "test"):
+        for one, other in zip(before.reference_views[split], after.reference_views[split], strict=True):
+            assert one.file.read_bytes() == other.file.read_bytes()
+            assert torch.equal(one.camera_to_world, other.camera_to_world)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_framework_reads_the_folder_and_the_video_shows_it(data: Path, tmp_path: Path) -> None:
+    Reconstruct(data, tmp_path / "out").main()
+    as_is = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
+    config = NerfstudioDataParserConfig(data=tmp_path / "out", **as_is)
+    views = opened(tmp_path / "out").reference_views
+    for split, count in (("train", 25), ("val", 1), ("test", 2)):
+        outputs = parse(config, split)
+        assert [Path(name) for name in outputs.image_filenames] == [view.file for view in views[split]]
+        assert len(outputs.cameras) == count
+        for pose, view in zip(outputs.cameras.camera_to_worlds, views[split], strict=True):
+            expected = (view.camera_to_world @ OPENCV_TO_OPENGL)[:3].float()
+            torch.testing.assert_close(pose, expected, rtol=0, atol=1e-6)
+    frames = imageio_ffmpeg.read_frames(str(tmp_path / "out" / "reconstruction.mp4"))
+    assert next(frames)["size"] == (6, 4)
+    assert len(list(frames)) == 25
+
+
+@pytest.mark.parametrize(("name", "network"), [("e2vid", E2VID), ("firenet", FireNet)])
+def test_a_network_reconstructs_with_the_weights_of_a_file(
+    name: str, network: type[E2VID] | type[FireNet], data: Path, tmp_path: Path
+) -> None:
+    torch.manual_seed(0)
+    torch.save({"state_dict": network().state_dict()}, tmp_path / "weights.pth.tar")
+    Reconstruct(data, tmp_path / "out", name, tmp_path / "weights.pth.tar", events_per_pixel=2.0).main()  # type: ignore[arg-type]
+    assert len(opened(tmp_path / "out").reference_views["train"]) == 4
+
+
+def test_images_without_a_pose_are_left_out(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    poses = read_tum_trajectory(data / "trajectory_estimated.txt")
+    write_tum_trajectory(data / "trajectory_estimated.txt", poses.between(START, START + 500_000_000))
+    Reconstruct(data, tmp_path / "out").main()
+    views = opened(tmp_path / "out").reference_views["train"]
+    assert 0 < len(views) < 25
+    assert all(view.time is not None and view.time <= START + 500_000_000 for view in views)
+    assert f"{25 - len(views)} of 25 images are left out" in capsys.readouterr().out
+
+
+def test_images_of_another_camera_are_left_out(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    meta = json.loads((data / "transforms.json").read_text())
+    meta["fl_x"] += 1
+    (data / "transforms.json").write_text(json.dumps(meta))
+    Reconstruct(data, tmp_path / "out").main()
+    assert {split: len(views) for split, views in opened(tmp_path / "out").reference_views.items()} == {
+        "train": 25,
+        "val": 0,
+        "test": 0,
+    }
+    assert "of another camera" in capsys.readouterr().out
+
+
+def test_what_cannot_be_reconstructed_ends_with_one_line_and_leaves_nothing(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    weights = tmp_path / "weights.pth.tar"
+    faults = [
+        (Reconstruct(data, out, "e2vid"), "no weights are given; .* https://github.com/uzh-rpg/rpg_e2vid"),
+        (Reconstruct(data, out, "firenet", weights), "there is no such file; .* firenet_1000.pth.tar"),
+        (Reconstruct(data, out, weights=weights), "the high-pass filter has no weights"),
+        (Reconstruct(data, out, events_per_pixel=0.0), "0.0 events a pixel; give a positive"),
+        (Reconstruct(data, out, events_per_pixel=9.0), "make 0 images of 216 events each"),
+        (Reconstruct(data, data), "the folder exists already"),
+    ]
+    for command, complaint in faults:
+        with pytest.raises(DataError, match=complaint):
+            command.main()
+    assert {path.name for path in tmp_path.iterdir()} == {"made"}

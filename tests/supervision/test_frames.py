@@ -1,0 +1,115 @@
+"""Supervision by images: which images, which pixels, and what their renderings are compared with."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from small_datasets import AS_RECORDED, END, START, parse, write_native
+from small_models import CAMERA, EPOCH, make_scene
+
+from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.recording.scene import SCENE, Scene
+from aenerf_ns.supervision.frames import FrameSampler, FrameSamplerConfig, FrameSupervision, FrameSupervisionConfig
+from aenerf_ns.supervision.pairs import PairSupervisionConfig
+
+SECONDS = (0.0, 0.25, 0.7)
+
+
+@dataclass
+class Dataset:
+    """A training dataset of images."""
+
+    scene: Scene
+
+
+def make_sampler(folder: Path, poses: torch.Tensor, pattern: BayerPattern = "", grey: bool = True) -> FrameSampler:
+    """A sampler of three images; pixel i of image f has the values 80 f + 5 i, and the colours 1 and 2 more."""
+    frames = []
+    for index, seconds in enumerate(SECONDS):
+        values = (80 * index + 5 * np.arange(12, dtype=np.uint8)).reshape(3, 4)
+        picture = values if grey else np.stack([values, values + 1, values + 2], -1).astype(np.uint8)
+        Image.fromarray(picture.astype(np.uint8)).save(folder / f"{index}.png")
+        frames.append((EPOCH + round(seconds * 1e9), folder / f"{index}.png"))
+    trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), poses)
+    scene = make_scene(SensorModel(bayer_pattern=pattern), trajectory)
+    scene = Scene(**{**vars(scene), "frames": tuple(frames)})
+    supervision = FrameSupervisionConfig().setup(sensor=scene.sensor, loss_coefficients={})
+    return FrameSamplerConfig().setup(dataset=Dataset(scene), supervision=supervision, device="cpu")
+
+
+@pytest.mark.parametrize(("pattern", "grey"), [("", True), ("RGGB", True), ("RGGB", False)])
+def test_a_pixel_has_the_value_of_its_image_and_the_ray_of_its_time(
+    pattern: BayerPattern, grey: bool, random_poses: torch.Tensor, tmp_path: Path
+) -> None:
+    rays, batch = make_sampler(tmp_path, random_poses, pattern, grey).sample(600)
+    assert rays.origins.shape == (600, 3)
+    values = torch.round(batch["values"] * 255).long()
+    assert values.shape == (600, 3 if pattern else 1)
+    if pattern:
+        assert (values - values[:, :1] == (torch.zeros(3).long() if grey else torch.arange(3))).all()
+    directions = CAMERA.pixel_directions()[0].reshape(-1, 3)
+    pixels = [int(np.abs(directions - ray).sum(1).argmin()) for ray in rays.metadata[CAMERA_DIRECTIONS].numpy()]
+    taken = torch.tensor(SECONDS, dtype=torch.float64)
+    frames = (rays.times - taken).abs().argmin(1)
+    torch.testing.assert_close(taken[frames], rays.times[:, 0], rtol=0, atol=1e-9)
+    assert values[:, 0].tolist() == (80 * frames + 5 * torch.tensor(pixels)).tolist()
+    # Images and pixels are drawn alike.
+    assert len(set(zip(frames.tolist(), pixels, strict=True))) == 36
+
+
+def test_the_loss_is_the_squared_error_of_display_values() -> None:
+    supervision = FrameSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={})
+    assert isinstance(supervision, FrameSupervision)
+    values = torch.tensor([[0.2], [0.5], [0.0]])
+    log_radiance = torch.tensor([[0.3], [0.5], [0.1]]).log().requires_grad_()
+    loss = supervision.losses({"log_radiance": log_radiance}, {"values": values})["reconstruction_loss"]
+    assert loss.item() == pytest.approx((0.01 + 0 + 0.01) / 3)
+    loss.backward()
+    assert log_radiance.grad is not None
+    torch.testing.assert_close(log_radiance.grad[:, 0], torch.tensor([0.06, 0.0, 0.02]) / 3)
+
+
+def test_pairs_and_images_do_not_mix(random_poses: torch.Tensor, tmp_path: Path) -> None:
+    scene = make_sampler(tmp_path, random_poses).dataset.scene
+    supervision = PairSupervisionConfig().setup(sensor=scene.sensor, loss_coefficients={})
+    with pytest.raises(DataError, match="its sampler draws frames and its supervision compares pairs"):
+        FrameSamplerConfig().setup(dataset=Dataset(scene), supervision=supervision, device="cpu")
+
+
+def test_images_that_cannot_be_trained_on_end_with_one_line(random_poses: torch.Tensor, tmp_path: Path) -> None:
+    sampler = make_sampler(tmp_path, random_poses)
+    Image.new("L", (5, 3)).save(tmp_path / "1.png")
+    with pytest.raises(DataError, match=r"1.png: the image has 5 x 3 pixels, its camera 4 x 3"):
+        sampler.prepare()
+    none = Dataset(Scene(**{**vars(sampler.dataset.scene), "frames": ()}))
+    supervision = FrameSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={})
+    with pytest.raises(DataError, match=r"no training images .*; make some with aenerf reconstruct"):
+        FrameSamplerConfig().setup(dataset=none, supervision=supervision, device="cpu").prepare()
+
+
+def test_a_dataset_hands_on_the_timed_training_images_of_the_event_camera(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    config = NativeDataParserConfig(data=data, start_time_ns=START, end_time_ns=END, **AS_RECORDED)
+    frames = parse(config).metadata[SCENE].frames
+    assert [(time, file.name) for time, file in frames] == [
+        (START, "00000.png"),
+        (START + 150_000_000, "00001.png"),
+        (END, "00002.png"),
+    ]
+    assert parse(config, "test").metadata[SCENE].frames == ()
+    config.start_time_ns, config.end_time_ns = START + 1, END - 1
+    assert [time for time, _ in parse(config).metadata[SCENE].frames] == [START + 150_000_000]
+    meta = json.loads((data / "transforms.json").read_text())
+    meta["fl_x"] += 1
+    (data / "transforms.json").write_text(json.dumps(meta))
+    assert parse(config).metadata[SCENE].frames == ()
