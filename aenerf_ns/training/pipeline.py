@@ -76,7 +76,8 @@ class AENeRFPipeline(VanillaPipeline):
         test_mode: Literal["test", "val", "inference"] = "val",
         **kwargs: Any,
     ) -> None:
-        if device.startswith("cuda") and not torch.cuda.is_available():
+        # Nerfstudio gives a torch.device in place of a name when it opens a run.
+        if torch.device(device).type == "cuda" and not torch.cuda.is_available():
             raise SystemExit(
                 "Error: --machine.device-type cuda: no GPU can be used; train on the CPU with: ns-train aenerf-small "
                 "--machine.device-type cpu ..., or install a driver that fits the CUDA of PyTorch"
