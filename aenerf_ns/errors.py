@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,6 +34,11 @@ def errors_as_one_line() -> Iterator[None]:
         yield
     except DataError as error:
         raise SystemExit(f"Error: {error}") from None
+
+
+def reason(error: OSError) -> str:
+    """Return the system's few words for an error. HDF5's text has several lines."""
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def _shortened(text: str) -> str:

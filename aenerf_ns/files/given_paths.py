@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.errors import DataError, reading, reason
 
 
 def require_dataset(data: Path) -> None:
@@ -18,12 +18,22 @@ def require_dataset(data: Path) -> None:
 
 
 def require_run(config: Path) -> None:
-    """Raise a DataError if a run's config.yml is no file."""
-    if not config.is_file():
-        raise DataError(config, "there is no such file", "give the config.yml of a trained run")
+    """Raise a DataError if a run's config.yml is no file or may not be looked at."""
+    with reading(config):
+        if not config.is_file():
+            raise DataError(config, "there is no such file", "give the config.yml of a trained run")
 
 
 def require_new(output: Path) -> None:
-    """Raise a DataError if the folder that a command will write exists."""
-    if output.exists():
+    """Raise a DataError if the folder that a command will write exists, or cannot have this name."""
+    try:
+        exists = output.exists()
+    except OSError as error:
+        raise cannot_be_created(output, error) from None
+    if exists:
         raise DataError(output, "the folder exists already", "remove it or choose another --output")
+
+
+def cannot_be_created(output: Path, error: OSError) -> DataError:
+    """Return the error for a folder that a command cannot create."""
+    return DataError(output, f"it cannot be created ({reason(error)})", "choose another --output")

@@ -10,7 +10,7 @@ from pathlib import Path
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import require_new
+from aenerf_ns.files.given_paths import cannot_be_created, require_new
 
 try:
     import fcntl
@@ -50,7 +50,7 @@ class OutputLock:
                 self.release()
                 raise
         except OSError as error:
-            raise DataError(output, f"it cannot be created ({error})", "choose another --output") from None
+            raise cannot_be_created(output, error) from None
         try:
             # The owner before may have finished in the meantime.
             require_new(self.output)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 from abc import ABC, abstractmethod
@@ -19,9 +18,10 @@ from torch import Tensor
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reason
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
+from aenerf_ns.files.given_paths import cannot_be_created
 from aenerf_ns.files.json_object import LENS_MODELS
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
@@ -60,7 +60,7 @@ class _FolderWriter(ABC):
         except OSError as error:
             shutil.rmtree(self._partial, ignore_errors=True)
             self._unlock()
-            raise DataError(folder, f"it cannot be created ({_reason(error)})", "choose another --output") from None
+            raise cannot_be_created(folder, error) from None
 
     def __enter__(self: _Writer) -> _Writer:
         return self
@@ -75,7 +75,7 @@ class _FolderWriter(ABC):
                 self._partial.rename(self._folder)
         except OSError as problem:
             raise DataError(
-                self._folder, f"it cannot be written ({_reason(problem)})", "check the space and the rights"
+                self._folder, f"it cannot be written ({reason(problem)})", "check the space and the rights"
             ) from None
         finally:
             shutil.rmtree(self._partial, ignore_errors=True)
@@ -296,11 +296,6 @@ class PoselessRecordingWriter(_FolderWriter):
 def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
     # OpenCV's own writing does not tell when the disk is full.
     path.write_bytes(cv2.imencode(".png", values)[1].tobytes())
-
-
-def _reason(error: OSError) -> str:
-    # HDF5's text has several lines.
-    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def _event_camera(camera: EventCamera, sensor: SensorModel) -> dict[str, Any]:

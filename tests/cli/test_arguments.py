@@ -19,6 +19,9 @@ from aenerf_ns.cli.reconstruct import Reconstruct
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.formats import FORMATS
 
+# Of which a message shows all, and no file system has a name.
+LONG = "a" * 290
+
 Command = Check | Convert | Evaluate | ExportTrajectory | Reconstruct
 
 
@@ -218,6 +221,8 @@ def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
         ("simulate --scene room --output G", 1, "G: the folder exists already"),
         ("evaluate nothing.yml --output O", 1, "nothing.yml: there is no such file"),
         ("export-trajectory --load_config nothing.yml --output O", 1, "nothing.yml: there is no such file"),
+        (f"simulate --output {LONG}", 1, f"{LONG}: it cannot be created (File name too long); choose another --output"),
+        (f"evaluate {LONG} --output O", 1, f"{LONG}: it cannot be read (File name too long); check its name"),
     ],
 )
 def test_wrong_paths_are_named_before_slow_imports(line: str, status: int, complaint: str) -> None:
