@@ -22,7 +22,7 @@ from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.images import image_size_and_mode
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
-from aenerf_ns.recording.views import read_image_list, views_on_trajectory
+from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_trajectory
 
 # The camera that recorded the dataset.
 _DAVIS240C = 240, 180
@@ -66,7 +66,7 @@ class EcdDataParser(EventDataParser):
         folder = Path(self.config.data)
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
-        images = read_image_list(folder / "images.txt") if (folder / "images.txt").exists() else []
+        images = read_image_list(folder / IMAGE_LIST) if (folder / IMAGE_LIST).exists() else []
         stated = (self.config.width, self.config.height)
         size = image_size_and_mode(images[0][1])[0] if images else _DAVIS240C
         width, height = (own if given is None else given for given, own in zip(stated, size, strict=True))

@@ -23,7 +23,7 @@ from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
-from aenerf_ns.recording.views import MAX_VIEWS, read_image_list, views_on_trajectory
+from aenerf_ns.recording.views import IMAGE_LIST, MAX_VIEWS, read_image_list, views_on_trajectory
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml")
 
@@ -117,7 +117,7 @@ class OwnRecordingDataParser(EventDataParser):
         return capture, calibration.frame_from_event, timed
 
     def _image_list(self, folder: Path) -> Path:
-        return folder / "images.txt" if self.config.images is None else self.config.images
+        return folder / IMAGE_LIST if self.config.images is None else self.config.images
 
     def _calibration_file(self, folder: Path) -> Path:
         if self.config.calibration is not None:

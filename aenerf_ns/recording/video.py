@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.images import image_size_and_mode, read_image, require_8_bits
-from aenerf_ns.recording.views import read_image_list
-
-IMAGE_LIST = "images.txt"
-"""The file in a folder of images that holds, on each line, a time in seconds and an image."""
+from aenerf_ns.recording.views import IMAGE_LIST, read_image_list
 
 
 class Video(ABC):

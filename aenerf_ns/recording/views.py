@@ -17,6 +17,9 @@ from aenerf_ns.files.boundary import file_inside
 from aenerf_ns.files.text import TimeUnit, parse_times, read_rows
 from aenerf_ns.recording.recording import ReferenceView, Split
 
+IMAGE_LIST = "images.txt"
+"""The file in a folder that holds, on each line, a time in seconds and an image."""
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 MAX_VIEWS = 20

@@ -27,6 +27,7 @@ from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import SPLITS, Split
+from aenerf_ns.recording.views import IMAGE_LIST
 
 _Writer = TypeVar("_Writer", bound="_FolderWriter")
 
@@ -279,7 +280,7 @@ class PoselessRecordingWriter(_FolderWriter):
 
     def _finish(self) -> None:
         lines = ["# t[s] file", *self._images]
-        (self._partial / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        (self._partial / IMAGE_LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
         if self._camera is not None:
             calibration = {"image_encoding": "srgb", "event_camera": _event_camera(self._camera, self._sensor)}
             text = json.dumps(calibration, indent=2)
