@@ -301,13 +301,13 @@ class Hdf5EventWriter:
         """Take room on the disk for what HDF5 is about to write, and for all that it holds until the file is closed.
 
         HDF5 can neither go on nor close a file after a write that failed, and the process ends with a segmentation
-        fault. So a full disk is found here.
+        fault. So a full disk is found here, where the system can reserve room: macOS and Windows cannot.
 
         Raises:
             OSError: there is no such room.
         """
         end = self._file.id.get_filesize() + num_bytes + _HELD_BYTES
-        if end > self._reserved:
+        if end > self._reserved and hasattr(os, "posix_fallocate"):
             os.posix_fallocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
             self._reserved = end
 
