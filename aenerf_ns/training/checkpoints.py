@@ -91,13 +91,16 @@ def move_whole(source: Path, destination: Path) -> None:
     Raises:
         OSError: the disk is full or fails.
     """
-    _sync(source)
+    _sync(source, os.O_RDWR)
     source.replace(destination)
-    _sync(destination.parent)
+    # Windows opens no folder.
+    if os.name == "posix":
+        _sync(destination.parent, os.O_RDONLY)
 
 
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+def _sync(path: Path, access: int) -> None:
+    # Windows writes back only files that are open for writing.
+    descriptor = os.open(path, access)
     try:
         os.fsync(descriptor)
     finally:
