@@ -37,9 +37,11 @@ def checkpoint_to_load(folder: Path, step: int | None = None) -> Path:
         fault = _fault(path)
         if fault is None:
             if broken:
-                CONSOLE.print(f"[yellow]Broken checkpoints: {'; '.join(broken)}. {path.name} is loaded", soft_wrap=True)
+                CONSOLE.print(
+                    f"[yellow]{folder}: broken checkpoints: {'; '.join(broken)}. {path.name} is loaded", soft_wrap=True
+                )
             return path
-        broken.append(f"{path} ({fault})")
+        broken.append(f"{path.name} ({fault})")
     problem = f"none of its checkpoints is whole: {'; '.join(broken)}" if broken else "it holds no checkpoint"
     raise DataError(folder, problem, "remove it and train again")
 

@@ -88,7 +88,7 @@ def test_a_broken_newest_checkpoint_is_named_and_passed_over(
     assert checkpoint_to_load(folder) == folder / "step-000000002.ckpt"
     said = capsys.readouterr().out
     assert said.count("\n") == 1
-    assert said.startswith(f"Broken checkpoints: {newest} (")
+    assert said.startswith(f"{folder}: broken checkpoints: {newest.name} (")
     assert said.endswith("). step-000000002.ckpt is loaded\n")
     with pytest.raises(DataError, match=r"step-000000003.ckpt: .*; load step-000000002.ckpt \(--load-step 2\)"):
         checkpoint_to_load(folder, 3)
