@@ -79,6 +79,11 @@ def require_known_tags(config: Path) -> None:
     for tag, line in tags:
         if not _is_known(tag):
             named = tag.removeprefix(_YAML)
+            kind, _, name = named.partition(":")
+            if kind in ("python/object", "python/name") and name.startswith("aenerf_ns.") and _find(name) is None:
+                raise DataError(
+                    config, f"line {line} names {name}, not of this version", "open it with the version that trained it"
+                )
             raise DataError(config, f"line {line} names {named}, and opening the file could run it", remedy)
     if not tags or not tags[0][0].startswith(f"{_YAML}python/object:"):
         raise DataError(config, "it is no configuration of a run", remedy)

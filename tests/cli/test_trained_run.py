@@ -16,9 +16,15 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
 from aenerf_ns.method_configs.aenerf_small import aenerf_small
+from aenerf_ns.method_configs.e2vid_nerf import e2vid_nerf
+from aenerf_ns.method_configs.eventnerf import eventnerf
+from aenerf_ns.method_configs.evnerf import evnerf
+from aenerf_ns.method_configs.robust_enerf import robust_enerf
+
+METHODS = (aenerf, aenerf_mlp, aenerf_small, e2vid_nerf, eventnerf, evnerf, robust_enerf)
 
 
-@pytest.mark.parametrize("method", [aenerf, aenerf_mlp, aenerf_small], ids=lambda m: m.config.method_name)
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.config.method_name)
 def test_the_configurations_of_the_methods_are_known(method: object, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(yaml.dump(replace(method.config, data=tmp_path)))
     require_known_tags(tmp_path / "config.yml")
@@ -64,6 +70,17 @@ def test_what_could_run_is_refused_before_the_file_is_opened(
     with pytest.raises(DataError, match=r"^config.yml: line \d names .*; give the config.yml of a trained run"):
         command(load_config=Path("config.yml"), output=Path("out")).main()
     assert not Path("executed").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["!!python/object:aenerf_ns.trainer.Config {}", "a: !!python/name:aenerf_ns.model.Model"]
+)
+def test_a_run_of_another_version_is_told_as_such(text: str, tmp_path: Path) -> None:
+    (tmp_path / "config.yml").write_text(text)
+    with pytest.raises(
+        DataError, match=r"line 1 names aenerf_ns\S+, not of this version; open it with the version that"
+    ):
+        require_known_tags(tmp_path / "config.yml")
 
 
 @pytest.mark.parametrize(
