@@ -28,9 +28,9 @@ class NativeDataParserConfig(SensorOptions, EventDataParserConfig):
 
     _target: type = field(default_factory=lambda: NativeDataParser)
     auto_scale_poses: bool | None = None
-    """Scale the estimated poses to fit in a box of +/- 1. By default as the dataset states: aenerf convert keeps the
-    default of the format that it reads, and other datasets are scaled. Where the poses are not scaled, choose a
-    scale_factor that brings the scene to a size of about 1 instead."""
+    """Scale the estimated poses to fit in a box of +/- 1. By default as the dataset states: aenerf convert and aenerf
+    reconstruct keep the default of the format that they read, and other datasets are scaled. Where the poses are not
+    scaled, choose a scale_factor that brings the scene to a size of about 1 instead."""
     poses: Literal["estimated", "ground-truth"] = "estimated"
     """Which trajectory to train on. Training on the true one shows how much the errors of the estimated one cost."""
 

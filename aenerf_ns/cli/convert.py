@@ -123,7 +123,7 @@ class Convert:
             max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
             frame_camera=recording.frame_camera,
             # Near and far planes keep their units.
-            auto_scale_poses=bool(parser.config.auto_scale_poses) or recording.scene_box is not None,
+            auto_scale_poses=parser.scales_poses(recording),
         ) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is not None:

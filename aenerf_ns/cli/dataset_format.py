@@ -54,7 +54,10 @@ else:
 
 
 def training_command(
-    data: Path, dataset_format: DatasetFormat | None = None, options: Mapping[str, object] | None = None
+    data: Path,
+    dataset_format: DatasetFormat | None = None,
+    options: Mapping[str, object] | None = None,
+    method: str = "aenerf",
 ) -> str:
     """Return the whole command that trains on a dataset.
 
@@ -62,8 +65,9 @@ def training_command(
         data: the dataset.
         dataset_format: its format with its options, where it is not recognised or its options are not the default.
         options: options of the method, by name.
+        method: its name.
     """
-    words = ["ns-train", "aenerf"]
+    words = ["ns-train", method]
     for name, value in (options or {}).items():
         words += [f"--{name}", str(value)]
     if isinstance(dataset_format, EventDataParserConfig):

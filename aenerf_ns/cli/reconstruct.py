@@ -15,7 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from aenerf_ns.camera.trajectory import homogeneous
-from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset
+from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset, training_command
 from aenerf_ns.cli.operands import Dataset
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
@@ -65,31 +65,30 @@ class Reconstruct:
         source = self._source(recording)
         camera, longest_gap = recording.event_camera, parser.config.max_pose_gap_ns
         longest_gap = recording.max_pose_gap if longest_gap is None else longest_gap
-        try:
-            with (
-                NativeDatasetWriter(
-                    lock,
-                    camera,
-                    recording.sensor,
-                    recording.image_encoding,
-                    scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
-                    max_pose_gap=longest_gap,
-                ) as writer,
-                closing(_new_video(writer.other_file(_VIDEO), camera.width, camera.height)) as video,
-            ):
-                writer.add_trajectories(recording.trajectory, recording.ground_truth)
-                _add_reference_views(recording, writer)
-                num_images = 0
-                for time, image in self._images(recording, source, longest_gap, writer):
-                    pose = homogeneous(recording.trajectory.interpolate(time))
-                    writer.add_image("train", image, pose, time)
-                    video.send(image.tobytes())
-                    num_images += 1
-        except OSError as error:
-            raise DataError(self.output, f"it cannot be written ({error})", "check the space and the rights") from None
+        with (
+            NativeDatasetWriter(
+                lock,
+                camera,
+                recording.sensor,
+                recording.image_encoding,
+                scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
+                max_pose_gap=longest_gap,
+                # The field then has the scale that a field of the recording's events has.
+                auto_scale_poses=parser.scales_poses(recording),
+            ) as writer,
+            closing(_new_video(writer.other_file(_VIDEO), camera.width, camera.height)) as video,
+        ):
+            writer.add_trajectories(recording.trajectory, recording.ground_truth)
+            _add_reference_views(recording, writer)
+            num_images = 0
+            for time, image in self._images(recording, source, longest_gap, writer):
+                pose = homogeneous(recording.trajectory.interpolate(time))
+                writer.add_image("train", image, pose, time)
+                video.send(image.tobytes())
+                num_images += 1
         CONSOLE.print(
             f"{self.output}: {num_images} images reconstructed by {self.method}, and {_VIDEO}.\n"
-            f"Train on them with: ns-train e2vid-nerf --data {self.output}",
+            f"Train on them with: {training_command(self.output, method='e2vid-nerf')}",
             highlight=False,
             soft_wrap=True,
         )

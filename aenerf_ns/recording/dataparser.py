@@ -93,6 +93,10 @@ class EventDataParser(DataParser):
             self._check_lens(recording.frame_camera, "camera of the images")
         return recording
 
+    def scales_poses(self, recording: Recording) -> bool:
+        """Return whether training scales the poses of a recording that this parser has read."""
+        return bool(self.config.auto_scale_poses) or recording.scene_box is not None
+
     def _check_lens(self, camera: EventCamera, name: str) -> None:
         """Raise a DataError for a lens whose distortion cannot be inverted at any pixel."""
         if not camera.sees():

@@ -91,6 +91,17 @@ def test_a_network_reconstructs_with_the_weights_of_a_file(
     assert len(opened(tmp_path / "out").reference_views["train"]) == 4
 
 
+@pytest.mark.parametrize("is_scaled", [False, True])
+def test_the_poses_keep_their_scale(is_scaled: bool, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    data = write_native(tmp_path / "made")
+    meta = json.loads((data / "transforms.json").read_text())
+    (data / "transforms.json").write_text(json.dumps({**meta, "auto_scale_poses": is_scaled}))
+    Reconstruct(data, tmp_path / "my images").main()
+    after = NativeDataParserConfig(data=tmp_path / "my images").setup()
+    assert after.scales_poses(after.recording) is is_scaled
+    assert f"ns-train e2vid-nerf --data '{tmp_path}/my images'\n" in capsys.readouterr().out
+
+
 def test_images_without_a_pose_are_left_out(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     poses = read_tum_trajectory(data / "trajectory_estimated.txt")
     write_tum_trajectory(data / "trajectory_estimated.txt", poses.between(START, START + 500_000_000))
