@@ -185,7 +185,9 @@ class Simulate:
         CONSOLE.print(
             f"{self.output}: {num_events:,} events in {truth.duration:.2f} s, {len(estimated)} poses, "
             f"{self.train_images} train, {self.validation_views} validation and {self.test_views} test images.\n"
-            f"Train with: {training_command(self.output)}"
+            f"Train with: {training_command(self.output)}",
+            highlight=False,
+            soft_wrap=True,
         )
 
     def _estimate(
