@@ -12,7 +12,8 @@ from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.scene import SimulationScene
 
 _PROBE_WIDTH = 24
-_PERCENTILE = 99.0
+DISPLACEMENT_PERCENTILE = 99.0
+"""Percentage of the picture that a limit on the motion between two pictures holds for."""
 _MARGIN = 0.98
 """Each step is guessed from the step before. A target a little below the limit saves most second guesses."""
 _LARGEST_STEP = 0.01
@@ -52,7 +53,7 @@ def frame_displacement(
     px, py, pz = rotation @ points + shift[:, None] * near
     if pz.min() <= 0:
         return np.inf
-    return float(np.percentile(np.hypot(fx * (px / pz - u), fy * (py / pz - v)), _PERCENTILE))
+    return float(np.percentile(np.hypot(fx * (px / pz - u), fy * (py / pz - v)), DISPLACEMENT_PERCENTILE))
 
 
 def frame_parameters(

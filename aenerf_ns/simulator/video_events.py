@@ -17,11 +17,11 @@ from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.video import Video
 from aenerf_ns.simulator.esim import NOISELESS, EventSimulator, SensorNoise
+from aenerf_ns.simulator.frames import DISPLACEMENT_PERCENTILE
 
 Interpolation = Literal["linear", "flow"]
 
 _GREY_LEVELS = decode(np.arange(256) / 255, "srgb")
-_PERCENTILE = 99.0
 
 
 class VideoInterval(NamedTuple):
@@ -142,7 +142,9 @@ class FlowInterpolation:
         # Without a guess of the flow to start from.
         forward = self._flow.calc(first_grey, second_grey, np.empty(0))
         backward = self._flow.calc(second_grey, first_grey, np.empty(0))
-        displacement = max(np.percentile(np.linalg.norm(flow, axis=-1), _PERCENTILE) for flow in (forward, backward))
+        displacement = max(
+            np.percentile(np.linalg.norm(flow, axis=-1), DISPLACEMENT_PERCENTILE) for flow in (forward, backward)
+        )
         steps = math.ceil(displacement / self._max_displacement)
         for fraction in np.arange(1, steps, dtype=np.float32) / np.float32(steps):
             rest = 1 - fraction
