@@ -118,7 +118,9 @@ class AENeRFTrainer(Trainer):
             folder.mkdir(parents=True, exist_ok=True)
             move_whole(partial / path.name, path)
         except (OSError, RuntimeError) as error:
-            # torch raises RuntimeError for a full disk.
+            # torch's writer raises RuntimeError for a full disk, and CUDA for faults of the GPU.
+            if "CUDA" in str(error):
+                raise
             raise SystemExit(_cannot_be_written(path, error)) from None
         finally:
             self.checkpoint_dir = folder
