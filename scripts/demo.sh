@@ -17,7 +17,7 @@ aenerf simulate --output demo/room --width 160 --height 120 --max-displacement 1
 # The simulated poses are exact: nothing of them is corrected here.
 echo "2/4 Training from its events alone (watch it at http://localhost:7007) ..."
 device=$(python -c "import torch; print('cuda' if torch.cuda.is_available() else 'cpu')")
-ns-train aenerf-small --machine.device-type "$device" --max-num-iterations 800 --output-dir demo/outputs \
+ns-train aenerf-small --machine.device-type "$device" --max-num-iterations 1200 --output-dir demo/outputs \
   --pipeline.model.camera-optimizer.mode off --pipeline.refine-test-poses False \
   --viewer.quit-on-train-completion True --viewer.websocket-host 127.0.0.1 --data demo/room
 config=$(ls -t demo/outputs/room/aenerf-small/*/config.yml | head -n 1)
