@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.events.stream import EventStream
@@ -28,6 +29,9 @@ if not torch.cuda.is_available():
 
 # Examples of each test that feeds readers with damaged and random input; many more when they are set to.
 FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
+# The same examples in every run of the suite, so that a failure is that of a change. Longer runs look for new ones.
+settings.register_profile("suite", derandomize="AENERF_FUZZ_EXAMPLES" not in os.environ)
+settings.load_profile("suite")
 
 # Third-party recordings, which are not part of the project.
 _SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
