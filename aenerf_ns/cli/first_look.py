@@ -1,4 +1,4 @@
-"""What is wrong with a command line, said before the imports of the framework, which take a quarter of a minute."""
+"""Check the paths of a command line before the import of the framework, which takes a quarter of a minute."""
 
 from __future__ import annotations
 

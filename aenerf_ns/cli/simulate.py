@@ -53,8 +53,8 @@ class Simulate:
     """A video in place of a scene: a file, or a folder of images with the list images.txt of their times (on each line:
     t[s] file). Without --trajectory and without --poses colmap, only events and images are written."""
     interpolation: Interpolation = "flow"
-    """What happens between the frames of the video. flow: log-radiance moves along optical flow. linear: it is linear
-    in time at each pixel, which is faster, and wrong where the picture moves by pixels from frame to frame."""
+    """How the log-radiance changes between two frames of the video. flow: it moves along optical flow. linear: each
+    pixel changes linearly in time. linear is faster, but wrong where the picture moves by pixels between frames."""
     trajectory: Path | None = None
     """Poses of the video's camera, as t tx ty tz qx qy qz qw in seconds on the clock of the video, camera-to-world,
     OpenCV camera axes. Needs the camera's intrinsics."""

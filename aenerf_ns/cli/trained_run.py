@@ -28,7 +28,7 @@ _PLAIN = {
 }
 # Whose classes a configuration is made of.
 _PACKAGES = ("nerfstudio.", "torch.optim.", "aenerf_ns.")
-# What else a configuration of the framework names.
+# The framework's configurations name these classes and functions, too.
 _PATHS = {f"pathlib.{name}" for name in ("PosixPath", "PurePosixPath", "WindowsPath", "PureWindowsPath", "Path")}
 _FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}
 

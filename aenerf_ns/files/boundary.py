@@ -1,4 +1,4 @@
-"""What the files of a dataset may ask of the machine: how much memory, and which other files.
+"""Limits on the memory that the files of a dataset may take, and on the other files that they may name.
 
 Every reader of untrusted files checks sizes here before it allocates anything.
 """
@@ -13,6 +13,13 @@ from aenerf_ns.errors import DataError, reading
 _FREE_BYTES = 1 << 28
 # Real events are compressed by a factor of 2 to 10, and a bomb by 1000 and more.
 _MAX_FACTOR = 100
+
+
+def require_file(path: Path) -> None:
+    """Raise a DataError if a file of a dataset does not exist."""
+    with reading(path):
+        if not path.is_file():
+            raise DataError(path, "there is no such file", "check the path of the dataset")
 
 
 def read_text(path: Path, max_bytes: int) -> str:
@@ -55,7 +62,7 @@ def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> 
     if unpacked > max(_FREE_BYTES, _MAX_FACTOR * packed):
         raise DataError(
             path,
-            f"{name} has {unpacked:,} bytes, of which the file holds {packed:,}",
+            f"{name} has {unpacked:,} bytes when it is unpacked, but only {packed:,} in the file",
             "write it again: it is damaged, or made to fill the memory",
         )
 

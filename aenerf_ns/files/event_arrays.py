@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, require_event_file
-from aenerf_ns.files.boundary import require_unpacked_size
+from aenerf_ns.files.boundary import require_file, require_unpacked_size
 from aenerf_ns.files.event_table import EventLayout, EventTableFile
 from aenerf_ns.files.text import TimeUnit
 
@@ -134,8 +134,7 @@ def open_npz_member(path: Path, name: str) -> Iterator[tuple[IO[bytes], zipfile.
 @contextmanager
 def _open_npz(path: Path) -> Iterator[zipfile.ZipFile]:
     with reading(path):
-        if not path.is_file():
-            raise DataError(path, "there is no such file", "check the path of the dataset")
+        require_file(path)
         try:
             archive = zipfile.ZipFile(path)
         except (zipfile.BadZipFile, ValueError, NotImplementedError, struct.error) as error:
@@ -201,8 +200,7 @@ def load_npy(path: Path) -> NDArray:
         DataError: the file is missing or malformed, or its array holds Python objects.
     """
     with reading(path):
-        if not path.is_file():
-            raise DataError(path, "there is no such file", "check the path of the dataset")
+        require_file(path)
         with path.open("rb") as file, _errors_as(path, "not a readable .npy file"):
             if file.read(2) == b"PK":
                 raise DataError(path, "it is an archive of several arrays", "name it .npz")

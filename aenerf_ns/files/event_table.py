@@ -20,7 +20,7 @@ _COLUMNS = ("x", "y", "t", "p")
 # Events read at once: 32 MB of a matrix of float64.
 _CHUNK = 1 << 20
 CHECK_SIZE = "check the sensor size and the order of the columns"
-"""What to do about a pixel outside the sensor."""
+"""The remedy that an error about a pixel outside the sensor names."""
 # Number of events that tell the unit of the times.
 SAMPLE = 4096
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.boundary import require_at_most
+from aenerf_ns.files.boundary import require_at_most, require_file
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
@@ -38,9 +38,8 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     """
     expected = len(columns.split())
     rows: list[list[str]] = []
+    require_file(path)
     with reading(path):
-        if not path.is_file():
-            raise DataError(path, "there is no such file", "check the path of the dataset")
         require_at_most(path, _MAX_BYTES)
     with reading(path), path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, start=1):

@@ -1,4 +1,4 @@
-"""Cutting a stream of events into batches, each of which gives one image."""
+"""Batches of events: each batch gives one image."""
 
 from __future__ import annotations
 

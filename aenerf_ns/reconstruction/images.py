@@ -26,7 +26,7 @@ _SHARPENING, _BLUR, _BLUR_SIZE = 0.3, 1.0, 5
 
 
 class ImageSource(Protocol):
-    """What makes images of batches of events."""
+    """Makes an image of each batch of events."""
 
     def image(self, events: EventStream) -> NDArray[np.uint8]:
         """Take the next batch of the stream, and return the image at its last event.

@@ -78,7 +78,7 @@ class ConvLSTM(nn.Module):
         self.Gates = nn.Conv2d(2 * num_channels, 4 * num_channels, 3, padding=1)
 
     def forward(self, features: Tensor, state: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
-        """Return the new state (hidden, cell), of which the hidden one is the output. No state means zeros."""
+        """Return the new state (hidden, cell). The hidden state is the output. None begins with zeros."""
         hidden, cell = (torch.zeros_like(features),) * 2 if state is None else state
         take, keep, show, new = self.Gates(torch.cat([features, hidden], 1)).chunk(4, 1)
         cell = keep.sigmoid() * cell + take.sigmoid() * new.tanh()

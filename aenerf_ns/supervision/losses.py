@@ -16,7 +16,7 @@ def log_radiance_change(
         num_positive: (N,) positive events after the earlier time up to the later one.
         num_negative: (N,) negative events in the same time.
         positive_threshold: C+; a scalar in the graph when it is learned.
-        negative_threshold: C−; likewise.
+        negative_threshold: C−; a scalar in the graph when it is learned.
 
     Returns:
         (N,) changes.
