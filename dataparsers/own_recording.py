@@ -17,6 +17,7 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.calibration import read_calibration
+from aenerf_ns.files.layouts import CALIBRATIONS
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
@@ -24,8 +25,6 @@ from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, MAX_VIEWS, read_image_list, views_on_trajectory
-
-_CALIBRATIONS = ("calibration.json", "camchain.yaml")
 
 
 @dataclass
@@ -62,16 +61,6 @@ class OwnRecordingDataParser(EventDataParser):
     """Read a recording from the files that the options name, or from the files of the default names in a folder."""
 
     config: OwnRecordingDataParserConfig
-    layout = (
-        f"events{{{','.join(SUFFIXES)}}} with {' or '.join(_CALIBRATIONS)} and trajectory.txt or a COLMAP model "
-        "in colmap"
-    )
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return any((data / name).is_file() for name in _CALIBRATIONS) and (
-            (data / "trajectory.txt").is_file() or (data / "colmap").is_dir()
-        )
 
     def read_recording(self) -> Recording:
         folder, config = Path(self.config.data), self.config
@@ -122,11 +111,11 @@ class OwnRecordingDataParser(EventDataParser):
     def _calibration_file(self, folder: Path) -> Path:
         if self.config.calibration is not None:
             return self.config.calibration
-        found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
+        found = [folder / name for name in CALIBRATIONS if (folder / name).is_file()]
         if len(found) != 1:
             raise DataError(
                 folder,
-                f"it holds {len(found)} of {' and '.join(_CALIBRATIONS)}",
+                f"it holds {len(found)} of {' and '.join(CALIBRATIONS)}",
                 "give the calibration as --calibration",
             )
         return found[0]
