@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.calibration import read_calibration
+from aenerf_ns.files.colmap import read_colmap_poses
 from aenerf_ns.files.layouts import CALIBRATIONS
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
@@ -140,18 +139,9 @@ class OwnRecordingDataParser(EventDataParser):
 
 def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:
     """Return the event camera's trajectory: a pose for each image that a COLMAP model places."""
-    # Imported lazily: every ns-* command imports this module, and pycolmap is slow to import.
-    import pycolmap
-
     folders = [folder for folder in (model, model / "sparse" / "0", model / "0") if any(folder.glob("images.*"))]
-    if not folders:
-        raise DataError(model, "there is no COLMAP model", "give the folder that holds images.bin or images.txt")
-    try:
-        placed = [image for image in pycolmap.Reconstruction(folders[0]).images.values() if image.has_pose]
-        poses = {image.name: image.cam_from_world().inverse().matrix() for image in placed}
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise DataError(folders[0], f"not a COLMAP model ({' '.join(str(error).split())})", "copy it again") from None
-    known: dict[int, Any] = {}
+    poses = read_colmap_poses(folders[0] if folders else model)
+    known: dict[int, Tensor] = {}
     for name, pose in poses.items():
         times = [time for time, file in timed if file.as_posix().endswith(f"/{name}")]
         if len(times) != 1:
@@ -160,7 +150,7 @@ def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame
     order = sorted(known)
     if len(order) < len(timed):
         CONSOLE.print(f"COLMAP placed {len(order)} of the {len(timed)} images: poses are interpolated between these.")
-    frames = homogeneous(torch.from_numpy(np.array([known[time] for time in order]).reshape(-1, 3, 4)))
+    frames = torch.stack([known[time] for time in order])
     return Trajectory(order, frames @ frame_from_event, folders[0])
 
 
