@@ -60,21 +60,20 @@ class Named:
     """A format that is named, without its options."""
 
 
-# With the names of the formats only, because their options come with the framework.
-_NAMED_FORMAT = tyro.conf.OmitArgPrefixes[
-    tyro.extras.subcommand_type_from_defaults(
-        {"auto": Automatic(), **{name: Named() for name in LAYOUTS}},
-        descriptions={
-            "auto": "recognise the format from the files of the dataset",
-            **{name: layout.summary for name, layout in LAYOUTS.items()},
-        },
-        prefix_names=False,
-    )
-]
 if TYPE_CHECKING:
     FormatName = Any
 else:
-    FormatName = _NAMED_FORMAT
+    # With the names of the formats only, because their options come with the framework.
+    FormatName = tyro.conf.OmitArgPrefixes[
+        tyro.extras.subcommand_type_from_defaults(
+            {"auto": Automatic(), **{name: Named() for name in LAYOUTS}},
+            descriptions={
+                "auto": "recognise the format from the files of the dataset",
+                **{name: layout.summary for name, layout in LAYOUTS.items()},
+            },
+            prefix_names=False,
+        )
+    ]
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import tyro
 
@@ -26,7 +26,7 @@ OfRun = EvaluateArguments | ExportTrajectoryArguments
 Arguments = SimulateArguments | OfDataset | OfRun
 
 DESCRIPTION = "AE-NeRF tools; train with ns-train aenerf."
-_COMMANDS = {
+_COMMANDS: dict[str, Callable[..., Arguments]] = {
     "simulate": SimulateArguments,
     "convert": ConvertArguments,
     "check": CheckArguments,
