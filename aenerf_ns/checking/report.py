@@ -35,7 +35,7 @@ _MIN_IN_BOX_SHARE = 0.5
 _NOISE_DEVIATIONS, _NOISE_FACTOR = 4.0, 1.5
 # Of slices that clearly fit another meaning of the poses. With right poses there is none on the recordings of the
 # tests, and with the poses of another path about half.
-_MAX_ELSEWHERE_SHARE = 0.25
+_MAX_ELSEWHERE_SHARE = 0.2
 # Fewer events give no contrast.
 _MIN_EVENTS = 2_000
 # The depth of a tile with less than this share of the mean contrast is not trusted.
