@@ -44,11 +44,6 @@ class EcdDataParser(EventDataParser):
     """Read a folder of the Event Camera Dataset. Its images alternate between the validation and the test split."""
 
     config: EcdDataParserConfig
-    layout = "events.txt with groundtruth.txt and calib.txt"
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return all((data / name).is_file() for name in ("events.txt", "groundtruth.txt", "calib.txt"))
 
     def read_recording(self) -> Recording:
         capture, images = self._read_all_but_poses()

@@ -64,11 +64,6 @@ class EdsDataParser(EventDataParser):
     """Read a sequence: its events, the poses of the event camera, and the images of the frame camera."""
 
     config: EdsDataParserConfig
-    layout = "events.h5 with stamped_groundtruth.txt"
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return all((data / name).is_file() for name in ("events.h5", "stamped_groundtruth.txt"))
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)

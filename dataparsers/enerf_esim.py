@@ -62,13 +62,6 @@ class ENeRFEsimDataParser(EventDataParser):
     """Read a scene of E-NeRF. Its images come from the event sensor."""
 
     config: ENeRFEsimDataParserConfig
-    layout = "events/*.npy with *poses_all*.txt and poses_bounds.npy"
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return (
-            any(data.glob("*poses_all*.txt")) and (data / "poses_bounds.npy").is_file() and (data / "events").is_dir()
-        )
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)

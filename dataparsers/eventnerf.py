@@ -20,6 +20,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.boundary import read_text
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
+from aenerf_ns.files.layouts import eventnerf_splits
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import ObjectDataParserConfig
@@ -85,15 +86,10 @@ class EventNeRFDataParser(EventDataParser):
     """
 
     config: EventNeRFDataParserConfig
-    layout = "train/events/*.npz with train/pose and train/intrinsics"
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return any((split / "pose").is_dir() and (split / "intrinsics").is_dir() for split in _training_splits(data))
 
     def read_recording(self) -> Recording:
         data = Path(self.config.data)
-        splits = [split for split in _training_splits(data) if (split / "pose").is_dir()]
+        splits = [split for split in eventnerf_splits(data) if (split / "pose").is_dir()]
         if not splits:
             raise DataError(data, "there is no train/pose", "give the folder of a scene or of one of its splits")
         if len(splits) > 1:
@@ -130,10 +126,6 @@ class EventNeRFDataParser(EventDataParser):
             image_encoding="srgb",
             scene_box=self.config.scene_box(UNIT_SPHERE),
         )
-
-
-def _training_splits(data: Path) -> list[Path]:
-    return [data] if (data / "pose").is_dir() else sorted(path for path in data.glob("train*") if path.is_dir())
 
 
 def _held_out_views(scene: Path) -> dict[Split, list[ReferenceView]]:

@@ -1,4 +1,4 @@
-"""The names of all dataset formats, and recognising which one a folder has."""
+"""All dataset formats, and the one that a folder is recognised to have."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from aenerf_ns.dataparsers.own_recording import own_recording_dataparser
 from aenerf_ns.dataparsers.paev3d import paev3d_dataparser
 from aenerf_ns.dataparsers.robust_enerf import robust_enerf_dataparser
 from aenerf_ns.dataparsers.tum_vie import tum_vie_dataparser
-from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.given_paths import require_dataset
+from aenerf_ns.files.layouts import recognise
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
 
-# By the names they are registered with. Where a folder has several formats, the first one here is taken.
+# By the names they are registered with.
 FORMATS: dict[str, EventDataParserConfig] = {
     "aenerf-data": native_dataparser.config,
     "ecd-data": ecd_dataparser.config,
@@ -37,22 +36,6 @@ FORMATS: dict[str, EventDataParserConfig] = {
     "paev3d-data": paev3d_dataparser.config,
     "event-recording-data": own_recording_dataparser.config,
 }
-
-
-def recognise(data: Path) -> str:
-    """Return the name of the format that a folder has, judged by the names of its files.
-
-    Raises:
-        DataError: the folder does not exist, or has none of the formats.
-    """
-    parsers: dict[str, type[EventDataParser]] = {name: config._target for name, config in FORMATS.items()}
-    with reading(data):
-        for name, parser in parsers.items():
-            if parser.recognises(data):
-                return name
-    require_dataset(data)
-    known = "; ".join(f"{name}: {parser.layout}" for name, parser in parsers.items())
-    raise DataError(data, "no known format of recordings", f"looked for {known}")
 
 
 @dataclass

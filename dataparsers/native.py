@@ -39,11 +39,6 @@ class NativeDataParser(EventDataParser):
     """Read a dataset folder that holds transforms.json, an event file and trajectory_estimated.txt."""
 
     config: NativeDataParserConfig
-    layout = "transforms.json with trajectory_estimated.txt"
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return all((data / name).is_file() for name in ("transforms.json", "trajectory_estimated.txt"))
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)

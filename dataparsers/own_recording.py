@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.calibration import read_calibration
+from aenerf_ns.files.colmap import read_colmap_poses
+from aenerf_ns.files.layouts import CALIBRATIONS
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
@@ -24,8 +24,6 @@ from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, MAX_VIEWS, read_image_list, views_on_trajectory
-
-_CALIBRATIONS = ("calibration.json", "camchain.yaml")
 
 
 @dataclass
@@ -62,16 +60,6 @@ class OwnRecordingDataParser(EventDataParser):
     """Read a recording from the files that the options name, or from the files of the default names in a folder."""
 
     config: OwnRecordingDataParserConfig
-    layout = (
-        f"events{{{','.join(SUFFIXES)}}} with {' or '.join(_CALIBRATIONS)} and trajectory.txt or a COLMAP model "
-        "in colmap"
-    )
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return any((data / name).is_file() for name in _CALIBRATIONS) and (
-            (data / "trajectory.txt").is_file() or (data / "colmap").is_dir()
-        )
 
     def read_recording(self) -> Recording:
         folder, config = Path(self.config.data), self.config
@@ -122,11 +110,11 @@ class OwnRecordingDataParser(EventDataParser):
     def _calibration_file(self, folder: Path) -> Path:
         if self.config.calibration is not None:
             return self.config.calibration
-        found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
+        found = [folder / name for name in CALIBRATIONS if (folder / name).is_file()]
         if len(found) != 1:
             raise DataError(
                 folder,
-                f"it holds {len(found)} of {' and '.join(_CALIBRATIONS)}",
+                f"it holds {len(found)} of {' and '.join(CALIBRATIONS)}",
                 "give the calibration as --calibration",
             )
         return found[0]
@@ -151,18 +139,9 @@ class OwnRecordingDataParser(EventDataParser):
 
 def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:
     """Return the event camera's trajectory: a pose for each image that a COLMAP model places."""
-    # Imported lazily: every ns-* command imports this module, and pycolmap is slow to import.
-    import pycolmap
-
     folders = [folder for folder in (model, model / "sparse" / "0", model / "0") if any(folder.glob("images.*"))]
-    if not folders:
-        raise DataError(model, "there is no COLMAP model", "give the folder that holds images.bin or images.txt")
-    try:
-        placed = [image for image in pycolmap.Reconstruction(folders[0]).images.values() if image.has_pose]
-        poses = {image.name: image.cam_from_world().inverse().matrix() for image in placed}
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise DataError(folders[0], f"not a COLMAP model ({' '.join(str(error).split())})", "copy it again") from None
-    known: dict[int, Any] = {}
+    poses = read_colmap_poses(folders[0] if folders else model)
+    known: dict[int, Tensor] = {}
     for name, pose in poses.items():
         times = [time for time, file in timed if file.as_posix().endswith(f"/{name}")]
         if len(times) != 1:
@@ -171,7 +150,7 @@ def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame
     order = sorted(known)
     if len(order) < len(timed):
         CONSOLE.print(f"COLMAP placed {len(order)} of the {len(timed)} images: poses are interpolated between these.")
-    frames = homogeneous(torch.from_numpy(np.array([known[time] for time in order]).reshape(-1, 3, 4)))
+    frames = torch.stack([known[time] for time in order])
     return Trajectory(order, frames @ frame_from_event, folders[0])
 
 

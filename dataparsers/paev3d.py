@@ -19,6 +19,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import open_npz_member, read_npy_header
 from aenerf_ns.files.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
+from aenerf_ns.files.layouts import paev3d_scenes
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, image_files_of_poses, views_on_trajectory
@@ -41,15 +42,10 @@ class PAEv3DDataParser(EventDataParser):
     """Read a scene, given the folder of its events, or the dataset's folder where that holds one scene only."""
 
     config: PAEv3DDataParserConfig
-    layout = "H5_Files/SCENE/event.h5 with Render_info/SCENE and Intrinsics"
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return bool(_scenes(data))
 
     def read_recording(self) -> Recording:
         data = Path(self.config.data)
-        scenes = _scenes(data)
+        scenes = paev3d_scenes(data)
         if not scenes:
             raise DataError(data, "there is no H5_Files/SCENE", "give the dataset's folder, or H5_Files/SCENE in it")
         if len(scenes) > 1:
@@ -79,13 +75,6 @@ class PAEv3DDataParser(EventDataParser):
             max_views=MAX_VIEWS,
             scene_box=self.config.scene_box(UNIT_SPHERE),
         )
-
-
-def _scenes(data: Path) -> list[Path]:
-    """Return the folders of events. A trained run is opened without its events, so the file need not exist."""
-    if data.parent.name == "H5_Files":
-        return [data]
-    return sorted(path for path in data.glob("H5_Files/*") if path.is_dir())
 
 
 class _Call:

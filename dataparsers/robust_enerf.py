@@ -42,11 +42,6 @@ class RobustENeRFDataParser(EventDataParser):
     """Read a scene of Robust e-NeRF. The folder ``views`` is in the scene's folder or one folder up."""
 
     config: RobustENeRFDataParserConfig
-    layout = "raw_events.npz with camera_poses.npz and camera_calibration.npz"
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return all((data / f"{name}.npz").is_file() for name in ("raw_events", "camera_poses", "camera_calibration"))
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)

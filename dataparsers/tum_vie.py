@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,14 +15,13 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
 from aenerf_ns.files.json_object import JsonObject
+from aenerf_ns.files.layouts import TUM_VIE_EVENTS, tum_vie_event_files
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
 
-_EVENTS = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
-_PARTS = ("-events_left.h5", "-vi_gt_data")
 # Sequences recorded with calibration A. All others were recorded with calibration B.
 _SET_A = {"loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"}
 # Indices into the lists of the calibration.
@@ -51,11 +49,6 @@ class TumVieDataParser(EventDataParser):
     """
 
     config: TumVieDataParserConfig
-    layout = "SEQUENCE-events_left.h5 with SEQUENCE-vi_gt_data"
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        return bool(_event_files(data))
 
     def read_recording(self) -> Recording:
         events, sequence, side = _choose(Path(self.config.data))
@@ -94,25 +87,16 @@ class TumVieDataParser(EventDataParser):
         )
 
 
-def _event_files(data: Path) -> list[Path]:
-    """Return the event files of the sequences in a folder. A trained run is opened without its events, so any other
-    part of a sequence suffices."""
-    if _EVENTS.fullmatch(data.name):
-        return [data]
-    names = {path.name.removesuffix(suffix) for suffix in _PARTS for path in data.glob(f"?*{suffix}")}
-    return [data / f"{name}-events_left.h5" for name in sorted(names)]
-
-
 def _choose(data: Path) -> tuple[Path, str, str]:
     """Return the event file, its sequence and its side."""
-    files = _event_files(data)
+    files = tum_vie_event_files(data)
     if not files:
         raise DataError(data, "there is no SEQUENCE-events_left.h5", "download a sequence to this folder")
     if len(files) > 1:
         raise DataError(
             data, f"it holds {len(files)} sequences", f"give the event file of one as --data, such as {files[0]}"
         )
-    match = _EVENTS.fullmatch(files[0].name)
+    match = TUM_VIE_EVENTS.fullmatch(files[0].name)
     assert match is not None
     return files[0], match["sequence"], match["side"]
 

@@ -179,9 +179,10 @@ class WarpedEvents:
             The comparison, or None if too few events have a pose and a direction under the hypothesis.
         """
         covered = TimeWindow(self._trajectory.start, self._trajectory.end)
-        given, alternative = [], []
+        given, alternative, numbers = [], [], []
         has_direction = np.isfinite(hypothesis.plane(self._plane) + self._plane).all(-1)
-        for events, as_given in list(zip(self._slices, self.given, strict=True))[slices]:
+        for number in range(len(self._slices))[slices]:
+            events, as_given = self._slices[number], self.given[number]
             seen = has_direction[events.y, events.x]
             usable = seen & covered.contains(events.t + hypothesis.clock_offset)
             if usable.sum() < max(_MIN_USABLE * seen.sum(), 2):
@@ -189,17 +190,12 @@ class WarpedEvents:
             part = events[usable]
             given.append(as_given if usable.all() else self._warp(part, GIVEN))
             alternative.append(self._warp(part, hypothesis))
+            numbers.append(number)
         if not given:
             return None
-        # The standard error of the difference of two ratios of sums, over the tiles.
-        error = np.sqrt(
-            sum(
-                np.square(_residuals(other, alternative) - _residuals(one, given)).sum()
-                for one, other in zip(given, alternative, strict=True)
-            )
-        )
-        difference = (_contrast(alternative) - _contrast(given)) / max(float(error), 1e-12)
-        return Comparison(hypothesis, _contrast(alternative), _contrast(given), difference)
+        alone = [_compared(hypothesis, [one], [other]) for one, other in zip(given, alternative, strict=True)]
+        clear = [number for number, one in zip(numbers, alone, strict=True) if one.is_clearly_better]
+        return replace(_compared(hypothesis, given, alternative), clear_slices=frozenset(clear))
 
     def comparisons(self) -> list[Comparison]:
         """Compare all alternatives whose events the poses cover, and return the comparisons, the best first.
@@ -332,6 +328,19 @@ class WarpedEvents:
 def _contrast(slices: Sequence[WarpedSlice]) -> float:
     """Return the contrast of all tiles of the slices together."""
     return float(sum(s.energy.sum() for s in slices) / max(sum(s.brightness.sum() for s in slices), 1e-30))
+
+
+def _compared(hypothesis: Hypothesis, given: list[WarpedSlice], alternative: list[WarpedSlice]) -> Comparison:
+    """Compare slices that are warped under a hypothesis with the same slices warped as given."""
+    # The standard error of the difference of two ratios of sums, over the tiles.
+    error = np.sqrt(
+        sum(
+            np.square(_residuals(other, alternative) - _residuals(one, given)).sum()
+            for one, other in zip(given, alternative, strict=True)
+        )
+    )
+    difference = (_contrast(alternative) - _contrast(given)) / max(float(error), 1e-12)
+    return Comparison(hypothesis, _contrast(alternative), _contrast(given), difference)
 
 
 def _residuals(one: WarpedSlice, slices: Sequence[WarpedSlice]) -> NDArray[np.float64]:

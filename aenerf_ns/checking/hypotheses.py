@@ -140,12 +140,14 @@ class Comparison:
         contrast: the contrast of the events warped under the hypothesis.
         given: the contrast of the events warped as given.
         difference: ``contrast`` less ``given``, in standard errors over the tiles.
+        clear_slices: the slices of the events that, each by itself, clearly fit the hypothesis better.
     """
 
     hypothesis: Hypothesis
     contrast: float
     given: float
     difference: float
+    clear_slices: frozenset[int] = frozenset()
 
     @property
     def is_clearly_better(self) -> bool:

@@ -33,6 +33,9 @@ _MIN_IN_BOX_SHARE = 0.5
 
 # Contrast above that of the shuffled events by so many standard deviations and by this factor is not noise.
 _NOISE_DEVIATIONS, _NOISE_FACTOR = 4.0, 1.5
+# Of slices that clearly fit another meaning of the poses. With right poses there is none on the recordings of the
+# tests, and with the poses of another path about half.
+_MAX_ELSEWHERE_SHARE = 0.2
 # Fewer events give no contrast.
 _MIN_EVENTS = 2_000
 # The depth of a tile with less than this share of the mean contrast is not trusted.
@@ -236,6 +239,13 @@ class Report:
                 f"the events are hardly sharper than the same events in a random order (contrast {still.given:.3f}, "
                 f"shuffled {mean:.3f} +/- {deviation:.3f}): they are noise, or the poses are of another recording: "
                 "check the polarities, the order of the columns and the poses"
+            )
+            return False
+        elsewhere = frozenset[int]().union(*(c.clear_slices for c in alternatives))
+        if len(elsewhere) > _MAX_ELSEWHERE_SHARE * len(seconds):
+            self.problems.append(
+                f"{len(elsewhere)} of {len(seconds)} slices of the events clearly fit another meaning of the poses, "
+                "and not all the same one: the poses are of another recording, or wrong in places"
             )
             return False
         return True

@@ -12,8 +12,8 @@ from PIL import Image
 
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.report import Report
-from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset, training_command
-from aenerf_ns.cli.operands import Dataset
+from aenerf_ns.cli.arguments import Automatic, CheckArguments
+from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.recording.scene import SCENE
@@ -22,19 +22,15 @@ _PICTURE_HEIGHT = 480
 
 
 @dataclass
-class Check:
-    """Look a dataset over: its events, its poses, and whether the two fit each other. Exit status 0 if all is well, 1
-    if there are problems, 2 if the dataset cannot be read. Options of a format come after its name; by default the
-    format is recognised."""
+class Check(CheckArguments):
+    __doc__ = CheckArguments.__doc__
 
-    data: Dataset
-    picture: Path | None = None
-    """PNG file to write: events as they came, and warped to one view by the poses."""
     format: DatasetFormat = field(default_factory=Automatic)
 
     def main(self) -> None:
         """Print what is found, and end the process with a status other than 0 unless all is well."""
         try:
+            self.judge()
             problems = self._problems()
         except DataError as error:
             print(f"Error: {error}", file=sys.stderr)

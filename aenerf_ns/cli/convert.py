@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset, training_command
-from aenerf_ns.cli.operands import Dataset
+from aenerf_ns.cli.arguments import Automatic, ConvertArguments
+from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.filters import EventFilters, FilteredEventFile, hot_pixel_summary
+from aenerf_ns.events.filters import FilteredEventFile, hot_pixel_summary
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.progress import tracked
@@ -26,67 +25,21 @@ from aenerf_ns.recording.structure_from_motion import compare_with_truth, estima
 from aenerf_ns.recording.views import thinned, views_on_trajectory
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
-# Takes exactly four words. As an optional tuple, the option would also take the dataset if it follows.
-Region = Annotated[
-    tuple[int, int, int, int] | None,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=4,
-        metavar="X Y WIDTH HEIGHT",
-        instance_from_str=lambda words: tuple(int(word) for word in words),
-        is_instance=lambda value: value is None or isinstance(value, tuple),
-        str_from_instance=lambda value: [str(value)],
-    ),
-]
-
 
 @dataclass
-class Convert:
-    """Write a dataset of any format as a dataset folder of aenerf-ns, with some of the events left out where asked.
-    The events are read and written piece by piece, and the folder appears when it is complete. Options of a format come
-    after its name; by default the format is recognised."""
+class Convert(ConvertArguments):
+    __doc__ = ConvertArguments.__doc__
 
-    data: Dataset
-    output: Path
-    """Dataset folder to create."""
-    poses: Literal["given", "colmap"] = "given"
-    """given: take the dataset's poses. colmap: have COLMAP estimate poses from the recording's frames, without metric
-    scale. The given poses are then kept as ground truth, to compare with."""
-    start_time_ns: int | None = None
-    """Leave out events and images before this time on the clock of the events, in nanoseconds."""
-    end_time_ns: int | None = None
-    """Leave out events and images after this time on the clock of the events, in nanoseconds."""
-    region: Region = None
-    """Keep only this part of the sensor, in pixels."""
-    drop_hot_pixels: bool = False
-    """Leave out pixels that fire by themselves. Reads the events twice."""
-    shortest_interval_ns: int = 0
-    """Leave out events that follow the last kept event of their pixel by less than this, in nanoseconds. Meant for
-    pixels that fire repeatedly for one change of light. Leaving out any other event loses a change of light of one
-    contrast threshold."""
-    pixel_share: float = 1.0
-    """Keep the events of this share of the pixels, chosen at random, to train on fewer events."""
-    seed: int = 0
-    """Seed of the choice of pixels, and of COLMAP."""
     format: DatasetFormat = field(default_factory=Automatic)
 
     def main(self) -> None:
         """Read the dataset and write it."""
+        self.judge()
         with ended_by_exception(), OutputLock(self.output) as lock:
             self._convert(lock)
 
     def _convert(self, lock: OutputLock) -> None:
-        try:
-            filters = EventFilters(
-                start=self.start_time_ns,
-                end=self.end_time_ns,
-                region=self.region,
-                hot_pixels=self.drop_hot_pixels,
-                pixel_share=self.pixel_share,
-                shortest_interval=self.shortest_interval_ns,
-                seed=self.seed,
-            )
-        except ValueError as error:
-            raise DataError("aenerf convert", str(error), "see aenerf convert --help") from None
+        filters = self.filters()
         parser = open_dataset(self.data, self.format)
         longest_gap = parser.config.max_pose_gap_ns
         report = None

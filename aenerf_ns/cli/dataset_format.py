@@ -5,20 +5,17 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import field, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_type_hints
 
 import tyro
 
-from aenerf_ns.dataparsers.formats import FORMATS, recognise
+from aenerf_ns.cli.arguments import Automatic
+from aenerf_ns.dataparsers.formats import FORMATS
+from aenerf_ns.files.layouts import LAYOUTS, recognise
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
-
-
-@dataclass
-class Automatic:
-    """Recognise the format from the files of the dataset."""
 
 
 def _format_options(config: EventDataParserConfig) -> Any:
@@ -46,7 +43,7 @@ else:
             {"auto": Automatic(), **{name: _format_options(config) for name, config in FORMATS.items()}},
             descriptions={
                 "auto": "recognise the format from the files of the dataset",
-                **{name: (type(config).__doc__ or "").splitlines()[0] for name, config in FORMATS.items()},
+                **{name: LAYOUTS[name].summary for name in FORMATS},
             },
             prefix_names=False,
         )

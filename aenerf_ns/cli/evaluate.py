@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.cli.operands import RunConfig
+from aenerf_ns.cli.arguments import EvaluateArguments
 from aenerf_ns.cli.trained_run import open_run
-from aenerf_ns.method.color_correction import ColorCorrectionProtocol
+from aenerf_ns.files.given_paths import created
 
 
 @dataclass
-class Evaluate:
-    """Compare a trained run's renderings with the test views, as ns-eval does and in the same JSON layout, optionally
-    under another protocol than the run's. Nothing in the run's folder changes."""
-
-    load_config: RunConfig
-    output: Path
-    """JSON file to write."""
-    color_correction: ColorCorrectionProtocol | None = None
-    """Fit this colour correction on the run's data and use it; by default the correction stored with the run."""
-    render_output: Path | None = None
-    """Folder for pictures, from the test poses as placed: truth beside reconstruction, accumulation, depth."""
+class Evaluate(EvaluateArguments):
+    __doc__ = EvaluateArguments.__doc__
 
     def main(self) -> None:
         """Load the run, evaluate it and write the metrics."""
+        self.judge()
         config, pipeline, checkpoint = open_run(self.load_config)
         of_run = pipeline.model.color_correction.protocol
         used = self.color_correction or of_run
@@ -44,8 +35,8 @@ class Evaluate:
             },
             "results": results,
         }
-        self.output.parent.mkdir(parents=True, exist_ok=True)
-        self.output.write_text(json.dumps(evaluation, indent=2) + "\n", "utf8")
+        with created(self.output, "--output"):
+            self.output.write_text(json.dumps(evaluation, indent=2) + "\n", "utf8")
         if results["num_views"] == 0:
             CONSOLE.print(f"{self.output}: errors of the poses; there are no views to evaluate on.")
             return

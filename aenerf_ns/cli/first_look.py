@@ -1,52 +1,91 @@
-"""Check the paths of a command line before the import of the framework, which takes a quarter of a minute."""
+"""Parse and judge a command line before the import of torch and the framework, which takes seconds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from importlib.metadata import entry_points
-from itertools import pairwise
-from pathlib import Path
 
-from aenerf_ns.files.given_paths import require_dataset, require_new, require_run
+import tyro
 
-_WORKS_ON: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "check": ("--data", require_dataset),
-    "convert": ("--data", require_dataset),
-    "reconstruct": ("--data", require_dataset),
-    "evaluate": ("--load-config", require_run),
-    "export-trajectory": ("--load-config", require_run),
+from aenerf_ns.cli.arguments import (
+    Automatic,
+    CheckArguments,
+    ConvertArguments,
+    EvaluateArguments,
+    ExportTrajectoryArguments,
+    Named,
+    ReconstructArguments,
+    SimulateArguments,
+)
+from aenerf_ns.cli.run_file import require_plausible
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.given_paths import require_dataset
+from aenerf_ns.files.layouts import LAYOUTS, look_over
+
+OfDataset = CheckArguments | ConvertArguments | ReconstructArguments
+OfRun = EvaluateArguments | ExportTrajectoryArguments
+Arguments = SimulateArguments | OfDataset | OfRun
+
+DESCRIPTION = "AE-NeRF tools; train with ns-train aenerf."
+_COMMANDS: dict[str, Callable[..., Arguments]] = {
+    "simulate": SimulateArguments,
+    "convert": ConvertArguments,
+    "check": CheckArguments,
+    "reconstruct": ReconstructArguments,
+    "evaluate": EvaluateArguments,
+    "export-trajectory": ExportTrajectoryArguments,
 }
-_WRITES_FOLDER = {"simulate", "convert", "reconstruct"}
+_FORMATS = {"auto", *LAYOUTS}
 
 
-def judge_paths(words: Sequence[str]) -> None:
-    """Raise a DataError for the words after ``aenerf`` if what they name is missing, or is in the way.
+def parsed(words: Sequence[str]) -> Arguments | None:
+    """Parse the words after ``aenerf``, without the options of a format, which come with the framework.
 
-    Words that could mean something else are left to the parser of the arguments.
+    Returns:
+        The arguments, or None where only the options of a format can tell what the words mean.
+
+    Raises:
+        DataError: nothing to work on is given, or it is given twice.
+        SystemExit: help is asked for, or the words cannot be parsed. Both are printed.
     """
-    if not words or "--help" in words or "-h" in words:
-        return
-    command, *rest = words
-    options = _options(rest)
-    if command in _WRITES_FOLDER and "--output" in options:
-        require_new(Path(options["--output"]))
-    if command in _WORKS_ON:
-        option, require = _WORKS_ON[command]
-        begins_with_word = bool(rest) and not rest[0].startswith("-") and rest[0] not in _formats()
-        if begins_with_word != (option in options):
-            require(Path(rest[0] if begins_with_word else options[option]))
+    before = _before_format(words)
+    if before is None:
+        return _parsed(words)
+    if {"-h", "--help"} & set(words):
+        return None
+    try:
+        arguments = _parsed(before, console_outputs=False)
+    except (SystemExit, DataError):
+        return None
+    assert isinstance(arguments, OfDataset)
+    arguments.format = Named()
+    return arguments
 
 
-def _options(words: Sequence[str]) -> dict[str, str]:
-    """Return the values of options that have one value, and more that are never asked for."""
-    options = {}
-    for word, following in pairwise([*words, ""]):
-        if word.startswith("--"):
-            name, equals, value = word.partition("=")
-            options[name.replace("_", "-")] = value if equals else following
-    return options
+def judge(arguments: Arguments) -> None:
+    """Judge arguments, and the dataset or the run that they name.
+
+    Raises:
+        DataError: an argument is impossible, or a file or folder is missing, in the way or malformed.
+    """
+    arguments.judge()
+    if isinstance(arguments, OfDataset):
+        (look_over if isinstance(arguments.format, Automatic) else require_dataset)(arguments.data)
+    elif isinstance(arguments, OfRun):
+        require_plausible(arguments.load_config)
 
 
-def _formats() -> set[str]:
-    """Return the names of the formats of datasets, which may come before the dataset."""
-    return {"auto", *(entry.name for entry in entry_points(group="nerfstudio.dataparser_configs"))}
+def _parsed(words: Sequence[str], console_outputs: bool = True) -> Arguments:
+    return tyro.extras.subcommand_cli_from_dict(
+        _COMMANDS, prog="aenerf", description=DESCRIPTION, args=words, console_outputs=console_outputs
+    )
+
+
+def _before_format(words: Sequence[str]) -> Sequence[str] | None:
+    """Return the words before the name of a format, or None if they name none."""
+    if not words or words[0] not in ("convert", "check", "reconstruct") or not _FORMATS & set(words):
+        return None
+    for index in range(1, len(words)):
+        # After an option, the word may be its value.
+        if words[index] in _FORMATS and (words[index - 1][:1] != "-" or "=" in words[index - 1]):
+            return words[:index]
+    return []

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import tyro
 
-from aenerf_ns.cli.first_look import judge_paths
+from aenerf_ns.cli import first_look
 from aenerf_ns.errors import DataError
 
 
@@ -15,12 +17,13 @@ def main() -> None:
 
     Bad input ends the process with one line and exit status 1, bad arguments with exit status 2.
     """
-    try:
-        judge_paths(sys.argv[1:])
-    except DataError as error:
-        print(f"Error: {error}", file=sys.stderr)
-        sys.exit(2 if sys.argv[1] == "check" else 1)
-    # Not before, because these imports take a quarter of a minute.
+    words = sys.argv[1:]
+    with _error_as_status(2):
+        arguments = first_look.parsed(words)
+    if arguments is not None:
+        with _error_as_status(2 if words[0] == "check" else 1):
+            first_look.judge(arguments)
+    # Not before, because these imports take seconds.
     from aenerf_ns.cli.check import Check
     from aenerf_ns.cli.convert import Convert
     from aenerf_ns.cli.evaluate import Evaluate
@@ -28,7 +31,7 @@ def main() -> None:
     from aenerf_ns.cli.reconstruct import Reconstruct
     from aenerf_ns.cli.simulate import Simulate
 
-    try:
+    with _error_as_status(2):
         command = tyro.extras.subcommand_cli_from_dict(
             {
                 "simulate": Simulate,
@@ -39,15 +42,20 @@ def main() -> None:
                 "export-trajectory": ExportTrajectory,
             },
             prog="aenerf",
-            description="AE-NeRF tools; train with ns-train aenerf.",
+            description=first_look.DESCRIPTION,
         )
+    with _error_as_status(1):
+        command.main()
+
+
+@contextmanager
+def _error_as_status(status: int) -> Iterator[None]:
+    """End the process with one line and a status in place of a DataError."""
+    try:
+        yield
     except DataError as error:
         print(f"Error: {error}", file=sys.stderr)
-        sys.exit(2)
-    try:
-        command.main()
-    except DataError as error:
-        sys.exit(f"Error: {error}")
+        sys.exit(status)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import imageio_ffmpeg
 import numpy as np
@@ -15,13 +14,13 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from aenerf_ns.camera.trajectory import homogeneous
-from aenerf_ns.cli.dataset_format import Automatic, DatasetFormat, open_dataset, training_command
-from aenerf_ns.cli.operands import Dataset
+from aenerf_ns.cli.arguments import Automatic, ReconstructArguments
+from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import tracked
-from aenerf_ns.reconstruction.images import EVENTS_PER_PIXEL, FilteredImages, ImageSource, NetworkImages, images_of
+from aenerf_ns.reconstruction.images import FilteredImages, ImageSource, NetworkImages, images_of
 from aenerf_ns.reconstruction.weights import load_network
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.output_lock import OutputLock
@@ -33,33 +32,18 @@ _VIDEO, _VIDEO_RATE = "reconstruction.mp4", 25
 
 
 @dataclass
-class Reconstruct:
-    """Make images of a recording's events, and write a dataset folder with these images as training images, at the
-    interpolated poses of their times. The events and the other images are those of the recording. reconstruction.mp4
-    in the folder shows the images one after another. Options of a format come after its name; by default the format is
-    recognised."""
+class Reconstruct(ReconstructArguments):
+    __doc__ = ReconstructArguments.__doc__
 
-    data: Dataset
-    output: Path
-    """Dataset folder to create."""
-    method: Literal["high-pass", "firenet", "e2vid"] = "high-pass"
-    """high-pass: the asynchronous high-pass filter of Scheerlinck et al. (2018), which needs no weights. firenet and
-    e2vid: the networks of Scheerlinck et al. (2020) and Rebecq et al. (2021), whose weights you have."""
-    weights: Path | None = None
-    """Weights file of the network, as its authors distribute it."""
-    events_per_pixel: float = EVENTS_PER_PIXEL
-    """Events between two images, as a share of the sensor's pixels."""
     format: DatasetFormat = field(default_factory=Automatic)
 
     def main(self) -> None:
         """Read the dataset, reconstruct the images and write them."""
+        self.judge()
         with ended_by_exception(), OutputLock(self.output) as lock:
             self._reconstruct(lock)
 
     def _reconstruct(self, lock: OutputLock) -> None:
-        if not 0 < self.events_per_pixel < np.inf:
-            remedy = "give a positive --events-per-pixel"
-            raise DataError("aenerf reconstruct", f"{self.events_per_pixel} events a pixel", remedy)
         parser = open_dataset(self.data, self.format)
         recording = parser.recording
         source = self._source(recording)
@@ -96,8 +80,6 @@ class Reconstruct:
     def _source(self, recording: Recording) -> ImageSource:
         camera, sensor = recording.event_camera, recording.sensor
         if self.method == "high-pass":
-            if self.weights is not None:
-                raise DataError(self.weights, "the high-pass filter has no weights", "leave out --weights")
             return FilteredImages(camera.width, camera.height, sensor)
         device = "cuda" if torch.cuda.is_available() else "cpu"
         return NetworkImages(load_network(self.method, self.weights), sensor, device)

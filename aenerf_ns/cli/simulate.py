@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.cli.arguments import SimulateArguments
 from aenerf_ns.cli.dataset_format import training_command
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
@@ -27,116 +27,26 @@ from aenerf_ns.recording.structure_from_motion import estimate_poses
 from aenerf_ns.recording.video import Video, open_video
 from aenerf_ns.recording.views import evenly_spread
 from aenerf_ns.recording.writer import NativeDatasetWriter, PoselessRecordingWriter
-from aenerf_ns.simulator.esim import SensorNoise
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.simulated_poses import poses_from_frames
 from aenerf_ns.simulator.simulation import Simulation
-from aenerf_ns.simulator.video_events import Interpolation, VideoInterval, video_events
+from aenerf_ns.simulator.video_events import VideoInterval, video_events
 
-_FOR_SCENES = ("scene", "speed", "width", "height", "duration", "pose_rate", "exposure")
-_FOR_VIDEOS = ("interpolation", "trajectory", "intrinsics", "calibration", "event_camera")
 _FRAME_RATE = 25.0
 
 
 @dataclass
-class Simulate:
-    """Simulate an event camera that moves through a scene, or that stands in for the camera of a video, and write a
-    dataset for ns-train aenerf."""
-
-    output: Path
-    """Dataset folder to create."""
-    scene: str = "room"
-    """room: a furnished room seen from inside. object: a toy locomotive seen from around it. shiny_object: the
-    same, varnished and polished. A .glb, .obj or .ply file: a mesh seen from around it. A .json file: a mesh, its light
-    and the camera's path (docs/simulator.md)."""
-    video: Path | None = None
-    """A video in place of a scene: a file, or a folder of images with the list images.txt of their times (on each line:
-    t[s] file). Without --trajectory and without --poses colmap, only events and images are written."""
-    interpolation: Interpolation = "flow"
-    """How the log-radiance changes between two frames of the video. flow: it moves along optical flow. linear: each
-    pixel changes linearly in time. linear is faster, but wrong where the picture moves by pixels between frames."""
-    trajectory: Path | None = None
-    """Poses of the video's camera, as t tx ty tz qx qy qz qw in seconds on the clock of the video, camera-to-world,
-    OpenCV camera axes. Needs the camera's intrinsics."""
-    intrinsics: tuple[float, float, float, float] | None = None
-    """Intrinsics of the video's camera without distortion: fl_x fl_y cx cy in pixels. cx and cy count from the edge of
-    the image."""
-    calibration: Path | None = None
-    """The video's camera: calibration.json, or the camchain.yaml that Kalibr writes. Without this option and without
-    --intrinsics, --poses colmap estimates the lens."""
-    event_camera: str | None = None
-    """Name of the video's camera in a camchain of several cameras, such as cam1."""
-    speed: Literal["easy", "hard"] = "easy"
-    """easy: constant speed. hard: the same path at 8^sin(2 pi t) times that speed."""
-    width: int = 346
-    """Pixel columns of the sensor."""
-    height: int = 260
-    """Pixel rows of the sensor."""
-    duration: float | None = None
-    """Seconds that the path takes at constant speed. Default: the duration in scene.json, or 4."""
-    pose_rate: float = 250.0
-    """Poses a second in the trajectories; with --poses colmap, in the true trajectory."""
-    poses: Literal["noise", "colmap"] = "noise"
-    """Source of the estimated poses. noise: the true poses, or those of --trajectory, with noise. colmap: COLMAP
-    estimates a pose for each frame of a camera at the event sensor's place, as in a DAVIS, or for each frame of the
-    video, and may lose or misplace frames."""
-    frame_rate: float | None = None
-    """Frames a second for COLMAP, 25 by default. With --video: the rate at which the camera took the frames, in place
-    of the times that the video states, as for slow motion."""
-    exposure: float = 0.003
-    """Seconds for which a frame is exposed. Motion blurs the frame meanwhile."""
-    pose_noise_degrees: float = 0.0
-    """Error of the estimated rotations: root mean square of its angle, in degrees."""
-    pose_noise_translation: float = 0.0
-    """Error of the estimated positions: root mean square of its length, in scene units (metres)."""
-    pose_noise_correlation_time: float = 0.25
-    """Correlation time of the pose errors in seconds."""
-    positive_contrast_threshold: float = 0.25
-    """C+: rise of log-radiance that triggers an event."""
-    negative_contrast_threshold: float = 0.25
-    """C-: fall of log-radiance that triggers an event."""
-    refractory_period_ns: int = 0
-    """Time for which a pixel is blind after each event, in nanoseconds."""
-    noise: tyro.conf.OmitArgPrefixes[SensorNoise] = field(default_factory=SensorNoise)
-    bayer_pattern: BayerPattern = ""
-    """RGGB for a colour sensor."""
-    max_displacement: float = 0.5
-    """Pixels that 99 % of the picture may move between two rendered frames, or between two frames along the flow."""
-    train_images: int = 50
-    """Reference images along the trajectory. They are not used for training."""
-    validation_views: int = 20
-    """Reference views around the trajectory, or frames of the video, for colour correction."""
-    test_views: int = 20
-    """Reference views from other places, or other frames of the video, for evaluation."""
-    seed: int = 0
-    """Seed of everything random: the scene, the sensor, the pose noise and the test views."""
+class Simulate(SimulateArguments):
+    __doc__ = SimulateArguments.__doc__
 
     def main(self) -> None:
         """Render the scene along its path, or read the video, and write the dataset."""
-        counts = (self.train_images, self.validation_views, self.test_views)
-        if min(counts) < 0:
-            raise DataError("aenerf simulate", f"numbers of images {counts}", "they must not be negative")
-        self._refuse_options_without_effect()
+        self.judge()
         with ended_by_exception(), OutputLock(self.output) as lock:
             if self.video is None:
                 self._simulate_scene(lock)
             else:
                 self._simulate_video(self.video, lock)
-
-    def _refuse_options_without_effect(self) -> None:
-        unused, subject = (_FOR_VIDEOS, "a scene") if self.video is None else (_FOR_SCENES, "a video")
-        for option in fields(self):
-            if option.name in unused and getattr(self, option.name) != option.default:
-                name = option.name.replace("_", "-")
-                raise DataError("aenerf simulate", f"--{name} has no meaning for {subject}", "leave the option out")
-
-    def _sensor(self) -> SensorModel:
-        return SensorModel(
-            self.positive_contrast_threshold,
-            self.negative_contrast_threshold,
-            self.refractory_period_ns,
-            self.bayer_pattern,
-        )
 
     def _simulate_scene(self, lock: OutputLock) -> None:
         scene = open_scene(self.scene, self.seed)
@@ -148,7 +58,7 @@ class Simulate:
         }
         try:
             camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
-            sensor = self._sensor()
+            sensor = self.sensor()
             simulation = Simulation(
                 scene,
                 camera,
@@ -197,12 +107,6 @@ class Simulate:
         noise = (self.pose_noise_degrees, self.pose_noise_translation)
         if self.poses == "noise":
             return perturb(truth, *noise, self.pose_noise_correlation_time, self.seed), None
-        if any(noise):
-            raise DataError(
-                "aenerf simulate",
-                f"pose noise {noise} with --poses colmap",
-                "leave the pose noise out, because COLMAP makes errors of its own",
-            )
         estimated, report, summary = poses_from_frames(
             simulation,
             camera,
@@ -218,7 +122,7 @@ class Simulate:
         video = open_video(source, self.frame_rate)
         camera = self._video_camera(video)
         try:
-            sensor = self._sensor()
+            sensor = self.sensor()
             poses = self._video_poses(video, camera)
             intervals = video_events(video, sensor, self.noise, self.interpolation, self.max_displacement, self.seed)
             if poses is None:
@@ -239,8 +143,6 @@ class Simulate:
 
     def _video_camera(self, video: Video) -> EventCamera | None:
         """Return the lens of the video's camera, or None where no option states it."""
-        if self.calibration is not None and self.intrinsics is not None:
-            raise DataError("aenerf simulate", "--calibration and --intrinsics are both given", "leave out one of them")
         if self.calibration is not None:
             camera = read_calibration(self.calibration, self.event_camera).event_camera
             if (camera.width, camera.height) != (video.width, video.height):
@@ -261,17 +163,8 @@ class Simulate:
     def _video_poses(self, video: Video, camera: EventCamera | None) -> _VideoPoses | None:
         """Return where the video's camera was, or None where no option tells."""
         noise = (self.pose_noise_degrees, self.pose_noise_translation)
-        if any(noise) and self.trajectory is None:
-            raise DataError("aenerf simulate", f"pose noise {noise} without poses to add it to", "give --trajectory")
         if self.trajectory is not None:
-            if self.poses == "colmap":
-                raise DataError("aenerf simulate", "--trajectory with --poses colmap", "leave out one of them")
-            if camera is None:
-                raise DataError(
-                    "aenerf simulate",
-                    "--trajectory without the intrinsics of the camera",
-                    "give --calibration or --intrinsics, or let COLMAP estimate lens and poses with --poses colmap",
-                )
+            assert camera is not None
             given = read_tum_trajectory(self.trajectory)
             given.between(int(video.times[0]), int(video.times[-1]))
             if not any(noise):

@@ -24,14 +24,18 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.boundary import require_unpacked_size
 from aenerf_ns.files.sensor_size import sensor_size
+from aenerf_ns.files.unpacking import MAX_PIECE, require_unpacker, unpacked
 
 _CHUNK = 1 << 20
 _MAGIC = b"#!AER-DAT4.0\r\n"
 # Microseconds.
 _EVENT = np.dtype([("time", "<i8"), ("x", "<u2"), ("y", "<u2"), ("on", "u1"), ("padding", "V3")])
-# DV writes headers of some kilobytes, and packets of at most some megabytes, as they are and compressed.
-_MAX_HEADER, _MAX_PACKET = 1 << 20, 1 << 28
+# DV writes headers of some kilobytes.
+_MAX_HEADER = 1 << 20
+# A table has some 50 bytes for a packet, and an hour of recording some 100,000 packets.
+_MAX_TABLE = 1 << 25
 _MAX_MICROSECONDS = np.iinfo(np.int64).max // 1000
 _COMPRESSIONS = ("none", "lz4", "lz4", "zstd", "zstd")
 # Indices of the fields in their tables.
@@ -129,13 +133,10 @@ class Aedat4File(EventFile):
 
     def _decompressor(self, compression: str) -> Callable[[bytes], bytes]:
         """Return a function that decompresses a packet or raises a DataError."""
+        if compression == "none":
+            return bytes
         try:
-            if compression == "lz4":
-                from lz4.frame import LZ4FrameDecompressor as Decompressor
-            elif compression == "zstd":
-                from backports.zstd import ZstdDecompressor as Decompressor
-            else:
-                return bytes
+            require_unpacker(compression)
         except ImportError as error:
             raise DataError(
                 self.path,
@@ -144,15 +145,10 @@ class Aedat4File(EventFile):
             ) from None
 
         def checked(data: bytes) -> bytes:
-            decompressor = Decompressor()
             try:
-                unpacked = decompressor.decompress(data, max_length=_MAX_PACKET)
-            # Each library raises its own errors.
-            except Exception as error:
-                self._fail(f"a packet cannot be decompressed ({error})")
-            if not decompressor.eof:
-                self._fail(f"a packet is cut, or has more than {_MAX_PACKET:,} bytes when decompressed")
-            return unpacked
+                return unpacked(data, compression)
+            except ValueError as error:
+                self._fail(f"a packet cannot be read: {error}")
 
         return checked
 
@@ -163,9 +159,10 @@ class Aedat4File(EventFile):
             file.seek(position)
             head = file.read(8)
             stream, length = struct.unpack("<2i", head) if len(head) == 8 else (0, -1)
-            if not 0 <= length <= _MAX_PACKET or position + 8 + length > header.end:
+            # No packet is empty, because its content names its kind. A file of zeros would have no end.
+            if not 0 < length <= MAX_PIECE or position + 8 + length > header.end:
                 self._fail(f"it ends within the packet at byte {position}, or is damaged there")
-            if stream == header.stream and length:
+            if stream == header.stream:
                 yield position + 8, length
             position += 8 + length
 
@@ -175,9 +172,12 @@ class Aedat4File(EventFile):
         decompress = self._decompressor(header.compression)
         with reading(self.path), self.path.open("rb") as file:
             packets: Iterable[tuple[int, int]] = self._packets(file, header)
+            size, total = self.path.stat().st_size, 0
             for position, length in reversed(list(packets)) if backwards else packets:
                 file.seek(position)
                 data = decompress(file.read(length))
+                total += len(data)
+                require_unpacked_size(self.path, "the stream", total, size)
                 try:
                     if data[8:12] != b"EVTS":
                         raise ValueError("it does not hold events")
@@ -223,9 +223,10 @@ class Aedat4File(EventFile):
         return start, end
 
     def count(self) -> int | None:
-        """Return the number of events from the table of packets. An interrupted recording has no table."""
+        """Return the number of events from the table of packets. An interrupted recording has no table, and a table of
+        more than 32 MB is not read."""
         header = self._checked_header()
-        if header.table is None:
+        if header.table is None or self.path.stat().st_size - header.table > _MAX_TABLE:
             return None
         with reading(self.path), self.path.open("rb") as file:
             file.seek(header.table)
@@ -239,7 +240,12 @@ class Aedat4File(EventFile):
                 row = place + struct.unpack_from("<I", data, place)[0]
                 if _number(data, row, _ROW_STREAM, "<i", -1) == header.stream:
                     total += _number(data, row, _ROW_COUNT, "<q", 0)
+            if total < 0:
+                raise ValueError(f"it counts {total} events")
+            require_unpacked_size(self.path, "its events", total * _EVENT.itemsize, self.path.stat().st_size)
             return total
+        except DataError:
+            raise
         except (struct.error, ValueError) as error:
             self._fail(f"its table of packets cannot be read ({error})")
 

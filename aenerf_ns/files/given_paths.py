@@ -5,6 +5,10 @@ They are judged twice: before the command imports the framework, which takes lon
 
 from __future__ import annotations
 
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from aenerf_ns.errors import DataError, reading, reason
@@ -28,12 +32,42 @@ def require_new(output: Path) -> None:
     """Raise a DataError if the folder that a command will write exists, or cannot have this name."""
     try:
         exists = output.exists()
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise cannot_be_created(output, error) from None
     if exists:
         raise DataError(output, "the folder exists already", "remove it or choose another --output")
 
 
-def cannot_be_created(output: Path, error: OSError) -> DataError:
-    """Return the error for a folder that a command cannot create."""
-    return DataError(output, f"it cannot be created ({reason(error)})", "choose another --output")
+def require_writable(output: Path, option: str) -> None:
+    """Raise a DataError if a file that a command will write cannot be created.
+
+    Args:
+        output: the file. A file that exists is overwritten, and folders that are missing are made.
+        option: the option that names the file.
+    """
+    try:
+        if output.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        place = next(folder for folder in output.absolute().parents if folder.exists())
+        if not place.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        if not os.access(output if output.exists() else place, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except (OSError, ValueError) as error:
+        raise cannot_be_created(output, error, option) from None
+
+
+@contextmanager
+def created(output: Path, option: str) -> Iterator[None]:
+    """Make the folder of a file that is written within the context, and turn errors of the system into a DataError."""
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise cannot_be_created(output, error, option) from None
+
+
+def cannot_be_created(output: Path, error: OSError | ValueError, option: str = "--output") -> DataError:
+    """Return the error for a file or folder that a command cannot create."""
+    told = reason(error) if isinstance(error, OSError) else str(error)
+    return DataError(output, f"it cannot be created ({told})", f"choose another {option}")

@@ -1,4 +1,7 @@
-"""Read objects in JSON and check their values."""
+"""Read objects in JSON and check their values.
+
+The import of torch takes seconds. So it waits until a matrix or a camera is read.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,17 @@ import math
 from collections.abc import Collection, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
-import torch
-from torch import Tensor
-
-from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.lens import EventCamera, LensModel
-from aenerf_ns.camera.trajectory import require_rigid
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.boundary import file_inside, read_text
 from aenerf_ns.files.text import MAX_TIME
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from aenerf_ns.camera.image_encoding import ImageEncoding
+    from aenerf_ns.camera.lens import EventCamera, LensModel
 
 # For each camera model of Nerfstudio: the lens, and the names of its distortion parameters in OpenCV's order.
 LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
@@ -171,6 +174,8 @@ class JsonObject:
         """Return the (4, 4) float64 matrix ``name`` of a rotation and a translation, or None if it is absent."""
         if name not in self._values:
             return None
+        from aenerf_ns.camera.trajectory import require_rigid
+
         matrix = self.numbers(name, self._values[name], (4, 4))
         require_rigid(matrix[None], f"{self.path}: {self._prefix}{name}")
         return matrix
@@ -181,6 +186,8 @@ class JsonObject:
         Raises:
             DataError: the value has another shape, or an entry is not a finite number.
         """
+        import torch
+
         try:
             array = torch.tensor(_floats(value), dtype=torch.float64)
         except (TypeError, ValueError, OverflowError):
@@ -248,6 +255,8 @@ def _number_or_text(value: Any) -> float | str:
 
 def read_camera(meta: JsonObject, width: str, height: str) -> EventCamera:
     """Read a camera from Nerfstudio's names of intrinsics; ``width`` and ``height`` are the keys of its size."""
+    from aenerf_ns.camera.lens import EventCamera
+
     model = meta.get("camera_model", str, "OPENCV")
     if model not in LENS_MODELS:
         raise meta.error("camera_model", f"is {model!r}, not one of {', '.join(LENS_MODELS)}")

@@ -3,35 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import torch
-import yaml
 from torch import Tensor
 
 from aenerf_ns.camera.lens import EventCamera, LensModel
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.boundary import read_text
 from aenerf_ns.files.json_object import JsonObject, require_shallow
+from aenerf_ns.files.plain_yaml import read_plain_yaml
 
 _LENS_MODELS: dict[str, LensModel] = {
     "radtan": "radial_tangential",
     "equidistant": "fisheye",
     "none": "radial_tangential",
 }
-
-
-# A camchain has 1 kB a camera. PyYAML reads 0.1 MB in a second.
-_MAX_BYTES = 1 << 17
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuse aliases. Kalibr writes none, and a few of them make a value of any size or one that holds itself."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("it has aliases, which Kalibr does not write")
-        return super().compose_node(parent, index)
 
 
 def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
@@ -47,12 +32,7 @@ def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
     with reading(path):
         if not path.is_file():
             raise DataError(path, "there is no such file", "give the camchain that Kalibr wrote")
-    text = read_text(path, _MAX_BYTES)
-    try:
-        # A safe loader, which makes no objects but lists, dictionaries, texts and numbers.
-        chain: Any = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "copy it again") from None
+    chain = read_plain_yaml(path)
     is_chain = isinstance(chain, dict) and all(isinstance(value, dict) for value in chain.values())
     if not chain or not is_chain or not all(isinstance(name, str) for name in chain):
         raise DataError(path, "not a list of cameras", "give the camchain that Kalibr wrote")

@@ -91,9 +91,12 @@ class PropheseeDatFile(EventFile):
         begin, count = self._records()
         if count == 0:
             raise self.empty_error()
-        records = np.memmap(self.path, _RECORD, "r", begin, (count,))
-        samples = records["time"][:: max(1, count // _MAX_SAMPLES)]
-        time = _unwrapped(np.append(samples, records["time"][-1]), None)
+        samples = []
+        with reading(self.path), self.path.open("rb") as file:
+            for index in (*range(0, count, max(1, count // _MAX_SAMPLES)), count - 1):
+                file.seek(begin + index * _RECORD.itemsize)
+                samples.append(np.fromfile(file, _RECORD, 1)["time"])
+        time = _unwrapped(np.concatenate(samples), None)
         return int(time[0]) * 1000, int(time[-1]) * 1000
 
 

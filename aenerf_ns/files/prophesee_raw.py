@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 # Words read at once.
 _BLOCK = 1 << 20
+# The kind of word that holds the upper bits of a time, in the upper 4 bits of a word in both encodings. Cameras send
+# one at least every 5 ms, in which no camera sends so many words.
+_TIME_HIGH, _MAX_TIMELESS = 0x8, 1 << 20
 
 
 class PropheseeRawFile(EventFile):
@@ -60,6 +63,12 @@ class PropheseeRawFile(EventFile):
         with reading(self.path), self.path.open("rb") as file:
             file.seek(begin)
             while len(block := np.fromfile(file, dtype, _BLOCK)):
+                if len(block) >= _MAX_TIMELESS and not (block >> 8 * dtype.itemsize - 4 == _TIME_HIGH).any():
+                    raise DataError(
+                        self.path,
+                        f"{len(block):,} words without the upper bits of a time end at byte {file.tell():,}",
+                        "copy it again",
+                    )
                 yield block
 
     def read_chunks(self) -> Iterator[EventStream]:

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.bag_reader import Bag
 from aenerf_ns.files.sensor_size import sensor_size
 
 if TYPE_CHECKING:
-    from rosbags import rosbag1, rosbag2
     from rosbags.interfaces import Connection
 
     from aenerf_ns.files.evt_words import Columns
@@ -117,24 +117,19 @@ class RosbagEventFile(EventFile):
         if not self.path.is_dir():
             super().require()
 
-    def _open(self) -> rosbag1.Reader | rosbag2.Reader:
+    def _open(self) -> Bag:
         self.require()
         try:
-            if self._is_ros2():
-                from rosbags.rosbag2 import Reader
-            else:
-                from rosbags.rosbag1 import Reader
+            return Bag(self.path, self._is_ros2())
         except ImportError:
             raise DataError(
                 self.path, "a ROS bag is read with the package rosbags", "pip install 'aenerf-ns[rosbag]'"
             ) from None
-        try:
-            reader = Reader(self.path)
-            reader.open()
+        except DataError:
+            raise
         # The parser raises whatever it stumbles over.
         except Exception as error:
             raise self._damaged(error) from None
-        return reader
 
     def _is_ros2(self) -> bool:
         if self.path.is_dir():
@@ -151,20 +146,21 @@ class RosbagEventFile(EventFile):
 
     def _messages(self, start: int | None = None) -> Iterator[_Message]:
         """Yield the messages of the topic in the order in which they were received, from a time in nanoseconds on."""
-        with closing(self._open()) as reader:
+        with closing(self._open()) as bag:
             is_ros2 = self._is_ros2()
-            chosen = _choose(self.path, reader.connections, self._topic)
-            connections = [connection for connection in reader.connections if connection.topic == chosen.topic]
-            messages = reader.messages(connections, start=start)
+            chosen = _choose(self.path, bag.connections, self._topic)
+            messages = bag.messages(chosen.topic, start)
             while True:
                 try:
-                    connection, _, data = next(messages)
+                    kind, data = next(messages)
                 except StopIteration:
                     return
+                except DataError:
+                    raise
                 except Exception as error:
                     raise self._damaged(error) from None
                 try:
-                    yield _parse(data, connection.msgtype == _PACKET_TYPE, is_ros2)
+                    yield _parse(data, kind == _PACKET_TYPE, is_ros2)
                 except struct.error:
                     raise DataError(
                         self.path, f"a message of {chosen.topic} does not have the parts of its type", "copy it again"
@@ -254,8 +250,8 @@ class RosbagEventFile(EventFile):
         first = next(self._columns(), None)
         if first is None:
             raise self.empty_error()
-        with closing(self._open()) as reader:
-            bag_end = reader.end_time
+        with closing(self._open()) as bag:
+            bag_end = bag.end_time
         for seconds in (*_TAIL_SECONDS, None):
             end = None
             for _, _, t, _ in self._columns(None if seconds is None else bag_end - seconds * 1_000_000_000):

@@ -16,6 +16,9 @@ TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 _UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
+POSE_COLUMNS = "t tx ty tz qx qy qz qw"
+"""The columns of a trajectory in the format of the TUM RGB-D benchmark."""
+
 # In nanoseconds: 126 years. The difference of two such times fits int64.
 MAX_TIME = 4 * 10**18
 

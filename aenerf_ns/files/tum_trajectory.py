@@ -12,7 +12,7 @@ from torch import Tensor
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.text import TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
+from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
 
 # Trajectories are commonly printed with six or more digits, so quaternions have rounding errors.
 _MAX_NORM_ERROR = 1e-3
@@ -32,7 +32,7 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
             not increase.
     """
-    rows = read_rows(path, "t tx ty tz qx qy qz qw")
+    rows = read_rows(path, POSE_COLUMNS)
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
     times = parse_times(path, [row[0] for row in rows], unit)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from aenerf_ns.camera.image_encoding import ImageEncoding, encode
-
-ColorCorrectionProtocol = Literal["affine", "affine-test", "translated-gamma", "network", "none"]
+from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 
 # Added to radiance in [0, 1] before the logarithm, so that black reference pixels stay finite.
 _EPSILON = 1e-3

@@ -29,7 +29,8 @@ from torch.nn import Parameter
 from aenerf_ns.camera.image_encoding import decode, encode, to_channels
 from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
 from aenerf_ns.method.box_collider import BoxCollider
-from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection, ColorCorrectionProtocol
+from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection
+from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 from aenerf_ns.method.comoving import CoMovingSpace
 from aenerf_ns.method.field import to_unit_cube
 from aenerf_ns.method.image_metrics import ImageMetrics

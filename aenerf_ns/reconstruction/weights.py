@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
-
-import torch
+from typing import TYPE_CHECKING, Literal
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.reconstruction.networks import E2VID, FireNet, ReconstructionNetwork
+
+if TYPE_CHECKING:
+    from aenerf_ns.reconstruction.networks import ReconstructionNetwork
 
 NetworkName = Literal["e2vid", "firenet"]
-
-_NETWORKS: dict[NetworkName, type[ReconstructionNetwork]] = {"e2vid": E2VID, "firenet": FireNet}
 
 # Where the authors' own pages lead to. The weights are not this project's to distribute.
 _WHERE = {
@@ -20,6 +18,20 @@ _WHERE = {
     "firenet": "download firenet_1000.pth.tar, which https://github.com/cedric-scheerlinck/rpg_e2vid links to, on its "
     "branch cedric/firenet",
 }
+
+
+def require_weights(name: NetworkName, weights: Path | None) -> Path:
+    """Return the weights file of a network, or raise a DataError if none is given or there is no such file."""
+    if weights is None:
+        raise DataError(f"--method {name}", "no weights are given", _remedy(name))
+    with reading(weights):
+        if not weights.is_file():
+            raise DataError(weights, "there is no such file", _remedy(name))
+    return weights
+
+
+def _remedy(name: NetworkName) -> str:
+    return f"{_WHERE[name]}, and give it with --weights"
 
 
 def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwork:
@@ -34,12 +46,13 @@ def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwo
     Raises:
         DataError: there is no such file, it cannot be read without executing it, or it is of another network.
     """
-    remedy = f"{_WHERE[name]}, and give it with --weights"
-    if weights is None:
-        raise DataError(f"--method {name}", "no weights are given", remedy)
-    with reading(weights):
-        if not weights.is_file():
-            raise DataError(weights, "there is no such file", remedy)
+    # The import takes seconds, and commands look for the file before them.
+    import torch
+
+    from aenerf_ns.reconstruction.networks import E2VID, FireNet
+
+    networks: dict[NetworkName, type[ReconstructionNetwork]] = {"e2vid": E2VID, "firenet": FireNet}
+    weights, remedy = require_weights(name, weights), _remedy(name)
     try:
         content = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as error:
@@ -47,7 +60,7 @@ def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwo
         raise DataError(weights, f"not a file of plain weights ({type(error).__name__})", remedy) from None
     if not isinstance(content, dict) or not isinstance(content.get("state_dict"), dict):
         raise DataError(weights, "it holds no state_dict", remedy)
-    network = _NETWORKS[name]()
+    network = networks[name]()
     try:
         network.load_state_dict(content["state_dict"], strict=True)
     except RuntimeError as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
@@ -19,6 +18,7 @@ from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.files.layouts import of_guessed_format
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import FrameSequence, Recording, Split
@@ -38,20 +38,13 @@ class EventDataParser(DataParser):
     """Hand a recording to Nerfstudio.
 
     Training cameras are places on the estimated trajectory; evaluation cameras are the reference views of a split. A
-    format implements :meth:`read_recording`. A format that is found without being named also implements
-    :meth:`recognises` and states its :attr:`layout`.
+    format implements :meth:`read_recording`. A format that is found without being named also states its files in
+    ``files/layouts.py``.
     """
 
     config: EventDataParserConfig
-    layout: ClassVar[str] = ""
-    """The files that :meth:`recognises` looks for, as messages name them."""
     guessed_format: str | None = None
     """The name of this format, where it was recognised and not named: an error may mean that it is another."""
-
-    @classmethod
-    def recognises(cls, data: Path) -> bool:
-        """Return whether ``data`` looks like this format, from the names of its files alone."""
-        return False
 
     @abstractmethod
     def read_recording(self) -> Recording:
@@ -86,8 +79,7 @@ class EventDataParser(DataParser):
         except DataError as error:
             if self.guessed_format is None:
                 raise
-            remark = f"the format {self.guessed_format} was guessed: where it is another, name it before --data"
-            raise DataError(error.source, error.problem, f"{error.remedy} ({remark})") from None
+            raise of_guessed_format(error, self.guessed_format) from None
         self._check_lens(recording.event_camera, "event camera")
         if any(recording.reference_views.values()):
             self._check_lens(recording.frame_camera, "camera of the images")

@@ -7,29 +7,16 @@ so the frame rate does not limit the number of events that a pixel fires between
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.events.sensor import LUMINANCE, RGGB, SensorModel
+from aenerf_ns.simulator.options import SensorNoise
 
 MINIMUM_CONTRAST_THRESHOLD = 0.01
 _BRIGHT_REDUCTION = 0.75
-
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """How a sensor differs from an ideal one."""
-
-    contrast_threshold_spread: float = 0.0
-    """Standard deviation of the thresholds over the pixels."""
-    leak_rate: float = 0.0
-    """Positive events a second that every pixel fires in steady light, because its reference leaks (real: 0.1 to 1)."""
-    shot_noise_rate: float = 0.0
-    """Events a second that a dark pixel fires at random. A bright pixel fires a quarter of them (real: up to 10)."""
-
 
 NOISELESS = SensorNoise()
 

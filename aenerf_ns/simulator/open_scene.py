@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.options import BUILT_IN
 from aenerf_ns.simulator.scene import SimulationScene
-
-BUILT_IN = ("room", "object", "shiny_object")
-"""Names of the built-in scenes."""
 
 
 def built_in_scene(name: str, seed: int = 0) -> SimulationScene:

@@ -14,11 +14,12 @@ from aenerf_ns.files.json_object import JsonObject
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.free_space import FreeSpace
+from aenerf_ns.simulator.options import MESH_SUFFIXES, require_scene_file
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight, baked_mesh, light_mesh
 from aenerf_ns.simulator.rendering.mesh import Gloss, Mesh, scaled
-from aenerf_ns.simulator.rendering.mesh_loading import SUFFIXES, load_mesh
+from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
 from aenerf_ns.simulator.rendering.mesh_repair import prepared
 from aenerf_ns.simulator.rendering.renderer import Renderer
 from aenerf_ns.simulator.scene import SimulationScene
@@ -62,16 +63,13 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
     Raises:
         DataError: a file is missing or malformed, or the camera's path runs into the mesh.
     """
-    is_bare = path.suffix.lower() in SUFFIXES
+    require_scene_file(path)
+    is_bare = path.suffix.lower() in MESH_SUFFIXES
     if is_bare:
         values = JsonObject(path, {"mesh": path.name}, remedy=_REMEDY)
-    elif path.suffix.lower() == ".json":
-        if not path.is_file():
-            raise DataError(path, "the file does not exist", "check the name")
+    else:
         values = JsonObject.read(path, _REMEDY)
         values.refuse_keys_except(_KEYS)
-    else:
-        raise DataError(path, "an unknown scene", "give a built-in scene, a .glb, .obj or .ply file, or a scene.json")
     file = path.parent / values.get("mesh", str)
     up = values.choice("up", ("y", "z"), "y" if file.suffix.lower() == ".glb" else "z")
     scale = values.positive("scale", 1.0)

@@ -16,8 +16,9 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.simulator.esim import NOISELESS, EventSimulator, SensorNoise
+from aenerf_ns.simulator.esim import NOISELESS, EventSimulator
 from aenerf_ns.simulator.frames import frame_parameters
+from aenerf_ns.simulator.options import SensorNoise
 from aenerf_ns.simulator.paths import SpeedProfile
 from aenerf_ns.simulator.scene import SimulationScene
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,10 +16,9 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.video import Video
-from aenerf_ns.simulator.esim import NOISELESS, EventSimulator, SensorNoise
+from aenerf_ns.simulator.esim import NOISELESS, EventSimulator
 from aenerf_ns.simulator.frames import DISPLACEMENT_PERCENTILE
-
-Interpolation = Literal["linear", "flow"]
+from aenerf_ns.simulator.options import Interpolation, SensorNoise
 
 _GREY_LEVELS = decode(np.arange(256) / 255, "srgb")
 

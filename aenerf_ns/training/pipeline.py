@@ -20,9 +20,11 @@ from torch import Tensor
 
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
-from aenerf_ns.method.color_correction import ColorCorrectionProtocol, NoColorCorrection
+from aenerf_ns.method.color_correction import NoColorCorrection
+from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.training.datamanager import EventDataManager
+from aenerf_ns.training.device import require_device
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
 from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
@@ -76,12 +78,7 @@ class AENeRFPipeline(VanillaPipeline):
         test_mode: Literal["test", "val", "inference"] = "val",
         **kwargs: Any,
     ) -> None:
-        # Nerfstudio gives a torch.device in place of a name when it opens a run.
-        if torch.device(device).type == "cuda" and not torch.cuda.is_available():
-            raise SystemExit(
-                "Error: --machine.device-type cuda: no GPU can be used; train on the CPU with: ns-train aenerf-small "
-                "--machine.device-type cpu ..., or install a driver that fits the CUDA of PyTorch"
-            )
+        require_device(device)
         if test_mode != "val":
             # Once the pipeline is made, ns-render asks for a program that pip cannot install.
             provide_ffmpeg()

@@ -17,6 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.training.checkpoints import checkpoint_to_load, move_whole, require_whole, step_of
+from aenerf_ns.training.device import require_device
 from aenerf_ns.training.schedules import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
 
 
@@ -33,6 +34,15 @@ class AENeRFTrainerConfig(TrainerConfig):
         for group in self.optimizers.values():
             if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, RelativeCosineSchedulerConfig)):
                 group["scheduler"].max_steps = self.schedule_length or self.max_num_iterations
+
+    def set_timestamp(self) -> None:
+        """Set the time that names the run. It is the first step of ns-train, which so far has written nothing.
+
+        Raises:
+            SystemExit: a GPU is asked for, and there is none.
+        """
+        require_device(self.machine.device_type)
+        super().set_timestamp()
 
     def get_checkpoint_dir(self) -> Path:
         """Return the folder of the run's checkpoints, and let the commands that open a run load the newest whole one.

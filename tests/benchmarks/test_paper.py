@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -22,6 +23,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from PIL import Image
 
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method_configs.aenerf import aenerf
@@ -341,6 +343,35 @@ def test_a_benchmark_that_is_killed_alone_takes_its_command_along_and_starts_aga
     again.terminate()
     assert again.wait() == 128 + signal.SIGTERM
     assert not list(tmp_path.glob("bench/datasets/.*.partial*"))
+
+
+@pytest.mark.slow
+def test_a_benchmark_that_is_killed_at_twenty_moments_is_finished_by_the_next_start(tmp_path: Path) -> None:
+    command = small_bench(tmp_path, "losses")
+    bench, environment = tmp_path / "bench", {**ENVIRONMENT, "OMP_NUM_THREADS": "1"}
+    stages, finished = set(), {}
+    for moment in np.linspace(1, 39, 20):
+        begin = time.monotonic()
+        process = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(moment)
+        process.kill()
+        process.wait()
+        assert_gone(process.pid)
+        assert time.monotonic() - begin < moment + 20
+        # What is there under its final name is whole, and later starts leave it as it is.
+        stages.add((len(list(bench.glob("datasets/*/transforms.json"))), len(list(bench.glob("runs/*.json")))))
+        for file in (*bench.glob("datasets/*/transforms.json"), *bench.glob("runs/*.json")):
+            json.loads(file.read_text())
+            assert finished.setdefault(file, file.stat().st_mtime_ns) == file.stat().st_mtime_ns
+        for file in bench.glob("datasets/*/transforms.json"):
+            NativeDataParserConfig(data=file.parent).setup().read_recording()
+    assert len(stages) > 1
+    assert subprocess.run(command, cwd=tmp_path, env=environment, check=False).returncode == 0
+    assert len(list(bench.glob("runs/*.json"))) == len(LOSSES)
+    assert "missing" not in (bench / "report.md").read_text()
+    left = [path.name for path in bench.rglob("*") if ".partial" in path.name]
+    assert not left
 
 
 @pytest.mark.slow

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 from small_datasets import START, write_native
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
@@ -223,6 +225,46 @@ def test_noise_of_other_simulations_is_not_blessed(options: dict, tmp_path: Path
     folder = shutil.copytree(whole, tmp_path / "changed")
     for change in (*SHUFFLES.values(), random_events):
         assert_noise_is_named(folder, whole, change)
+
+
+def another_orbit(times: np.ndarray, radius: float, seed: int) -> list[str]:
+    """Lines of poses on a random path around the origin, which the camera looks at."""
+    knots = np.random.default_rng(seed).normal(size=(8, 3))
+    ways = CubicSpline(np.linspace(times[0], times[-1], 8), knots)(times)
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    x = np.cross([0, 0, 1.0], -ways)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    turns = Rotation.from_matrix(np.stack([x, np.cross(-ways, x), -ways], -1)).as_quat()
+    rows = np.concatenate([radius * ways, turns], 1).tolist()
+    return [
+        f"{format_seconds(time)} {' '.join(map(repr, row))}" for time, row in zip(times.tolist(), rows, strict=True)
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_poses_of_another_path_around_an_object_are_named(seed: int, small_object: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(small_object, tmp_path / "changed")
+    true = NativeDataParserConfig(data=folder).setup().read_recording().trajectory
+    radius = float(true.camera_to_worlds[:, :3, 3].norm(dim=-1).mean())
+    (folder / "trajectory_ground_truth.txt").unlink()
+    (folder / "trajectory_estimated.txt").write_text("\n".join(another_orbit(true.times.numpy(), radius, seed)) + "\n")
+    # The box would also tell.
+    meta = json.loads((folder / "transforms.json").read_text())
+    meta.pop("scene_box", None)
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    status, output = run(folder)
+    assert status == 1, output
+    assert "the events look as if" in output or "clearly fit another meaning of the poses" in output
+    assert run(small_object)[0] == 0
+
+
+@pytest.fixture(scope="module")
+def small_object(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("object") / "made"
+    views = {"train_images": 2, "validation_views": 1, "test_views": 1}
+    Simulate(folder, scene="object", width=128, height=96, duration=2.0, **views).main()
+    return folder
 
 
 @pytest.mark.parametrize("order", SHUFFLES)

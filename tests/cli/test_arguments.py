@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,15 +10,18 @@ from pathlib import Path
 import pytest
 from commands import run as run_command
 
+from aenerf_ns.cli import first_look
+from aenerf_ns.cli.arguments import Automatic
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
-from aenerf_ns.cli.dataset_format import Automatic
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.main import main
 from aenerf_ns.cli.reconstruct import Reconstruct
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.formats import FORMATS
+from aenerf_ns.files.layouts import LAYOUTS
+from aenerf_ns.files.training_words import judge_training
 
 # Of which a message shows all, and no file system has a name.
 LONG = "a" * 290
@@ -29,8 +33,13 @@ Command = Check | Convert | Evaluate | ExportTrajectory | Reconstruct
 def what_commands_work_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Paths that the command lines name, because commands look for them first."""
     monkeypatch.chdir(tmp_path)
-    for name in ("F", "G", "C", "ecd-data"):
-        (tmp_path / name).touch()
+    for name in ("F", "G", "ecd-data"):
+        (tmp_path / name).mkdir()
+        for file in ("events.txt", "calib.txt"):
+            (tmp_path / name / file).touch()
+        (tmp_path / name / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n")
+    (tmp_path / "C").write_text("!!python/object:nerfstudio.engine.trainer.TrainerConfig {}")
+    (tmp_path / "W").touch()
 
 
 def parsed(line: str, monkeypatch: pytest.MonkeyPatch) -> Command:
@@ -47,18 +56,18 @@ def parsed(line: str, monkeypatch: pytest.MonkeyPatch) -> Command:
 @pytest.mark.parametrize(
     "line",
     [
-        "check --data F --picture P",
-        "check --data=F --picture P",
-        "check --picture P --data F",
-        "check --data F --picture P auto",
-        "check F --picture P",
-        "check --picture P F",
+        "check --data F --picture P.png",
+        "check --data=F --picture P.png",
+        "check --picture P.png --data F",
+        "check --data F --picture P.png auto",
+        "check F --picture P.png",
+        "check --picture P.png F",
     ],
 )
 def test_a_dataset_is_checked(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     command = parsed(line, monkeypatch)
     assert isinstance(command, Check)
-    assert (command.data, command.picture) == (Path("F"), Path("P"))
+    assert (command.data, command.picture) == (Path("F"), Path("P.png"))
     assert isinstance(command.format, Automatic)
 
 
@@ -149,7 +158,7 @@ def test_a_run_is_given(name: str, run: str, monkeypatch: pytest.MonkeyPatch) ->
     ("line", "complaint"),
     [
         ("check F --data G", "Error: F: --data G is given as well; leave out one of the two"),
-        ("check --data G --picture P F", "Error: F: --data G is given as well; leave out one of the two"),
+        ("check --data G --picture P.png F", "Error: F: --data G is given as well; leave out one of the two"),
         ("check F ecd-data --data G", "Error: F: --data G is given as well; leave out one of the two"),
         ("convert F --data G --output O", "Error: F: --data G is given as well; leave out one of the two"),
         ("evaluate F --load-config G --output O", "Error: F: --load-config G is given as well; leave out one"),
@@ -215,7 +224,7 @@ def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
     ("line", "status", "complaint"),
     [
         ("check nothing", 2, "nothing: there is no such folder"),
-        ("check --picture P --data=nothing ecd-data", 2, "nothing: there is no such folder"),
+        ("check --picture P.png --data=nothing ecd-data", 2, "nothing: there is no such folder"),
         ("convert nothing --output O", 1, "nothing: there is no such folder"),
         ("convert F --output G", 1, "G: the folder exists already"),
         ("simulate --scene room --output G", 1, "G: the folder exists already"),
@@ -223,9 +232,36 @@ def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
         ("export-trajectory --load_config nothing.yml --output O", 1, "nothing.yml: there is no such file"),
         (f"simulate --output {LONG}", 1, f"{LONG}: it cannot be created (File name too long); choose another --output"),
         (f"evaluate {LONG} --output O", 1, f"{LONG}: it cannot be read (File name too long); check its name"),
+        ("check empty", 2, "empty: no known format of recordings; looked for aenerf-data: transforms.json"),
+        ("reconstruct empty --output O", 1, "empty: no known format of recordings"),
+        ("check broken", 2, "broken/groundtruth.txt: line 1 has 3 fields; each line must hold the 8"),
+        ("check F --picture F", 2, "F: its name is not that of a picture; end the --picture with .png"),
+        ("check F --picture C/a.png", 2, "C/a.png: it cannot be created (Not a directory); choose another --picture"),
+        ("convert F --output O --pixel-share 2", 1, "aenerf convert: the share of pixels must be above 0"),
+        ("convert F --output O --pixel-share 2 ecd-data", 1, "aenerf convert: the share of pixels must be above 0"),
+        ("convert F --output O --seed -1", 1, "aenerf convert: --seed -1; give a whole number from 0 on"),
+        ("reconstruct F --output O --method e2vid", 1, "--method e2vid: no weights are given; download"),
+        ("reconstruct F --output O --events-per-pixel nan", 1, "aenerf reconstruct: nan events a pixel"),
+        ("simulate --output O --scene nothing.glb", 1, "nothing.glb: the file does not exist; check the name"),
+        ("simulate --output O --width 0", 1, "aenerf simulate: --width 0; give a positive number"),
+        ("simulate --output O --leak-rate -1", 1, "aenerf simulate: noise of (0.0, 0.0, 0.0, -1.0, 0.0); give"),
+        ("simulate --output O --positive-contrast-threshold 0", 1, "aenerf simulate: positive_contrast_threshold must"),
+        (
+            "simulate --output O --interpolation linear",
+            1,
+            "aenerf simulate: --interpolation has no meaning for",
+        ),
+        ("simulate --output O --video F --trajectory W", 1, "aenerf simulate: --trajectory without the intrinsics"),
+        ("evaluate W --output O", 1, "W: it is no configuration of a run; give the config.yml of a trained run"),
+        ("evaluate C --output F", 1, "F: it cannot be created (Is a directory); choose another --output"),
+        ("export-trajectory C --output O --rate 0", 1, "aenerf export-trajectory: a rate of 0.0; give one above 0"),
     ],
 )
-def test_wrong_paths_are_named_before_slow_imports(line: str, status: int, complaint: str) -> None:
+def test_mistakes_are_named_before_slow_imports(line: str, status: int, complaint: str, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    broken = tmp_path / "broken"
+    shutil.copytree(tmp_path / "F", broken)
+    (broken / "groundtruth.txt").write_text("0 0 0\n")
     program = (
         "import sys; sys.argv[1:] = sys.argv[1].split(); from aenerf_ns.cli.main import main\n"
         "try: main()\nfinally: print('torch' in sys.modules, 'nerfstudio' in sys.modules)"
@@ -234,3 +270,47 @@ def test_wrong_paths_are_named_before_slow_imports(line: str, status: int, compl
     assert (done.returncode, done.stdout.split()) == (status, ["False", "False"])
     assert done.stderr.startswith(f"Error: {complaint}")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("line", ["--help", "check --help", "simulate --help", "evaluate --help", "check --nothing"])
+def test_help_and_complaints_take_no_slow_imports(
+    line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("the commands were imported")
+
+    monkeypatch.setattr(first_look, "judge", fail)
+    with pytest.raises(SystemExit):
+        parsed(line, monkeypatch)
+    assert capsys.readouterr()
+
+
+def test_formats_are_described_alike_before_and_after_slow_imports() -> None:
+    assert list(LAYOUTS) == list(FORMATS)
+    for name, config in FORMATS.items():
+        assert LAYOUTS[name].summary == (type(config).__doc__ or "").splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("aenerf --data nothing", "nothing: there is no such folder"),
+        ("aenerf-small --vis viewer --data=nothing", "nothing: there is no such folder"),
+        ("aenerf ecd-data --data nothing", "nothing: there is no such folder"),
+        ("aenerf --data C", "C: no known format of recordings"),
+        ("aenerf --data F", None),
+        ("aenerf ecd-data --data C", None),
+        ("aenerf --data nothing --help", None),
+        ("aenerf --data nothing --load-config C", None),
+        ("nerfacto --data nothing", None),
+        ("", None),
+    ],
+)
+def test_the_dataset_of_a_training_is_judged_early(words: str, complaint: str | None) -> None:
+    line = ["/somewhere/ns-train", *words.split()]
+    judge_training(["/somewhere/pytest", *line[1:]])
+    if complaint is None:
+        judge_training(line)
+    else:
+        with pytest.raises(SystemExit, match=f"^Error: {complaint}"):
+            judge_training(line)

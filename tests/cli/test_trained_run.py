@@ -10,7 +10,7 @@ import yaml
 
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
-from aenerf_ns.cli.trained_run import require_known_tags
+from aenerf_ns.cli.run_file import require_known_tags
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.errors import DataError
 from aenerf_ns.method_configs.aenerf import aenerf
@@ -89,7 +89,7 @@ def test_a_run_of_another_version_is_told_as_such(text: str, tmp_path: Path) -> 
         (b"", "it is no configuration of a run"),
         (b"a: 1", "it is no configuration of a run"),
         (b"a: [1", "it cannot be read"),
-        (b"\xff\xfe\xff", "it cannot be read"),
+        (b"\xff\xfe\xff", "not text in UTF-8"),
         (b"a: \x00", "it cannot be read"),
         (b"[" * 10_000, "it cannot be read"),
     ],

@@ -187,7 +187,7 @@ FAULTS = {
             (folder / "colmap").mkdir(),
             (folder / "colmap" / "images.bin").write_bytes(b"\1"),
         ),
-        "colmap: not a COLMAP model",
+        "images.bin: not a COLMAP model",
     ),
     "unknown distortion": (
         lambda folder: (

@@ -14,11 +14,11 @@ from aenerf_ns.camera.image_encoding import encode
 from aenerf_ns.method.color_correction import (
     COLOR_CORRECTIONS,
     AffineColorCorrection,
-    ColorCorrectionProtocol,
     NetworkColorCorrection,
     NoColorCorrection,
     TranslatedGammaColorCorrection,
 )
+from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 
 FITTED = [protocol for protocol in COLOR_CORRECTIONS if protocol != "none"]
 

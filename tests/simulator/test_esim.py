@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
-from aenerf_ns.simulator.esim import EventSimulator, SensorNoise
+from aenerf_ns.simulator.esim import EventSimulator
+from aenerf_ns.simulator.options import SensorNoise
 
 WIDTH, HEIGHT = 7, 6
 LOG_EPSILON = 1e-3

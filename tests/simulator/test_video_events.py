@@ -19,9 +19,10 @@ from aenerf_ns.camera.image_encoding import decode, encode
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.video import Video, open_video
-from aenerf_ns.simulator.esim import EventSimulator, SensorNoise
+from aenerf_ns.simulator.esim import EventSimulator
+from aenerf_ns.simulator.options import Interpolation, SensorNoise
 from aenerf_ns.simulator.textures import spectral_noise
-from aenerf_ns.simulator.video_events import Interpolation, quantisation_epsilon, video_events
+from aenerf_ns.simulator.video_events import quantisation_epsilon, video_events
 
 FRAME = 33_333_333
 LEVELS = decode(np.arange(256) / 255, "srgb")

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.arrays import Array, Texture
+from aenerf_ns.simulator.options import MESH_SUFFIXES
 from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh
 from aenerf_ns.simulator.rendering.polygons import triangulated_obj
 
-SUFFIXES = (".glb", ".obj", ".ply")
 UNCOLOURED = 0.5
 """Albedo of a surface that has no colour in its file."""
 
@@ -41,8 +41,8 @@ def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) 
     import trimesh
 
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise DataError(path, f"unknown kind of mesh {suffix!r}", f"give one of {', '.join(SUFFIXES)}")
+    if suffix not in MESH_SUFFIXES:
+        raise DataError(path, f"unknown kind of mesh {suffix!r}", f"give one of {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():
         raise DataError(path, "the file does not exist", "check the name")
     content = path.read_bytes()

@@ -1,0 +1,116 @@
+"""The poses of images in a COLMAP model: images.bin or images.txt, in COLMAP's binary and text format.
+
+https://colmap.github.io/format.html
+
+pycolmap reads models too. But it reserves memory for the numbers that a damaged file states, and does not notice the
+end of the file, so that such a model takes minutes and all of the memory. Of a model, only this one file is needed.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from aenerf_ns.errors import DataError, reading
+from aenerf_ns.files.boundary import require_at_most
+from aenerf_ns.files.tum_trajectory import poses_from_quaternions
+
+# Number of the image; rotation as qw qx qy qz and translation of world to camera; number of the camera.
+_IMAGE = struct.Struct("<I7dI")
+_COUNT = struct.Struct("<Q")
+# A feature: x, y and the number of its 3D point.
+_FEATURE_BYTES = 24
+_MAX_NAME = 4096
+# An image of 100,000 features has 5 MB in a line of text.
+_MAX_LINE = 1 << 24
+_MAX_IMAGES = 200_000
+_MAX_TEXT_BYTES = 1 << 32
+
+Row = tuple[str, list[float]]
+
+
+def read_colmap_poses(model: Path) -> dict[str, Tensor]:
+    """Read the poses of the images that a model places.
+
+    Args:
+        model: the folder that holds images.bin or images.txt. If it holds both, images.bin is read, as COLMAP does.
+
+    Returns:
+        (4, 4) float64 camera-to-world poses with OpenCV axes, by the names of the images.
+
+    Raises:
+        DataError: there is no such file, it is damaged, or a pose is no pose.
+    """
+    with reading(model):
+        binary, text = model / "images.bin", model / "images.txt"
+        path = binary if binary.is_file() else text
+        if not path.is_file():
+            raise DataError(model, "there is no COLMAP model", "give the folder that holds images.bin or images.txt")
+        with path.open("rb") as file:
+            rows = list(_of_binary(path, file) if path == binary else _of_text(path, file))
+    if not rows:
+        raise DataError(path, "it places no image", "reconstruct again")
+    if len(dict(rows)) < len(rows):
+        raise _damaged(path, "it names an image twice")
+    values = np.array([values for _, values in rows])
+    world_to_camera = poses_from_quaternions(path, values[:, 4:7], values[:, [1, 2, 3, 0]])
+    return dict(zip([name for name, _ in rows], torch.linalg.inv(world_to_camera), strict=True))
+
+
+def _of_binary(path: Path, file: BinaryIO) -> Iterator[Row]:
+    size = path.stat().st_size
+    try:
+        (count,) = _COUNT.unpack(file.read(_COUNT.size))
+        if count > min(_MAX_IMAGES, size // _IMAGE.size):
+            raise _damaged(path, f"it says to hold {count:,} images, in {size:,} bytes")
+        for index in range(count):
+            _, *values, _ = _IMAGE.unpack(file.read(_IMAGE.size))
+            if not any(values[:4]):
+                raise _damaged(path, f"image {index + 1} has no rotation")
+            begin = file.tell()
+            name, end, _ = file.read(_MAX_NAME).partition(b"\0")
+            if not end:
+                raise _damaged(path, f"the name of image {index + 1} does not end")
+            file.seek(begin + len(name) + 1)
+            (num_features,) = _COUNT.unpack(file.read(_COUNT.size))
+            place = file.tell() + _FEATURE_BYTES * num_features
+            if place > size:
+                raise _damaged(path, f"it ends within the {num_features:,} features of image {index + 1}")
+            file.seek(place)
+            yield name.decode("utf-8", "replace"), values
+    except struct.error:
+        raise _damaged(path, "it ends within an image") from None
+
+
+def _of_text(path: Path, file: BinaryIO) -> Iterator[Row]:
+    require_at_most(path, _MAX_TEXT_BYTES)
+    is_pose = True
+    for number in range(1, 2 * _MAX_IMAGES):
+        line = file.readline(_MAX_LINE)
+        if not line:
+            return
+        if len(line) == _MAX_LINE:
+            raise _damaged(path, f"line {number} has more than {_MAX_LINE:,} bytes")
+        if line.startswith(b"#"):
+            continue
+        # The line of the features, which may be empty, follows each line of a pose.
+        if is_pose:
+            fields = line.decode("utf-8", "replace").strip().split(maxsplit=9)
+            if not fields:
+                continue
+            try:
+                _, *values, _ = (float(field) for field in fields[:9])
+                yield fields[9], values
+            except (ValueError, IndexError):
+                raise _damaged(path, f"line {number} is not an image: {line[:40]!r}") from None
+        is_pose = not is_pose
+
+
+def _damaged(path: Path, problem: str) -> DataError:
+    return DataError(path, f"not a COLMAP model ({problem})", "copy it again")

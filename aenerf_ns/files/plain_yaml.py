@@ -1,0 +1,37 @@
+"""YAML that holds nothing but lists, dictionaries, texts and numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.boundary import read_text
+
+# Calibrations and the metadata of bags have 1 kB a camera or topic. PyYAML reads 0.1 MB in a second.
+_MAX_BYTES = 1 << 17
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuse aliases. Few of them make a value of any size, or one that holds itself."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it has aliases, which the programs that write such files do not use")
+        return super().compose_node(parent, index)
+
+
+def read_plain_yaml(path: Path) -> Any:
+    """Return the value of a YAML file.
+
+    Raises:
+        DataError: the file is missing, too large, or not valid YAML, or it has aliases.
+    """
+    try:
+        return yaml.load(read_text(path, _MAX_BYTES), _Loader)
+    except DataError:
+        raise
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "copy it again") from None

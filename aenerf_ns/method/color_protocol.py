@@ -1,0 +1,8 @@
+"""The names of the colour corrections: commands show them without importing torch."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+ColorCorrectionProtocol = Literal["affine", "affine-test", "translated-gamma", "network", "none"]
+"""How the colours of renderings are fitted to images."""
