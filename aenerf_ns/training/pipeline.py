@@ -27,6 +27,8 @@ from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
 from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
 from aenerf_ns.training.training_state import TrainingState
+from aenerf_ns.viewer.panel import RecordingPanel
+from aenerf_ns.viewer.recording_view import RecordingView
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
@@ -95,6 +97,10 @@ class AENeRFPipeline(VanillaPipeline):
         self._unchecked_losses: dict[str, Tensor] = {}
         self._steps_per_log = 1
         self._warn_of_test_views()
+        # The viewer finds its elements there, where one runs.
+        self.recording = RecordingPanel(
+            RecordingView(self.model, self.datamanager.train_dataset, self.in_recording, self.pose_errors)
+        )
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
         """Load all of a checkpoint. The framework would silently drop what does not fit.
@@ -193,7 +199,7 @@ class AENeRFPipeline(VanillaPipeline):
         # After every step, because the trainer saves its last checkpoint before it calls the callbacks for the end.
         callbacks = [
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], function, update_every_num_iters=1)
-            for function in (check_losses, diagnose_poses, fit)
+            for function in (check_losses, diagnose_poses, fit, lambda step: self.recording.after_step())
         ]
         return [*super().get_training_callbacks(training_callback_attributes), *callbacks]
 
