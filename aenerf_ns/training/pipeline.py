@@ -16,6 +16,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils import comms
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.utils.writer import GLOBAL_BUFFER, EventName
 from torch import Tensor
 
 from aenerf_ns.camera.alignment import pose_errors
@@ -128,15 +129,15 @@ class AENeRFPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
         """Return outputs, weighted losses and metrics of a training batch.
 
-        There are metrics only at the steps that the trainer logs, with the errors of the corrected poses if the step is
-        a multiple of 100. The losses are checked after the backward pass, together with the gradients.
+        There are metrics only at the steps that the trainer logs, with the pairs that are trained on in a second, and
+        with the errors of the corrected poses if the step is a multiple of 100. The losses are checked after the backward pass, together with the gradients.
         """
         rays, batch = self.datamanager.next_train(step)
         # In several processes the model is wrapped in DistributedDataParallel.
         outputs = self._model(rays)
         metrics = {}
         if step_check(step, self._steps_per_log, run_at_zero=True):
-            metrics = self.model.get_metrics_dict(outputs, batch)
+            metrics = self.model.get_metrics_dict(outputs, batch) | self._rate(batch)
             if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
                 errors = self.pose_errors()
                 if errors is not None:
@@ -144,6 +145,14 @@ class AENeRFPipeline(VanillaPipeline):
         losses = self.model.get_loss_dict(outputs, batch, metrics)
         self._unchecked_losses = losses
         return outputs, losses, metrics
+
+    def _rate(self, batch: Mapping[str, Any]) -> dict[str, float]:
+        """Return ``pairs_per_second`` at the framework's mean time of a step, where a batch holds pairs of times."""
+        # The framework has no mean before the first step, and none outside a training.
+        times = GLOBAL_BUFFER.get("events", {}).get(EventName.ITER_TRAIN_TIME.value)
+        if times is None or "num_positive" not in batch:
+            return {}
+        return {"pairs_per_second": comms.get_world_size() * len(batch["num_positive"]) / times["avg"]}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

@@ -28,8 +28,9 @@ from aenerf_ns.viewer.recording_view import RecordingView, png
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
 
-# While training, drawing takes at most this share of the time, and happens at most once in so many seconds.
-_SHARE_OF_TIME, _SHORTEST_INTERVAL = 0.01, 1.0
+# While training, drawing takes at most this share of the time, and happens at most once in so many seconds: a browser
+# is then sent at most 25 KB a second.
+_SHARE_OF_TIME, _SHORTEST_INTERVAL = 0.01, 2.0
 _COLORS = {"estimated": (255, 140, 30), "corrected": (60, 220, 90), "true": (255, 255, 255)}
 # Steps in which the slider goes through the recording by itself, and the seconds between two of them.
 _PLAYED_STEPS, _PLAYED_INTERVAL = 120, 0.5
@@ -53,6 +54,8 @@ class RecordingPanel(nn.Module):
         self._drawn: tuple[Any, ...] | None = None
         # Not the middle of the recording: a camera of the training cameras, evenly spread, would hide the scene.
         self._first_time = round(0.4 * view.duration, 3)
+        # The lines as browsers have them: one that has not changed is not sent again.
+        self._lines: dict[str, tuple[bool, bytes]] = {}
         self._playing: threading.Thread | None = None
         self.control = _Control(self)
         self.accuracy = ViewerMarkdown("Accuracy", "")
@@ -94,7 +97,10 @@ class RecordingPanel(nn.Module):
             "Trajectories",
             True,
             cb_hook=lambda _: self._show_trajectories(),
-            hint="Orange: as given. Green: corrected. White: true, where it is known.",
+            hint="The poses of the event camera, as lines that move while training corrects them.",
+        )
+        self.trajectories_legend = ViewerMarkdown(
+            "Legend", "Lines: orange as given, green corrected, white true (where known)"
         )
         self.write_snapshot = DownloadButton("Export snapshot", self._snapshot)
         self.write_trajectory = DownloadButton("Export trajectory", self._trajectory_file)
@@ -110,7 +116,7 @@ class RecordingPanel(nn.Module):
         self._viewer = viewer
         viewer.viser_server.on_client_connect(self._welcome)
         self._show_trajectories()
-        self.accuracy.content = self._view.figures()
+        self._show_figures()
 
     def after_step(self) -> None:
         """Draw what has changed in training, if a browser looks on and drawing has been rare enough."""
@@ -126,7 +132,7 @@ class RecordingPanel(nn.Module):
     def draw(self) -> None:
         """Draw everything for the run's present state."""
         self._show_trajectories()
-        self.accuracy.content = self._view.figures()
+        self._show_figures()
         self._drawn = None
         self.show_time(moves_camera=False)
 
@@ -155,7 +161,7 @@ class RecordingPanel(nn.Module):
             "/recording/event_camera",
             fov=self._view.vertical_field_of_view,
             aspect=camera.width / camera.height * camera.fy / camera.fx,
-            scale=self._viewer.config.camera_frustum_scale,
+            scale=3 * self._viewer.config.camera_frustum_scale,
             color=_COLORS["corrected"],
             wxyz=wxyz,
             position=position,
@@ -207,15 +213,25 @@ class RecordingPanel(nn.Module):
     def _show_trajectories(self) -> None:
         if self._viewer is None:
             return
+        visible = self.trajectories.value
         for name, places in self._view.lines().items():
+            state = (visible, places.tobytes())
+            if self._lines.get(name) == state:
+                continue
+            self._lines[name] = state
             self._viewer.viser_server.scene.add_spline_catmull_rom(
                 f"/recording/trajectory_{name}",
                 places * self._scale(),
                 line_width=2.0,
                 color=_COLORS[name],
                 segments=2 * len(places),
-                visible=self.trajectories.value,
+                visible=visible,
             )
+
+    def _show_figures(self) -> None:
+        if self._viewer is not None:
+            # Nerfstudio's own line of the step stands still where rendering takes long.
+            self.accuracy.content = f"**Step** {self._viewer.step:,}\n\n{self._view.figures()}"
 
     def _follow(self) -> None:
         """Begin or end to look through the event camera."""
