@@ -38,7 +38,7 @@ class _Row(str):
 class ConsoleWriter(LocalWriter):
     """The framework's writer to the console, with each loss and what tells most of a training.
 
-    A figure that a row lacks, such as the errors of the poses, which are measured every 100 steps, keeps its last value.
+    A figure that a row lacks keeps its last value: the errors of the poses are measured every 100 steps.
 
     Args:
         config: of the framework's writer. Its ``stats_to_track`` can name the framework's own figures only.

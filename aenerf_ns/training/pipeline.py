@@ -130,7 +130,8 @@ class AENeRFPipeline(VanillaPipeline):
         """Return outputs, weighted losses and metrics of a training batch.
 
         There are metrics only at the steps that the trainer logs, with the pairs that are trained on in a second, and
-        with the errors of the corrected poses if the step is a multiple of 100. The losses are checked after the backward pass, together with the gradients.
+        with the errors of the corrected poses if the step is a multiple of 100. The losses are checked after the
+        backward pass, together with the gradients.
         """
         rays, batch = self.datamanager.next_train(step)
         # In several processes the model is wrapped in DistributedDataParallel.

@@ -260,8 +260,8 @@ class RecordingPanel(nn.Module):
         assert self._viewer is not None
         panel = self._viewer.control_panel
         aspect = client.camera.aspect
-        width, height = (panel.max_res, panel.max_res / aspect) if aspect > 1 else (panel.max_res * aspect, panel.max_res)
-        camera = self.control.get_camera(round(height), round(width), client.client_id)
+        height = panel.max_res / max(aspect, 1.0)
+        camera = self.control.get_camera(round(height), round(height * aspect), client.client_id)
         assert camera is not None
         model = self._viewer.get_model()
         was_training = model.training

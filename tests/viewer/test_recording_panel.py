@@ -192,12 +192,13 @@ def test_figures_tell_errors_thresholds_and_colours(pipeline: AENeRFPipeline) ->
 
 
 def test_figures_without_true_poses(tmp_path: Path) -> None:
-    pipeline = make_pipeline_of(make_recording(tmp_path / "data", true_poses=False), learn_contrast_threshold_ratio=True)
+    data = make_recording(tmp_path / "data", true_poses=False)
+    pipeline = make_pipeline_of(data, learn_contrast_threshold_ratio=True)
     text = pipeline.recording._view.figures()
     assert "the true ones are not known. pose correction translation 0, pose correction degrees 0." in text
     assert "C⁺ 0.2 (learned), C⁻ 0.3" in text
     assert pipeline.recording._view.lines().keys() == {"estimated", "corrected"}
-    off = make_pipeline_of(tmp_path / "data", pose_correction="off")
+    off = make_pipeline_of(data, pose_correction="off")
     assert "as given" in off.recording._view.figures()
 
 
@@ -230,9 +231,7 @@ def test_buttons_send_files_to_the_browser_that_clicks(
     assert np.asarray(picture).std() > 0
 
 
-def test_following_looks_through_the_event_camera(
-    browser: Browser, viewer: Viewer, pipeline: AENeRFPipeline
-) -> None:
+def test_following_looks_through_the_event_camera(browser: Browser, viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     panel = pipeline.recording
     panel.camera_follows.value = True
     assert browser.wait_for("SetCameraFovMessage")["fov"] == pytest.approx(2 * np.arctan(8 / 20))
@@ -252,9 +251,7 @@ def test_following_looks_through_the_event_camera(
     wait_until(lambda: all(handle.visible for handle in viewer.camera_handles.values()))
 
 
-def test_training_draws_rarely_and_only_for_a_browser(
-    workspace: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_draws_rarely_and_only_for_a_browser(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline = make_pipeline_of(workspace / "data")
     panel = pipeline.recording
     # Without a viewer, nothing happens.
