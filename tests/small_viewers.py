@@ -96,11 +96,11 @@ def browser_of(viewer: Viewer) -> Iterator[Browser]:
 
 
 class Browser:
-    """Sends what a browser sends, and keeps what it is sent."""
+    """Sends what a browser sends, and waits for what it is sent."""
 
     def __init__(self, connection: websockets.sync.client.ClientConnection) -> None:
         self._connection = connection
-        self.messages: list[dict[str, Any]] = []
+        self._waiting: list[dict[str, Any]] = []
 
     def look_from(self, position: tuple[float, float, float]) -> None:
         """Tell where the view's camera is. The first time, the viewer takes the browser for connected."""
@@ -114,19 +114,22 @@ class Browser:
         self._send("GuiUpdateMessage", id=element.gui_handle._impl.id, updates={"value": True})
 
     def wait_for(self, kind: str, **fields: Any) -> dict[str, Any]:
-        """Return the next message of a kind with some values."""
+        """Return the next message of a kind with some values. Messages before it are passed over."""
+        passed = []
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline:
-            for message in self._receive():
+            while self._waiting:
+                message = self._waiting.pop(0)
                 if message["type"] == kind and all(message[name] == value for name, value in fields.items()):
                     return message
-        raise AssertionError(f"no {kind} among {[message['type'] for message in self.messages]}")
+                passed.append(message["type"])
+            received = msgspec.msgpack.decode(self._connection.recv(timeout=30, decode=False))
+            self._waiting += received["messages"] if isinstance(received, dict) else received
+        raise AssertionError(f"no {kind} among {passed}")
 
-    def _receive(self) -> list[dict[str, Any]]:
-        received = msgspec.msgpack.decode(self._connection.recv(timeout=30, decode=False))
-        received = received["messages"] if isinstance(received, dict) else received
-        self.messages += received
-        return received
+    def pass_over(self) -> None:
+        """Pass over all messages that are here."""
+        self._waiting.clear()
 
     def _send(self, kind: str, **fields: Any) -> None:
         self._connection.send(msgspec.msgpack.encode({"type": kind, **fields}))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_viewers import NUM_EVENTS, make_pipeline_of, make_recording, viewer_of
+from small_viewers import DURATION, NUM_EVENTS, make_pipeline_of, make_recording, viewer_of
 
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 
@@ -18,7 +18,7 @@ DRIVER = shutil.which("chromedriver")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--window-size=1200,900",
+    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--window-size=700,600",
     # The page asks for a logo and for statistics elsewhere.
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )  # fmt: skip
@@ -70,15 +70,14 @@ def test_the_panel_in_chromium(chromium: Any, tmp_path: Path) -> None:
         assert before.startswith("data:image/png;base64,")
         slider = control("Time (s)").find_element("css selector", "[role=slider]")
         assert float(slider.get_attribute("aria-valuenow")) == 0.8
-        for _ in range(50):
-            slider.send_keys("\ue014")  # the right arrow
-        eventually(lambda: panel.at_time.value == pytest.approx(0.9))
+        slider.send_keys("\ue010")  # the key End
+        eventually(lambda: panel.at_time.value == DURATION)
         eventually(lambda: picture() != before)
         click(lambda: control("Events in scene"))
         eventually(lambda: panel.events_in_scene.value)
         click(lambda: control("Follow"))
         (client,) = viewer.viser_server.get_clients().values()
-        _, position = panel._in_viewer(panel._view.pose(0.9))
+        _, position = panel._in_viewer(panel._view.pose(DURATION))
         # What the browser says of its own view.
         eventually(lambda: client.camera.position == pytest.approx(position, abs=1e-3))
         assert client.camera.fov == pytest.approx(panel._view.vertical_field_of_view)
