@@ -127,10 +127,6 @@ class Browser:
             self._waiting += received["messages"] if isinstance(received, dict) else received
         raise AssertionError(f"no {kind} among {passed}")
 
-    def pass_over(self) -> None:
-        """Pass over all messages that are here."""
-        self._waiting.clear()
-
     def _send(self, kind: str, **fields: Any) -> None:
         self._connection.send(msgspec.msgpack.encode({"type": kind, **fields}))
 

@@ -99,7 +99,8 @@ def test_trajectories_are_lines_that_move_with_the_correction(viewer: Viewer, pi
     first = sent(viewer, "CatmullRomSplineMessage", "/recording/trajectory_estimated")
     with torch.no_grad():
         correction.twists.control_twists[:, 1] = 0.2 / correction.translation_unit
-    pipeline.recording.draw()
+    with viewer.train_lock:
+        pipeline.recording.draw()
     after = lines()
     moved = np.linalg.norm(after["corrected"] - before["corrected"], axis=1)
     np.testing.assert_allclose(moved, SCALE * 0.2, atol=1e-6)
@@ -151,7 +152,8 @@ def test_events_are_points_at_the_rendered_depth(viewer: Viewer, pipeline: AENeR
     # In the event camera of each event's time, its point lies behind its pixel, 1 % nearer than what is rendered there.
     view = panel._view
     events = view.events(0.8, 400)
-    points, colors = view.points(events)
+    with viewer.train_lock:
+        points, colors = view.points(events)
     np.testing.assert_allclose(cloud.points, SCALE * points, atol=1e-5)
     assert len(points) == len(events)
     correction = pipeline.model.camera_optimizer
@@ -163,7 +165,8 @@ def test_events_are_points_at_the_rendered_depth(viewer: Viewer, pipeline: AENeR
     np.testing.assert_allclose(x, events.pixels % SIZE[0] + 0.5, atol=1e-3)
     np.testing.assert_allclose(y, events.pixels // SIZE[0] + 0.5, atol=1e-3)
     camera = view.camera.cameras(poses[:1])
-    depth = pipeline.model.eval().get_outputs_for_camera(camera)["depth"].reshape(-1)
+    with viewer.train_lock:
+        depth = pipeline.model.eval().get_outputs_for_camera(camera)["depth"].reshape(-1)
     distance = np.linalg.norm(in_camera[0])
     assert distance == pytest.approx(0.99 * float(depth[events.pixels[0]]), rel=1e-3)
     positive = colors[:, 0] > colors[:, 2]
@@ -172,17 +175,19 @@ def test_events_are_points_at_the_rendered_depth(viewer: Viewer, pipeline: AENeR
     wait_until(lambda: len(sent(viewer, "PointCloudMessage", "/recording/events")[-1].points) == 0)
 
 
-def test_points_are_limited_for_slow_links(pipeline: AENeRFPipeline) -> None:
+def test_points_are_limited_for_slow_links(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     timeline = pipeline.datamanager.train_dataset.timeline
     many = timeline._part(np.sort(np.random.default_rng(0).integers(len(timeline), size=9000)))
-    points, _ = pipeline.recording._view.points(many)
+    with viewer.train_lock:
+        points, _ = pipeline.recording._view.points(many)
     assert len(points) <= 2000
 
 
-def test_figures_tell_errors_thresholds_and_colours(pipeline: AENeRFPipeline) -> None:
+def test_figures_tell_errors_thresholds_and_colours(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     panel = pipeline.recording
-    pipeline.fit_color_correction()
-    panel.draw()
+    with viewer.train_lock:
+        pipeline.fit_color_correction()
+        panel.draw()
     text = panel.accuracy.content
     errors = pipeline.pose_errors()
     given, corrected = (errors[name]["rotation_error_degrees"] for name in ("estimated", "corrected"))
@@ -214,7 +219,7 @@ def test_a_run_without_its_events_says_where_they_should_be(tmp_path: Path) -> N
 
 
 def test_buttons_send_files_to_the_browser_that_clicks(
-    browser: Browser, pipeline: AENeRFPipeline, tmp_path: Path
+    browser: Browser, viewer: Viewer, pipeline: AENeRFPipeline, tmp_path: Path
 ) -> None:
     browser.click(pipeline.recording.write_trajectory)
     assert browser.wait_for("FileTransferStart")["filename"] == "trajectory_000000.txt"
@@ -230,7 +235,8 @@ def test_buttons_send_files_to_the_browser_that_clicks(
     # The browser's aspect is 1.5, the viewer's highest resolution 512.
     assert picture.size == (512, 341)
     camera = pipeline.recording.control.get_camera(341, 512)
-    expected = 255 * pipeline.model.eval().get_outputs_for_camera(camera)["rgb"].numpy()
+    with viewer.train_lock:
+        expected = 255 * pipeline.model.eval().get_outputs_for_camera(camera)["rgb"].numpy()
     np.testing.assert_allclose(np.asarray(picture, float), expected, atol=0.51)
 
 
@@ -241,8 +247,8 @@ def test_following_looks_through_the_event_camera(browser: Browser, viewer: View
     wait_until(lambda: not any(handle.visible for handle in viewer.camera_handles.values()))
     panel.at_time.value = 1.0
     pose = pipeline.model.camera_optimizer.pose(torch.tensor([1.0], dtype=torch.float64))[0].detach()
-    position = browser.wait_for("SetCameraPositionMessage")["position"]
-    np.testing.assert_allclose(position, SCALE * pose[:, 3], atol=1e-6)
+    while not np.allclose(browser.wait_for("SetCameraPositionMessage")["position"], SCALE * pose[:, 3], atol=1e-6):
+        pass
     # The time runs on by itself, and begins anew at the end.
     panel.at_time.value = DURATION
     panel.camera_plays.value = True
