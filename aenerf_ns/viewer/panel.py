@@ -64,7 +64,7 @@ class RecordingPanel(nn.Module):
             self._first_time,
             0.0,
             view.duration,
-            max(round(view.duration / 1000, 4), 1e-4),
+            min(max(round(view.duration / 1000, 4), 1e-4), view.duration),
             cb_hook=lambda _: self.show_time(),
             hint="Seconds from the first pose. The frame in the scene is the event camera at this time.",
         )
@@ -133,22 +133,22 @@ class RecordingPanel(nn.Module):
         """Draw everything for the run's present state."""
         self._show_trajectories()
         self._show_figures()
-        self._drawn = None
-        self.show_time(moves_camera=False)
+        self.show_time(anew=True)
 
-    def show_time(self, moves_camera: bool = True) -> None:
+    def show_time(self, anew: bool = False) -> None:
         """Show the slider's time: the event camera, its events, and, if the view follows, what it sees.
 
         Args:
-            moves_camera: whether a view that follows moves. Training, which moves the pose too, leaves it alone.
+            anew: draw also what was asked for before. A view that follows then stays, although training moves the pose.
         """
         wanted = (self.at_time.value, self.events_number.value, self.events_in_scene.value, self.camera_follows.value)
-        if self._viewer is None or wanted == self._drawn:
+        is_new = wanted != self._drawn
+        if self._viewer is None or not (is_new or anew):
             return
         self._drawn = wanted
         seconds, count, in_scene, follows = wanted
         pose = self._view.pose(seconds)
-        if follows and moves_camera:
+        if follows and is_new:
             for client in self._viewer.viser_server.get_clients().values():
                 self._place(client, pose)
                 client.camera.fov = self._view.vertical_field_of_view
