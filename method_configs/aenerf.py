@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.utils.writer import EventName
 
 from aenerf_ns.dataparsers.formats import AutomaticDataParserConfig
 from aenerf_ns.method.model import AENeRFModelConfig
@@ -50,7 +51,13 @@ aenerf = MethodSpecification(
         # A batch has few rays for each knot of the spline. If poses follow every single batch, the field stays blurred,
         # at lower rates and in longer runs too (docs/experiments.md).
         gradient_accumulation_steps={"camera_opt": 8},
-        logging=LoggingConfig(local_writer=LocalWriterConfig(_target=ConsoleWriter, enable=True)),
+        logging=LoggingConfig(
+            local_writer=LocalWriterConfig(
+                _target=ConsoleWriter,
+                enable=True,
+                stats_to_track=(EventName.ITER_TRAIN_TIME, EventName.ETA),
+            )
+        ),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
         vis="viewer",
     ),

@@ -23,7 +23,9 @@ MAY_USE = {
     "supervision": {"errors", "events", "camera", "recording"},
     "method": {"errors", "camera", "recording", "supervision"},
     "checking": {"progress", "events", "camera", "recording"},
-    "training": {"errors", "events", "camera", "recording", "supervision", "method", "checking"},
+    # What the viewer shows of a run. It only looks: the pipeline hands it what it needs.
+    "viewer": {"errors", "events", "camera", "files", "recording", "method"},
+    "training": {"errors", "events", "camera", "recording", "supervision", "method", "checking", "viewer"},
     "simulator": {"errors", "progress", "events", "camera", "files", "recording"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},

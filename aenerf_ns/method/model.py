@@ -45,6 +45,8 @@ from aenerf_ns.supervision.pairs import PairSupervisionConfig
 
 # ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
+# The error of a display value that has the last colour of the error's colour map.
+_LARGEST_SHOWN_ERROR = 0.5
 
 # Share of a run in which the space that moves along with the poses counts rays, and the steps between two of its
 # weighings. A weighing moves the field a little, so the weights must stay for the rest of the run.
@@ -236,8 +238,9 @@ class AENeRFModel(Model):
         Returns:
             ``log_radiance`` (N, channels), the raw log L̂. While training, also the samples and weights of both stages,
             and the ``log_radiance_rate`` (rate rays, channels) of the rays at the end of the batch that the supervision
-            needs rates of. Otherwise also ``rgb`` (N, 3) colour-corrected display values, ``accumulation`` (N, 1) and
-            ``depth`` (N, 1), the median distance along the ray in scene units.
+            needs rates of. Otherwise also ``rgb`` (N, 3) colour-corrected display values, ``uncorrected_rgb`` (N, 3)
+            display values of the radiance as it was rendered, ``accumulation`` (N, 1) and ``depth`` (N, 1), the median
+            distance along the ray in scene units; of a colour sensor also ``mean_log_radiance`` (N, 1) of its channels.
         """
         if self.space is not None:
             self.space.follow()
@@ -267,12 +270,18 @@ class AENeRFModel(Model):
             self.space.observe(samples.frustums.get_positions(), weights[..., 0], ray_bundle.times[:, 0])
         weights_list.append(weights)
         samples_list.append(samples)
-        outputs["log_radiance"] = log_radiance
         if self.training:
+            outputs["log_radiance"] = log_radiance
             outputs["weights_list"] = weights_list
             outputs["ray_samples_list"] = samples_list
         else:
+            # The viewer shows the first at the start, and lists the others in this order.
             outputs["rgb"] = self.display(log_radiance.detach())
+            outputs["uncorrected_rgb"] = _grey_to_rgb(encode(log_radiance.detach().exp(), self.image_encoding))
+            outputs["log_radiance"] = log_radiance
+            if self.sensor.num_channels > 1:
+                # The viewer takes three channels for a picture: it has colour maps for single channels only.
+                outputs["mean_log_radiance"] = log_radiance.mean(-1, keepdim=True)
             outputs["accumulation"] = self.renderer_accumulation(weights)
             outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
         return outputs
@@ -330,26 +339,34 @@ class AENeRFModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Return the metrics of the display values, and pictures with the reference beside the rendering.
 
-        The reference is shown as the sensor sees it: grey for a monochrome sensor.
+        The reference is shown as the sensor sees it: grey for a monochrome sensor. The picture ``error`` shows the
+        absolute difference of the display values, the mean over their channels, in the colours of viridis: from dark
+        blue for 0 to yellow for 0.5 and more.
         """
         predicted = outputs["rgb"]
         reference = self.reference_display(batch["image"].to(predicted.device))
+        error = (predicted - reference).abs().mean(-1, keepdim=True)
         images = {
             "img": torch.cat([reference, predicted], dim=1),
+            "error": colormaps.apply_float_colormap((error / _LARGEST_SHOWN_ERROR).clamp(0, 1)),
             "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
             "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
         }
         return self.image_metrics(predicted, reference), images
 
-    @torch.no_grad()
     def render_log_radiance(self, rays: RayBundle) -> Tensor:
         """Return log-radiance (N, channels) of any number of rays, rendered in evaluation mode."""
+        return self.render_rays(rays, "log_radiance")[0]
+
+    @torch.no_grad()
+    def render_rays(self, rays: RayBundle, *names: str) -> list[Tensor]:
+        """Return the outputs (N, channels) with the given names of any number of rays, rendered in evaluation mode."""
         was_training = self.training
         self.eval()
         chunk = self.config.eval_num_rays_per_chunk
-        rendered = [self(rays[begin : begin + chunk])["log_radiance"] for begin in range(0, len(rays), chunk)]
+        rendered = [self(rays[begin : begin + chunk]) for begin in range(0, len(rays), chunk)]
         self.train(was_training)
-        return torch.cat(rendered)
+        return [torch.cat([outputs[name] for outputs in rendered]) for name in names]
 
 
 def _is_of_batch(ray_bundle: RayBundle) -> bool:

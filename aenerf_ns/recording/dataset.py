@@ -15,6 +15,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_table import EventPairs
 from aenerf_ns.events.picture import PolaritySums, polarity_picture
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.events.timeline import EventTimeline, timeline_of_pairs, timeline_of_windows
 from aenerf_ns.events.windows import EventWindows, window_events
 from aenerf_ns.progress import tracked
 from aenerf_ns.recording.pair_file import PairFile
@@ -22,6 +23,8 @@ from aenerf_ns.recording.scene import SCENE, Scene
 
 # Events in a picture, as a share of the sensor's pixels: enough to show edges, too few to smear them.
 _PICTURE_DENSITY = 0.25
+# The most rows that a timeline is made from, in memory and in a file, where each row is a page to read.
+_TIMELINE_ROWS, _TIMELINE_ROWS_IN_FILE = 1 << 23, 1 << 18
 
 
 class EventDataset(InputDataset):
@@ -131,10 +134,32 @@ class EventDataset(InputDataset):
         if scene.has_image[image_idx]:
             return super().get_numpy_image(image_idx)
         width, height = scene.event_camera.width, scene.event_camera.height
-        # A trained run may be opened where its events are not.
-        has_events = scene.event_file.path.exists()
-        # Those of the events that were read for training: reading them again would take as long.
-        read = "_windows_and_pictures" if "_windows_and_pictures" in vars(self) else "_pairs_and_pictures"
-        net = getattr(self, read)[1][image_idx] if has_events else np.zeros((height, width), np.int16)
+        if not self.has_events:
+            net = np.zeros((height, width), np.int16)
+        else:
+            net = (self._windows_and_pictures if self._has_windows else self._pairs_and_pictures)[1][image_idx]
         rows, columns = np.nonzero(net)
         return polarity_picture(columns, rows, net[rows, columns], width, height)
+
+    @property
+    def has_events(self) -> bool:
+        """Whether the event file is there. A trained run may be opened where it is not."""
+        return self.scene.event_file.path.exists()
+
+    @property
+    def _has_windows(self) -> bool:
+        """Whether the events were read as windows for training: reading them again, as pairs, would take as long."""
+        return "_windows_and_pictures" in vars(self)
+
+    @cached_property
+    def timeline(self) -> EventTimeline:
+        """Events to look at around a time, at most 8 million. The first access may read the whole event file.
+
+        Raises:
+            DataError: see :attr:`pairs`.
+        """
+        if self._has_windows:
+            return timeline_of_windows(self.windows, _TIMELINE_ROWS)
+        # Rows that are mapped from a file are read-only.
+        in_memory = self.pairs.rows.flags.writeable
+        return timeline_of_pairs(self.pairs, _TIMELINE_ROWS if in_memory else _TIMELINE_ROWS_IN_FILE)

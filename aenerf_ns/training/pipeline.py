@@ -16,6 +16,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils import comms
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.utils.writer import GLOBAL_BUFFER, EventName
 from torch import Tensor
 
 from aenerf_ns.camera.alignment import pose_errors
@@ -29,6 +30,8 @@ from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
 from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
 from aenerf_ns.training.training_state import TrainingState
+from aenerf_ns.viewer.panel import RecordingPanel
+from aenerf_ns.viewer.recording_view import RecordingView
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
@@ -92,6 +95,10 @@ class AENeRFPipeline(VanillaPipeline):
         self._unchecked_losses: dict[str, Tensor] = {}
         self._steps_per_log = 1
         self._warn_of_test_views()
+        # The viewer finds its elements there, where one runs.
+        self.recording = RecordingPanel(
+            RecordingView(self.model, self.datamanager.train_dataset, self.in_recording, self.pose_errors)
+        )
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
         """Load all of a checkpoint. The framework would silently drop what does not fit.
@@ -119,15 +126,16 @@ class AENeRFPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Any]]:
         """Return outputs, weighted losses and metrics of a training batch.
 
-        There are metrics only at the steps that the trainer logs, with the errors of the corrected poses if the step is
-        a multiple of 100. The losses are checked after the backward pass, together with the gradients.
+        There are metrics only at the steps that the trainer logs, with the pairs that are trained on in a second, and
+        with the errors of the corrected poses if the step is a multiple of 100. The losses are checked after the
+        backward pass, together with the gradients.
         """
         rays, batch = self.datamanager.next_train(step)
         # In several processes the model is wrapped in DistributedDataParallel.
         outputs = self._model(rays)
         metrics = {}
         if step_check(step, self._steps_per_log, run_at_zero=True):
-            metrics = self.model.get_metrics_dict(outputs, batch)
+            metrics = self.model.get_metrics_dict(outputs, batch) | self._rate(batch)
             if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
                 errors = self.pose_errors()
                 if errors is not None:
@@ -135,6 +143,14 @@ class AENeRFPipeline(VanillaPipeline):
         losses = self.model.get_loss_dict(outputs, batch, metrics)
         self._unchecked_losses = losses
         return outputs, losses, metrics
+
+    def _rate(self, batch: Mapping[str, Any]) -> dict[str, float]:
+        """Return ``pairs_per_second`` at the framework's mean time of a step, where a batch holds pairs of times."""
+        # The framework has no mean before the first step, and none outside a training.
+        times = GLOBAL_BUFFER.get("events", {}).get(EventName.ITER_TRAIN_TIME.value)
+        if times is None or "num_positive" not in batch:
+            return {}
+        return {"pairs_per_second": comms.get_world_size() * len(batch["num_positive"]) / times["avg"]}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -190,7 +206,7 @@ class AENeRFPipeline(VanillaPipeline):
         # After every step, because the trainer saves its last checkpoint before it calls the callbacks for the end.
         callbacks = [
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], function, update_every_num_iters=1)
-            for function in (check_losses, diagnose_poses, fit)
+            for function in (check_losses, diagnose_poses, fit, lambda step: self.recording.after_step())
         ]
         return [*super().get_training_callbacks(training_callback_attributes), *callbacks]
 

@@ -177,6 +177,27 @@ def test_image_metrics_compare_with_what_the_sensor_sees() -> None:
     assert metrics["psnr"] > 60
     assert metrics["ssim"] == pytest.approx(1.0, abs=1e-4)
     assert images["img"].shape == (16, 32, 3)
+    # The ends of the colour map: no error, and one of half of the range of display values.
+    dark, bright = torch.tensor([0.267, 0.005, 0.329]), torch.tensor([0.993, 0.906, 0.144])
+    torch.testing.assert_close(images["error"], dark.expand(16, 16, 3), atol=2e-3, rtol=0)
+    outputs["rgb"] = torch.where(grey > 0.5, grey - 0.5, grey + 0.5)
+    _, images = model.get_image_metrics_and_images(outputs, {"image": reference})
+    torch.testing.assert_close(images["error"], bright.expand(16, 16, 3), atol=0.02, rtol=0)
+
+
+def test_pictures_are_also_rendered_without_colour_correction() -> None:
+    rays = make_rays()
+    outputs = make_model(color_correction="none").eval()(rays)
+    # The viewer shows the first when it starts.
+    assert list(outputs) == ["rgb", "uncorrected_rgb", "log_radiance", "accumulation", "depth"]
+    torch.testing.assert_close(outputs["uncorrected_rgb"], outputs["rgb"])
+    model = make_model(sensor=SensorModel(0.2, 0.3, bayer_pattern="RGGB")).eval()
+    before = model(rays)
+    model.color_correction.stretch(before["log_radiance"])
+    after = model(rays)
+    assert (after["rgb"] - before["rgb"]).abs().max() > 0.01
+    torch.testing.assert_close(after["uncorrected_rgb"], before["uncorrected_rgb"])
+    torch.testing.assert_close(after["mean_log_radiance"], after["log_radiance"].mean(-1, keepdim=True))
 
 
 def test_rendering_in_chunks_changes_nothing() -> None:

@@ -7,30 +7,60 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_pipelines import make_pipeline_config
 from small_trainings import train_small_model
+
+from aenerf_ns.camera.rotation import rotation_from_vector
 
 
 def without_formatting(output: str) -> str:
     return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", output)
 
 
-def test_the_console_shows_the_losses_beside_the_times(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    trainer = train_small_model(tmp_path, "run", 21)
+def columns_of(line: str) -> list[str]:
+    return re.split(r" {2,}", line.strip())
+
+
+def test_the_console_shows_losses_and_pose_errors_beside_the_times(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_pipeline_config(tmp_path / "data", true_world=lambda poses: (poses @ turned_by(0.1))[:, :3])
+    trainer = train_small_model(tmp_path, "run", 121)
     printed = without_formatting(capsys.readouterr().out)
-    headings = [line for line in printed.splitlines() if line.startswith("Step (% Done)")]
-    rows = {line.split()[0]: line for line in printed.splitlines() if re.match(r"\d+ \(", line)}
-    assert rows.keys() >= {"0", "10", "20"}
-    assert headings[-1].split("  ")[0] == "Step (% Done)"
-    columns = re.split(r" {2,}", headings[-1].strip())
-    assert columns[1:5] == ["Train Loss", "Reconstruction", "Polarity agreement", "Poses turned (deg)"]
-    assert "Train Iter (time)" in columns
-    values = dict(zip(columns, re.split(r" {2,}", rows["20"].strip()), strict=True))
-    assert float(values["Train Loss"]) >= float(values["Reconstruction"]) > 0
-    assert 0 <= float(values["Polarity agreement"]) <= 1
-    # At step 20 the poses have moved twice: after steps 7 and 15.
+    headings = [columns_of(line) for line in printed.splitlines() if line.startswith("Step (% Done)")][-1]
+    rows = {line.split()[0]: columns_of(line) for line in printed.splitlines() if re.match(r"\d+ \(", line)}
+    assert rows.keys() >= {"0", "10", "100", "110", "120"}
+    assert headings == [
+        "Step (% Done)", "Loss", "Reconstruction", "Interlevel", "Distortion", "Penalty", "Polarity", "Turned (°)",
+        "Error (°)", "Error (length)", "Step time", "ETA", "Pairs/s",
+    ]  # fmt: skip
+    values = dict(zip(headings, rows["120"], strict=True))
+    terms = [float(values[name]) for name in ("Reconstruction", "Interlevel", "Distortion", "Penalty")]
+    assert float(values["Loss"]) == pytest.approx(sum(terms), rel=1e-3)
+    assert terms[0] > 0
+    assert 0 <= float(values["Polarity"]) <= 1
+    # At step 120 the poses have moved last after step 119.
     metrics: dict[str, torch.Tensor] = {}
     trainer.pipeline.model.camera_optimizer.get_metrics_dict(metrics)
-    assert float(values["Poses turned (deg)"]) == pytest.approx(float(metrics["pose_correction_degrees"]), abs=1e-4)
+    assert float(values["Turned (°)"]) == pytest.approx(float(metrics["pose_correction_degrees"]), rel=1e-3)
+    # The errors are measured every 100 steps and shown in between.
+    index = headings.index("Error (°)")
+    assert rows["100"][index] == rows["120"][index]
+    error = trainer.pipeline.pose_errors()["corrected"]["rotation_error_degrees"]
+    assert float(rows["120"][index]) == pytest.approx(error, rel=0.3)
+    # 32 pairs in a batch of 64 rays.
+    number, unit = re.fullmatch(r"([\d.]+)(?: (K|M))?", values["Pairs/s"]).groups()
+    rate = float(number) * {None: 1, "K": 1e3, "M": 1e6}[unit]
+    milliseconds = float(re.fullmatch(r"([\d.]+) ms", values["Step time"])[1])
+    # The rate is of the steps before.
+    assert rate == pytest.approx(32e3 / milliseconds, rel=0.5)
+
+
+def turned_by(angle: float) -> torch.Tensor:
+    """A turn of cameras about their own axes (4, 4): no motion of the world makes up for it in all of their poses."""
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = rotation_from_vector(torch.tensor([0.0, 0.0, angle], dtype=torch.float64))
+    return turn
 
 
 def test_a_run_that_goes_on_ends_at_a_hundred_percent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

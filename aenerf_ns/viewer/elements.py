@@ -1,0 +1,69 @@
+"""Elements of Nerfstudio's viewer that Nerfstudio lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerElement
+from viser import ClientHandle, GuiMarkdownHandle, ViserServer
+
+
+class ViewerMarkdown(ViewerElement[str]):
+    """A text in Markdown, which may hold tables and pictures.
+
+    Args:
+        name: of the element. It is not shown.
+        content: the text.
+    """
+
+    def __init__(self, name: str, content: str) -> None:
+        super().__init__(name)
+        self._content = content
+        self._handle: GuiMarkdownHandle | None = None
+
+    def install(self, viser_server: ViserServer) -> None:
+        """Add the element to the viewer."""
+        self._handle = viser_server.gui.add_markdown(self._content)
+
+    @property
+    def content(self) -> str:
+        """The text. Browsers are sent a new one if it differs."""
+        return self._content
+
+    @content.setter
+    def content(self, content: str) -> None:
+        if content == self._content:
+            return
+        self._content = content
+        if self._handle is not None:
+            self._handle.content = content
+
+
+class DownloadButton(ViewerButton):
+    """A button that sends a file to the browser in which it was clicked.
+
+    Args:
+        name: the text on the button.
+        make: makes the file's name and content for the browser.
+    """
+
+    def __init__(self, name: str, make: Callable[[ClientHandle], tuple[str, bytes]]) -> None:
+        super().__init__(name, cb_hook=self._send)
+        self._make = make
+        self._client: ClientHandle | None = None
+
+    def install(self, viser_server: ViserServer) -> None:
+        """Add the element to the viewer."""
+        self._create_gui_handle(viser_server)
+
+        def click(event: Any) -> None:
+            # Nerfstudio wraps the hook so that it waits until no training step runs, but hands it no browser.
+            self._client = event.client
+            self.cb_hook(self)
+
+        self.gui_handle.on_click(click)
+
+    def _send(self, _: ViewerButton) -> None:
+        if self._client is not None:
+            self._client.send_file_download(*self._make(self._client))

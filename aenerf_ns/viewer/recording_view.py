@@ -1,0 +1,217 @@
+"""What the viewer shows of a recording beside the scene, as arrays, texts and files."""
+
+from __future__ import annotations
+
+import base64
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from numpy.typing import NDArray
+from torch import Tensor
+
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.events.picture import polarity_picture
+from aenerf_ns.events.timeline import EventTimeline
+from aenerf_ns.files.tum_trajectory import write_tum_trajectory
+from aenerf_ns.method.model import AENeRFModel
+from aenerf_ns.method.pose_correction import world_rays
+from aenerf_ns.recording.dataset import EventDataset
+
+# A line of so many places looks smooth and takes 5 KB.
+_MOST_PLACES = 200
+# As many points take 30 KB, and a fraction of a training step to place.
+_MOST_POINTS = 2000
+# Events whose ray meets less than this much matter hang nowhere.
+_LEAST_ACCUMULATION = 0.5
+# Points this much nearer than the surface are not half hidden by it.
+_IN_FRONT = 0.99
+_PICTURE_WIDTH = 280
+_POSITIVE_COLOR, _NEGATIVE_COLOR = (230, 60, 40), (60, 110, 255)
+
+
+class RecordingView:
+    """Events, trajectories and figures of a run at its present state.
+
+    Args:
+        model: with the poses as corrected so far.
+        dataset: the training data.
+        in_recording: converts scene poses (N, 3, 4) to the recording's world and units, with OpenCV axes.
+        pose_errors: returns the errors of the estimated and the corrected poses, None where the true ones are unknown.
+    """
+
+    def __init__(
+        self,
+        model: AENeRFModel,
+        dataset: EventDataset,
+        in_recording: Callable[[Tensor], Tensor],
+        pose_errors: Callable[[], Mapping[str, Mapping[str, float]] | None],
+    ) -> None:
+        self._model = model
+        self._dataset = dataset
+        self._in_recording = in_recording
+        self._pose_errors = pose_errors
+        self.camera = dataset.scene.event_camera
+        self.duration = dataset.scene.trajectory.duration
+
+    @property
+    def usual_number_of_events(self) -> int:
+        """Events in a picture that show edges without smearing them: a quarter of the pixels."""
+        return min(max(self.camera.width * self.camera.height // 400 * 100, 200), 20_000)
+
+    @property
+    def vertical_field_of_view(self) -> float:
+        """The event camera's, in radians, without its distortion."""
+        return 2 * float(np.arctan(self.camera.height / 2 / self.camera.fy))
+
+    @torch.no_grad()
+    def pose(self, seconds: float) -> NDArray[np.float64]:
+        """Return the corrected pose (3, 4) at a time since the trajectory's start: camera-to-world, OpenGL axes."""
+        correction = self._model.camera_optimizer
+        return correction.pose(torch.tensor([seconds], dtype=torch.float64, device=self._model.device))[0].cpu().numpy()
+
+    @torch.no_grad()
+    def lines(self) -> dict[str, NDArray[np.float64]]:
+        """Return places (N, 3) along the ``estimated``, ``corrected`` and, where it is known, ``true`` trajectory.
+
+        They are in the scene, whose frame is that of the corrected poses: the true trajectory is mapped there.
+        """
+        correction = self._model.camera_optimizer
+        estimated, corrected, reference = correction.compared_poses()
+        lines = {"estimated": estimated, "corrected": corrected}
+        if correction.has_ground_truth:
+            lines["true"] = correction.alignment().inverse()(reference)
+        count = min(len(estimated), _MOST_PLACES)
+        index = torch.linspace(0, len(estimated) - 1, count, dtype=torch.float64).round().long()
+        return {name: poses[index.to(poses.device), :, 3].cpu().numpy() for name, poses in lines.items()}
+
+    def prepare(self) -> None:
+        """Read the events now, where they are there and have not been read for training.
+
+        Raises:
+            DataError: the events cannot be used.
+        """
+        if self._dataset.has_events:
+            _ = self._dataset.timeline
+
+    def events(self, seconds: float, count: int) -> EventTimeline:
+        """Return about ``count`` events around a time since the trajectory's start; none where there is no file."""
+        if not self._dataset.has_events:
+            return EventTimeline(np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0, np.int8))
+        return self._dataset.timeline.nearest(self._dataset.scene.trajectory.start + round(seconds * 1e9), count)
+
+    def picture(self, events: EventTimeline) -> NDArray[np.uint8]:
+        """Return a picture (height, width, 3) of events, as wide as the viewer's panel: red positive, blue negative."""
+        width, height = self.camera.width, self.camera.height
+        rows, columns = np.divmod(events.pixels, width)
+        picture = polarity_picture(columns, rows, events.polarities, width, height)
+        scale = _PICTURE_WIDTH / width
+        interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
+        return cv2.resize(picture, (_PICTURE_WIDTH, max(round(scale * height), 1)), interpolation=interpolation)
+
+    def described_picture(self, events: EventTimeline, seconds: float) -> str:
+        """Return the picture of events around a time with their span, in Markdown."""
+        if len(events) == 0:
+            path = self._dataset.scene.event_file.path
+            return f"There are no events at {path}." if not self._dataset.has_events else "No events around this time."
+        middle = self._dataset.scene.trajectory.start + round(seconds * 1e9)
+        begin, end = ((int(time) - middle) / 1e6 for time in events.times[[0, -1]])
+        data = base64.b64encode(png(self.picture(events))).decode()
+        return (
+            f"![events](data:image/png;base64,{data})\n\n"
+            f"{len(events):,} events from {begin:+.1f} to {end:+.1f} ms: red positive, blue negative"
+        )
+
+    @cached_property
+    def _directions(self) -> Tensor:
+        """(pixels, 3) float64 directions in the camera's frame."""
+        directions, _ = self.camera.pixel_directions()
+        return torch.from_numpy(directions).reshape(-1, 3).to(self._model.device)
+
+    @torch.no_grad()
+    def points(self, events: EventTimeline) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Return places (N, 3) in the scene of at most 2000 of the events, and their colours (N, 3).
+
+        An event lies on the surface that its pixel sees from the corrected pose of its time, 1 % nearer to the camera.
+        """
+        shown = events.thinned(_MOST_POINTS)
+        device = self._model.device
+        seconds = self._model.camera_optimizer.trajectory.seconds(torch.from_numpy(shown.times).to(device))
+        pixels = torch.from_numpy(shown.pixels.astype(np.int64)).to(device)
+        origins, directions = world_rays(self._model.camera_optimizer.pose(seconds), self._directions[pixels])
+        count = len(pixels)
+        if count == 0:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+        rays = RayBundle(
+            origins=origins.float(),
+            directions=directions.float(),
+            pixel_area=torch.full((count, 1), 1 / (self.camera.fx * self.camera.fy), device=device),
+            camera_indices=torch.zeros((count, 1), dtype=torch.long, device=device),
+        )
+        depth, accumulation = self._model.render_rays(rays, "depth", "accumulation")
+        seen = (accumulation[:, 0] > _LEAST_ACCUMULATION).cpu().numpy()
+        places = (rays.origins + _IN_FRONT * depth * rays.directions).cpu().numpy()
+        colors = np.where(shown.polarities[:, None] > 0, _POSITIVE_COLOR, _NEGATIVE_COLOR).astype(np.uint8)
+        return places[seen], colors[seen]
+
+    def figures(self) -> str:
+        """Return pose errors, contrast thresholds and the state of the colour correction, in Markdown."""
+        return "\n\n".join([self._pose_figures(), self._threshold_figures(), self._color_figures()])
+
+    def _pose_figures(self) -> str:
+        errors = self._pose_errors()
+        correction = self._model.camera_optimizer
+        if errors is not None:
+            rows = [
+                "| pose error | given | corrected |",
+                "|---|---|---|",
+                *(
+                    f"| {label} | {errors['estimated'][name]:{form}} | {errors['corrected'][name]:{form}} |"
+                    for label, name, form in (
+                        ("rotation (°)", "rotation_error_degrees", ".3f"),
+                        ("translation", "translation_error", ".4g"),
+                        ("ATE, Sim(3)", "ate_rmse_sim3", ".4g"),
+                    )
+                ),
+            ]
+            return "\n".join(rows)
+        if not correction.is_learned:
+            return "**Poses** as given; the true ones are not known."
+        sizes: dict[str, Tensor | float] = {}
+        correction.get_metrics_dict(sizes)
+        words = ", ".join(f"{name.replace('_', ' ')} {float(value):.4g}" for name, value in sizes.items())
+        return f"**Poses**: the true ones are not known. {words}."
+
+    def _threshold_figures(self) -> str:
+        sensor, learned = self._model.sensor, self._model.supervision.learned()
+        positive, negative = sensor.positive_contrast_threshold, sensor.negative_contrast_threshold
+        ratio = learned.get("contrast_threshold_ratio")
+        if ratio is not None:
+            positive = ratio * negative
+        text = f"**Thresholds** C⁺ {positive:.4g}{' (learned)' if ratio is not None else ''}, C⁻ {negative:.4g}"
+        period = learned.get("refractory_period_ns")
+        return text if period is None else f"{text}; refractory period {period / 1e3:.4g} µs (learned)"
+
+    def _color_figures(self) -> str:
+        return f"**Colour correction** {self._model.color_correction.description}"
+
+    @torch.no_grad()
+    def trajectory_file(self) -> bytes:
+        """Return the corrected poses at the times of the given ones in TUM format, in the recording's world."""
+        correction = self._model.camera_optimizer
+        times = correction.trajectory.times
+        poses = self._in_recording(correction.pose(correction.trajectory.seconds(times)))
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "trajectory.txt")
+            write_tum_trajectory(path, Trajectory(times.cpu(), poses))
+            return path.read_bytes()
+
+
+def png(picture: NDArray[np.uint8]) -> bytes:
+    """Return a picture (height, width, 3) as a PNG file."""
+    return cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
