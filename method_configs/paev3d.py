@@ -1,4 +1,4 @@
-"""``ns-train paev3d``: the supervision of PAEv3D, for a GPU."""
+"""``ns-train paev3d``: the supervision of PAEv3D (Wang et al., ICRA 2024), for a GPU."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from dataclasses import replace
 
 from nerfstudio.plugins.types import MethodSpecification
 
-from aenerf_ns.method.pose_correction import PoseCorrectionConfig
-from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.supervision.paev3d import PAEv3DSupervisionConfig, PatchSamplerConfig
+from aenerf_ns.method_configs.eventnerf import eventnerf
+from aenerf_ns.supervision.paev3d import FlowPatchSamplerConfig, PAEv3DSupervisionConfig
 
-_base = deepcopy(aenerf.config)
+_base = deepcopy(eventnerf.config)
 
 paev3d = MethodSpecification(
     config=replace(
@@ -19,19 +18,16 @@ paev3d = MethodSpecification(
         method_name="paev3d",
         pipeline=replace(
             _base.pipeline,
-            datamanager=replace(_base.pipeline.datamanager, sampler=PatchSamplerConfig()),
+            datamanager=replace(_base.pipeline.datamanager, sampler=FlowPatchSamplerConfig()),
             model=replace(
                 _base.pipeline.model,
                 supervision=PAEv3DSupervisionConfig(),
                 loss_coefficients={
-                    "reconstruction_loss": 1.0,
+                    **_base.pipeline.model.loss_coefficients,
                     "mask_loss": 1e-3,
                     "flow_loss": 1e-2,
                     "depth_loss": 1e-3,
-                    "interlevel_loss": 2.5e-3,
-                    "distortion_loss": 1e-3,
                 },
-                camera_optimizer=PoseCorrectionConfig(mode="off"),
             ),
         ),
     ),

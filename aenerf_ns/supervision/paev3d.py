@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,16 +36,8 @@ from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRen
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.errors import DataError
-from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.supervision.base import Supervision, SupervisionConfig
-from aenerf_ns.supervision.windows import (
-    DrawnWindow,
-    WindowSampler,
-    WindowSamplerConfig,
-    WindowSupervision,
-    drawn_from,
-)
+from aenerf_ns.supervision.base import SupervisionConfig
+from aenerf_ns.supervision.windows import DrawnWindow, PatchSampler, WindowSamplerConfig, WindowSupervision
 
 # A change is cut at that of so many events.
 _MOST_EVENTS = 5
@@ -52,8 +45,6 @@ _MOST_EVENTS = 5
 _LEAST_OPACITY = 0.25
 # The mask loss of a ray of less opacity is constant.
 _LEAST_LOG_OPACITY = 1e-3
-# Shares of the patches with 0, 1, 2, 3 and 4 active pixels.
-_SHARES = np.array([5, 25, 25, 25, 176]) / 256
 # Events from which a flow is computed, as a share of the sensor's pixels. With half as many, edges of the benchmark's
 # scenes move by three pixels only.
 _FLOW_DENSITY = 2.0
@@ -93,15 +84,13 @@ def change_by_flow(values: Tensor, displacement: Tensor) -> Tensor:
     """Return the change of an image that is displaced, to first order: the negative product of gradient and flow.
 
     Args:
-        values: (P, 2, 2) of the image in patches, rows first.
+        values: (P, 2, 2, channels) of the image in patches, rows first.
         displacement: (P, 2, 2, 2) of the patches' pixels along x and y, in pixels.
 
     Returns:
-        (P, 2, 2) changes.
+        (P, 2, 2, channels) changes.
     """
-    along_x = values.diff(dim=2).expand_as(values)
-    along_y = values.diff(dim=1).expand_as(values)
-    return -(along_x * displacement[..., 0] + along_y * displacement[..., 1])
+    return -(values.diff(dim=2) * displacement[..., :1] + values.diff(dim=1) * displacement[..., 1:])
 
 
 def _mean(values: Tensor, counts: Tensor) -> Tensor:
@@ -132,10 +121,8 @@ class PAEv3DSupervision(WindowSupervision):
             weights = outputs["weights_list"][-1][: len(change)]
             depth = DepthRenderer("expected")(weights, outputs["ray_samples_list"][-1][: len(change)])[:, 0]
             opacity, speed = AccumulationRenderer()(weights)[:, 0], displacement.norm(dim=-1)
-            start = outputs["log_radiance"][: len(change)]
-            by_flow = torch.stack(
-                [change_by_flow(one.view(-1, 2, 2), displacement.view(-1, 2, 2, 2)).flatten() for one in start.T], -1
-            )
+            start = outputs["log_radiance"][: len(change)].unflatten(0, (-1, 2, 2))
+            by_flow = change_by_flow(start, displacement.unflatten(0, (-1, 2, 2))).flatten(0, 2)
             losses["mask_loss"] = mask_loss(opacity, speed > 0)
             losses["depth_loss"] = depth_loss(depth, opacity, speed, batch["window"])
             losses["flow_loss"] = F.l1_loss(by_flow.gather(1, batch["channel"][:, None])[:, 0], change)
@@ -143,56 +130,25 @@ class PAEv3DSupervision(WindowSupervision):
 
 
 @dataclass
-class PatchSamplerConfig(WindowSamplerConfig):
-    """Windows of time, and in them patches of 2 x 2 pixels."""
+class FlowPatchSamplerConfig(WindowSamplerConfig):
+    """Windows of time, and in them patches of 2 x 2 pixels with their optical flow."""
 
-    _target: type = field(default_factory=lambda: PatchSampler)
+    _target: type = field(default_factory=lambda: FlowPatchSampler)
     longest_window: float = 0.01
 
 
-class PatchSampler(WindowSampler):
-    """Samples windows of time, and in each of them patches of 2 x 2 pixels by the number of their active pixels.
+class FlowPatchSampler(PatchSampler):
+    """Samples patches in windows of time, with the optical flow of the events.
 
-    The image is divided into patches that do not overlap. A pixel is active if its polarities do not add up to zero in
-    the window. If no patch has some number of active pixels, patches of any number take its share.
-
-    Optical flow is computed when a window is drawn for the first time in a stretch of events, and kept.
-
-    Args:
-        config: the options. ``share_of_all_pixels`` has no effect.
-        dataset: the training data.
-        supervision: a :class:`PAEv3DSupervision`.
-        device: of the batches.
-
-    Raises:
-        DataError: an option is out of range, or no patch can be used.
+    The flow is computed when a window first begins in a stretch of events, and kept.
     """
 
     batch = "patches"
 
-    def __init__(
-        self, config: PatchSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
-    ) -> None:
-        super().__init__(config, dataset, supervision, device)
-        usable = self._pixel_rays.usable
-        height, width = usable.shape
-        numbers = np.arange(height * width).reshape(height, width)[: height // 2 * 2, : width // 2 * 2]
-        patches = numbers.reshape(height // 2, 2, width // 2, 2).swapaxes(1, 2).reshape(-1, 4)
-        self._patches = patches[usable.ravel()[patches].all(1)]
-        if len(self._patches) == 0:
-            raise DataError("the lens model", "it gives no patch of 2 x 2 pixels a direction", "check its parameters")
-        self._flows: dict[int, tuple[NDArray[np.float64], int]] = {}
-
-    def _draw_pixels(self, counts: NDArray[np.int64], num_pixels: int) -> NDArray[np.int64]:
-        """Return the numbers (N,) of pixels, patch by patch, given the events (2, pixels) of a window."""
-        num_active = (counts[0] != counts[1])[self._patches].sum(1)
-        # Whole patches for every number, which add up to all.
-        ends = np.rint(np.cumsum(_SHARES) * (num_pixels // 4)).astype(int)
-        drawn = []
-        for number, share in enumerate(np.diff(ends, prepend=0)):
-            chosen_from = np.flatnonzero(num_active == number)
-            drawn.append(drawn_from(chosen_from if len(chosen_from) else np.arange(len(self._patches)), share))
-        return self._patches[np.concatenate(drawn)].ravel()
+    @cached_property
+    def _flows(self) -> dict[int, tuple[NDArray[np.float64], int]]:
+        """Velocities of the tiles and side of a tile, by the number of the first event of a stretch."""
+        return {}
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
         """Draw a batch of patches in windows.
@@ -202,11 +158,12 @@ class PatchSampler(WindowSampler):
             training: has no effect.
 
         Returns:
-            As :meth:`WindowSampler.sample` does, with the four pixels of a patch one after another, row by row. And for
-            each pixel: the number (N,) of its ``window`` in the batch, and its ``displacement`` (N, 2) over the window
-            by the optical flow, in pixels along x and y, 0 where the pixel has no events.
+            As :class:`~aenerf_ns.supervision.windows.WindowSampler` does, with the four pixels of a patch one after
+            another, row by row. And for each pixel: the number (N,) of its ``window`` in the batch, and its
+            ``displacement`` (N, 2) over the window by the optical flow, in pixels along x and y, 0 where the pixel has
+            no events.
         """
-        drawn = self._draw(num_rays // 2, 4)
+        drawn = self._draw(num_rays // 2)
         rays, batch = self._batch(drawn)
         window = np.repeat(np.arange(len(drawn)), [len(one.pixels) for one in drawn])
         displacement = np.concatenate([self._displacement(one) for one in drawn])

@@ -27,6 +27,8 @@ from aenerf_ns.supervision.losses import (
 )
 from aenerf_ns.supervision.pixel_rays import PixelRays
 
+# Shares of the patches with 0, 1, 2, 3 and 4 active pixels, as PAEv3D draws them.
+_PATCH_SHARES = np.array([5, 25, 25, 25, 176]) / 256
 # The inverse of softplus at 1.
 _RAW_ONE = math.log(math.expm1(1))
 
@@ -257,7 +259,7 @@ class WindowSampler(Sampler):
         """Return the numbers (N,) of pixels, given the positive and negative events (2, pixels) of a window."""
         active = np.flatnonzero(counts[0] != counts[1])
         num_active = int(num_pixels * (1 - self.config.share_of_all_pixels)) if len(active) else 0
-        return np.concatenate([drawn_from(active, num_active), drawn_from(self._usable, num_pixels - num_active)])
+        return np.concatenate([_drawn_from(active, num_active), _drawn_from(self._usable, num_pixels - num_active)])
 
     def _draw(self, num_pixels: int, patch_size: int = 1) -> list[DrawnWindow]:
         """Return windows with their pixels: whole patches of ``patch_size`` pixels, at least one in all."""
@@ -298,6 +300,49 @@ class WindowSampler(Sampler):
         return self._batch(self._draw(num_rays // 2))
 
 
-def drawn_from(numbers: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+class PatchSampler(WindowSampler):
+    """Samples windows of time, and in each of them patches of 2 x 2 pixels by the number of their active pixels.
+
+    The image is divided into patches that do not overlap. A pixel is active if its polarities do not add up to zero in
+    the window. If no patch has some number of active pixels, patches of any number take its share.
+
+    Args:
+        config: the options. ``share_of_all_pixels`` has no effect.
+        dataset: the training data.
+        supervision: a :class:`WindowSupervision`.
+        device: of the batches.
+
+    Raises:
+        DataError: an option is out of range, or no patch can be used.
+    """
+
+    def __init__(
+        self, config: WindowSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
+    ) -> None:
+        super().__init__(config, dataset, supervision, device)
+        usable = self._pixel_rays.usable
+        height, width = usable.shape
+        numbers = np.arange(height * width).reshape(height, width)[: height // 2 * 2, : width // 2 * 2]
+        patches = numbers.reshape(height // 2, 2, width // 2, 2).swapaxes(1, 2).reshape(-1, 4)
+        self._patches = patches[usable.ravel()[patches].all(1)]
+        if len(self._patches) == 0:
+            raise DataError("the lens model", "it gives no patch of 2 x 2 pixels a direction", "check its parameters")
+
+    def _draw_pixels(self, counts: NDArray[np.int64], num_pixels: int) -> NDArray[np.int64]:
+        """Return the numbers (N,) of pixels, patch by patch, given the events (2, pixels) of a window."""
+        num_active = (counts[0] != counts[1])[self._patches].sum(1)
+        # Whole patches for every number, which add up to all.
+        ends = np.rint(np.cumsum(_PATCH_SHARES) * (num_pixels // 4)).astype(int)
+        drawn = []
+        for number, share in enumerate(np.diff(ends, prepend=0)):
+            chosen_from = np.flatnonzero(num_active == number)
+            drawn.append(_drawn_from(chosen_from if len(chosen_from) else np.arange(len(self._patches)), share))
+        return self._patches[np.concatenate(drawn)].ravel()
+
+    def _draw(self, num_pixels: int, patch_size: int = 4) -> list[DrawnWindow]:
+        return super()._draw(num_pixels, patch_size)
+
+
+def _drawn_from(numbers: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Return (count,) of the numbers, drawn uniformly with replacement."""
     return numbers[torch.randint(max(len(numbers), 1), (count,)).numpy()]

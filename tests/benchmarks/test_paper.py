@@ -18,6 +18,7 @@ import pytest
 import torch
 import torchmetrics.functional as functional
 import torchmetrics.image.lpip as lpip
+from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from PIL import Image
@@ -29,8 +30,20 @@ from aenerf_ns.method_configs.aenerf_small import aenerf_small
 from benchmarks import environment
 from benchmarks.paper import tables
 from benchmarks.paper.figures import draw, error_map
-from benchmarks.paper.nerfacto import prepare
-from benchmarks.paper.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
+from benchmarks.paper.plan import (
+    CEILING,
+    CORRECTED,
+    HIGH_PASS,
+    LOSSES,
+    ON_TRUE_POSES,
+    OURS,
+    PEERS,
+    TRUE_POSES,
+    WITHOUT_CORRECTION,
+    Run,
+    plan,
+)
+from benchmarks.paper.worker import prepare
 
 ROOT = Path(__file__).parents[2]
 # Published results, which a benchmark with the same options must find again.
@@ -61,6 +74,43 @@ def test_the_plan_has_every_run_once() -> None:
     # One simulation serves all rows.
     assert len({run.dataset for run in runs}) == 2 * 2
     assert all(run.dataset.options[-2:] == ("--poses", "colmap") for run in small_plan(poses="colmap"))
+
+
+ALL_METHODS = ("aenerf", *PEERS, "nerfacto")
+
+
+def test_other_papers_methods_have_rows_on_estimated_poses_corrected_ones_and_true_ones() -> None:
+    runs = small_plan(methods=ALL_METHODS, tables=("methods",), seeds=(1,), scenes=("room",), speeds=("hard",))
+    assert len({run.name for run in runs}) == len(runs) == 4 + 5 * 3
+    rows = {run.row: run for run in runs}
+    mode = "--pipeline.model.camera-optimizer.mode"
+    for method, name in PEERS.items():
+        shown = HIGH_PASS if method == "e2vid-nerf" else name
+        for end, true_poses, correction in (
+            ("", False, "off"),
+            (CORRECTED, False, "spline"),
+            (ON_TRUE_POSES, True, "off"),
+        ):
+            run = rows[shown + end]
+            assert (run.method, run.true_poses) == (f"{method}-small", true_poses)
+            assert run.options == (mode, correction)
+            assert run.images == (("--method", "high-pass") if method == "e2vid-nerf" else ())
+    # Registered under these names, and corrected by the same spline as ours.
+    assert all_methods.keys() >= {run.method for run in runs} | set(PEERS)
+    assert aenerf_small.config.pipeline.model.camera_optimizer.mode == "spline"
+    # The rows of AE-NeRF are found again in a folder that was made without the others.
+    alone = {run.name for run in small_plan(seeds=(1,), scenes=("room",), speeds=("hard",), tables=("methods",))}
+    assert alone == {run.name for run in runs if run.row in (OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING)}
+    full = small_plan(methods=("paev3d",), scale="full", tables=("methods",))
+    assert {run.method for run in full} == {"paev3d"}
+
+
+def test_e2vid_makes_the_images_if_there_are_weights(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"methods": ("e2vid-nerf",), "tables": ("methods",)}
+    with_weights = small_plan(e2vid_weights=tmp_path / "e2vid.pth.tar", **options)
+    assert {run.row for run in with_weights} == {"E2VID + NeRF" + end for end in ("", CORRECTED, ON_TRUE_POSES)}
+    assert with_weights[0].images == ("--method", "e2vid", "--weights", str(tmp_path / "e2vid.pth.tar"))
+    assert not {run.name for run in with_weights} & {run.name for run in small_plan(**options)}
 
 
 def test_all_losses_are_compared_on_as_many_pairs() -> None:
@@ -196,6 +246,40 @@ def test_tables_are_means_over_scenes_and_seeds() -> None:
     assert text.count("- data: `aenerf simulate --scene SCENE --speed SPEED --width 96 --height 72 ") == 1
     # Over two seeds 24 runs apart.
     assert f"± {24 / 2**0.5:.2f} / - |" in text
+
+
+def test_the_papers_order_stands_beside_ours() -> None:
+    runs = small_plan(methods=ALL_METHODS, tables=("methods",), speeds=("hard",), scenes=("object",))
+    # The worst row has 10 dB; a seed is worth 1 dB, a refined test pose 2 dB.
+    rank = {run.row: index for index, run in enumerate(runs[: len(runs) // 2])}
+    figures = []
+    for run in runs:
+        one = figures_of(run, 10.0 + rank[run.row] + run.seed, "object", (1.0, 0.5))
+        one["results"]["refined_test_poses"] = {"psnr": one["results"]["psnr"] + 2, "ssim": 0.5, "lpips": None}
+        figures.append({**one, "reconstruct": " ".join(run.images)})
+    text = tables.report(figures, {})
+    assert "### 1 object scenes, hard speed" in text
+    # Of seeds 1 and 2, whose standard deviation is 0.71 dB.
+    corrected = 11.5 + rank["Robust e-NeRF, pose correction"]
+    (row,) = (line for line in text.splitlines() if line.startswith("| Robust e-NeRF | 28.37 |"))
+    assert f"| {corrected:.2f} ± 0.71 / {corrected + 2:.2f} ± 0.71 |" in row
+    assert "| AE-NeRF | 28.90 |" in text
+    assert "| PAEv3D | - |" in text
+    assert "| high-pass + NeRF | - |" in text
+    paper = "E2VID + NeRF < EventNeRF < Ev-NeRF < Robust e-NeRF < AE-NeRF"
+    ours = "AE-NeRF < high-pass + NeRF < EventNeRF < Ev-NeRF < Robust e-NeRF < PAEv3D"
+    assert f"- the paper: {paper}\n- here, estimated poses, which only AE-NeRF corrects: {ours}\n" in text
+    assert f"- here, true poses: {ours}\n" in text
+    assert "- images of the events: `aenerf reconstruct --method high-pass`\n" in text
+    # Every row stands in the table with all metrics, too.
+    header, _, *rows = cells(tables.methods_table(figures))
+    assert len(rows) == 4 + 5 * 3
+    # Without AE-NeRF there are no errors of poses to report, and without other methods no order.
+    alone = tables.report([one for one in figures if one["method"] == "paev3d-small"], {})
+    assert "table 3" not in alone
+    assert "Order by PSNR" in alone
+    own = tables.report([one for one in figures if one["method"] in ("aenerf-small", "nerfacto")], {})
+    assert "Order by PSNR" not in own
 
 
 def test_refined_figures_stand_beside_the_placed_ones() -> None:

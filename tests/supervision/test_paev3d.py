@@ -20,9 +20,9 @@ from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.events.windows import EventWindows, window_events
 from aenerf_ns.recording.scene import Scene
 from aenerf_ns.supervision.paev3d import (
+    FlowPatchSampler,
+    FlowPatchSamplerConfig,
     PAEv3DSupervisionConfig,
-    PatchSampler,
-    PatchSamplerConfig,
     change_by_flow,
     depth_loss,
     mask_loss,
@@ -59,11 +59,16 @@ def test_the_depth_loss_by_hand() -> None:
 
 
 def test_the_change_by_flow_by_hand() -> None:
-    values = 255 * torch.tensor([[[0.1, 0.2], [0.1, 0.3]]])
+    values = 255 * torch.tensor([[[0.1, 0.2], [0.1, 0.3]]])[..., None]
     along_x = torch.tensor([1.0, 0.0]).expand(1, 2, 2, 2)
-    torch.testing.assert_close(change_by_flow(values, along_x), torch.tensor([[[-25.5, -25.5], [-51.0, -51.0]]]))
+    torch.testing.assert_close(
+        change_by_flow(values, along_x)[..., 0], torch.tensor([[[-25.5, -25.5], [-51.0, -51.0]]])
+    )
     along_y = torch.tensor([0.0, 2.0]).expand(1, 2, 2, 2)
-    torch.testing.assert_close(change_by_flow(values, along_y), torch.tensor([[[0.0, -51.0], [0.0, -51.0]]]))
+    torch.testing.assert_close(change_by_flow(values, along_y)[..., 0], torch.tensor([[[0.0, -51.0], [0.0, -51.0]]]))
+    # Each channel by itself.
+    both = change_by_flow(torch.cat([values, 2 * values], -1), along_y)
+    torch.testing.assert_close(both[..., 1], 2 * both[..., 0])
 
 
 class Samples:
@@ -159,11 +164,11 @@ def make_events() -> EventStream:
 
 def make_sampler(
     random_poses: torch.Tensor, camera: EventCamera = CAMERA, events: EventStream | None = None, **options: Any
-) -> PatchSampler:
+) -> FlowPatchSampler:
     window = TimeWindow(int(KNOTS[0]), int(KNOTS[-1]), (GAP,))
     scene = replace(make_scene(SensorModel(), Trajectory(KNOTS, random_poses), camera), window=window)
     windows = window_events([events or make_events()], window=window, usable=camera.pixel_directions()[1])
-    return PatchSamplerConfig(**{"longest_window": 0.0, **options}).setup(
+    return FlowPatchSamplerConfig(**{"longest_window": 0.0, **options}).setup(
         dataset=Windows(scene, windows),
         supervision=PAEv3DSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={}),
         device="cpu",
@@ -233,7 +238,7 @@ def test_a_batch_of_another_kind_is_refused(random_poses: torch.Tensor) -> None:
     from aenerf_ns.supervision.windows import EventNeRFSupervisionConfig
 
     with pytest.raises(DataError, match="its sampler draws patches and its supervision compares windows"):
-        PatchSamplerConfig().setup(
+        FlowPatchSamplerConfig().setup(
             dataset=make_sampler(random_poses).dataset,
             supervision=EventNeRFSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={}),
             device="cpu",
