@@ -86,13 +86,9 @@ def test_other_papers_methods_have_rows_on_estimated_poses_corrected_ones_and_tr
     mode = "--pipeline.model.camera-optimizer.mode"
     for method, name in PEERS.items():
         shown = HIGH_PASS if method == "e2vid-nerf" else name
-        for end, true_poses, correction in (
-            ("", False, "off"),
-            (CORRECTED, False, "spline"),
-            (ON_TRUE_POSES, True, "off"),
-        ):
+        for end, correction in (("", "off"), (CORRECTED, "spline"), (ON_TRUE_POSES, "off")):
             run = rows[shown + end]
-            assert (run.method, run.true_poses) == (f"{method}-small", true_poses)
+            assert (run.method, run.true_poses) == (f"{method}-small", end == ON_TRUE_POSES)
             assert run.options == (mode, correction)
             assert run.images == (("--method", "high-pass") if method == "e2vid-nerf" else ())
     # Registered under these names, and corrected by the same spline as ours.
@@ -272,7 +268,7 @@ def test_the_papers_order_stands_beside_ours() -> None:
     assert f"- here, true poses: {ours}\n" in text
     assert "- images of the events: `aenerf reconstruct --method high-pass`\n" in text
     # Every row stands in the table with all metrics, too.
-    header, _, *rows = cells(tables.methods_table(figures))
+    _, _, *rows = cells(tables.methods_table(figures))
     assert len(rows) == 4 + 5 * 3
     # Without AE-NeRF there are no errors of poses to report, and without other methods no order.
     alone = tables.report([one for one in figures if one["method"] == "paev3d-small"], {})
