@@ -161,14 +161,16 @@ def _paths(data: Path, corrected: Path, file: Path) -> Path:
 
 def _curves(runs: Sequence[Run], figures: Mapping[str, dict[str, Any]], file: Path) -> Path:
     """Draw PSNR during the trainings."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5, 3.5), layout="constrained")
+    figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
+    axes.set_prop_cycle(color=colormaps["tab20"].colors)
     for run in runs:
         if figures[run.name]["curve"]:
             axes.plot(*zip(*figures[run.name]["curve"], strict=True), marker=".", label=run.row)
     axes.set(xlabel="steps", ylabel="PSNR [dB] on the validation views")
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     figure.savefig(file, dpi=100)
     return file

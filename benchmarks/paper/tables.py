@@ -113,7 +113,8 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
     parts = [
         "PSNR: mean over scenes and seeds ± standard deviation over seeds, with test poses as placed / refined. Means "
         "over what all rows of a table have in common. Of these methods only AE-NeRF corrects poses; the paper's PSNR "
-        "of AE-NeRF is with correction. The paper does not say on which poses it ran the others."
+        "of AE-NeRF is with correction. The paper does not say on which poses it ran the others. In the other tables, "
+        "rows without a method's name are AE-NeRF's."
     ]
     if HIGH_PASS in named:
         parts.append(
@@ -140,7 +141,7 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
             means = {name: fmean(one["results"]["psnr"] for one in some) for name, some in found.items()}
             orders.append(f"- here, {setting}: {_order(means)}")
         parts += [
-            f"### {len({one['scene'] for one in common})} {kind} scenes, {speed} speed",
+            f"### Scenes of kind {kind}: {len({one['scene'] for one in common})}, {speed} speed",
             _markdown(["method", "the paper", *_SETTINGS], rows),
             "Order by PSNR with placed test poses:",
             "\n".join(orders),
@@ -149,7 +150,7 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
 
 
 def _order(values: Mapping[str, float]) -> str:
-    return " < ".join(sorted(values, key=values.__getitem__))
+    return " < ".join(f"{name} ({values[name]:.2f})" for name in sorted(values, key=values.__getitem__))
 
 
 def _mean_and_spread(figures: Sequence[Figures]) -> str:
