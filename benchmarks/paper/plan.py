@@ -180,7 +180,9 @@ def plan(
 
     def dataset(scene: str, speed: str) -> Dataset:
         estimated = _NOISE[scale] if poses == "noise" else ("--poses", "colmap")
-        return Dataset(scene, speed, poses, (*_SIMULATE[scale], *estimated, *simulate))
+        # Otherwise all paths of one duration would have the same errors, and a mean over scenes would hold one draw.
+        seed = str(int(digest((scene_name(scene), speed)), 16))
+        return Dataset(scene, speed, poses, (*_SIMULATE[scale], "--seed", seed, *estimated, *simulate))
 
     length, runs = _STEPS[scale] if steps is None else steps, []
     end = "-small" if scale == "tiny" else ""

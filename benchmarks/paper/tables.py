@@ -253,9 +253,9 @@ def _conditions(figures: Sequence[Figures]) -> str:
 
 
 def _simulation(figures: Figures) -> str:
-    """Return the command that made the data, with SCENE and SPEED in place of their values."""
+    """Return the command that made the data, with SCENE, SPEED and SEED in place of their values."""
     words = shlex.split(figures["simulate"])
-    for option in ("--scene", "--speed"):
+    for option in ("--scene", "--speed", "--seed"):
         words[words.index(option) + 1] = option[2:].upper()
     return shlex.join(words)
 

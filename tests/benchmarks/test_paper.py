@@ -209,6 +209,12 @@ def cells(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
 
 
+def test_each_path_has_errors_of_its_own() -> None:
+    datasets = {run.dataset for run in small_plan()}
+    seeds = {one.options[one.options.index("--seed") + 1] for one in datasets}
+    assert len(seeds) == len(datasets) == 4
+
+
 def test_tables_are_means_over_scenes_and_seeds() -> None:
     runs = small_plan()
     kinds = {"room": "large", "object": "object"}
