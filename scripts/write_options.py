@@ -25,6 +25,8 @@ from aenerf_ns.method_configs.eventnerf import eventnerf
 from aenerf_ns.method_configs.eventnerf_small import eventnerf_small
 from aenerf_ns.method_configs.evnerf import evnerf
 from aenerf_ns.method_configs.evnerf_small import evnerf_small
+from aenerf_ns.method_configs.paev3d import paev3d
+from aenerf_ns.method_configs.paev3d_small import paev3d_small
 from aenerf_ns.method_configs.robust_enerf import robust_enerf
 from aenerf_ns.method_configs.robust_enerf_small import robust_enerf_small
 
@@ -41,6 +43,8 @@ PEERS = {
         eventnerf_small,
         evnerf,
         evnerf_small,
+        paev3d,
+        paev3d_small,
         e2vid_nerf,
         e2vid_nerf_small,
     )

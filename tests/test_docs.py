@@ -13,6 +13,7 @@ from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
 from aenerf_ns.method_configs.eventnerf import eventnerf
 from aenerf_ns.method_configs.evnerf import evnerf
+from aenerf_ns.method_configs.paev3d import paev3d
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -37,7 +38,7 @@ def test_the_table_of_options_is_up_to_date() -> None:
 @pytest.fixture(scope="module")
 def flags() -> set[str]:
     """The flags of ns-train with the methods of this project."""
-    methods = (aenerf, aenerf_mlp, eventnerf, evnerf)
+    methods = (aenerf, aenerf_mlp, eventnerf, evnerf, paev3d)
     parsers = [tyro.extras.get_parser(type(method.config), default=method.config) for method in methods]
     return {flag for parser in parsers for action in parser._actions for flag in action.option_strings}
 

@@ -20,9 +20,9 @@ MAY_USE = {
     "camera": {"errors", "events"},
     "files": {"errors", "events", "camera"},
     "recording": {"errors", "progress", "events", "camera", "files"},
-    "supervision": {"errors", "events", "camera", "recording"},
-    "method": {"errors", "camera", "recording", "supervision"},
     "checking": {"progress", "events", "camera", "recording"},
+    "supervision": {"errors", "events", "camera", "recording", "checking"},
+    "method": {"errors", "camera", "recording", "supervision"},
     # What the viewer shows of a run. It only looks: the pipeline hands it what it needs.
     "viewer": {"errors", "events", "camera", "files", "recording", "method"},
     "training": {"errors", "events", "camera", "recording", "supervision", "method", "checking", "viewer"},

@@ -12,9 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
-import cv2
 import numba
 import numpy as np
 import torch
@@ -22,6 +20,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.checking.event_images import TILE, accumulate, best_of, image_size, tile_contrast
 from aenerf_ns.checking.hypotheses import (
     ALTERNATIVES,
     CLOCK_OFFSETS,
@@ -35,13 +34,6 @@ from aenerf_ns.checking.hypotheses import (
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.events.time_window import TimeWindow
 
-# The images of warped events are at most this wide: larger sensors are binned.
-_MAX_WIDTH = 240
-# Side of the tiles, in pixels of these images. Each tile has a depth of its own.
-_TILE = 16
-# Edges are the difference between the image smoothed by a Gaussian of this standard deviation and by two boxes of this
-# width. The two boxes are about a Gaussian of 2.8 pixels.
-_FINE, _COARSE = 0.7, 7
 # From one depth to the next, events at the ends of a slice move by this many pixels.
 _DEPTH_STEP = 1.5
 # Poses within a slice. From one to the next, nothing moves visibly.
@@ -101,18 +93,8 @@ def num_slices(num_events: int, camera: EventCamera) -> int:
 
 def slice_size(camera: EventCamera) -> int:
     """Return the largest number of events in a slice."""
-    width, height, _ = _image_size(camera)
+    width, height, _ = image_size(camera.width, camera.height)
     return int(_DENSITIES[-1] * width * height)
-
-
-def _image_size(camera: EventCamera) -> tuple[int, int, int]:
-    """Return width and height of the images of warped events, and the binning.
-
-    The size is a whole number of tiles. The binning is the number of the sensor's pixels along a pixel of the images.
-    """
-    binning = -(-camera.width // _MAX_WIDTH)
-    width, height = (-(-size // (binning * _TILE)) * _TILE for size in (camera.width, camera.height))
-    return width, height, binning
 
 
 class WarpedEvents:
@@ -130,7 +112,7 @@ class WarpedEvents:
 
     def __init__(self, runs: list[EventStream], trajectory: Trajectory, camera: EventCamera, seed: int = 0) -> None:
         self._trajectory = trajectory
-        self._width, self._height, self._binning = _image_size(camera)
+        self._width, self._height, self._binning = image_size(camera.width, camera.height)
         self._camera = camera
         directions, valid = camera.pixel_directions()
         depth = np.where(valid & (directions[..., 2] < -0.05), -directions[..., 2], np.nan)[..., None]
@@ -241,7 +223,7 @@ class WarpedEvents:
         return np.array(contrasts)
 
     def _prepared(self, events: EventStream, hypothesis: Hypothesis) -> tuple:
-        """Return what :func:`_lines` and :func:`_accumulate` need, for a slice under a hypothesis.
+        """Return what :func:`_lines` and :func:`accumulate` need, for a slice under a hypothesis.
 
         Returns:
             (N, 2) directions of the events on the plane at depth 1, (N,) their polarities, (N,) the indices of their
@@ -273,18 +255,15 @@ class WarpedEvents:
             steps = np.arange(0, self._width / _DEPTH_STEP + 1)
             inverse_depths = steps * _DEPTH_STEP / (intrinsics[0] * baseline)
         net, total = np.zeros((2, self._height, self._width), np.float32)
-        energies, brightnesses = [], []
+        measured = []
         for inverse_depth in inverse_depths:
-            _accumulate(lines, polarity, np.float32(inverse_depth), net, total)
-            coarse, edges = _smooth(total), _edges(net)
-            energies.append(_tile_sums(edges * edges - _noise_energy() * coarse))
-            brightnesses.append(_tile_sums(coarse * coarse))
-        energy, brightness = np.array(energies), np.array(brightnesses)
-        # With the ratio alone, tiles would choose the depth that leaves them empty.
-        best = (energy / (brightness + brightness.mean() + 1e-12)).argmax(0)
+            accumulate(lines, polarity, np.float32(inverse_depth), net, total)
+            measured.append(tile_contrast(net, total))
+        energy, brightness = map(np.array, zip(*measured, strict=True))
+        best = best_of(energy, brightness)
         with np.errstate(divide="ignore"):
             depth = 1 / inverse_depths[best]
-        rows, columns = (np.arange(n) * _TILE + _TILE / 2 for n in best.shape)
+        rows, columns = (np.arange(n) * TILE + TILE / 2 for n in best.shape)
         plane = np.stack(
             np.broadcast_arrays(
                 ((columns - intrinsics[2]) / intrinsics[0])[None],
@@ -314,13 +293,13 @@ class WarpedEvents:
         points, polarity, index, relative, intrinsics, _ = self._prepared(events, GIVEN)
         shape = (self._height, self._width)
         net, total = np.zeros((2, *shape), np.float32)
-        depth_of_pixel = np.kron(depth, np.ones((_TILE, _TILE)))
+        depth_of_pixel = np.kron(depth, np.ones((TILE, TILE)))
         still = np.tile(np.eye(3, 4), (_POSES, 1, 1))
-        _accumulate(_lines(points, index, still, intrinsics), polarity, np.float32(0), net, total)
+        accumulate(_lines(points, index, still, intrinsics), polarity, np.float32(0), net, total)
         lines = _lines(points, index, relative, intrinsics)
         unwarped, warped = net.copy(), np.zeros(shape, np.float32)
         for value in np.unique(depth):
-            _accumulate(lines, polarity, np.float32(1 / value), net, total)
+            accumulate(lines, polarity, np.float32(1 / value), net, total)
             warped[depth_of_pixel == value] = net[depth_of_pixel == value]
         return np.concatenate([unwarped, warped], 1)
 
@@ -346,27 +325,6 @@ def _compared(hypothesis: Hypothesis, given: list[WarpedSlice], alternative: lis
 def _residuals(one: WarpedSlice, slices: Sequence[WarpedSlice]) -> NDArray[np.float64]:
     """Return by how much each (R, C) tile of one slice raises the contrast of all slices, to first order."""
     return (one.energy - _contrast(slices) * one.brightness) / max(sum(s.brightness.sum() for s in slices), 1e-30)
-
-
-def _smooth(image: NDArray) -> NDArray:
-    return cv2.blur(cv2.blur(image, (_COARSE, _COARSE)), (_COARSE, _COARSE))
-
-
-def _edges(image: NDArray) -> NDArray:
-    return cv2.GaussianBlur(image, (0, 0), _FINE) - _smooth(image)
-
-
-@lru_cache(maxsize=1)
-def _noise_energy() -> float:
-    """Return the squared contrast that each event adds if all events are independent."""
-    impulse = np.zeros((41, 41), np.float32)
-    impulse[20, 20] = 1
-    return float(np.square(_edges(impulse)).sum())
-
-
-def _tile_sums(image: NDArray) -> NDArray[np.float64]:
-    height, width = image.shape
-    return image.reshape(height // _TILE, _TILE, width // _TILE, _TILE).sum((1, 3), dtype=np.float64)
 
 
 @numba.njit(cache=True)
@@ -396,22 +354,3 @@ def _lines(points, index, relative, intrinsics):
         else:
             lines[:, i] = np.nan
     return lines
-
-
-@numba.njit(cache=True)
-def _accumulate(lines, polarity, inverse_depth, net, total):
-    """Add up polarities and numbers of the events in each pixel of the reference view, on a plane at one depth.
-
-    Each event goes to one pixel: spreading an event over its four nearest pixels would smooth the image by an amount
-    that depends on the motion.
-    """
-    net[:] = 0
-    total[:] = 0
-    height, width = net.shape
-    for i in range(lines.shape[1]):
-        u = lines[0, i] + lines[1, i] * inverse_depth
-        v = lines[2, i] + lines[3, i] * inverse_depth
-        # NaN fails this test too.
-        if 0 <= u < width and 0 <= v < height and lines[4, i] * inverse_depth < 1:
-            net[int(v), int(u)] += polarity[i]
-            total[int(v), int(u)] += 1

@@ -57,6 +57,19 @@ class EventWindows:
         begin, stop = np.searchsorted(self.times, [start, end], side="right")
         return np.bincount(self.codes[begin:stop], minlength=2 * self.num_pixels).reshape(-1, 2).T
 
+    def stream(self, part: slice, width: int) -> EventStream:
+        """Return some of the events in the order of time, given the width of the sensor."""
+        codes = self.codes[part]
+        rows, columns = np.divmod(codes >> 1, np.uint32(width))
+        return EventStream(
+            x=columns.astype(np.uint16),
+            y=rows.astype(np.uint16),
+            t=self.times[part],
+            p=np.where(codes & 1, -1, 1).astype(np.int8),
+            width=width,
+            height=self.num_pixels // width,
+        )
+
     def summary(self) -> str:
         """Return one line that accounts for every event of the stream."""
         total = len(self.times) + self.num_outside + self.num_unusable

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -27,6 +27,8 @@ from aenerf_ns.supervision.losses import (
 )
 from aenerf_ns.supervision.pixel_rays import PixelRays
 
+# Shares of the patches with 0, 1, 2, 3 and 4 active pixels, as PAEv3D draws them.
+_PATCH_SHARES = np.array([5, 25, 25, 25, 176]) / 256
 # The inverse of softplus at 1.
 _RAW_ONE = math.log(math.expm1(1))
 
@@ -155,6 +157,27 @@ class WindowSamplerConfig(SamplerConfig):
     """Pixels that are drawn in a window. A batch has as many windows as it takes to fill it."""
 
 
+@dataclass(frozen=True)
+class DrawnWindow:
+    """A window of time, and the pixels that were drawn in it.
+
+    Attributes:
+        start: nanoseconds.
+        end: nanoseconds.
+        pixels: (N,) numbers of the pixels.
+        counts: (2, N) positive and negative events of the pixels.
+    """
+
+    start: int
+    end: int
+    pixels: NDArray[np.int64]
+    counts: NDArray[np.int64]
+
+    def rows(self) -> NDArray[np.int64]:
+        """Return (5, N) of pixel, positive events, negative events, start and end."""
+        return np.stack([self.pixels, *self.counts, *(np.full_like(self.pixels, t) for t in (self.start, self.end))])
+
+
 class WindowSampler(Sampler):
     """Samples windows of time, and in each of them pixels with the events that the pixel had.
 
@@ -232,18 +255,35 @@ class WindowSampler(Sampler):
         length = torch.randint(min(shortest, longest), longest + 1, ())
         return int(times[end - length]), int(times[end])
 
-    def _draw_pixels(self, start: int, end: int, num_pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the numbers (N,) of pixels, and their positive and negative events (2, N) in a window."""
-        counts = self.dataset.windows.counts(start, end)
+    def _draw_pixels(self, counts: NDArray[np.int64], num_pixels: int) -> NDArray[np.int64]:
+        """Return the numbers (N,) of pixels, given the positive and negative events (2, pixels) of a window."""
         active = np.flatnonzero(counts[0] != counts[1])
         num_active = int(num_pixels * (1 - self.config.share_of_all_pixels)) if len(active) else 0
-        pixels = np.concatenate(
-            [
-                chosen_from[torch.randint(max(len(chosen_from), 1), (number,)).numpy()]
-                for chosen_from, number in ((active, num_active), (self._usable, num_pixels - num_active))
-            ]
-        )
-        return pixels, counts[:, pixels]
+        return np.concatenate([_drawn_from(active, num_active), _drawn_from(self._usable, num_pixels - num_active)])
+
+    def _draw(self, num_pixels: int, patch_size: int = 1) -> list[DrawnWindow]:
+        """Return windows with their pixels: whole patches of ``patch_size`` pixels, at least one in all."""
+        drawn = []
+        num_windows = max(round(num_pixels / self.config.pixels_per_window), 1)
+        for part in np.array_split(np.arange(max(num_pixels // patch_size, 1)), num_windows):
+            start, end = self._draw_window()
+            counts = self.dataset.windows.counts(start, end)
+            pixels = self._draw_pixels(counts, patch_size * len(part))
+            drawn.append(DrawnWindow(start, end, pixels, counts[:, pixels]))
+        return drawn
+
+    def _batch(self, drawn: Sequence[DrawnWindow]) -> tuple[RayBundle, dict[str, Any]]:
+        """Return the rays of windows, and what the sensor recorded of them."""
+        # In one piece, because every copy to a GPU takes its time.
+        rows = torch.from_numpy(np.concatenate([one.rows() for one in drawn], 1)).to(self.device)
+        pixel, positive, negative, *times = rows
+        rays = self._pixel_rays.rays(pixel, [self._pixel_rays.trajectory.seconds(time) for time in times])
+        batch = {
+            "num_positive": positive.float(),
+            "num_negative": negative.float(),
+            "channel": self._pixel_rays.channels.index_select(0, pixel),
+        }
+        return rays, batch
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
         """Draw a batch of pixels in windows.
@@ -257,19 +297,52 @@ class WindowSampler(Sampler):
             ``num_positive`` and ``num_negative`` (N,) counts of events after the start up to the end, and the
             ``channel`` (N,) of its filter.
         """
-        num_pixels = max(num_rays // 2, 1)
-        num_windows = max(round(num_pixels / self.config.pixels_per_window), 1)
+        return self._batch(self._draw(num_rays // 2))
+
+
+class PatchSampler(WindowSampler):
+    """Samples windows of time, and in each of them patches of 2 x 2 pixels by the number of their active pixels.
+
+    The image is divided into patches that do not overlap. A pixel is active if its polarities do not add up to zero in
+    the window. If no patch has some number of active pixels, patches of any number take its share.
+
+    Args:
+        config: the options. ``share_of_all_pixels`` has no effect.
+        dataset: the training data.
+        supervision: a :class:`WindowSupervision`.
+        device: of the batches.
+
+    Raises:
+        DataError: an option is out of range, or no patch can be used.
+    """
+
+    def __init__(
+        self, config: WindowSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
+    ) -> None:
+        super().__init__(config, dataset, supervision, device)
+        usable = self._pixel_rays.usable
+        height, width = usable.shape
+        numbers = np.arange(height * width).reshape(height, width)[: height // 2 * 2, : width // 2 * 2]
+        patches = numbers.reshape(height // 2, 2, width // 2, 2).swapaxes(1, 2).reshape(-1, 4)
+        self._patches = patches[usable.ravel()[patches].all(1)]
+        if len(self._patches) == 0:
+            raise DataError("the lens model", "it gives no patch of 2 x 2 pixels a direction", "check its parameters")
+
+    def _draw_pixels(self, counts: NDArray[np.int64], num_pixels: int) -> NDArray[np.int64]:
+        """Return the numbers (N,) of pixels, patch by patch, given the events (2, pixels) of a window."""
+        num_active = (counts[0] != counts[1])[self._patches].sum(1)
+        # Whole patches for every number, which add up to all.
+        ends = np.rint(np.cumsum(_PATCH_SHARES) * (num_pixels // 4)).astype(int)
         drawn = []
-        for part in np.array_split(np.arange(num_pixels), num_windows):
-            window = self._draw_window()
-            pixels, counts = self._draw_pixels(*window, len(part))
-            drawn.append(np.stack([pixels, *counts, *(np.full_like(pixels, time) for time in window)]))
-        # In one piece, because every copy to a GPU takes its time.
-        pixel, positive, negative, *times = torch.from_numpy(np.concatenate(drawn, 1)).to(self.device)
-        rays = self._pixel_rays.rays(pixel, [self._pixel_rays.trajectory.seconds(time) for time in times])
-        batch = {
-            "num_positive": positive.float(),
-            "num_negative": negative.float(),
-            "channel": self._pixel_rays.channels.index_select(0, pixel),
-        }
-        return rays, batch
+        for number, share in enumerate(np.diff(ends, prepend=0)):
+            chosen_from = np.flatnonzero(num_active == number)
+            drawn.append(_drawn_from(chosen_from if len(chosen_from) else np.arange(len(self._patches)), share))
+        return self._patches[np.concatenate(drawn)].ravel()
+
+    def _draw(self, num_pixels: int, patch_size: int = 4) -> list[DrawnWindow]:
+        return super()._draw(num_pixels, patch_size)
+
+
+def _drawn_from(numbers: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return (count,) of the numbers, drawn uniformly with replacement."""
+    return numbers[torch.randint(max(len(numbers), 1), (count,)).numpy()]

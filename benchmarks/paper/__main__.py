@@ -16,7 +16,7 @@ from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
 from aenerf_ns.progress import progress_bar
 from benchmarks.paper.figures import draw
-from benchmarks.paper.plan import Poses, Run, Scale, Table, plan
+from benchmarks.paper.plan import Method, Poses, Run, Scale, Table, plan
 from benchmarks.paper.running import Runner
 from benchmarks.paper.tables import report
 
@@ -41,6 +41,11 @@ class Bench:
     """Where the estimated poses come from: true poses with noise, or COLMAP."""
     tables: tuple[Table, ...] = ("methods", "losses")
     """Methods (the paper's tables 1 and 3), losses (its table 4)."""
+    methods: tuple[Method, ...] = ("aenerf", "nerfacto")
+    """Whose rows the table of methods has. A method of another paper has three: on estimated poses, on these with our
+    pose correction, and on true poses."""
+    e2vid_weights: Path | None = None
+    """Weights file of E2VID, which makes the images of e2vid-nerf. Without it the high-pass filter makes them."""
     seeds: tuple[int, ...] = (42,)
     """Seeds of the trainings."""
     steps: int | None = None
@@ -48,7 +53,7 @@ class Bench:
     simulate: str = ""
     """More options of aenerf simulate, as in --simulate="--bayer-pattern RGGB"."""
     train: str = ""
-    """More options of the event method's trainings."""
+    """More options of the trainings of all methods but nerfacto."""
     device: Literal["cuda", "cpu"] = "cuda"
     """Where to train."""
 
@@ -60,7 +65,7 @@ class Bench:
         """
         runs = plan(
             self.scenes, self.speeds, self.poses, self.tables, self.seeds, self.scale, self.steps,
-            shlex.split(self.simulate), shlex.split(self.train),
+            shlex.split(self.simulate), shlex.split(self.train), self.methods, self.e2vid_weights,
         )  # fmt: skip
         runner = Runner(self.output, self.device)
         # The exception reaches the command that is running, which is then ended too.

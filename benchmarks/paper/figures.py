@@ -17,6 +17,8 @@ _GAP = 4
 _LABEL = 14
 _MIN_WIDTH = 190
 """In pixels. Smaller pictures are enlarged, because the names above them would not fit."""
+_MAX_COLUMNS = 7
+"""More columns go on below."""
 
 
 def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]]) -> list[Path]:
@@ -94,20 +96,26 @@ def _view(folder: Path, run: Run) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 def _grid(columns: Mapping[str, Sequence[NDArray[np.uint8]]]) -> Image.Image:
-    """Return a picture of columns of equally large pictures, with the names of the columns above."""
+    """Return a picture of columns of equally large pictures, with the names of the columns above.
+
+    The columns stand in bands of at most :data:`_MAX_COLUMNS`, one below another.
+    """
     height, width = next(iter(columns.values()))[0].shape[:2]
     factor = -(-_MIN_WIDTH // width)
     height, width = factor * height, factor * width
     count = max(map(len, columns.values()))
-    size = (len(columns) * (width + _GAP) - _GAP, _LABEL + count * (height + _GAP) - _GAP)
+    across = min(len(columns), _MAX_COLUMNS)
+    band = _LABEL + count * (height + _GAP)
+    size = (across * (width + _GAP) - _GAP, -(-len(columns) // across) * band - _GAP)
     picture = Image.new("RGB", size, "white")
     pen = ImageDraw.Draw(picture)
     for index, (name, tiles) in enumerate(columns.items()):
-        left = index * (width + _GAP)
-        pen.text((left + 2, 1), name, fill="black")
+        below, column = divmod(index, across)
+        left, top = column * (width + _GAP), below * band
+        pen.text((left + 2, top + 1), name, fill="black")
         for row, tile in enumerate(tiles):
             enlarged = Image.fromarray(tile).resize((width, height), Image.Resampling.NEAREST)
-            picture.paste(enlarged, (left, _LABEL + row * (height + _GAP)))
+            picture.paste(enlarged, (left, top + _LABEL + row * (height + _GAP)))
     return picture
 
 
@@ -153,14 +161,16 @@ def _paths(data: Path, corrected: Path, file: Path) -> Path:
 
 def _curves(runs: Sequence[Run], figures: Mapping[str, dict[str, Any]], file: Path) -> Path:
     """Draw PSNR during the trainings."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5, 3.5), layout="constrained")
+    figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
+    axes.set_prop_cycle(color=colormaps["tab20"].colors)
     for run in runs:
         if figures[run.name]["curve"]:
             axes.plot(*zip(*figures[run.name]["curve"], strict=True), marker=".", label=run.row)
     axes.set(xlabel="steps", ylabel="PSNR [dB] on the validation views")
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     figure.savefig(file, dpi=100)
     return file

@@ -13,6 +13,7 @@ from aenerf_ns.errors import DataError
 Poses = Literal["noise", "colmap"]
 Scale = Literal["full", "tiny"]
 Table = Literal["methods", "losses"]
+Method = Literal["aenerf", "robust-enerf", "eventnerf", "evnerf", "paev3d", "e2vid-nerf", "nerfacto"]
 
 _SIMULATE = {
     "full": ("--width", "346", "--height", "260", "--validation-views", "100", "--test-views", "100"),
@@ -25,7 +26,6 @@ _NOISE = {
     "full": ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03"),
     "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
 }
-_METHOD = {"full": "aenerf", "tiny": "aenerf-small"}
 _STEPS = {"full": 30000, "tiny": 1500}
 # Pairs of a batch in the table of losses. They are as many as the methods' own batches hold, at two rays a pair.
 _PAIRS = {"full": 4096, "tiny": 512}
@@ -36,8 +36,22 @@ OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
     "true poses",
     "images, nerfacto",
 )
-"""The rows of the table of methods. The last two are bounds, not rivals: the event method with true poses, and
-Nerfstudio's own method on sharp images with true poses."""
+"""The rows of AE-NeRF and nerfacto in the table of methods. The last two are bounds, not rivals: the event method with
+true poses, and Nerfstudio's own method on sharp images with true poses."""
+
+PEERS: dict[Method, str] = {
+    "e2vid-nerf": "E2VID + NeRF",
+    "eventnerf": "EventNeRF",
+    "evnerf": "Ev-NeRF",
+    "robust-enerf": "Robust e-NeRF",
+    "paev3d": "PAEv3D",
+}
+"""Other papers' methods in the paper's order, the worst first. PAEv3D stands only in a table of the appendix, between
+Robust e-NeRF and AE-NeRF."""
+HIGH_PASS = "high-pass + NeRF"
+"""What e2vid-nerf is called on images that no network has reconstructed."""
+ON_TRUE_POSES, CORRECTED = ", true poses", ", pose correction"
+"""Ends of the names of a peer's rows. The row on estimated poses without correction has neither."""
 
 LOSSES = {
     "l_p + l_r": {"temporal-loss": 0.0, "distortion-loss": 0.0},
@@ -48,7 +62,8 @@ LOSSES = {
 """The rows of the paper's table 4: weights of the terms. All rows have equally many pairs in a batch. A pair takes two
 rays, or three with the temporal loss."""
 
-_OFF = ("--pipeline.model.camera-optimizer.mode", "off")
+_MODE = "--pipeline.model.camera-optimizer.mode"
+_OFF, _SPLINE = (_MODE, "off"), (_MODE, "spline")
 # nerfacto in the proportions of aenerf-small.
 _SMALL_NERFACTO = (
     "--pipeline.datamanager.train-num-rays-per-batch", "1024",
@@ -103,6 +118,7 @@ class Run:
         steps: of the training.
         seed: of the training.
         options: of ns-train.
+        images: options of aenerf reconstruct, where the run trains on images made by it.
     """
 
     table: Table
@@ -112,16 +128,17 @@ class Run:
     steps: int
     seed: int
     options: tuple[str, ...]
+    images: tuple[str, ...] = ()
 
     @property
     def true_poses(self) -> bool:
         """Whether the run gets the true poses in place of the estimated ones."""
-        return self.row in (TRUE_POSES, CEILING)
+        return self.row in (TRUE_POSES, CEILING) or self.row.endswith(ON_TRUE_POSES)
 
     @property
     def name(self) -> str:
         """Name of the files: scene, speed, row, seed and a digest of the other options."""
-        unique = digest((self.dataset.name, self.method, str(self.steps), *self.options))
+        unique = digest((self.dataset.name, self.method, str(self.steps), *self.options, *self.images))
         row = self.row.replace(",", "").replace(" + ", "+").replace(" ", "-")
         return f"{scene_name(self.dataset.scene)}_{self.dataset.speed}_{row}_seed{self.seed}_{unique}"
 
@@ -136,6 +153,8 @@ def plan(
     steps: int | None = None,
     simulate: Sequence[str] = (),
     train: Sequence[str] = (),
+    methods: Sequence[Method] = ("aenerf", "nerfacto"),
+    e2vid_weights: Path | None = None,
 ) -> list[Run]:
     """Return all runs, in the order in which they are made.
 
@@ -148,7 +167,9 @@ def plan(
         scale: "full" or, for a CPU, "tiny".
         steps: of every training; 30,000 or 1500 by default.
         simulate: more options of aenerf simulate.
-        train: more options of the event method's trainings.
+        train: more options of the trainings of all methods but nerfacto.
+        methods: whose rows the table of methods has.
+        e2vid_weights: weights file of E2VID; without it the high-pass filter makes the images of e2vid-nerf.
 
     Raises:
         DataError: two scenes have one name.
@@ -159,22 +180,36 @@ def plan(
 
     def dataset(scene: str, speed: str) -> Dataset:
         estimated = _NOISE[scale] if poses == "noise" else ("--poses", "colmap")
-        return Dataset(scene, speed, poses, (*_SIMULATE[scale], *estimated, *simulate))
+        # Otherwise all paths of one duration would have the same errors, and a mean over scenes would hold one draw.
+        seed = str(int(digest((scene_name(scene), speed)), 16))
+        return Dataset(scene, speed, poses, (*_SIMULATE[scale], "--seed", seed, *estimated, *simulate))
 
-    event_method, length, runs = _METHOD[scale], _STEPS[scale] if steps is None else steps, []
+    length, runs = _STEPS[scale] if steps is None else steps, []
+    end = "-small" if scale == "tiny" else ""
+    images: tuple[str, ...] = ("--method", "high-pass")
+    if e2vid_weights is not None:
+        images = ("--method", "e2vid", "--weights", str(e2vid_weights.resolve()))
+
+    def rows_of(method: Method) -> dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]]:
+        """Return method, options of ns-train and options of aenerf reconstruct by row."""
+        if method == "nerfacto":
+            return {CEILING: (method, _SMALL_NERFACTO if scale == "tiny" else (), ())}
+        off, spline = (*train, *_OFF), (*train, *_SPLINE)
+        if method == "aenerf":
+            options = {OURS: tuple(train), WITHOUT_CORRECTION: off, TRUE_POSES: off}
+            return {row: (method + end, words, ()) for row, words in options.items()}
+        of_images = images if method == "e2vid-nerf" else ()
+        name = HIGH_PASS if of_images and e2vid_weights is None else PEERS[method]
+        options = {name: off, name + CORRECTED: spline, name + ON_TRUE_POSES: off}
+        return {row: (method + end, words, of_images) for row, words in options.items()}
+
     for seed in seeds:
         for scene in scenes:
             for speed in speeds if "methods" in tables else ():
-                small = _SMALL_NERFACTO if scale == "tiny" else ()
-                rows = {
-                    OURS: (event_method, tuple(train)),
-                    WITHOUT_CORRECTION: (event_method, (*train, *_OFF)),
-                    TRUE_POSES: (event_method, (*train, *_OFF)),
-                    CEILING: ("nerfacto", small),
-                }
                 runs += [
-                    Run("methods", row, dataset(scene, speed), method, length, seed, options)
-                    for row, (method, options) in rows.items()
+                    Run("methods", row, dataset(scene, speed), name, length, seed, options, of_images)
+                    for method in methods
+                    for row, (name, options, of_images) in rows_of(method).items()
                 ]
             if "losses" in tables:
                 data = dataset(scene, "hard")
@@ -183,7 +218,7 @@ def plan(
                     options = ["--pipeline.datamanager.train-num-rays-per-batch", str(rays)]
                     for loss, weight in weights.items():
                         options += [f"--pipeline.model.loss-coefficients.{loss}", str(weight)]
-                    runs.append(Run("losses", row, data, event_method, length, seed, (*train, *options)))
+                    runs.append(Run("losses", row, data, f"aenerf{end}", length, seed, (*train, *options)))
     return runs
 
 

@@ -14,13 +14,12 @@ Several processes can work on the folder at once, or one after the other. Each s
 from __future__ import annotations
 
 import json
-import math
 import os
 import shlex
 import shutil
 import subprocess
 import sys
-import time
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -33,14 +32,14 @@ from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from benchmarks.common import script
 from benchmarks.environment import environment
 from benchmarks.owned import owned
-from benchmarks.paper.plan import CEILING, OURS, Dataset, Run, scene_name
+from benchmarks.paper.plan import CEILING, Dataset, Run, digest, scene_name
 
 # A training has so many parts. The framework evaluates the validation views after each part but the last, because it
 # counts the final step as one less.
 _CURVE_PARTS = 5
 _CURVE = "Eval Images Metrics Dict (all images)/psnr"
 # By its path, because the command runs in the benchmark's folder, where the package `benchmarks` is not found.
-_NERFACTO = (sys.executable, str(Path(__file__).with_name("nerfacto.py")))
+_WORKER = (sys.executable, str(Path(__file__).with_name("worker.py")))
 
 
 class Runner:
@@ -83,11 +82,13 @@ class Runner:
         data = self._dataset(run.dataset)
         # A training that was killed leaves files.
         shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)
-        begin = time.perf_counter()
+        if run.images:
+            data = self._with_images(data, run.images)
         training = self._train(run, data)
-        seconds = time.perf_counter() - begin
+        evaluation = self._folder / "runs" / run.name / "evaluation.json"
+        made = json.loads(evaluation.read_text("utf8"))
+        evaluation.unlink()
         (config,) = (self._folder / "outputs" / run.name).rglob("config.yml")
-        results = self._evaluate(run, config)
         figures = {
             "table": run.table,
             "row": run.row,
@@ -101,9 +102,11 @@ class Runner:
             "device": self._device,
             "simulate": shlex.join(("aenerf", "simulate", *run.dataset.command)),
             "train": shlex.join(training),
-            "train_seconds": round(seconds),
+            "reconstruct": shlex.join(run.images),
+            "train_seconds": round(made["train_seconds"]),
             "poses_report": _read(data / "poses_report.json"),
-            "results": results,
+            # JSON has no NaN.
+            "results": {name: None if value != value else value for name, value in made["results"].items()},
             "curve": _curve(config.parent),
             **origin,
         }
@@ -135,51 +138,39 @@ class Runner:
                     raise
         return folder
 
+    def _with_images(self, data: Path, options: Sequence[str]) -> Path:
+        """Return a dataset whose training images are reconstructed from the events of a dataset."""
+        folder = data.with_name(f"{data.name}_images_{digest(options)}")
+        with FileLock(folder.with_name(f".{folder.name}.lock")):
+            if not folder.exists():
+                arguments = ("--data", str(data.resolve()), "--output", str(folder.resolve()), *options)
+                self._call(folder.name, script("aenerf"), "reconstruct", *arguments)
+        return folder
+
     def _train(self, run: Run, data: Path) -> tuple[str, ...]:
-        """Train and return the command, without the folders of this machine."""
-        common = (
+        """Train, evaluate, and return the command of the training, without the folders of this machine."""
+        words = [
             run.method, "--machine.device-type", self._device, "--machine.seed", str(run.seed), "--vis", "tensorboard",
             "--experiment-name", run.name, "--output-dir", "outputs", "--max-num-iterations", str(run.steps),
             "--steps-per-eval-all-images", str(max(run.steps // _CURVE_PARTS, 1)),
-        )  # fmt: skip
+        ]  # fmt: skip
         if run.row == CEILING:
             # The framework's implementation that needs no CUDA extension.
-            command = [
-                *_NERFACTO, "ns-train", *common, "--pipeline.model.implementation", "torch",
+            words += [
+                "--pipeline.model.implementation", "torch",
                 "--pipeline.model.camera-optimizer.mode", "off", "--pipeline.model.use-appearance-embedding", "False",
             ]  # fmt: skip
             if self._device == "cpu":
                 # Renders the same pictures faster, because a small chunk fits the cache.
-                command += ["--pipeline.model.eval-num-rays-per-chunk", "1024"]
-            command += [*run.options, "nerfstudio-data", "--data", str(_with_true_poses(data).resolve())]
+                words += ["--pipeline.model.eval-num-rays-per-chunk", "1024"]
+            words += [*run.options, "nerfstudio-data", "--data", str(_with_true_poses(data).resolve())]
         else:
             # As for nerfacto, LPIPS is reported where its network can be downloaded.
-            command = [script("ns-train"), *common, "--pipeline.model.lpips", "True", *run.options]
+            words += ["--pipeline.model.lpips", "True", *run.options]
             poses = "ground-truth" if run.true_poses else "estimated"
-            command += ["aenerf-data", "--data", str(data.resolve()), "--poses", poses]
-        self._call(run.name, *command)
-        folder, root = f"{self._folder.resolve()}/", f"{Path(__file__).parents[2]}/"
-        words = (word.replace(folder, "").replace(root, "") for word in command[1:])
-        return (Path(command[0]).name, *words)
-
-    def _evaluate(self, run: Run, config: Path) -> dict[str, Any]:
-        relative = str(config.relative_to(self._folder))
-        folder = Path("runs") / run.name
-        output = folder / "evaluation.json"
-        command = (*_NERFACTO, "ns-eval") if run.row == CEILING else (script("ns-eval"),)
-        pictures = ("--render-output-path", str(folder / "pictures"))
-        self._call(run.name, *command, "--load-config", relative, "--output-path", str(output), *pictures)
-        results = json.loads((self._folder / output).read_text("utf8"))["results"]
-        (self._folder / output).unlink()
-        if run.row == CEILING:
-            # JSON has no NaN.
-            return {name: None if math.isnan(value) else value for name, value in results.items()}
-        if run.row == OURS:
-            corrected = str(folder / "corrected.txt")
-            self._call(
-                run.name, script("aenerf"), "export-trajectory", "--load-config", relative, "--output", corrected
-            )
-        return results
+            words += ["aenerf-data", "--data", str(data.resolve()), "--poses", poses]
+        self._call(run.name, *_WORKER, run.name, *words)
+        return ("ns-train", *(word.replace(f"{self._folder.resolve()}/", "") for word in words))
 
     def _call(self, log: str, *command: str) -> None:
         """Run a command in the benchmark's folder.

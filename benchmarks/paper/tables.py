@@ -7,7 +7,17 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
-from benchmarks.paper.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION
+from benchmarks.paper.plan import (
+    CEILING,
+    CORRECTED,
+    HIGH_PASS,
+    LOSSES,
+    ON_TRUE_POSES,
+    OURS,
+    PEERS,
+    TRUE_POSES,
+    WITHOUT_CORRECTION,
+)
 
 Figures = dict[str, Any]
 _METRICS = ("psnr", "ssim", "lpips")
@@ -16,7 +26,25 @@ _TEST_POSES = (
     "PSNR, SSIM and LPIPS: with test poses as placed / refined photometrically on the test images; - where only the "
     "first was measured."
 )
-_METHODS = (WITHOUT_CORRECTION, OURS, TRUE_POSES, CEILING)
+_OWN_ROWS = (WITHOUT_CORRECTION, OURS, TRUE_POSES, CEILING)
+_AE_NERF = "AE-NeRF"
+_SETTINGS = ("estimated poses", "estimated poses, pose correction", "true poses")
+# Rows of a method in these settings, the method of the paper last.
+_ROWS_OF = {name: (name, name + CORRECTED, name + ON_TRUE_POSES) for name in (HIGH_PASS, *PEERS.values())}
+_ROWS_OF[_AE_NERF] = (WITHOUT_CORRECTION, OURS, TRUE_POSES)
+# Which of these rows are put in order: of other papers' methods, and of AE-NeRF.
+_ORDERS = {
+    "estimated poses, which only AE-NeRF corrects": (0, 1),
+    "estimated poses, which all correct": (1, 1),
+    "true poses": (2, 2),
+}
+# PSNR in the paper's tables 1 and 2. AE-NeRF's is with its correction.
+_PAPER = {
+    ("object", "easy"): (18.92, 26.81, 27.72, 28.38, None, 28.96),
+    ("object", "hard"): (18.92, 24.92, 25.44, 28.37, None, 28.90),
+    ("large", "easy"): (15.60, 17.99, 18.26, 21.48, None, 24.28),
+    ("large", "hard"): (15.60, 17.68, 17.82, 21.41, None, 24.23),
+}
 
 
 def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
@@ -35,6 +63,11 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
             "## Novel views (the paper's table 1)",
             "Means over what all methods of a column have in common.",
             methods_table(methods),
+        ]
+    if any(one["row"] not in _OWN_ROWS for one in methods):
+        parts += ["## Methods of other papers", *peers_parts(methods)]
+    if _of(methods, row=OURS):
+        parts += [
             "## Pose correction (the paper's table 3)",
             "RE: rotation error in degrees, TE: translation error in percent of the length of the path; both after "
             "Sim(3) alignment; with pose correction and without it.",
@@ -60,7 +93,8 @@ def methods_table(figures: Sequence[Figures]) -> str:
     """
     columns = [(kind, speed) for kind in ("object", "large") for speed in ("easy", "hard")]
     columns = [column for column in columns if _of(figures, kind=column[0], speed=column[1])]
-    header, rows = ["method"], [[method] for method in _METHODS if _of(figures, row=method)]
+    peers = (row for name, rows in _ROWS_OF.items() if name != _AE_NERF for row in rows)
+    header, rows = ["method"], [[row] for row in (*peers, *_OWN_ROWS) if _of(figures, row=row)]
     for kind, speed in columns:
         common = _common(_of(figures, kind=kind, speed=speed))
         count = len({one["scene"] for one in common})
@@ -68,6 +102,72 @@ def methods_table(figures: Sequence[Figures]) -> str:
         for row in rows:
             row += [_mean(_of(common, row=row[0]), metric) for metric in _METRICS]
     return _markdown(header, rows)
+
+
+def peers_parts(figures: Sequence[Figures]) -> list[str]:
+    """Return a table of PSNR and the order of the methods for each kind of scene and speed, beside the paper's.
+
+    Cells are means over scenes, of all seeds, with the standard deviation of the means of the seeds.
+    """
+    named = [name for name, rows in _ROWS_OF.items() if any(_of(figures, row=row) for row in rows)]
+    parts = [
+        "PSNR: mean over scenes and seeds ± standard deviation over seeds, with test poses as placed / refined. Means "
+        "over what all rows of a table have in common. Of these methods only AE-NeRF corrects poses; the paper's PSNR "
+        "of AE-NeRF is with correction. The paper does not say on which poses it ran the others. In the other tables, "
+        "rows without a method's name are AE-NeRF's."
+    ]
+    if HIGH_PASS in named:
+        parts.append(
+            f"{HIGH_PASS} stands in the place of {PEERS['e2vid-nerf']}. It is not the paper's row, because its images "
+            "are a filter's and not a network's."
+        )
+    for (kind, speed), paper in _PAPER.items():
+        common = _common([one for one in _of(figures, kind=kind, speed=speed) if one["row"] != CEILING])
+        if not common:
+            continue
+        published = {name: value for name, value in zip((*PEERS.values(), _AE_NERF), paper, strict=True) if value}
+        rows = [
+            [
+                name,
+                f"{published[name]:.2f}" if name in published else "-",
+                *(_mean_and_spread(_of(common, row=row)) for row in _ROWS_OF[name]),
+            ]
+            for name in named
+        ]
+        orders = [f"- the paper: {_order(published)}"]
+        for setting, (peers_column, own_column) in _ORDERS.items():
+            wanted = {name: _ROWS_OF[name][own_column if name == _AE_NERF else peers_column] for name in named}
+            found = {name: some for name, row in wanted.items() if (some := _of(common, row=row))}
+            means = {name: fmean(one["results"]["psnr"] for one in some) for name, some in found.items()}
+            orders.append(f"- here, {setting}: {_order(means)}")
+        parts += [
+            f"### Scenes of kind {kind}: {len({one['scene'] for one in common})}, {speed} speed",
+            _markdown(["method", "the paper", *_SETTINGS], rows),
+            "Order by PSNR with placed test poses:",
+            "\n".join(orders),
+        ]
+    return parts
+
+
+def _order(values: Mapping[str, float]) -> str:
+    return " < ".join(f"{name} ({values[name]:.2f})" for name in sorted(values, key=values.__getitem__))
+
+
+def _mean_and_spread(figures: Sequence[Figures]) -> str:
+    """Return the mean PSNR with test poses placed / refined, each with the standard deviation over seeds."""
+    if not figures:
+        return "-"
+    parts = []
+    for results in ([one["results"] for one in figures], [one["results"].get("refined_test_poses") for one in figures]):
+        if None in results:
+            parts.append("-")
+            continue
+        by_seed: dict[int, list[float]] = {}
+        for one, result in zip(figures, results, strict=True):
+            by_seed.setdefault(one["seed"], []).append(result["psnr"])
+        means = [fmean(values) for values in by_seed.values()]
+        parts.append(f"{fmean(means):.2f}" + (f" ± {stdev(means):.2f}" if len(means) > 1 else ""))
+    return " / ".join(parts)
 
 
 def poses_table(figures: Sequence[Figures]) -> str:
@@ -141,6 +241,8 @@ def _conditions(figures: Sequence[Figures]) -> str:
     trained = dict.fromkeys((one["method"], one["steps"]) for one in figures)
     lines = [f"- {method}, {steps} steps" for method, steps in trained]
     lines += [f"- data: `{command}`" for command in dict.fromkeys(_simulation(one) for one in figures)]
+    made = dict.fromkeys(one["reconstruct"] for one in figures if one.get("reconstruct"))
+    lines += [f"- images of the events: `aenerf reconstruct {options}`" for options in made]
     for one in {(str(one["machine"]), str(one["versions"]), one["commit"]): one for one in figures}.values():
         machine, versions = one["machine"], ", ".join(f"{name} {number}" for name, number in one["versions"].items())
         device = f"{machine['gpu'] if one['device'] == 'cuda' else machine['cpu']}, {machine['cores']} cores"
@@ -151,9 +253,9 @@ def _conditions(figures: Sequence[Figures]) -> str:
 
 
 def _simulation(figures: Figures) -> str:
-    """Return the command that made the data, with SCENE and SPEED in place of their values."""
+    """Return the command that made the data, with SCENE, SPEED and SEED in place of their values."""
     words = shlex.split(figures["simulate"])
-    for option in ("--scene", "--speed"):
+    for option in ("--scene", "--speed", "--seed"):
         words[words.index(option) + 1] = option[2:].upper()
     return shlex.join(words)
 

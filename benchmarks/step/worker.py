@@ -170,7 +170,7 @@ def main() -> None:
     if sys.argv[1] == "nerfacto":
         # At the end, because the repository's own `aenerf_ns` lacks two folders of the installed one.
         sys.path.append(str(Path(__file__).parents[2]))
-        from benchmarks.paper.nerfacto import prepare
+        from benchmarks.paper.worker import prepare
 
         prepare()
     # All else that is printed goes to standard error.

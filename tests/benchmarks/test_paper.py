@@ -19,6 +19,7 @@ import pytest
 import torch
 import torchmetrics.functional as functional
 import torchmetrics.image.lpip as lpip
+from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from PIL import Image
@@ -31,8 +32,20 @@ from aenerf_ns.method_configs.aenerf_small import aenerf_small
 from benchmarks import environment
 from benchmarks.paper import tables
 from benchmarks.paper.figures import draw, error_map
-from benchmarks.paper.nerfacto import prepare
-from benchmarks.paper.plan import CEILING, LOSSES, OURS, TRUE_POSES, WITHOUT_CORRECTION, Run, plan
+from benchmarks.paper.plan import (
+    CEILING,
+    CORRECTED,
+    HIGH_PASS,
+    LOSSES,
+    ON_TRUE_POSES,
+    OURS,
+    PEERS,
+    TRUE_POSES,
+    WITHOUT_CORRECTION,
+    Run,
+    plan,
+)
+from benchmarks.paper.worker import prepare
 
 ROOT = Path(__file__).parents[2]
 # Published results, which a benchmark with the same options must find again.
@@ -65,6 +78,39 @@ def test_the_plan_has_every_run_once() -> None:
     assert all(run.dataset.options[-2:] == ("--poses", "colmap") for run in small_plan(poses="colmap"))
 
 
+ALL_METHODS = ("aenerf", *PEERS, "nerfacto")
+
+
+def test_other_papers_methods_have_rows_on_estimated_poses_corrected_ones_and_true_ones() -> None:
+    runs = small_plan(methods=ALL_METHODS, tables=("methods",), seeds=(1,), scenes=("room",), speeds=("hard",))
+    assert len({run.name for run in runs}) == len(runs) == 4 + 5 * 3
+    rows = {run.row: run for run in runs}
+    mode = "--pipeline.model.camera-optimizer.mode"
+    for method, name in PEERS.items():
+        shown = HIGH_PASS if method == "e2vid-nerf" else name
+        for end, correction in (("", "off"), (CORRECTED, "spline"), (ON_TRUE_POSES, "off")):
+            run = rows[shown + end]
+            assert (run.method, run.true_poses) == (f"{method}-small", end == ON_TRUE_POSES)
+            assert run.options == (mode, correction)
+            assert run.images == (("--method", "high-pass") if method == "e2vid-nerf" else ())
+    # Registered under these names, and corrected by the same spline as ours.
+    assert all_methods.keys() >= {run.method for run in runs} | set(PEERS)
+    assert aenerf_small.config.pipeline.model.camera_optimizer.mode == "spline"
+    # The rows of AE-NeRF are found again in a folder that was made without the others.
+    alone = {run.name for run in small_plan(seeds=(1,), scenes=("room",), speeds=("hard",), tables=("methods",))}
+    assert alone == {run.name for run in runs if run.row in (OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING)}
+    full = small_plan(methods=("paev3d",), scale="full", tables=("methods",))
+    assert {run.method for run in full} == {"paev3d"}
+
+
+def test_e2vid_makes_the_images_if_there_are_weights(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"methods": ("e2vid-nerf",), "tables": ("methods",)}
+    with_weights = small_plan(e2vid_weights=tmp_path / "e2vid.pth.tar", **options)
+    assert {run.row for run in with_weights} == {"E2VID + NeRF" + end for end in ("", CORRECTED, ON_TRUE_POSES)}
+    assert with_weights[0].images == ("--method", "e2vid", "--weights", str(tmp_path / "e2vid.pth.tar"))
+    assert not {run.name for run in with_weights} & {run.name for run in small_plan(**options)}
+
+
 def test_all_losses_are_compared_on_as_many_pairs() -> None:
     option = "--pipeline.datamanager.train-num-rays-per-batch"
     for scale, method in (("tiny", aenerf_small), ("full", aenerf)):
@@ -88,13 +134,13 @@ def test_whatever_a_run_depends_on_is_in_its_name() -> None:
         assert not changed & names, change
 
 
-def test_published_runs_are_found_by_their_names() -> None:
-    scenes = sorted({path.name.split("_hard_")[0] for path in PUBLISHED.glob("*_hard_*.json")})
-    files = tuple(f"scenes/{scene}/scene.json" for scene in scenes)
-    runs = {run.name for run in small_plan(scenes=files, seeds=(42,))}
-    published = {path.stem for path in PUBLISHED.glob("*.json")}
+def test_published_runs_go_by_what_they_hold() -> None:
+    published = list(PUBLISHED.glob("*.json"))
     assert len(published) == 96
-    assert published <= runs
+    for path in published:
+        run = json.loads(path.read_text("utf8"))
+        row = run["row"].replace(",", "").replace(" + ", "+").replace(" ", "-")
+        assert path.name.startswith(f"{run['scene']}_{run['speed']}_{row}_seed{run['seed']}_")
 
 
 def test_a_scene_file_goes_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,6 +211,12 @@ def cells(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
 
 
+def test_each_path_has_errors_of_its_own() -> None:
+    datasets = {run.dataset for run in small_plan()}
+    seeds = {one.options[one.options.index("--seed") + 1] for one in datasets}
+    assert len(seeds) == len(datasets) == 4
+
+
 def test_tables_are_means_over_scenes_and_seeds() -> None:
     runs = small_plan()
     kinds = {"room": "large", "object": "object"}
@@ -198,6 +250,45 @@ def test_tables_are_means_over_scenes_and_seeds() -> None:
     assert text.count("- data: `aenerf simulate --scene SCENE --speed SPEED --width 96 --height 72 ") == 1
     # Over two seeds 24 runs apart.
     assert f"± {24 / 2**0.5:.2f} / - |" in text
+
+
+def test_the_papers_order_stands_beside_ours() -> None:
+    runs = small_plan(methods=ALL_METHODS, tables=("methods",), speeds=("hard",), scenes=("object",))
+    # The worst row has 10 dB; a seed is worth 1 dB, a refined test pose 2 dB.
+    rank = {run.row: index for index, run in enumerate(runs[: len(runs) // 2])}
+    figures = []
+    for run in runs:
+        one = figures_of(run, 10.0 + rank[run.row] + run.seed, "object", (1.0, 0.5))
+        one["results"]["refined_test_poses"] = {"psnr": one["results"]["psnr"] + 2, "ssim": 0.5, "lpips": None}
+        figures.append({**one, "reconstruct": " ".join(run.images)})
+    text = tables.report(figures, {})
+    assert "### Scenes of kind object: 1, hard speed" in text
+    # Of seeds 1 and 2, whose standard deviation is 0.71 dB.
+    corrected = 11.5 + rank["Robust e-NeRF, pose correction"]
+    (row,) = (line for line in text.splitlines() if line.startswith("| Robust e-NeRF | 28.37 |"))
+    assert f"| {corrected:.2f} ± 0.71 / {corrected + 2:.2f} ± 0.71 |" in row
+    assert "| AE-NeRF | 28.90 |" in text
+    assert "| PAEv3D | - |" in text
+    assert "| high-pass + NeRF | - |" in text
+    paper = "E2VID + NeRF (18.92) < EventNeRF (24.92) < Ev-NeRF (25.44) < Robust e-NeRF (28.37) < AE-NeRF (28.90)"
+    assert f"- the paper: {paper}\n" in text
+    # AE-NeRF's rows were made first, and others in the order of the paper.
+    names = ["AE-NeRF", HIGH_PASS, *list(PEERS.values())[1:]]
+    own = {"which only AE-NeRF corrects": (OURS, ""), "which all correct": (OURS, CORRECTED)}
+    for setting, (row, end) in own.items():
+        means = [11.5 + rank[row], *(11.5 + rank[name + end] for name in names[1:])]
+        order = " < ".join(f"{name} ({mean:.2f})" for name, mean in zip(names, means, strict=True))
+        assert f"- here, estimated poses, {setting}: {order}\n" in text
+    assert "- images of the events: `aenerf reconstruct --method high-pass`\n" in text
+    # Every row stands in the table with all metrics, too.
+    _, _, *rows = cells(tables.methods_table(figures))
+    assert len(rows) == 4 + 5 * 3
+    # Without AE-NeRF there are no errors of poses to report, and without other methods no order.
+    alone = tables.report([one for one in figures if one["method"] == "paev3d-small"], {})
+    assert "table 3" not in alone
+    assert "Order by PSNR" in alone
+    own = tables.report([one for one in figures if one["method"] in ("aenerf-small", "nerfacto")], {})
+    assert "Order by PSNR" not in own
 
 
 def test_refined_figures_stand_beside_the_placed_ones() -> None:

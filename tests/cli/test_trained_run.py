@@ -19,9 +19,10 @@ from aenerf_ns.method_configs.aenerf_small import aenerf_small
 from aenerf_ns.method_configs.e2vid_nerf import e2vid_nerf
 from aenerf_ns.method_configs.eventnerf import eventnerf
 from aenerf_ns.method_configs.evnerf import evnerf
+from aenerf_ns.method_configs.paev3d import paev3d
 from aenerf_ns.method_configs.robust_enerf import robust_enerf
 
-METHODS = (aenerf, aenerf_mlp, aenerf_small, e2vid_nerf, eventnerf, evnerf, robust_enerf)
+METHODS = (aenerf, aenerf_mlp, aenerf_small, e2vid_nerf, eventnerf, evnerf, paev3d, robust_enerf)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.config.method_name)

@@ -26,6 +26,7 @@ from aenerf_ns.method.encoding.hash_grid import HashEncoding
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.supervision.base import SupervisionConfig
+from aenerf_ns.supervision.paev3d import PAEv3DSupervisionConfig
 from aenerf_ns.supervision.pairs import PairSupervisionConfig
 from aenerf_ns.supervision.windows import EventNeRFSupervisionConfig, EvNeRFSupervisionConfig
 
@@ -63,12 +64,15 @@ def test_a_step_computes_on_the_device_alone(backbone: str, bounded: bool, corre
 
 
 @NEEDS_SIMULATION
-@pytest.mark.parametrize("supervision", [EventNeRFSupervisionConfig(), EvNeRFSupervisionConfig()])
+@pytest.mark.parametrize(
+    "supervision", [EventNeRFSupervisionConfig(), EvNeRFSupervisionConfig(), PAEv3DSupervisionConfig()]
+)
 def test_a_step_on_windows_computes_on_the_device_alone(supervision: SupervisionConfig) -> None:
     model = make_model(camera_optimizer=PoseCorrectionConfig(mode="spline"), supervision=supervision)
     with SimulatedCuda() as gpu:
         to_device(model)
-        rays, batch = to_device(make_rays(10, with_times=True)), to_device(make_batch(5))
+        of_patches = {"displacement": torch.ones(4, 2), "window": torch.zeros(4, dtype=torch.long)}
+        rays, batch = to_device(make_rays(8, with_times=True)), to_device(make_batch(4) | of_patches)
         outputs = model(rays)
         torch.stack(list(model.get_loss_dict(outputs, batch).values())).sum().backward()
         assert model.supervision.metrics(outputs, batch)["polarity_agreement"].device == device()

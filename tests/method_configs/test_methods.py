@@ -27,12 +27,14 @@ from aenerf_ns.method_configs.eventnerf import eventnerf
 from aenerf_ns.method_configs.eventnerf_small import eventnerf_small
 from aenerf_ns.method_configs.evnerf import evnerf
 from aenerf_ns.method_configs.evnerf_small import evnerf_small
+from aenerf_ns.method_configs.paev3d import paev3d
+from aenerf_ns.method_configs.paev3d_small import paev3d_small
 from aenerf_ns.method_configs.robust_enerf import robust_enerf
 from aenerf_ns.method_configs.robust_enerf_small import robust_enerf_small
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
-SMALL = [robust_enerf_small, eventnerf_small, evnerf_small, e2vid_nerf_small]
-PEERS = [*SMALL, robust_enerf, eventnerf, evnerf, e2vid_nerf]
+SMALL = [robust_enerf_small, eventnerf_small, evnerf_small, paev3d_small, e2vid_nerf_small]
+PEERS = [*SMALL, robust_enerf, eventnerf, evnerf, paev3d, e2vid_nerf]
 
 
 @pytest.fixture
