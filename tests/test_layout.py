@@ -23,7 +23,7 @@ MAY_USE = {
     "supervision": {"errors", "events", "camera", "recording"},
     "method": {"errors", "camera", "recording", "supervision"},
     "checking": {"progress", "events", "camera", "recording"},
-    "training": {"errors", "events", "camera", "recording", "supervision", "method", "checking"},
+    "training": {"errors", "progress", "events", "camera", "recording", "supervision", "method", "checking"},
     "simulator": {"errors", "progress", "events", "camera", "files", "recording"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -27,6 +27,7 @@ from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
 from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
 from aenerf_ns.training.training_state import TrainingState
+from aenerf_ns.training.view_metrics import OF_THE_PICTURE, describe_views, measure_views, picture_names
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
@@ -293,6 +294,19 @@ class AENeRFPipeline(VanillaPipeline):
         poses[:, :3, 3] /= outputs.dataparser_scale
         return (torch.linalg.inv(to_scene) @ poses @ OPENCV_TO_OPENGL)[:, :3]
 
+    def camera_speeds(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how fast the corrected camera moves and turns at (N,) float64 seconds since the trajectory's start.
+
+        Returns:
+            (N,) units of the recording per second, and (N,) degrees per second.
+        """
+        with torch.no_grad():
+            pose, rate = self.model.camera_optimizer.pose_and_rate(seconds.to(self.device))
+        scale = self.datamanager.train_dataparser_outputs.dataparser_scale
+        # The derivative of a rotation R is R [ω]ₓ, whose norm is √2 |ω|.
+        turning = (pose[..., :3].mT @ rate[..., :3]).flatten(1).norm(dim=-1) / math.sqrt(2)
+        return rate[..., 3].norm(dim=-1).cpu() / scale, torch.rad2deg(turning).cpu()
+
     def pose_errors(self) -> dict[str, dict[str, float]] | None:
         """Return the errors of the ``estimated`` and of the ``corrected`` poses, in the units of the recording.
 
@@ -326,7 +340,8 @@ class AENeRFPipeline(VanillaPipeline):
         """Return mean metrics over the reference views, and the protocol that they were computed with.
 
         The views are rendered from where they are placed. Of a trained run, ``refined_test_poses`` holds the metrics of
-        the views that are rendered from photometrically refined poses. No camera stays moved.
+        the views that are rendered from photometrically refined poses, and ``views`` those of each view
+        (:func:`~aenerf_ns.training.view_metrics.describe_views`). No camera stays moved.
 
         Without reference views, but with known true poses, return the errors of the poses alone.
 
@@ -334,9 +349,12 @@ class AENeRFPipeline(VanillaPipeline):
             SystemExit: there are neither views nor true poses; or, outside training, a metric is not a number.
         """
         metrics: dict[str, Any] = {}
+        placed: list[dict[str, float]] = []
+        refined = None
         if self.datamanager.has_reference_views or not self.model.camera_optimizer.has_ground_truth:
             self._require_reference_views()
-            metrics = self._checked(super().get_average_eval_image_metrics(step, output_path, get_std))
+            placed = self._measure(self.datamanager.fixed_indices_eval_dataloader, output_path)
+            metrics = self._checked(_averages(placed, get_std))
         if self.test_mode == "test":
             # In the other mode, the trainer's log takes numbers only.
             metrics["color_correction"] = self.model.color_correction.description
@@ -347,20 +365,30 @@ class AENeRFPipeline(VanillaPipeline):
             metrics["pose_diagnosis"] = self._pose_diagnosis
             metrics["test_poses"] = self._test_poses
             if metrics["num_views"] and self.config.refine_test_poses:
-                metrics["refined_test_poses"] = self._metrics_of_refined_test_poses(get_std)
+                refined = self._measure(_RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader))
+                metrics["refined_test_poses"] = self._metrics_of_refined_test_poses(refined, get_std)
             metrics |= self.model.supervision.learned()
             if self.model.image_metrics.lpips_absent is not None:
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent
+            metrics["views"] = describe_views(self, placed, refined) if placed else []
         return metrics
 
-    def _metrics_of_refined_test_poses(self, get_std: bool) -> dict[str, Any]:
-        """Return the metrics of the reference views from refined poses, and how the poses were refined."""
-        views = _RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader)
-        metrics = self._checked(self.get_average_image_metrics(views, "refined", get_std=get_std))
+    def _measure(
+        self, views: Iterable[tuple[Cameras, dict[str, Any]]], output_path: Path | None = None
+    ) -> list[dict[str, float]]:
+        """Return the metrics of each reference view, and write its pictures as ns-eval names them."""
+        self.eval()
+        names = picture_names(self.datamanager.eval_dataset.image_filenames)
+        measured = measure_views(self.model, views, names, output_path, "eval")
+        self.train()
+        return measured
+
+    def _metrics_of_refined_test_poses(self, refined: list[dict[str, float]], get_std: bool) -> dict[str, Any]:
+        """Return the mean metrics of the reference views from refined poses, and how the poses were refined."""
+        metrics = self._checked(_averages(refined, get_std))
         # The time to render includes no refinement, so it says nothing new.
-        names = {"psnr", "ssim", "lpips"}
-        metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in names}
+        metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in OF_THE_PICTURE}
         if self.model.image_metrics.lpips_absent is not None:
             metrics["lpips"] = None
         how = f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {self._test_poses}"
@@ -381,6 +409,17 @@ class AENeRFPipeline(VanillaPipeline):
                 "the run renders values that are not finite; train it again"
             )
         return metrics
+
+
+def _averages(metrics: list[dict[str, float]], get_std: bool) -> dict[str, float]:
+    """Return the mean, and with ``get_std`` the standard deviation, of each metric of views."""
+    averages = {}
+    for name in metrics[0]:
+        deviation, mean = torch.std_mean(torch.tensor([one[name] for one in metrics]))
+        averages[name] = float(mean)
+        if get_std:
+            averages[f"{name}_std"] = float(deviation)
+    return averages
 
 
 class _RefinedViews:

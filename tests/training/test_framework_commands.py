@@ -48,7 +48,7 @@ def evaluate(config: Path, workspace: Path, name: str) -> dict:
     output = workspace / f"{name}.json"
     pictures = workspace / f"{name}_pictures"
     run("ns-eval", "--load-config", config, "--output-path", output, "--render-output-path", pictures, cwd=workspace)
-    assert len(list(pictures.glob("eval_img_*.png"))) == 3
+    assert {path.name for path in pictures.glob("eval_img_*.png")} == {f"eval_img_{view:05d}.png" for view in range(3)}
     return json.loads(output.read_text())
 
 
@@ -73,6 +73,12 @@ def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, wo
     assert refined["test_poses"].startswith("photometric refinement, 10 Levenberg-Marquardt steps, from: Sim(3)")
     assert -0.1 < refined["psnr"] - results["psnr"] < 3
     assert refined["psnr"] != results["psnr"]
+    views = results["views"]
+    assert [view["file"] for view in views] == [f"images/test/{view:05d}.png" for view in range(3)]
+    for figures, name in ((results, "placed"), (refined, "refined")):
+        for metric in ("psnr", "ssim"):
+            mean = np.mean([view[name][metric] for view in views])
+            assert figures[metric] == pytest.approx(mean, rel=1e-5)
     data = workspace / "room"
     (data / "events.gone").rename(data / "events.h5")
     run(
