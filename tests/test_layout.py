@@ -24,7 +24,11 @@ MAY_USE = {
     "method": {"errors", "camera", "recording", "supervision"},
     "checking": {"progress", "events", "camera", "recording"},
     "training": {"errors", "progress", "events", "camera", "recording", "supervision", "method", "checking"},
+    # What training and checking left behind, measured and shown.
+    "report": {"errors", "progress", "camera", "supervision", "training", "checking"},
     "simulator": {"errors", "progress", "events", "camera", "files", "recording"},
+    # What other tools take from a trained run. Of the simulator only the loader of Open3D.
+    "export": {"errors", "progress", "events", "camera", "files", "recording", "training", "simulator"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},
     "cli": {
@@ -38,6 +42,8 @@ MAY_USE = {
         "method",
         "training",
         "checking",
+        "export",
+        "report",
         "simulator",
         "dataparsers",
     },

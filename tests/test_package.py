@@ -45,7 +45,7 @@ def test_the_wheel_holds_the_package_and_nothing_generic(wheel: zipfile.ZipFile)
         for folder in ("aenerf_ns", "dataparsers", "method_configs")
         for path in (ROOT / folder).rglob("*.py")
     }
-    assert names == sources | {"aenerf_ns/py.typed"}
+    assert names == sources | {"aenerf_ns/py.typed", "aenerf_ns/report/page.html"}
     assert any(name.endswith("LICENSE") for name in wheel.namelist())
 
 

@@ -9,14 +9,18 @@ from pathlib import Path
 
 from aenerf_ns.files.given_paths import require_dataset, require_new, require_run
 
-_WORKS_ON: dict[str, tuple[str, Callable[[Path], None]]] = {
+_WORKS_ON: dict[str, tuple[str, Callable[[Path], object]]] = {
     "check": ("--data", require_dataset),
     "convert": ("--data", require_dataset),
     "reconstruct": ("--data", require_dataset),
     "evaluate": ("--load-config", require_run),
     "export-trajectory": ("--load-config", require_run),
+    "export-cameras": ("--load-config", require_run),
+    "export-frames": ("--load-config", require_run),
+    "export-mesh": ("--load-config", require_run),
+    "export-video": ("--load-config", require_run),
 }
-_WRITES_FOLDER = {"simulate", "convert", "reconstruct"}
+_WRITES_FOLDER = {"simulate", "convert", "reconstruct", "export-cameras", "export-frames"}
 
 
 def judge_paths(words: Sequence[str]) -> None:

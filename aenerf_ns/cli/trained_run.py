@@ -33,13 +33,11 @@ _PATHS = {f"pathlib.{name}" for name in ("PosixPath", "PurePosixPath", "WindowsP
 _FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}
 
 
-def open_run(
-    config: Path, test_mode: Literal["test", "inference"] = "test"
-) -> tuple[TrainerConfig, AENeRFPipeline, Path]:
+def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tuple[TrainerConfig, AENeRFPipeline, Path]:
     """Open a trained run.
 
     Args:
-        config: the run's config.yml.
+        run: the run's config.yml, or its folder.
         test_mode: see :class:`~aenerf_ns.training.pipeline.AENeRFPipeline`.
 
     Returns:
@@ -48,7 +46,7 @@ def open_run(
     Raises:
         DataError: there is no such file, opening it could run foreign code, or the run is of another method.
     """
-    require_run(config)
+    config = require_run(run)
     require_known_tags(config)
     # Imported lazily, because these imports take seconds.
     from nerfstudio.utils.eval_utils import eval_setup

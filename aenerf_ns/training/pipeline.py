@@ -294,6 +294,13 @@ class AENeRFPipeline(VanillaPipeline):
         poses[:, :3, 3] /= outputs.dataparser_scale
         return (torch.linalg.inv(to_scene) @ poses @ OPENCV_TO_OPENGL)[:, :3]
 
+    def in_scene(self, poses: Tensor) -> Tensor:
+        """Convert poses (N, 3, 4) or (N, 4, 4) of the recording's world, OpenCV axes, to scene poses, OpenGL axes."""
+        outputs = self.datamanager.train_dataparser_outputs
+        poses = homogeneous(outputs.dataparser_transform.double()) @ homogeneous(poses[:, :3].cpu()) @ OPENCV_TO_OPENGL
+        poses[:, :3, 3] *= outputs.dataparser_scale
+        return poses[:, :3]
+
     def camera_speeds(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """Return how fast the corrected camera moves and turns at (N,) float64 seconds since the trajectory's start.
 

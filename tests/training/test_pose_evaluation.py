@@ -321,13 +321,13 @@ def test_views_on_the_trajectory_have_their_times_and_the_camera_s_speed(
     assert view["time_ns"] == 250_000_000
     assert view["camera_speed"] == pytest.approx(0.2, rel=1e-5)
     assert view["camera_turn_rate_degrees"] == pytest.approx(0, abs=1e-6)
-    turning = torch.linspace(0, 1, 3, dtype=torch.float64)
-    poses = torch.cat(
-        [rotation_from_vector(torch.stack([0 * turning, turning, 0 * turning], -1)), torch.zeros(3, 3, 1)], -1
-    )
-    pipeline.model.camera_optimizer.trajectory = Trajectory([0, SECOND // 2, SECOND], poses)
+    # A radian a second about an axis, in steps that the spline follows closely.
+    turning = torch.linspace(0, 1, 21, dtype=torch.float64)
+    rotations = rotation_from_vector(turning[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64))
+    poses = torch.cat([rotations, torch.zeros(21, 3, 1)], -1)
+    pipeline.model.camera_optimizer.trajectory = Trajectory(SECOND // 20 * np.arange(21), poses)
     _, turn_rates = pipeline.camera_speeds(torch.tensor([0.5], dtype=torch.float64))
-    assert float(turn_rates) == pytest.approx(math.degrees(1), rel=0.01)
+    assert float(turn_rates) == pytest.approx(math.degrees(1), rel=1e-4)
 
 
 def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor) -> None:
