@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 from aenerf_ns.files.given_paths import require_dataset, require_new, require_run
@@ -34,6 +34,9 @@ def judge_paths(words: Sequence[str]) -> None:
     options = _options(rest)
     if command in _WRITES_FOLDER and "--output" in options:
         require_new(Path(options["--output"]))
+    if command == "report":
+        for run in takewhile(lambda word: not word.startswith("-"), rest):
+            require_run(Path(run))
     if command in _WORKS_ON:
         option, require = _WORKS_ON[command]
         begins_with_word = bool(rest) and not rest[0].startswith("-") and rest[0] not in _formats()

@@ -58,7 +58,7 @@ def make_page(reports: Sequence[RunReport], paired: Sequence[dict[str, Any]], mi
 def _plot(figure: go.Figure | None, otherwise: str = "") -> str:
     if figure is None:
         return f"<p>{escape(otherwise)}</p>"
-    return figure.to_html(full_html=False, include_plotlyjs=False, config={"displaylogo": False, "responsive": True})
+    return figure.to_html(full_html=False, include_plotlyjs=False, config={"displayModeBar": False, "responsive": True})
 
 
 def _of_different_data(reports: Sequence[RunReport]) -> list[RunReport]:

@@ -13,7 +13,9 @@ from aenerf_ns.report.measuring import RunReport
 
 # One for each run, and dashes for what a run began with and what is true.
 _COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf")
-_TRUE = "#555555"
+_TRUE = "#999999"
+# A loss that vanishes for some steps must not press the rest of its curve together.
+_MOST_DECADES = 5
 
 # Panels of the curves: the scalar's name, its title, and whether the axis is logarithmic.
 _CURVES = (
@@ -60,9 +62,23 @@ def curves(reports: Sequence[RunReport]) -> go.Figure | None:
                     x=steps, y=values, name=report.name, mode=mode, line_color=color(run), legendgroup=report.name,
                     showlegend=len(reports) > 1 and index == 0, row=row, col=column,
                 )  # fmt: skip
-        figure.update_yaxes(type="log" if logarithmic else "linear", exponentformat="power", row=row, col=column)
+        figure.update_yaxes(exponentformat="power", row=row, col=column)
+        if logarithmic:
+            logged = [value for scalars in kept for value in scalars.get(name, ([], []))[1] if value > 0]
+            figure.update_yaxes(type="log", range=_decades(logged), row=row, col=column)
+    last = max(steps[-1] for scalars in kept for steps, _ in scalars.values())
+    figure.update_xaxes(range=[0, last])
     figure.update_xaxes(title_text="step", row=rows)
     return _styled(figure, 210 * rows + 60)
+
+
+def _decades(values: Sequence[float]) -> list[float] | None:
+    """Return the ends of a logarithmic axis: of all values, but no more than some decades below the highest."""
+    if not values:
+        return None
+    low, high = np.log10([min(values), max(values)])
+    margin = 0.05 * (min(high - low, _MOST_DECADES) + 0.1)
+    return [max(low, high - _MOST_DECADES) - margin, high + margin]
 
 
 def event_rate(report: RunReport) -> go.Figure:
@@ -98,12 +114,14 @@ def trajectory(reports: Sequence[RunReport]) -> go.Figure:
 def _paths(report: RunReport, first: bool) -> list[tuple[str, Any]]:
     positions = report.poses["positions"]
     # All runs of a comparison may have the same true poses.
-    return [(name, points) for name, points in positions.items() if first or name != "true"]
+    shown = [(name, points) for name, points in positions.items() if first or name != "true"]
+    # Below the others.
+    return sorted(shown, key=lambda path: path[0] != "true")
 
 
 def _line(name: str, run: int) -> dict[str, Any]:
     if name == "true":
-        return {"color": _TRUE, "width": 4}
+        return {"color": _TRUE, "width": 3}
     return {"color": color(run), "width": 1.5, "dash": "dot" if name == "estimated" else "solid"}
 
 
@@ -153,14 +171,16 @@ def changes(report: RunReport) -> go.Figure:
     edges = np.array(pairs["edges"])
     middles = (edges[1:] + edges[:-1]) / 2
     counts = np.array(pairs["histogram"])
+    # Nothing is drawn where there are no pairs.
+    shown = [[float(np.log10(count)) if count else None for count in row] for row in counts]
     figure = go.Figure(
         go.Heatmap(
-            x=middles, y=middles, z=np.log10(np.maximum(counts, 1)), customdata=counts, colorscale="Viridis",
+            x=middles, y=middles, z=shown, customdata=counts, colorscale="Viridis",
             hovertemplate="measured %{x:.1f}, rendered %{y:.1f}: %{customdata} pairs<extra></extra>",
-            colorbar={"title": "pairs", "tickvals": [0, 1, 2, 3, 4], "ticktext": ["≤ 1", "10", "100", "1000", "10⁴"]},
+            colorbar={"title": "pairs", "tickvals": [0, 1, 2, 3, 4], "ticktext": ["1", "10", "100", "1000", "10⁴"]},
         )
     )  # fmt: skip
-    figure.add_scatter(x=edges[[0, -1]], y=edges[[0, -1]], mode="lines", line={"color": "white", "dash": "dot"})
+    figure.add_scatter(x=edges[[0, -1]], y=edges[[0, -1]], mode="lines", line={"color": "#d62728", "dash": "dot"})
     figure.update_layout(
         xaxis_title="measured change (thresholds)", yaxis_title="rendered change (thresholds)", showlegend=False
     )
@@ -190,9 +210,11 @@ def residual_by_length(reports: Sequence[RunReport]) -> go.Figure:
 def residual_by_tile(report: RunReport) -> go.Figure:
     """Return the mean absolute residual by tile of the sensor."""
     assert report.pairs is not None
+    tiles = report.pairs["by_tile"]
+    highest = max((value for row in tiles for value in row if value is not None), default=1.0)
     figure = go.Figure(
         go.Heatmap(
-            z=report.pairs["by_tile"], colorscale="Viridis", zmin=0, colorbar={"title": "thresholds"},
+            z=tiles, colorscale="Viridis", zmin=0, zmax=highest, colorbar={"title": "thresholds"},
             hovertemplate="%{z:.3f} thresholds<extra></extra>",
         )
     )  # fmt: skip

@@ -144,9 +144,15 @@ def view_table(reports: Sequence[RunReport]) -> str:
         if any(name in view.get(protocol, {}) for report in reports for view in report.views)
     ]
     heads = [("view", "")] + ([("run", "")] if len(reports) > 1 else [])
-    heads += [("time (s)", "number")]
+    # Columns that are empty in every line are left out.
+    has = {
+        name: any(view[name] is not None for report in reports for view in report.views)
+        for name in ("time_ns", "camera_speed", "camera_turn_rate_degrees")
+    }
+    heads += [("time (s)", "number")] * has["time_ns"]
     heads += [(f"{name.upper()}{', refined' if protocol == 'refined' else ''}", "number") for protocol, name in metrics]
-    heads += [("camera speed (units/s)", "number"), ("turn rate (°/s)", "number")]
+    heads += [("camera speed (units/s)", "number")] * has["camera_speed"]
+    heads += [("turn rate (°/s)", "number")] * has["camera_turn_rate_degrees"]
     rows = []
     for report in reports:
         for view in report.views:
@@ -154,9 +160,14 @@ def view_table(reports: Sequence[RunReport]) -> str:
             if len(reports) > 1:
                 cells.append(f"<td>{escape(report.name)}</td>")
             time = view["time_ns"]
-            cells.append(_cell(None if time is None else time * 1e-9, 3))
+            if has["time_ns"]:
+                cells.append(_cell(None if time is None else time * 1e-9, 3))
             cells += [_cell(view.get(protocol, {}).get(name), _DIGITS[name]) for protocol, name in metrics]
-            cells += [_cell(view["camera_speed"], 3), _cell(view["camera_turn_rate_degrees"], 1)]
+            cells += [
+                _cell(view[name], digits)
+                for name, digits in (("camera_speed", 3), ("camera_turn_rate_degrees", 1))
+                if has[name]
+            ]
             rows.append(f"<tr>{''.join(cells)}</tr>")
     top = "".join(f'<th scope="col" class="{kind}">{name}</th>' for name, kind in heads)
     return (

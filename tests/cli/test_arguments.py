@@ -16,13 +16,14 @@ from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.main import main
 from aenerf_ns.cli.reconstruct import Reconstruct
+from aenerf_ns.cli.report import Report
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.formats import FORMATS
 
 # Of which a message shows all, and no file system has a name.
 LONG = "a" * 290
 
-Command = Check | Convert | Evaluate | ExportTrajectory | Reconstruct
+Command = Check | Convert | Evaluate | ExportTrajectory | Reconstruct | Report
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +37,7 @@ def what_commands_work_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def parsed(line: str, monkeypatch: pytest.MonkeyPatch) -> Command:
     """Return the command made of the words after ``aenerf``, without running it."""
     made: list[Command] = []
-    for kind in (Check, Convert, Evaluate, ExportTrajectory, Reconstruct):
+    for kind in (Check, Convert, Evaluate, ExportTrajectory, Reconstruct, Report):
         monkeypatch.setattr(kind, "main", lambda command: made.append(command))
     monkeypatch.setattr(sys, "argv", ["aenerf", *line.split()])
     main()
@@ -145,6 +146,13 @@ def test_a_run_is_given(name: str, run: str, monkeypatch: pytest.MonkeyPatch) ->
         assert (command.load_config, command.output) == (Path("C"), Path("O"))
 
 
+def test_runs_to_report_on_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    for line in ("report C F --output O", "report --output O C F"):
+        command = parsed(line, monkeypatch)
+        assert isinstance(command, Report)
+        assert (command.runs, command.output) == ((Path("C"), Path("F")), Path("O"))
+
+
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
@@ -188,8 +196,9 @@ def test_other_words_are_refused(
         ("check", "DATA", "--data DATA"),
         ("convert", "DATA", "--data DATA"),
         ("reconstruct", "DATA", "--data DATA"),
-        ("evaluate", "CONFIG", "--load-config CONFIG"),
-        ("export-trajectory", "CONFIG", "--load-config CONFIG"),
+        ("evaluate", "RUN", "--load-config RUN"),
+        ("export-trajectory", "RUN", "--load-config RUN"),
+        ("export-cameras", "RUN", "--load-config RUN"),
     ],
 )
 def test_the_help_names_both_ways(
@@ -221,6 +230,9 @@ def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
         ("simulate --scene room --output G", 1, "G: the folder exists already"),
         ("evaluate nothing.yml --output O", 1, "nothing.yml: there is no such file"),
         ("export-trajectory --load_config nothing.yml --output O", 1, "nothing.yml: there is no such file"),
+        ("export-cameras nothing --output O", 1, "nothing: there is no such file"),
+        ("export-frames F --output G", 1, "G: the folder exists already"),
+        ("report F nothing --output O", 1, "nothing: there is no such file"),
         (f"simulate --output {LONG}", 1, f"{LONG}: it cannot be created (File name too long); choose another --output"),
         (f"evaluate {LONG} --output O", 1, f"{LONG}: it cannot be read (File name too long); check its name"),
     ],

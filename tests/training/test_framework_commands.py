@@ -271,9 +271,9 @@ def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
         assert browser.evaluate("document.images.length") == 13
         order = (
             "[...document.querySelectorAll('table.sortable tbody tr')]"
-            ".map((row) => parseFloat(row.cells[2].dataset.value))"
+            ".map((row) => parseFloat(row.cells[1].dataset.value))"
         )
-        head = "document.querySelectorAll('table.sortable th')[2]"
+        head = "document.querySelectorAll('table.sortable th')[1]"
         psnr = [float(row["psnr_placed"]) for row in rows]
         assert browser.evaluate(order) == psnr
         for expected, said in ((sorted(psnr), "ascending"), (sorted(psnr, reverse=True), "descending")):
