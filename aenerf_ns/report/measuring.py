@@ -12,6 +12,7 @@ import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
+from aenerf_ns.camera.alignment import align
 from aenerf_ns.report.pair_residuals import pair_residuals
 from aenerf_ns.report.run_files import read_record, read_scalars
 from aenerf_ns.report.trajectory_errors import as_evo_prints, correction_components, errors_over_time
@@ -215,8 +216,6 @@ def _poses(pipeline: AENeRFPipeline) -> dict[str, Any]:
             name: {kind: values[::every] for kind, values in errors_over_time(poses, reference).items()}
             for name, poses in both.items()
         }
-        from aenerf_ns.camera.alignment import align
-
         positions["estimated"] = align(scene_poses[0], scene_poses[2])(scene_poses[0].double())
     found["positions"] = {name: (poses[::every, :, 3].cpu() / scale).tolist() for name, poses in positions.items()}
     found["correction"] = None

@@ -13,6 +13,7 @@ from aenerf_ns.training.run_record import RUN_FILE, SCALARS_FILE
 
 # Points of a curve. More are not seen, and make the page large.
 _MOST_POINTS = 1000
+_NEEDED = {"state", "first_step", "planned_steps", "steps", "started", "seconds"}
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
@@ -28,8 +29,9 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         record = json.loads(path.read_text("utf8"))
     except (OSError, ValueError) as error:
         raise DataError(path, f"it cannot be read ({error})", "copy the run again, or remove the file") from None
-    if not isinstance(record, dict):
-        raise DataError(path, "it is not a JSON object", "copy the run again, or remove the file")
+    lacking = _NEEDED - (record.keys() if isinstance(record, dict) else set())
+    if lacking:
+        raise DataError(path, f"it lacks {', '.join(sorted(lacking))}", "copy the run again, or remove the file")
     return record
 
 
