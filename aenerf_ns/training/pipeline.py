@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import comms
@@ -25,9 +24,15 @@ from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
-from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
+from aenerf_ns.training.pose_refinement import NUM_STEPS, RefinedViews
 from aenerf_ns.training.training_state import TrainingState
-from aenerf_ns.training.view_metrics import OF_THE_PICTURE, describe_views, measure_views, picture_names
+from aenerf_ns.training.view_metrics import (
+    OF_THE_PICTURE,
+    average_metrics,
+    describe_views,
+    measure_views,
+    picture_names,
+)
 
 # Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
@@ -361,7 +366,7 @@ class AENeRFPipeline(VanillaPipeline):
         if self.datamanager.has_reference_views or not self.model.camera_optimizer.has_ground_truth:
             self._require_reference_views()
             placed = self._measure(self.datamanager.fixed_indices_eval_dataloader, output_path)
-            metrics = self._checked(_averages(placed, get_std))
+            metrics = self._checked(average_metrics(placed, get_std))
         if self.test_mode == "test":
             # In the other mode, the trainer's log takes numbers only.
             metrics["color_correction"] = self.model.color_correction.description
@@ -372,7 +377,7 @@ class AENeRFPipeline(VanillaPipeline):
             metrics["pose_diagnosis"] = self._pose_diagnosis
             metrics["test_poses"] = self._test_poses
             if metrics["num_views"] and self.config.refine_test_poses:
-                refined = self._measure(_RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader))
+                refined = self._measure(RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader))
                 metrics["refined_test_poses"] = self._metrics_of_refined_test_poses(refined, get_std)
             metrics |= self.model.supervision.learned()
             if self.model.image_metrics.lpips_absent is not None:
@@ -393,7 +398,7 @@ class AENeRFPipeline(VanillaPipeline):
 
     def _metrics_of_refined_test_poses(self, refined: list[dict[str, float]], get_std: bool) -> dict[str, Any]:
         """Return the mean metrics of the reference views from refined poses, and how the poses were refined."""
-        metrics = self._checked(_averages(refined, get_std))
+        metrics = self._checked(average_metrics(refined, get_std))
         # The time to render includes no refinement, so it says nothing new.
         metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in OF_THE_PICTURE}
         if self.model.image_metrics.lpips_absent is not None:
@@ -416,34 +421,3 @@ class AENeRFPipeline(VanillaPipeline):
                 "the run renders values that are not finite; train it again"
             )
         return metrics
-
-
-def _averages(metrics: list[dict[str, float]], get_std: bool) -> dict[str, float]:
-    """Return the mean, and with ``get_std`` the standard deviation, of each metric of views."""
-    averages = {}
-    for name in metrics[0]:
-        deviation, mean = torch.std_mean(torch.tensor([one[name] for one in metrics]))
-        averages[name] = float(mean)
-        if get_std:
-            averages[f"{name}_std"] = float(deviation)
-    return averages
-
-
-class _RefinedViews:
-    """Reference views whose cameras are refined when it is their turn, as a loader of the framework's evaluation.
-
-    Args:
-        model: in evaluation mode by then.
-        views: loader of single cameras (1,) and their batches.
-    """
-
-    def __init__(self, model: AENeRFModel, views: FixedIndicesEvalDataloader) -> None:
-        self._model = model
-        self._views = views
-
-    def __len__(self) -> int:
-        return len(self._views)
-
-    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        for camera, batch in self._views:
-            yield refine_camera(self._model, camera, batch["image"][..., :3]), batch

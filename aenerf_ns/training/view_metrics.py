@@ -61,6 +61,17 @@ def measure_views(
     return measured
 
 
+def average_metrics(metrics: Sequence[dict[str, float]], get_std: bool) -> dict[str, float]:
+    """Return the mean, and with ``get_std`` the standard deviation, of each metric of views."""
+    averages = {}
+    for name in metrics[0]:
+        deviation, mean = torch.std_mean(torch.tensor([one[name] for one in metrics]))
+        averages[name] = float(mean)
+        if get_std:
+            averages[f"{name}_std"] = float(deviation)
+    return averages
+
+
 def to_image(values: Tensor) -> Image.Image:
     """Return the picture of (H, W, 3) display values in [0, 1]."""
     return Image.fromarray((255 * values.detach().clamp(0, 1)).round().byte().cpu().numpy())
