@@ -69,7 +69,7 @@ class ReadmePicture:
         """Return the (H, W, 3) panels of a test view."""
         # ns-eval puts the truth to the left of the rendering.
         pictures = [
-            np.asarray(Image.open(folder / f"eval_img_{view:04}.png").convert("RGB"))
+            np.asarray(Image.open(sorted(folder.glob("eval_img_*.png"))[view]).convert("RGB"))
             for folder in (self.uncorrected, self.corrected)
         ]
         width = pictures[0].shape[1] // 2

@@ -25,8 +25,22 @@ MAY_USE = {
     "method": {"errors", "camera", "recording", "supervision"},
     # What the viewer shows of a run. It only looks: the pipeline hands it what it needs.
     "viewer": {"errors", "events", "camera", "files", "recording", "method"},
-    "training": {"errors", "events", "camera", "recording", "supervision", "method", "checking", "viewer"},
+    "training": {
+        "errors",
+        "progress",
+        "events",
+        "camera",
+        "recording",
+        "supervision",
+        "method",
+        "checking",
+        "viewer",
+    },
+    # What training and checking left behind, measured and shown.
+    "report": {"errors", "progress", "camera", "supervision", "training", "checking"},
     "simulator": {"errors", "progress", "events", "camera", "files", "recording"},
+    # What other tools take from a trained run. Of the simulator only the loader of Open3D.
+    "export": {"errors", "progress", "events", "camera", "files", "recording", "training", "simulator"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},
     "cli": {
@@ -40,6 +54,8 @@ MAY_USE = {
         "method",
         "training",
         "checking",
+        "export",
+        "report",
         "simulator",
         "dataparsers",
     },

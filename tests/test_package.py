@@ -45,14 +45,14 @@ def test_the_wheel_holds_the_package_and_nothing_generic(wheel: zipfile.ZipFile)
         for folder in ("aenerf_ns", "dataparsers", "method_configs")
         for path in (ROOT / folder).rglob("*.py")
     }
-    assert names == sources | {"aenerf_ns/py.typed"}
+    assert names == sources | {"aenerf_ns/py.typed", "aenerf_ns/report/page.html"}
     assert any(name.endswith("LICENSE") for name in wheel.namelist())
 
 
 def test_the_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
     text = next(wheel.read(name).decode() for name in wheel.namelist() if name.endswith("entry_points.txt"))
     targets = [line.split("=")[1].strip() for line in text.splitlines() if "=" in line]
-    assert len(targets) == 22
+    assert len(targets) == 24
     for target in targets:
         module, attribute = target.split(":")
         assert attribute in wheel.read(module.replace(".", "/") + ".py").decode()

@@ -55,6 +55,7 @@ class Report:
         problems: what is wrong with the recording and what to do about it, a line for each problem.
         planes: options of training, by name: a near and a far plane in scene units for a camera that stays as far from
             everything. Empty for a scene with a box, and where no depth is known.
+        statistics: of all events.
         warped: the warped events, or None if too few events have a pose.
 
     Raises:
@@ -70,6 +71,7 @@ class Report:
         self.planes: dict[str, str] = {}
         self.warped: WarpedEvents | None = None
         statistics, num_covered = self._count()
+        self.statistics = statistics
         self._report_events(statistics)
         self._report_poses(statistics, num_covered)
         if num_covered < _MIN_EVENTS:

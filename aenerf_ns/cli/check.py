@@ -6,19 +6,16 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
 from aenerf_ns.checking.contrast import WarpedEvents
+from aenerf_ns.checking.picture import warped_picture
 from aenerf_ns.checking.report import Report
 from aenerf_ns.cli.arguments import Automatic, CheckArguments
 from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.recording.scene import SCENE
-
-_PICTURE_HEIGHT = 480
 
 
 @dataclass
@@ -64,12 +61,8 @@ def _print(line: str) -> None:
 
 
 def _write_picture(path: Path, warped: WarpedEvents) -> None:
-    net = np.rint(warped.picture()).astype(np.int64)
-    rows, columns = np.nonzero(net)
-    picture = polarity_picture(columns, rows, net[rows, columns], net.shape[1], net.shape[0])
-    enlarged = max(_PICTURE_HEIGHT // net.shape[0], 1)
     try:
-        Image.fromarray(picture.repeat(enlarged, 0).repeat(enlarged, 1)).save(path)
+        Image.fromarray(warped_picture(warped)).save(path)
     except (OSError, ValueError) as error:
         raise DataError(path, f"it cannot be written ({error})", "choose another --picture, ending with .png") from None
     _print(f"{path}: events as they came, and warped")

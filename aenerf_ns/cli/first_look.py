@@ -16,14 +16,28 @@ from aenerf_ns.cli.arguments import (
     ReconstructArguments,
     SimulateArguments,
 )
+from aenerf_ns.cli.export_arguments import (
+    ExportCamerasArguments,
+    ExportFramesArguments,
+    ExportMeshArguments,
+    ExportVideoArguments,
+    ReportArguments,
+)
 from aenerf_ns.cli.run_file import require_plausible
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.given_paths import require_dataset
 from aenerf_ns.files.layouts import LAYOUTS, look_over
 
 OfDataset = CheckArguments | ConvertArguments | ReconstructArguments
-OfRun = EvaluateArguments | ExportTrajectoryArguments
-Arguments = SimulateArguments | OfDataset | OfRun
+OfRun = (
+    EvaluateArguments
+    | ExportTrajectoryArguments
+    | ExportCamerasArguments
+    | ExportFramesArguments
+    | ExportMeshArguments
+    | ExportVideoArguments
+)
+Arguments = SimulateArguments | OfDataset | OfRun | ReportArguments
 
 DESCRIPTION = "AE-NeRF tools; train with ns-train aenerf."
 _COMMANDS: dict[str, Callable[..., Arguments]] = {
@@ -32,7 +46,12 @@ _COMMANDS: dict[str, Callable[..., Arguments]] = {
     "check": CheckArguments,
     "reconstruct": ReconstructArguments,
     "evaluate": EvaluateArguments,
+    "report": ReportArguments,
     "export-trajectory": ExportTrajectoryArguments,
+    "export-cameras": ExportCamerasArguments,
+    "export-frames": ExportFramesArguments,
+    "export-mesh": ExportMeshArguments,
+    "export-video": ExportVideoArguments,
 }
 _FORMATS = {"auto", *LAYOUTS}
 
@@ -72,6 +91,9 @@ def judge(arguments: Arguments) -> None:
         (look_over if isinstance(arguments.format, Automatic) else require_dataset)(arguments.data)
     elif isinstance(arguments, OfRun):
         require_plausible(arguments.load_config)
+    elif isinstance(arguments, ReportArguments):
+        for run in arguments.runs:
+            require_plausible(run)
 
 
 def _parsed(words: Sequence[str], console_outputs: bool = True) -> Arguments:

@@ -27,8 +27,13 @@ def main() -> None:
     from aenerf_ns.cli.check import Check
     from aenerf_ns.cli.convert import Convert
     from aenerf_ns.cli.evaluate import Evaluate
+    from aenerf_ns.cli.export_cameras import ExportCameras
+    from aenerf_ns.cli.export_frames import ExportFrames
+    from aenerf_ns.cli.export_mesh import ExportMesh
     from aenerf_ns.cli.export_trajectory import ExportTrajectory
+    from aenerf_ns.cli.export_video import ExportVideo
     from aenerf_ns.cli.reconstruct import Reconstruct
+    from aenerf_ns.cli.report import Report
     from aenerf_ns.cli.simulate import Simulate
 
     with _error_as_status(2):
@@ -39,7 +44,12 @@ def main() -> None:
                 "check": Check,
                 "reconstruct": Reconstruct,
                 "evaluate": Evaluate,
+                "report": Report,
                 "export-trajectory": ExportTrajectory,
+                "export-cameras": ExportCameras,
+                "export-frames": ExportFrames,
+                "export-mesh": ExportMesh,
+                "export-video": ExportVideo,
             },
             prog="aenerf",
             description=first_look.DESCRIPTION,

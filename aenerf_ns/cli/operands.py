@@ -42,14 +42,14 @@ def _run(
         Path | None,
         tyro.conf.Positional,
         tyro.conf.arg(
-            metavar="CONFIG",
-            help="The config.yml of the run.",
+            metavar="RUN",
+            help="The run: its config.yml, or its folder.",
             help_behavior_hint="(required, here or with --load-config)",
         ),
     ] = None,
     load_config: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="CONFIG", help="Another way to give the config.yml.", help_behavior_hint=""),
+        tyro.conf.arg(metavar="RUN", help="Another way to give the run.", help_behavior_hint=""),
     ] = None,
 ) -> Path:
     return _one_of(word, load_config, "--load-config")
@@ -60,4 +60,4 @@ Dataset = Annotated[Path, tyro.conf.arg(constructor=_dataset, name=""), tyro.con
 """A dataset: ``DATA`` or ``--data DATA``."""
 
 RunConfig = Annotated[Path, tyro.conf.arg(constructor=_run, name="")]
-"""The config.yml of a trained run: ``CONFIG`` or ``--load-config CONFIG``."""
+"""A trained run, by its config.yml or its folder: ``RUN`` or ``--load-config RUN``."""

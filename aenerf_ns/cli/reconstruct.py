@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
-from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -17,6 +15,7 @@ from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.cli.arguments import Automatic, ReconstructArguments
 from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
 from aenerf_ns.cli.termination import ended_by_exception
+from aenerf_ns.cli.video_file import new_video
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import tracked
@@ -60,7 +59,7 @@ class Reconstruct(ReconstructArguments):
                 # The field then has the scale that a field of the recording's events has.
                 auto_scale_poses=parser.scales_poses(recording),
             ) as writer,
-            closing(_new_video(writer.other_file(_VIDEO), camera.width, camera.height)) as video,
+            closing(new_video(writer.other_file(_VIDEO), camera.width, camera.height, _VIDEO_RATE)) as video,
         ):
             writer.add_trajectories(recording.trajectory, recording.ground_truth)
             _add_reference_views(recording, writer)
@@ -127,18 +126,3 @@ def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> N
     for split, kept in views.items():
         for view in kept:
             writer.add_image_file(split, view.file, view.camera_to_world, view.time, recording.image_background)
-
-
-def _new_video(path: Path, width: int, height: int) -> Generator[None, bytes | None, None]:
-    """Return a video that takes (height, width, 3) RGB pictures, as bytes."""
-    try:
-        # Fails if there is no ffmpeg, before any work is done.
-        imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise DataError(path.name, f"there is no ffmpeg to write it ({error})", "install ffmpeg") from None
-    # H.264 stores colours for blocks of 2 x 2 pixels: an odd size is scaled by a fraction of a pixel.
-    video = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=_VIDEO_RATE, macro_block_size=2, ffmpeg_log_level="error"
-    )
-    video.send(None)
-    return video

@@ -33,9 +33,10 @@ _REMEDY = "give the config.yml of a trained run, and only one that you trust"
 _MAX_BYTES = 1 << 18
 
 
-def require_plausible(config: Path) -> None:
-    """Raise a DataError unless a file may be the config.yml of a run, without importing what it names."""
-    require_run(config)
+def require_plausible(run: Path) -> None:
+    """Raise a DataError unless a file, or that in a folder, may be the config.yml of a run, without importing anything
+    that it names."""
+    config = require_run(run)
     tags = _tags(config)
     for tag, line in tags:
         if not _is_plausible(tag):

@@ -15,13 +15,11 @@ if TYPE_CHECKING:
     from aenerf_ns.training.pipeline import AENeRFPipeline
 
 
-def open_run(
-    config: Path, test_mode: Literal["test", "inference"] = "test"
-) -> tuple[TrainerConfig, AENeRFPipeline, Path]:
+def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tuple[TrainerConfig, AENeRFPipeline, Path]:
     """Open a trained run.
 
     Args:
-        config: the run's config.yml.
+        run: the run's config.yml, or its folder.
         test_mode: see :class:`~aenerf_ns.training.pipeline.AENeRFPipeline`.
 
     Returns:
@@ -30,7 +28,7 @@ def open_run(
     Raises:
         DataError: there is no such file, opening it could run foreign code, or the run is of another method.
     """
-    require_run(config)
+    config = require_run(run)
     require_known_tags(config)
     # Imported lazily, because these imports take seconds.
     from nerfstudio.utils.eval_utils import eval_setup

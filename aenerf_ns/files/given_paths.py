@@ -21,11 +21,17 @@ def require_dataset(data: Path) -> None:
             raise DataError(data, "there is no such folder", "give the folder of a dataset as --data")
 
 
-def require_run(config: Path) -> None:
-    """Raise a DataError if a run's config.yml is no file or may not be looked at."""
-    with reading(config):
+def require_run(run: Path) -> Path:
+    """Return the config.yml of a run, which is given by this file or by its folder.
+
+    Raises:
+        DataError: there is none, or it may not be looked at.
+    """
+    with reading(run):
+        config = run / "config.yml" if run.is_dir() else run
         if not config.is_file():
-            raise DataError(config, "there is no such file", "give the config.yml of a trained run")
+            raise DataError(config, "there is no such file", "give the config.yml of a trained run, or its folder")
+    return config
 
 
 def require_new(output: Path) -> None:

@@ -10,7 +10,9 @@ import numpy as np
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
+from torch import Tensor
 
+from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_table import EventPairs
 from aenerf_ns.events.picture import PolaritySums, polarity_picture
@@ -34,6 +36,15 @@ class EventDataset(InputDataset):
     def scene(self) -> Scene:
         """The recording in the frame of the scene."""
         return self.metadata[SCENE]
+
+    @property
+    def reference_seconds(self) -> Tensor:
+        """When the images of a split of reference views were taken, also after their cameras are placed elsewhere.
+
+        They are (N,) float64 seconds since the start of the estimated trajectory, NaN of images off the trajectory.
+        """
+        seconds: Tensor = self._dataparser_outputs.cameras.metadata[REFERENCE_SECONDS]
+        return seconds[:, 0]
 
     @property
     def pairs(self) -> EventPairs:

@@ -118,7 +118,7 @@ class PairSupervision(Supervision):
 
     def losses(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the reconstruction loss (eq. 11), and while training the temporal loss (eq. 12) where it is on."""
-        predicted, change = self._changes(outputs, batch)
+        predicted, change = self.changes(outputs, batch)
         silent = silent_change(
             predicted, change, self._positive_threshold(outputs), self.sensor.negative_contrast_threshold
         )
@@ -133,7 +133,7 @@ class PairSupervision(Supervision):
 
     def metrics(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
         """Return the share of the pairs whose rendered change has the sign of the events."""
-        predicted, target = self._changes(outputs, batch)
+        predicted, target = self.changes(outputs, batch)
         # Polarities that cancel have no sign. A change that is known to a threshold only may have either.
         signed = (target != 0) & ~batch["ends_between_events"]
         agreeing = (predicted.detach() * target > 0) & signed
@@ -143,7 +143,7 @@ class PairSupervision(Supervision):
         """Return C+ / C- and the refractory period in nanoseconds, each where it is learned."""
         return self.sensor_parameters.learned()
 
-    def _changes(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    def changes(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
         """Return the (N,) changes over a batch's intervals: as rendered in the pixel's channel, and as events tell."""
         start, end = outputs["log_radiance"].split(len(batch["channel"]))[:2]
         predicted = (end - start).gather(1, batch["channel"][:, None])[:, 0]
@@ -260,9 +260,10 @@ class PairSampler(Sampler):
             The rays at the starts of the N intervals, then the rays at their ends, then those at t_sam if there are
             any: at a random time between the last two events of the pair, because over more events the mean rate tells
             little of a moment's. And for each pair: ``num_positive`` and ``num_negative`` (N,) counts of events after
-            its earlier one up to its end, whether it ``ends_between_events`` (N,), and the ``channel`` (N,) of its
-            pixel's filter. And of the event that it ends at, or that follows its end: ``last_num_positive`` and
-            ``last_num_negative`` (N,) at its time and the ``last_interval`` (N,) in seconds from the event before.
+            its earlier one up to its end, whether it ``ends_between_events`` (N,), its ``pixel`` (N,), counted row by
+            row, and the ``channel`` (N,) of the pixel's filter. And of the event that it ends at, or that follows its
+            end: ``last_num_positive`` and ``last_num_negative`` (N,) at its time and the ``last_interval`` (N,) in
+            seconds from the event before.
         """
         with_time_within = training and self._needs_rates
         rays_per_pair = 3 if with_time_within else 2
@@ -299,6 +300,7 @@ class PairSampler(Sampler):
             "last_num_positive": last_count[0],
             "last_num_negative": last_count[1],
             "last_interval": last_interval.float(),
+            "pixel": pixel,
             "channel": self._pixel_rays.channels.index_select(0, pixel),
         }
         return rays, batch

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import comms
@@ -28,8 +27,15 @@ from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.device import require_device
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
 from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
-from aenerf_ns.training.pose_refinement import NUM_STEPS, refine_camera
+from aenerf_ns.training.pose_refinement import NUM_STEPS, RefinedViews
 from aenerf_ns.training.training_state import TrainingState
+from aenerf_ns.training.view_metrics import (
+    OF_THE_PICTURE,
+    average_metrics,
+    describe_views,
+    measure_views,
+    picture_names,
+)
 from aenerf_ns.viewer.panel import RecordingPanel
 from aenerf_ns.viewer.recording_view import RecordingView
 
@@ -306,6 +312,26 @@ class AENeRFPipeline(VanillaPipeline):
         poses[:, :3, 3] /= outputs.dataparser_scale
         return (torch.linalg.inv(to_scene) @ poses @ OPENCV_TO_OPENGL)[:, :3]
 
+    def in_scene(self, poses: Tensor) -> Tensor:
+        """Convert poses (N, 3, 4) or (N, 4, 4) of the recording's world, OpenCV axes, to scene poses, OpenGL axes."""
+        outputs = self.datamanager.train_dataparser_outputs
+        poses = homogeneous(outputs.dataparser_transform.double()) @ homogeneous(poses[:, :3].cpu()) @ OPENCV_TO_OPENGL
+        poses[:, :3, 3] *= outputs.dataparser_scale
+        return poses[:, :3]
+
+    def camera_speeds(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how fast the corrected camera moves and turns at (N,) float64 seconds since the trajectory's start.
+
+        Returns:
+            (N,) units of the recording per second, and (N,) degrees per second.
+        """
+        with torch.no_grad():
+            pose, rate = self.model.camera_optimizer.pose_and_rate(seconds.to(self.device))
+        scale = self.datamanager.train_dataparser_outputs.dataparser_scale
+        # The derivative of a rotation R is R [ω]ₓ, whose norm is √2 |ω|.
+        turning = (pose[..., :3].mT @ rate[..., :3]).flatten(1).norm(dim=-1) / math.sqrt(2)
+        return rate[..., 3].norm(dim=-1).cpu() / scale, torch.rad2deg(turning).cpu()
+
     def pose_errors(self) -> dict[str, dict[str, float]] | None:
         """Return the errors of the ``estimated`` and of the ``corrected`` poses, in the units of the recording.
 
@@ -339,7 +365,8 @@ class AENeRFPipeline(VanillaPipeline):
         """Return mean metrics over the reference views, and the protocol that they were computed with.
 
         The views are rendered from where they are placed. Of a trained run, ``refined_test_poses`` holds the metrics of
-        the views that are rendered from photometrically refined poses. No camera stays moved.
+        the views that are rendered from photometrically refined poses, and ``views`` those of each view
+        (:func:`~aenerf_ns.training.view_metrics.describe_views`). No camera stays moved.
 
         Without reference views, but with known true poses, return the errors of the poses alone.
 
@@ -347,9 +374,12 @@ class AENeRFPipeline(VanillaPipeline):
             SystemExit: there are neither views nor true poses; or, outside training, a metric is not a number.
         """
         metrics: dict[str, Any] = {}
+        placed: list[dict[str, float]] = []
+        refined = None
         if self.datamanager.has_reference_views or not self.model.camera_optimizer.has_ground_truth:
             self._require_reference_views()
-            metrics = self._checked(super().get_average_eval_image_metrics(step, output_path, get_std))
+            placed = self._measure(self.datamanager.fixed_indices_eval_dataloader, output_path)
+            metrics = self._checked(average_metrics(placed, get_std))
         if self.test_mode == "test":
             # In the other mode, the trainer's log takes numbers only.
             metrics["color_correction"] = self.model.color_correction.description
@@ -360,20 +390,30 @@ class AENeRFPipeline(VanillaPipeline):
             metrics["pose_diagnosis"] = self._pose_diagnosis
             metrics["test_poses"] = self._test_poses
             if metrics["num_views"] and self.config.refine_test_poses:
-                metrics["refined_test_poses"] = self._metrics_of_refined_test_poses(get_std)
+                refined = self._measure(RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader))
+                metrics["refined_test_poses"] = self._metrics_of_refined_test_poses(refined, get_std)
             metrics |= self.model.supervision.learned()
             if self.model.image_metrics.lpips_absent is not None:
                 metrics["lpips"] = None
                 metrics["lpips_absent"] = self.model.image_metrics.lpips_absent
+            metrics["views"] = describe_views(self, placed, refined) if placed else []
         return metrics
 
-    def _metrics_of_refined_test_poses(self, get_std: bool) -> dict[str, Any]:
-        """Return the metrics of the reference views from refined poses, and how the poses were refined."""
-        views = _RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader)
-        metrics = self._checked(self.get_average_image_metrics(views, "refined", get_std=get_std))
+    def _measure(
+        self, views: Iterable[tuple[Cameras, dict[str, Any]]], output_path: Path | None = None
+    ) -> list[dict[str, float]]:
+        """Return the metrics of each reference view, and write its pictures as ns-eval names them."""
+        self.eval()
+        names = picture_names(self.datamanager.eval_dataset.image_filenames)
+        measured = measure_views(self.model, views, names, output_path, "eval")
+        self.train()
+        return measured
+
+    def _metrics_of_refined_test_poses(self, refined: list[dict[str, float]], get_std: bool) -> dict[str, Any]:
+        """Return the mean metrics of the reference views from refined poses, and how the poses were refined."""
+        metrics = self._checked(average_metrics(refined, get_std))
         # The time to render includes no refinement, so it says nothing new.
-        names = {"psnr", "ssim", "lpips"}
-        metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in names}
+        metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in OF_THE_PICTURE}
         if self.model.image_metrics.lpips_absent is not None:
             metrics["lpips"] = None
         how = f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {self._test_poses}"
@@ -394,23 +434,3 @@ class AENeRFPipeline(VanillaPipeline):
                 "the run renders values that are not finite; train it again"
             )
         return metrics
-
-
-class _RefinedViews:
-    """Reference views whose cameras are refined when it is their turn, as a loader of the framework's evaluation.
-
-    Args:
-        model: in evaluation mode by then.
-        views: loader of single cameras (1,) and their batches.
-    """
-
-    def __init__(self, model: AENeRFModel, views: FixedIndicesEvalDataloader) -> None:
-        self._model = model
-        self._views = views
-
-    def __len__(self) -> int:
-        return len(self._views)
-
-    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        for camera, batch in self._views:
-            yield refine_camera(self._model, camera, batch["image"][..., :3]), batch

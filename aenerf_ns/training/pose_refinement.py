@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from torch import Tensor
 
 from aenerf_ns.camera.rotation import motion_from_twist
@@ -65,6 +68,26 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
     if after < before:
         camera.camera_to_worlds = pose[None, :3].to(camera.camera_to_worlds)
     return camera
+
+
+class RefinedViews:
+    """Reference views whose cameras are refined when it is their turn, as a loader of the framework's evaluation.
+
+    Args:
+        model: in evaluation mode by then.
+        views: loader of single cameras (1,) and their batches.
+    """
+
+    def __init__(self, model: AENeRFModel, views: FixedIndicesEvalDataloader) -> None:
+        self._model = model
+        self._views = views
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+        for camera, batch in self._views:
+            yield refine_camera(self._model, camera, batch["image"][..., :3]), batch
 
 
 class _Pixels:

@@ -1,4 +1,4 @@
-"""Nerfstudio's trainer, with schedules of the run's length and checkpoints that are whole."""
+"""Nerfstudio's trainer, with schedules of the run's length, whole checkpoints, and a record of the run."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from typing import Literal
 
 import yaml
 from nerfstudio.engine.trainer import Trainer, TrainerConfig, writer
+from nerfstudio.utils import comms
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.training.checkpoints import checkpoint_to_load, move_whole, require_whole, step_of
 from aenerf_ns.training.device import require_device
+from aenerf_ns.training.run_record import RunRecord, ScalarWriter
 from aenerf_ns.training.schedules import RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig
 
 
@@ -96,6 +98,7 @@ class AENeRFTrainer(Trainer):
                 config.load_dir = config.load_step = None
             elif config.load_checkpoint is not None:
                 require_whole(config.load_checkpoint)
+        self._record: RunRecord | None = None
         super().__init__(config, local_rank, world_size)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -104,11 +107,33 @@ class AENeRFTrainer(Trainer):
             super().setup(test_mode)
         # The framework counts its percentages and its time left from step 0, also in a run that goes on.
         writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
+        if comms.is_main_process():
+            with _full_disk_as_one_line(self.base_dir):
+                writer.EVENT_WRITERS.append(ScalarWriter(self.base_dir))
+                self._record = RunRecord(
+                    self.base_dir, self.config.machine.seed, self._start_step, self.config.max_num_iterations
+                )
 
     def train(self) -> None:
-        """Train the model."""
+        """Train the model, and record how far that came."""
         with _full_disk_as_one_line(self.base_dir):
-            super().train()
+            try:
+                super().train()
+            except BaseException:
+                self._record_end("stopped", self.step - self._start_step)
+                raise
+
+    def _after_train(self) -> None:
+        num_steps = self.step + 1 - self._start_step
+        # Before the framework waits for the user to end the viewer.
+        self._record_end("finished" if num_steps == self.config.max_num_iterations else "stopped", num_steps)
+        super()._after_train()
+
+    def _record_end(self, state: str, num_steps: int) -> None:
+        # Once: the user ends the viewer of a finished training by an interrupt.
+        record, self._record = self._record, None
+        if record is not None:
+            record.write(state, num_steps)
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:

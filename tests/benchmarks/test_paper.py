@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,6 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_small import aenerf_small
-from benchmarks import environment
 from benchmarks.paper import tables
 from benchmarks.paper.figures import draw, error_map
 from benchmarks.paper.plan import (
@@ -154,33 +152,6 @@ def test_a_scene_file_goes_by_its_folder(tmp_path: Path, monkeypatch: pytest.Mon
     assert run.name.startswith("hall_easy_")
     with pytest.raises(DataError, match="two scenes have the name piano"):
         small_plan(scenes=("old/piano/scene.json", "new/piano/scene.json"))
-
-
-def test_a_command_is_recorded_as_it_is_typed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", [str(ROOT / "benchmarks" / "paper" / "__main__.py"), "--output", "bench"])
-    for name in ("benchmarks.paper.__main__", "benchmarks.paper"):
-        monkeypatch.setattr(sys.modules["__main__"], "__spec__", ModuleSpec(name, None))
-        assert environment.environment()["command"] == "python -m benchmarks.paper --output bench"
-
-
-def test_a_commit_is_that_of_this_package_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    git = ("git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b")
-    module = tmp_path / "package" / "environment.py"
-    module.parent.mkdir()
-    module.write_text("")
-    monkeypatch.setattr(environment, "__file__", str(module))
-    assert environment.environment()["commit"] is None
-    subprocess.run([*git, "init", "--quiet"], check=True)
-    subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "of something else"], check=True)
-    assert environment.environment()["commit"] is None
-    subprocess.run([*git, "add", "package"], check=True)
-    subprocess.run([*git, "commit", "--quiet", "--message", "of this"], check=True)
-    commit = environment.environment()["commit"]
-    assert len(commit) == 7
-    module.write_text("changed")
-    assert environment.environment()["commit"] == f"{commit}+changes"
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert environment.environment()["commit"] is None
 
 
 def figures_of(run: Run, psnr: float, kind: str, errors: tuple[float, float]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.main import main
 from aenerf_ns.cli.reconstruct import Reconstruct
+from aenerf_ns.cli.report import Report
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.files.layouts import LAYOUTS
@@ -26,7 +27,7 @@ from aenerf_ns.files.training_words import judge_training
 # Of which a message shows all, and no file system has a name.
 LONG = "a" * 290
 
-Command = Check | Convert | Evaluate | ExportTrajectory | Reconstruct
+Command = Check | Convert | Evaluate | ExportTrajectory | Reconstruct | Report
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +46,7 @@ def what_commands_work_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def parsed(line: str, monkeypatch: pytest.MonkeyPatch) -> Command:
     """Return the command made of the words after ``aenerf``, without running it."""
     made: list[Command] = []
-    for kind in (Check, Convert, Evaluate, ExportTrajectory, Reconstruct):
+    for kind in (Check, Convert, Evaluate, ExportTrajectory, Reconstruct, Report):
         monkeypatch.setattr(kind, "main", lambda command: made.append(command))
     monkeypatch.setattr(sys, "argv", ["aenerf", *line.split()])
     main()
@@ -154,6 +155,13 @@ def test_a_run_is_given(name: str, run: str, monkeypatch: pytest.MonkeyPatch) ->
         assert (command.load_config, command.output) == (Path("C"), Path("O"))
 
 
+def test_runs_to_report_on_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    for line in ("report C F/../C --output O", "report --output O C F/../C"):
+        command = parsed(line, monkeypatch)
+        assert isinstance(command, Report)
+        assert (command.runs, command.output) == ((Path("C"), Path("F/../C")), Path("O"))
+
+
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
@@ -197,8 +205,9 @@ def test_other_words_are_refused(
         ("check", "DATA", "--data DATA"),
         ("convert", "DATA", "--data DATA"),
         ("reconstruct", "DATA", "--data DATA"),
-        ("evaluate", "CONFIG", "--load-config CONFIG"),
-        ("export-trajectory", "CONFIG", "--load-config CONFIG"),
+        ("evaluate", "RUN", "--load-config RUN"),
+        ("export-trajectory", "RUN", "--load-config RUN"),
+        ("export-cameras", "RUN", "--load-config RUN"),
     ],
 )
 def test_the_help_names_both_ways(
@@ -230,6 +239,9 @@ def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
         ("simulate --scene room --output G", 1, "G: the folder exists already"),
         ("evaluate nothing.yml --output O", 1, "nothing.yml: there is no such file"),
         ("export-trajectory --load_config nothing.yml --output O", 1, "nothing.yml: there is no such file"),
+        ("export-cameras nothing --output O", 1, "nothing: there is no such file"),
+        ("export-frames F --output G", 1, "G: the folder exists already"),
+        ("report C nothing --output O", 1, "nothing: there is no such file"),
         (f"simulate --output {LONG}", 1, f"{LONG}: it cannot be created (File name too long); choose another --output"),
         (f"evaluate {LONG} --output O", 1, f"{LONG}: it cannot be read (File name too long); check its name"),
         ("check empty", 2, "empty: no known format of recordings; looked for aenerf-data: transforms.json"),

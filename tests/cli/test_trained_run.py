@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,12 @@ import pytest
 import yaml
 
 from aenerf_ns.cli.evaluate import Evaluate
+from aenerf_ns.cli.export_cameras import ExportCameras
+from aenerf_ns.cli.export_frames import ExportFrames
+from aenerf_ns.cli.export_mesh import ExportMesh
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
+from aenerf_ns.cli.export_video import ExportVideo
+from aenerf_ns.cli.report import Report
 from aenerf_ns.cli.run_file import require_known_tags
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.errors import DataError
@@ -25,6 +31,11 @@ from aenerf_ns.method_configs.robust_enerf import robust_enerf
 METHODS = (aenerf, aenerf_mlp, aenerf_small, e2vid_nerf, eventnerf, evnerf, paev3d, robust_enerf)
 
 
+def report_of_one(run: Path, output: Path) -> Report:
+    """The report of one run, with the arguments of the other commands."""
+    return Report((run,), output)
+
+
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.config.method_name)
 def test_the_configurations_of_the_methods_are_known(method: object, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(yaml.dump(replace(method.config, data=tmp_path)))
@@ -37,6 +48,7 @@ def test_the_configurations_of_the_formats_are_known(name: str, tmp_path: Path) 
     require_known_tags(tmp_path / "config.yml")
 
 
+COMMANDS = (Evaluate, ExportTrajectory, ExportCameras, ExportFrames, ExportMesh, ExportVideo, report_of_one)
 TOUCH = "!!python/object/apply:os.system ['touch executed']"
 HOSTILE = {
     "a call": TOUCH,
@@ -62,14 +74,14 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
-@pytest.mark.parametrize("command", [Evaluate, ExportTrajectory])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_what_could_run_is_refused_before_the_file_is_opened(
-    command: type[Evaluate | ExportTrajectory], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: Callable[..., Evaluate], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("config.yml").write_text(text)
     with pytest.raises(DataError, match=r"^config.yml: line \d names .*; give the config.yml of a trained run"):
-        command(load_config=Path("config.yml"), output=Path("out")).main()
+        command(Path("config.yml"), output=Path("out.ply")).main()
     assert not Path("executed").exists()
 
 

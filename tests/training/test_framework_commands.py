@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import itertools
 import json
 import os
 import re
@@ -10,16 +12,29 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
+import pycolmap
 import pytest
 import torch
+import trimesh
 import websockets.sync.client
+from browser import chromium
 from commands import CPU, newest_config, run, simulate
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
 
+from aenerf_ns.cli.export_cameras import ExportCameras
+from aenerf_ns.cli.export_frames import ExportFrames
+from aenerf_ns.cli.export_mesh import ExportMesh
+from aenerf_ns.cli.export_video import ExportVideo
+from aenerf_ns.cli.report import Report
+from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.training.pipeline import AENeRFPipeline
 
 # Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.
 STEPS = 300
@@ -48,8 +63,31 @@ def evaluate(config: Path, workspace: Path, name: str) -> dict:
     output = workspace / f"{name}.json"
     pictures = workspace / f"{name}_pictures"
     run("ns-eval", "--load-config", config, "--output-path", output, "--render-output-path", pictures, cwd=workspace)
-    assert len(list(pictures.glob("eval_img_*.png"))) == 3
+    assert {path.name for path in pictures.glob("eval_img_*.png")} == {f"eval_img_{view:05d}.png" for view in range(3)}
     return json.loads(output.read_text())
+
+
+@pytest.fixture(scope="module")
+def untrained(trained: Path, workspace: Path) -> Path:
+    """config.yml of a run of one step on the same data."""
+    data = workspace / "room"
+    (data / "events.gone").rename(data / "events.h5")
+    run(
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "1", "--data", data,
+        "--experiment-name", "untrained", cwd=workspace,
+    )  # fmt: skip
+    (data / "events.h5").rename(data / "events.gone")
+    return newest_config(workspace / "outputs" / "untrained")
+
+
+@pytest.fixture
+def with_events(trained: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The run, while its events are there again, in the folder that it was trained from."""
+    monkeypatch.chdir(workspace)
+    data = workspace / "room"
+    (data / "events.gone").rename(data / "events.h5")
+    yield trained
+    (data / "events.h5").rename(data / "events.gone")
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +96,7 @@ def evaluated(trained: Path, workspace: Path) -> dict:
     return evaluate(trained, workspace, "trained")
 
 
-def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, workspace: Path) -> None:
+def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, untrained: Path, workspace: Path) -> None:
     results = evaluated["results"]
     assert results["color_correction"] == "affine, fitted on 4 validation views"
     assert results["num_views"] == 3
@@ -73,16 +111,15 @@ def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, wo
     assert refined["test_poses"].startswith("photometric refinement, 10 Levenberg-Marquardt steps, from: Sim(3)")
     assert -0.1 < refined["psnr"] - results["psnr"] < 3
     assert refined["psnr"] != results["psnr"]
-    data = workspace / "room"
-    (data / "events.gone").rename(data / "events.h5")
-    run(
-        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "1", "--data", data,
-        "--experiment-name", "untrained", cwd=workspace,
-    )  # fmt: skip
-    (data / "events.h5").rename(data / "events.gone")
-    untrained = evaluate(newest_config(workspace / "outputs" / "untrained"), workspace, "untrained")["results"]
-    assert results["psnr"] > untrained["psnr"] + PSNR_MARGIN
-    assert results["ssim"] > untrained["ssim"]
+    views = results["views"]
+    assert [view["file"] for view in views] == [f"images/test/{view:05d}.png" for view in range(3)]
+    for figures, name in ((results, "placed"), (refined, "refined")):
+        for metric in ("psnr", "ssim"):
+            mean = np.mean([view[name][metric] for view in views])
+            assert figures[metric] == pytest.approx(mean, rel=1e-5)
+    worse = evaluate(untrained, workspace, "untrained")["results"]
+    assert results["psnr"] > worse["psnr"] + PSNR_MARGIN
+    assert results["ssim"] > worse["ssim"]
 
 
 def test_a_run_is_evaluated_under_other_protocols(trained: Path, evaluated: dict, workspace: Path) -> None:
@@ -149,6 +186,127 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
             assert difference < 1e-6
     missing = ("aenerf", "export-trajectory", "--load-config", "nothing.yml", "--output", output)
     assert "nothing.yml: there is no such file" in run(*missing, cwd=workspace, fails=True)
+
+
+def test_cameras_frames_and_a_mesh_go_on_to_other_tools(
+    trained: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(workspace)
+    ExportCameras(trained.parent, workspace / "cameras", num_points=500).main()
+    model = pycolmap.Reconstruction(str(workspace / "cameras" / "sparse" / "0"))
+    # All images but those outside the events, at the corrected poses, where the given ones are the true ones.
+    names = {image.name: image for image in model.images.values()}
+    assert {name.split("/")[0] for name in names} == {"train", "val", "test"}
+    assert model.num_points3D() > 400
+    meta = json.loads((workspace / "room" / "transforms.json").read_text())
+    given = {
+        frame["file_path"].removeprefix("images/"): np.array(frame["transform_matrix"]) for frame in meta["frames"]
+    }
+    for name, image in names.items():
+        assert (workspace / "cameras" / "images" / name).is_symlink()
+        center = image.cam_from_world().inverse().matrix()[:, 3]
+        assert np.linalg.norm(center - given[f"images/{name}"][:3, 3]) < 0.3, name
+    outputs = NerfstudioDataParserConfig(data=workspace / "cameras").setup().get_dataparser_outputs("test")
+    assert len(outputs.image_filenames) == 3
+    with pytest.raises(DataError, match="cameras: the folder exists already"):
+        ExportCameras(trained, workspace / "cameras").main()
+
+    ExportFrames(trained, workspace / "frames", times=(1.0, 2.5), num_points=100).main()
+    lines = (workspace / "frames" / "images.txt").read_text().splitlines()
+    assert lines == ["1.000000000 images/000000.png", "2.500000000 images/000001.png"]
+    for index in range(2):
+        frame = np.array(Image.open(workspace / "frames" / "images" / f"{index:06d}.png"))
+        assert frame.shape == (36, 48, 3)
+        assert frame.std() > 5
+        # The room is some metres large, and depth is in millimetres.
+        depth = np.array(Image.open(workspace / "frames" / "depth" / f"{index:06d}.png"))
+        assert 500 < np.median(depth) < 8000
+    outputs = NerfstudioDataParserConfig(data=workspace / "frames").setup().get_dataparser_outputs("train")
+    assert outputs.metadata["depth_filenames"]
+
+    ExportMesh(trained, workspace / "mesh.ply", resolution=48, num_views=8).main()
+    mesh = trimesh.load(workspace / "mesh.ply")
+    assert len(mesh.faces) > 300
+    # The room has 4.5 x 4.5 x 2.8 metres.
+    assert 2 < mesh.extents.max() < 12
+
+
+def test_a_video_shows_events_rendering_and_images(with_events: Path, workspace: Path) -> None:
+    video = workspace / "along.mp4"
+    ExportVideo(with_events, video, rate=2).main()
+    frames = imageio.imread(video, plugin="pyav")
+    # Five panels of 48 x 36 pixels, seven times as large, under a line of text.
+    assert frames.shape[1:] == (16 + 7 * 36, 5 * (7 * 48 + 4), 3)
+    assert len(frames) == 7
+    panels = [frames[:, 16:, left : left + 7 * 48] for left in range(0, frames.shape[2], 7 * 48 + 4)]
+    assert all(panel.std() > 5 for panel in panels)
+    # The field has learned the events that it shows: both pictures are of the same events.
+    recorded, rendered = (panel.astype(int)[..., 0] - panel.astype(int)[..., 2] for panel in panels[:2])
+    assert np.corrcoef(recorded.ravel(), rendered.ravel())[0, 1] > 0.2
+
+
+def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
+    Report((with_events.parent,), workspace / "report").main()
+    page = (workspace / "report" / "report.html").read_text()
+    assert len(page.encode()) < 10e6
+    (figures,) = json.loads((workspace / "report" / "report.json").read_text())["runs"]
+    assert figures["record"]["state"] == "finished"
+    assert figures["record"]["steps"] == STEPS
+    assert figures["pairs"]["correlation"] > 0.3
+    assert figures["poses"]["evo"]["estimated"]["ate"]["rmse"] < 1e-5
+    with (workspace / "report" / "views.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["file"] for row in rows] == [f"images/test/{view:05d}.png" for view in range(3)]
+    for row, view in zip(rows, figures["evaluation"]["views"], strict=True):
+        assert float(row["psnr_placed"]) == view["placed"]["psnr"]
+        assert f">{view['placed']['psnr']:.2f}<" in page
+        assert row["lpips_placed"] == ""
+    assert "LPIPS: not asked for" in page
+    with chromium(workspace) as browser:
+        browser.open(workspace / "report" / "report.html")
+        browser.wait_for("[...document.querySelectorAll('.plotly-graph-div')].every((plot) => plot._fullLayout)")
+        assert browser.evaluate("document.querySelectorAll('.plotly-graph-div').length") >= 8
+        assert browser.evaluate("[...document.images].every((image) => image.naturalWidth > 0)")
+        # Truth, rendering, error and depth of three views, and the check's picture.
+        assert browser.evaluate("document.images.length") == 13
+        order = (
+            "[...document.querySelectorAll('table.sortable tbody tr')]"
+            ".map((row) => parseFloat(row.cells[1].dataset.value))"
+        )
+        head = "document.querySelectorAll('table.sortable th')[1]"
+        psnr = [float(row["psnr_placed"]) for row in rows]
+        assert browser.evaluate(order) == psnr
+        for expected, said in ((sorted(psnr), "ascending"), (sorted(psnr, reverse=True), "descending")):
+            browser.evaluate(f"{head}.click()")
+            assert browser.evaluate(order) == expected
+            assert browser.evaluate(f"{head}.getAttribute('aria-sort')") == said
+        assert browser.complaints == []
+
+
+def test_runs_are_compared_if_they_were_measured_alike(
+    trained: Path, untrained: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(workspace)
+    Report((untrained, trained), workspace / "compared").main()
+    figures = json.loads((workspace / "compared" / "report.json").read_text())
+    psnr = {(row["test_poses"], row["metric"]): row for row in figures["paired_differences"]}["placed", "psnr"]
+    assert (psnr["run"], psnr["minus"], psnr["num_views"]) == ("room", "untrained", 3)
+    one, two = (report["evaluation"]["psnr"] for report in figures["runs"])
+    assert psnr["mean"] == pytest.approx(two - one, rel=1e-4)
+    assert psnr["interval"][0] < psnr["mean"] < psnr["interval"][1]
+    # Their events are gone, which the page says.
+    page = (workspace / "compared" / "report.html").read_text()
+    assert "the events are no longer at" in page
+    assert page.count("<figcaption>truth</figcaption>") == 6
+
+    ways = itertools.count()
+    monkeypatch.setattr(AENeRFPipeline, "_test_poses", property(lambda _: f"placed in way {next(ways)}"))
+    with pytest.raises(
+        DataError, match=r"measured differently from .*: test poses: placed in way .* --allow-different"
+    ):
+        Report((untrained, trained), workspace / "mixed").main()
+    Report((untrained, trained), workspace / "mixed", allow_different_protocols=True).main()
+    assert "These runs were measured differently" in (workspace / "mixed" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -285,6 +285,12 @@ def test_metrics_are_of_placed_and_of_refined_test_poses(tmp_path: Path, monkeyp
     metrics = json.loads(json.dumps(pipeline.get_average_eval_image_metrics(get_std=True)))
     refined = metrics["refined_test_poses"]
     assert refined.keys() == {"psnr", "psnr_std", "lpips", "test_poses"}
+    for view, file in zip(metrics["views"], pipeline.datamanager.eval_dataset.image_filenames, strict=True):
+        assert file == tmp_path / "made" / view["file"]
+        assert view["placed"].keys() == view["refined"].keys() == {"psnr"}
+        # Not taken on the trajectory.
+        assert view["time_ns"] is view["camera_speed"] is view["camera_turn_rate_degrees"] is None
+    assert np.mean([view["refined"]["psnr"] for view in metrics["views"]]) == pytest.approx(refined["psnr"])
     assert refined["test_poses"].endswith(f"from: {metrics['test_poses']}")
     # The pose correction of this pipeline is off.
     assert metrics["test_poses"].startswith("as the dataset gives them")
@@ -297,6 +303,31 @@ def test_metrics_are_of_placed_and_of_refined_test_poses(tmp_path: Path, monkeyp
     # While training, never.
     training = make_pipeline(tmp_path / "made", "val").get_average_eval_image_metrics()
     assert all(isinstance(value, float) for value in training.values())
+
+
+def test_views_on_the_trajectory_have_their_times_and_the_camera_s_speed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ImageMetrics, "__call__", lambda *_: {"psnr": 20.0})
+    make_pipeline_config(tmp_path / "made", num_views=0)
+    # The camera moves along x, by 0.1 units in half a second.
+    file = tmp_path / "made" / "transforms.json"
+    meta = json.loads(file.read_text())
+    (frame,) = meta["frames"]
+    frame["timestamp"] = 0.25
+    file.write_text(json.dumps(meta))
+    pipeline = make_pipeline(tmp_path / "made", "test")
+    (view,) = pipeline.get_average_eval_image_metrics()["views"]
+    assert view["time_ns"] == 250_000_000
+    assert view["camera_speed"] == pytest.approx(0.2, rel=1e-5)
+    assert view["camera_turn_rate_degrees"] == pytest.approx(0, abs=1e-6)
+    # A radian a second about an axis, in steps that the spline follows closely.
+    turning = torch.linspace(0, 1, 21, dtype=torch.float64)
+    rotations = rotation_from_vector(turning[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64))
+    poses = torch.cat([rotations, torch.zeros(21, 3, 1)], -1)
+    pipeline.model.camera_optimizer.trajectory = Trajectory(SECOND // 20 * np.arange(21), poses)
+    _, turn_rates = pipeline.camera_speeds(torch.tensor([0.5], dtype=torch.float64))
+    assert float(turn_rates) == pytest.approx(math.degrees(1), rel=1e-4)
 
 
 def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor) -> None:

@@ -1,0 +1,98 @@
+"""``aenerf report``: a page that explains one run, or compares several."""
+
+from __future__ import annotations
+
+import csv
+import gc
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.cli.export_arguments import ReportArguments
+from aenerf_ns.cli.trained_run import open_run
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.given_paths import cannot_be_created
+
+if TYPE_CHECKING:
+    from aenerf_ns.report.measuring import RunReport
+
+
+@dataclass
+class Report(ReportArguments):
+    __doc__ = ReportArguments.__doc__
+
+    def main(self) -> None:
+        """Measure the runs and write the page."""
+        self.judge()
+        # Imported lazily, because these imports take seconds.
+        from aenerf_ns.report.comparison import paired_differences, protocol_differences
+        from aenerf_ns.report.measuring import measure_run
+        from aenerf_ns.report.page import make_page
+
+        reports: list[RunReport] = []
+        configs: list[TrainerConfig] = []
+        for run in self.runs:
+            config, pipeline, _ = open_run(run)
+            configs.append(config)
+            # The views of the first run, so that the same ones are beside each other.
+            shown = reports[0].chosen if reports else None
+            reports.append(measure_run(str(run), config, pipeline, shown or None))
+            del pipeline
+            gc.collect()
+        for report, name in zip(reports, _names(configs), strict=True):
+            report.name = name
+        mixed = protocol_differences(reports)
+        if mixed and not self.allow_different_protocols:
+            raise DataError(
+                str(self.runs[1]),
+                f"it was measured differently from {self.runs[0]}: {'; '.join(mixed)}",
+                "evaluate both alike, or give --allow-different-protocols",
+            )
+        paired = paired_differences(reports)
+        page = make_page(reports, paired, mixed)
+        try:
+            self.output.mkdir(parents=True, exist_ok=True)
+            (self.output / "report.html").write_text(page, "utf8")
+            _write_views(self.output / "views.csv", reports)
+            figures = {
+                "runs": [report.as_json() for report in reports],
+                "paired_differences": paired,
+                "protocol_differences": mixed,
+            }
+            (self.output / "report.json").write_text(json.dumps(figures, indent=1) + "\n", "utf8")
+        except OSError as error:
+            raise cannot_be_created(self.output, error) from None
+        size = len(page.encode()) / 1e6
+        CONSOLE.print(f"{self.output / 'report.html'}: {size:.1f} MB, with views.csv and report.json.", soft_wrap=True)
+
+
+def _names(configs: Sequence[TrainerConfig]) -> list[str]:
+    """Return names that tell the runs apart, as short as that allows."""
+    parts = [(config.experiment_name, config.method_name, config.timestamp) for config in configs]
+    for chosen in ((0,), (1,), (0, 1), (2,), (0, 1, 2)):
+        names = ["/".join(str(part[index]) for index in chosen) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{number}: {'/'.join(map(str, part))}" for number, part in enumerate(parts, start=1)]
+
+
+def _write_views(path: Path, reports: Sequence[RunReport]) -> None:
+    """Write a line for each view of each run."""
+    metrics = ("psnr", "ssim", "lpips")
+    protocols = ("placed", "refined")
+    with path.open("w", encoding="utf8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(
+            ["run", "file", "time_ns", "camera_speed", "camera_turn_rate_degrees"]
+            + [f"{metric}_{protocol}" for protocol in protocols for metric in metrics]
+        )
+        for report in reports:
+            for view in report.views:
+                figures: list[Any] = [view.get(protocol, {}).get(name) for protocol in protocols for name in metrics]
+                known = [view[name] for name in ("file", "time_ns", "camera_speed", "camera_turn_rate_degrees")]
+                rows.writerow([report.name, *known, *figures])

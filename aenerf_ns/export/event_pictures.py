@@ -1,0 +1,72 @@
+"""Events between the frames of a video: as they were recorded, and as a rendering triggers them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventFile
+from aenerf_ns.progress import tracked
+
+
+def recorded_between(events: EventFile, times: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Yield the (height, width) sums of polarities between each two times, of the events from the first time on.
+
+    Args:
+        events: read once, in pieces.
+        times: (N,) in nanoseconds, increasing. There are N - 1 sums.
+    """
+    shape = (events.height, events.width)
+    net = np.zeros(shape, np.int64)
+    index = 1
+    for chunk in tracked(events.chunks(), f"Reading {events.path.name}", events.count()):
+        begin = int(np.searchsorted(chunk.t, times[0]))
+        while index < len(times):
+            end = int(np.searchsorted(chunk.t, times[index]))
+            np.add.at(net, (chunk.y[begin:end], chunk.x[begin:end]), chunk.p[begin:end])
+            if end == len(chunk):
+                # Later pieces may go on with this interval.
+                break
+            yield net
+            net = np.zeros(shape, np.int64)
+            begin, index = end, index + 1
+        if index == len(times):
+            return
+    for _ in range(index, len(times)):
+        yield net
+        net = np.zeros(shape, np.int64)
+
+
+class RenderedEvents:
+    """Triggers events as the sensor's model does (paper, eq. 5), from renderings one after another.
+
+    Args:
+        sensor: its thresholds and its filters. Its refractory period plays no part.
+        width: pixel columns.
+        height: pixel rows.
+    """
+
+    def __init__(self, sensor: SensorModel, width: int, height: int) -> None:
+        self._sensor = sensor
+        rows, columns = np.divmod(np.arange(width * height), width)
+        self._channel = sensor.channel(columns, rows).reshape(height, width, 1)
+        self._reference: NDArray[np.float64] | None = None
+
+    def __call__(self, log_radiance: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Return the (height, width) sums of polarities since the call before; none at the first call.
+
+        Args:
+            log_radiance: (height, width, channels).
+        """
+        seen = np.take_along_axis(log_radiance.astype(np.float64), self._channel, -1)[..., 0]
+        if self._reference is None:
+            self._reference = seen
+        change = seen - self._reference
+        sensor = self._sensor
+        threshold = np.where(change > 0, sensor.positive_contrast_threshold, sensor.negative_contrast_threshold)
+        count = np.trunc(change / threshold)
+        self._reference = self._reference + count * threshold
+        return count.astype(np.int64)

@@ -1,0 +1,69 @@
+"""Frames and depths that a trained run renders along the trajectory, with their cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from aenerf_ns.camera.trajectory import homogeneous
+from aenerf_ns.export.placing import corrected_poses
+from aenerf_ns.export.rendering import points_seen, render
+from aenerf_ns.files.placed_images import IMAGE_FOLDER, PlacedImage, SeenPoints, write_colmap_model, write_transforms
+from aenerf_ns.files.text import format_seconds
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.recording.views import IMAGE_LIST
+from aenerf_ns.training.pipeline import AENeRFPipeline
+from aenerf_ns.training.view_metrics import to_image
+
+DEPTH_FOLDER = "depth"
+DEPTH_UNIT = 1e-3
+"""Units of the recording that one step of a depth picture stands for: the framework's own default."""
+_DEEPEST = 2**16 - 1
+
+
+@torch.no_grad()
+def export_frames(pipeline: AENeRFPipeline, folder: Path, times: Tensor, num_points: int) -> None:
+    """Render frames and depths at times along the trajectory, and write them with their cameras.
+
+    Depth pictures have 16 bits and hold the distance along the optical axis, in thousandths of the recording's unit,
+    0 where no surface is seen or where it is too far.
+
+    Args:
+        pipeline: of the run, in evaluation mode.
+        folder: to create.
+        times: (N,) in nanoseconds.
+        num_points: points of the scene at most.
+    """
+    lens = pipeline.datamanager.dataparser.recording.event_camera
+    directions, _ = lens.pixel_directions()
+    # What a distance along the ray counts along the optical axis, which looks along -z.
+    along_axis = torch.from_numpy(-directions[..., 2:])
+    poses = homogeneous(corrected_poses(pipeline, times))
+    for name in (IMAGE_FOLDER, DEPTH_FOLDER):
+        (folder / name).mkdir(parents=True)
+    images, lines = [], []
+    with progress_bar() as progress:
+        task = progress.add_task("Rendering frames", total=len(times))
+        for index, (time, pose) in enumerate(zip(times.tolist(), poses, strict=True)):
+            outputs = render(pipeline, lens, pose)
+            name = f"{index:06d}.png"
+            to_image(outputs["rgb"]).save(folder / IMAGE_FOLDER / name)
+            depth = (outputs["depth"].cpu() * along_axis / DEPTH_UNIT).round()[..., 0].numpy()
+            depth[depth > _DEEPEST] = 0
+            Image.fromarray(depth.astype(np.uint16)).save(folder / DEPTH_FOLDER / name)
+            images.append(PlacedImage(name, lens, pose.numpy(), depth=f"{DEPTH_FOLDER}/{name}"))
+            lines.append(f"{format_seconds(time)} {IMAGE_FOLDER}/{name}\n")
+            progress.advance(task)
+    (folder / IMAGE_LIST).write_text("".join(lines), "utf8")
+    write_cameras(folder, images, points_seen(pipeline, images, num_points))
+
+
+def write_cameras(folder: Path, images: Sequence[PlacedImage], points: SeenPoints) -> None:
+    """Write images' cameras as a COLMAP model and as a transforms.json, with points of the scene."""
+    write_colmap_model(folder, images, points)
+    write_transforms(folder, images, points)

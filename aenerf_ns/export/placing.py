@@ -1,0 +1,73 @@
+"""Where the images of a recording were taken, in the frame of the corrected poses and the units of the recording."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from aenerf_ns.camera.alignment import align
+from aenerf_ns.camera.trajectory import homogeneous
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.placed_images import PlacedImage
+from aenerf_ns.recording.recording import SPLITS, ReferenceView, Split
+from aenerf_ns.recording.views import thinned, views_within
+from aenerf_ns.training.pipeline import AENeRFPipeline
+
+
+def placed_views(pipeline: AENeRFPipeline) -> list[tuple[PlacedImage, Path]]:
+    """Return the images of a run's recording where the corrected poses put them, and their files.
+
+    An image with a time is at the corrected pose of that time, with the place on the rig that it has beside the
+    dataset's own poses. Other images are carried over by the Sim(3) that best maps the dataset's trajectory, the true
+    one where it is known, to the corrected one. An image that is in several splits is a test or validation image.
+
+    Raises:
+        DataError: the recording has no images, or their files are missing.
+    """
+    recording = pipeline.datamanager.dataparser.recording
+    window = pipeline.datamanager.train_dataset.scene.window
+    split_of: dict[Path, tuple[Split, ReferenceView]] = {}
+    for split in SPLITS:
+        views = views_within(recording.reference_views[split], window)
+        for view in views if split == "train" else thinned(views, recording.max_views):
+            split_of[view.file] = (split, view)
+    found = {file: entry for file, entry in split_of.items() if file.is_file()}
+    if not found:
+        problem = "its images are missing" if split_of else "it has no images"
+        raise DataError(
+            pipeline.datamanager.get_datapath(), problem, "aenerf export-frames renders images along the trajectory"
+        )
+    poses = _carried_over(pipeline, [view for _, view in found.values()])
+    common = Path(os.path.commonpath([file.parent for file in found]))
+    return [
+        (PlacedImage(file.relative_to(common).as_posix(), recording.frame_camera, pose.numpy(), split), file)
+        for (file, (split, _)), pose in zip(found.items(), poses, strict=True)
+    ]
+
+
+def _carried_over(pipeline: AENeRFPipeline, views: list[ReferenceView]) -> Tensor:
+    """Return the poses (N, 4, 4), OpenCV axes, of views in the frame of the corrected poses."""
+    correction = pipeline.model.camera_optimizer
+    recording = pipeline.datamanager.dataparser.recording
+    _, corrected, reference = (pipeline.in_recording(poses) for poses in correction.compared_poses())
+    alignment = align(corrected, reference).inverse()
+    given = recording.reference_trajectory
+    poses = []
+    for view in views:
+        if view.time is not None and given.start <= view.time <= given.end:
+            on_rig = torch.linalg.inv(homogeneous(given.interpolate(view.time))) @ view.camera_to_world
+            poses.append(homogeneous(corrected_poses(pipeline, torch.tensor([view.time])))[0] @ on_rig)
+        else:
+            poses.append(homogeneous(alignment(view.camera_to_world[:3])))
+    return torch.stack(poses)
+
+
+@torch.no_grad()
+def corrected_poses(pipeline: AENeRFPipeline, times: Tensor) -> Tensor:
+    """Return the corrected poses (N, 3, 4) at (N,) times in nanoseconds: OpenCV axes, in the recording's world."""
+    correction = pipeline.model.camera_optimizer
+    seconds = correction.trajectory.seconds(times.to(pipeline.device))
+    return pipeline.in_recording(correction.pose(seconds))

@@ -1,0 +1,56 @@
+"""Times along the trajectory of a run at which frames are rendered."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.training.pipeline import AENeRFPipeline
+
+
+def spread_times(pipeline: AENeRFPipeline, count: int) -> Tensor:
+    """Return (count,) times in nanoseconds, evenly spread over the time window of a run, its gaps left out."""
+    window = pipeline.datamanager.train_dataset.scene.window
+    if count < 1:
+        raise DataError("aenerf", f"{count} views", "give one or more")
+    starts, ends = torch.tensor(window.pieces()).T
+    passed = (ends - starts).cumsum(0)
+    # In the middles of equal parts.
+    places = ((torch.arange(count) + 0.5) * (int(passed[-1]) / count)).long()
+    piece = torch.searchsorted(passed, places, right=True)
+    return ends[piece] - (passed[piece] - places)
+
+
+def times_at_rate(pipeline: AENeRFPipeline, rate: float) -> Tensor:
+    """Return times in nanoseconds, so many a second, in the time window of a run but not in its gaps.
+
+    Raises:
+        DataError: the rate is not positive, or too high for the run.
+    """
+    window = pipeline.datamanager.train_dataset.scene.window
+    if not 0 < rate <= 1e6:
+        raise DataError("aenerf", f"a rate of {rate}", "give one above 0 and up to 1e6 a second")
+    times = torch.arange(window.start, window.end + 1, max(round(1e9 / rate), 1))
+    return times[torch.from_numpy(window.contains(times))]
+
+
+def times_of_seconds(pipeline: AENeRFPipeline, seconds: Sequence[float]) -> Tensor:
+    """Return times in nanoseconds for times in seconds on the clock of the events.
+
+    Raises:
+        DataError: a time is not in the time window of the run.
+    """
+    window = pipeline.datamanager.train_dataset.scene.window
+    times = [round(one * 1e9) if math.isfinite(one) else -1 for one in seconds]
+    for one, time in zip(seconds, times, strict=True):
+        if not window.contains(time):
+            raise DataError(
+                "--times",
+                f"{one:g} s is not in the run's time, {window.start * 1e-9:g} to {window.end * 1e-9:g} s",
+                "give times on the clock of the events, in which poses are known",
+            )
+    return torch.tensor(times)

@@ -1,0 +1,229 @@
+"""What a report says of a run: everything is measured or read here, and shown elsewhere."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
+from PIL import Image
+
+from aenerf_ns.camera.alignment import align
+from aenerf_ns.report.pair_residuals import pair_residuals
+from aenerf_ns.report.run_files import read_record, read_scalars
+from aenerf_ns.report.trajectory_errors import as_evo_prints, correction_components, errors_over_time
+from aenerf_ns.report.view_pictures import ViewPictures, chosen_views, picture_views
+from aenerf_ns.training.pipeline import AENeRFPipeline
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_MOST_POSES = 600
+
+
+@dataclass
+class RunReport:
+    """What is known of a run.
+
+    Attributes:
+        name: of the run, by which the page tells runs apart.
+        folder: of the run.
+        config: the settings that tell runs apart: method, data, steps, pose correction, seed.
+        record: see :func:`~aenerf_ns.report.run_files.read_record`.
+        scalars: see :func:`~aenerf_ns.report.run_files.read_scalars`.
+        evaluation: what ``ns-eval`` writes as results.
+        truths: a checksum of each reference view's image, by the view's file.
+        contrast: of each channel; see :func:`~aenerf_ns.report.view_pictures.picture_views`.
+        chosen: why a view is shown, by its index.
+        pictures: by the index of the view.
+        data: the check's lines and problems, the rate of the events and the account of the pairs.
+        check_picture: of the check, or None.
+        poses: positions and errors along the trajectory; see :func:`_poses`.
+        pairs: see :func:`~aenerf_ns.report.pair_residuals.pair_residuals`.
+        missing: what was not measured, and why.
+    """
+
+    name: str
+    folder: Path
+    config: dict[str, Any]
+    record: dict[str, Any] | None = None
+    scalars: dict[str, tuple[list[int], list[float]]] | None = None
+    evaluation: dict[str, Any] = field(default_factory=dict)
+    truths: dict[str, int] = field(default_factory=dict)
+    contrast: list[float] = field(default_factory=list)
+    chosen: dict[int, str] = field(default_factory=dict)
+    pictures: dict[int, ViewPictures] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+    check_picture: Image.Image | None = None
+    poses: dict[str, Any] = field(default_factory=dict)
+    pairs: dict[str, Any] | None = None
+    missing: list[str] = field(default_factory=list)
+
+    @property
+    def views(self) -> list[dict[str, Any]]:
+        """What is known of each reference view; see :func:`~aenerf_ns.training.view_metrics.describe_views`."""
+        return self.evaluation.get("views", [])
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all figures in plain values."""
+        return {
+            "name": self.name,
+            "folder": str(self.folder),
+            "config": self.config,
+            "record": self.record,
+            "evaluation": self.evaluation,
+            "contrast_per_channel": self.contrast,
+            "data": self.data,
+            "poses": self.poses,
+            "pairs": self.pairs,
+            "scalars": self.scalars,
+            "not_measured": self.missing,
+        }
+
+
+def measure_run(
+    name: str, config: TrainerConfig, pipeline: AENeRFPipeline, shown: dict[int, str] | None = None
+) -> RunReport:
+    """Measure a trained run.
+
+    Args:
+        name: of the run.
+        config: of the run.
+        pipeline: of the run, as it is opened to be tested.
+        shown: the views to show, and why; None chooses them by this run's metrics.
+    """
+    pipeline.eval()
+    folder = config.get_base_dir()
+    report = RunReport(name, folder, _settings(config, pipeline), read_record(folder), read_scalars(folder))
+    missing = report.missing
+    if report.record is None:
+        missing.append("Commit, command, machine, seconds and peak memory: the run was made by an earlier version.")
+    if report.scalars is None:
+        missing.append("Curves: the run was made by an earlier version, which kept no scalars.")
+    _views(report, pipeline, shown)
+    _data(report, pipeline)
+    pipeline.eval()
+    report.poses = _poses(pipeline)
+    if report.poses["errors"] is None:
+        missing.append("Pose errors: the recording has no true poses.")
+    return report
+
+
+def _settings(config: TrainerConfig, pipeline: AENeRFPipeline) -> dict[str, Any]:
+    scene = pipeline.datamanager.train_dataset.scene
+    camera = scene.event_camera
+    return {
+        "data": str(pipeline.datamanager.get_datapath()),
+        "method": config.method_name,
+        "supervision": type(pipeline.model.supervision).__name__,
+        "pose_correction": pipeline.model.config.camera_optimizer.mode,
+        "color_correction": pipeline.model.color_correction.protocol,
+        "steps": config.max_num_iterations,
+        "seed": config.machine.seed,
+        "sensor": f"{camera.width} x {camera.height} pixels",
+        "window_ns": [scene.window.start, scene.window.end],
+        "thresholds": [scene.sensor.positive_contrast_threshold, scene.sensor.negative_contrast_threshold],
+    }
+
+
+def _views(report: RunReport, pipeline: AENeRFPipeline, shown: dict[int, str] | None) -> None:
+    data = pipeline.datamanager
+    if not data.has_reference_views and not pipeline.model.camera_optimizer.has_ground_truth:
+        report.missing.append("PSNR, SSIM and LPIPS: the recording has no test views.")
+        return
+    report.evaluation = pipeline.get_average_eval_image_metrics(get_std=True)
+    pipeline.eval()
+    if not report.views:
+        report.missing.append("PSNR, SSIM and LPIPS: the recording has no test views.")
+        return
+    if report.evaluation.get("lpips") is None:
+        report.missing.append(f"LPIPS: {report.evaluation['lpips_absent']}.")
+    if "refined_test_poses" not in report.evaluation:
+        report.missing.append("Metrics from refined test poses: --pipeline.refine-test-poses False.")
+    if all(view["time_ns"] is None for view in report.views):
+        report.missing.append("Camera speed at the test views: they were not taken on the trajectory.")
+    for index, view in enumerate(report.views):
+        report.truths[view["file"]] = zlib.crc32(np.ascontiguousarray(data.eval_dataset.get_numpy_image(index)))
+    report.chosen = shown or chosen_views([view["placed"]["psnr"] for view in report.views])
+    known = [index for index in report.chosen if index < len(report.views)]
+    report.pictures, report.contrast = picture_views(pipeline, known)
+
+
+def _data(report: RunReport, pipeline: AENeRFPipeline) -> None:
+    """Measure what needs the events, where they still are."""
+    # Imported lazily, because numba is slow to import.
+    from aenerf_ns.checking.picture import warped_picture
+    from aenerf_ns.checking.report import Report
+
+    dataset = pipeline.datamanager.train_dataset
+    scene = dataset.scene
+    report.data = {"pose_gaps_ns": [list(gap) for gap in scene.window.gaps], "check": [], "problems": []}
+    if not scene.event_file.path.is_file():
+        report.missing.append(
+            f"Rate, polarity, pairs and the check: the events are no longer at {scene.event_file.path}."
+        )
+        return
+    recording = pipeline.datamanager.dataparser.recording
+    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    check = Report(recording, scene.window, scale, report.data["check"].append)
+    statistics = check.statistics
+    report.data |= {
+        "problems": check.problems,
+        "num_events": int(statistics.counts.sum()),
+        "num_positive": statistics.num_positive,
+        "start_ns": statistics.start,
+        "end_ns": statistics.end,
+        "rate": _per_second(statistics.rate, statistics.start, statistics.end),
+    }
+    if check.warped is None:
+        report.missing.append("The check's picture: too few events have a pose.")
+    else:
+        report.check_picture = Image.fromarray(warped_picture(check.warped))
+    report.pairs = pair_residuals(pipeline)
+    if report.pairs is None:
+        report.missing.append("Rendered against measured changes: the batches of this method are no pairs of events.")
+    else:
+        report.data["pairs"] = dataset.pairs.summary()
+
+
+def _per_second(counts: NDArray[np.int64], start: int, end: int) -> list[float]:
+    return (counts * (len(counts) / max(end - start, 1) * 1e9)).tolist()
+
+
+def _poses(pipeline: AENeRFPipeline) -> dict[str, Any]:
+    """Return positions, errors and corrections along the trajectory, thinned.
+
+    Positions are (N, 3) in units of the recording, with z up as far as the cameras tell, and aligned to the true
+    trajectory where it is known. Errors are None where it is not.
+    """
+    correction = pipeline.model.camera_optimizer
+    scene_poses = correction.compared_poses()
+    estimated, corrected, reference = (pipeline.in_recording(poses) for poses in scene_poses)
+    every = -(-len(estimated) // _MOST_POSES)
+    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    to_true = correction.alignment()
+    positions = {"estimated": scene_poses[0], "corrected": to_true(scene_poses[1].double())}
+    found: dict[str, Any] = {"seconds": correction.compared_seconds[::every].tolist(), "errors": None, "evo": None}
+    if correction.has_ground_truth:
+        positions["true"] = scene_poses[2]
+        both = {"estimated": estimated, "corrected": corrected}
+        found["evo"] = {name: as_evo_prints(poses, reference) for name, poses in both.items()}
+        found["errors"] = {
+            name: {kind: values[::every] for kind, values in errors_over_time(poses, reference).items()}
+            for name, poses in both.items()
+        }
+        positions["estimated"] = align(scene_poses[0], scene_poses[2])(scene_poses[0].double())
+    found["positions"] = {name: (poses[::every, :, 3].cpu() / scale).tolist() for name, poses in positions.items()}
+    found["correction"] = None
+    if correction.is_learned:
+        found["correction"] = {
+            name: values[::every] for name, values in correction_components(estimated, corrected).items()
+        }
+    with torch.no_grad():
+        speeds, turn_rates = pipeline.camera_speeds(correction.compared_seconds[::every])
+    found["speed"], found["turn_rate_degrees"] = speeds.tolist(), turn_rates.tolist()
+    return found

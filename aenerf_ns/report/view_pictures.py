@@ -1,0 +1,108 @@
+"""Pictures of reference views: truth, rendering, error and depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.utils import colormaps
+from PIL import Image
+
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.training.pipeline import AENeRFPipeline
+from aenerf_ns.training.view_metrics import to_image
+
+ERROR_RANGE = 0.25
+"""The mean absolute difference of display values in [0, 1] that an error picture shows brightest."""
+# Of a depth picture's range: the share of the pixels that may lie beyond either end.
+_BEYOND = 0.02
+_MOST_CHOSEN = 9
+
+
+@dataclass(frozen=True)
+class ViewPictures:
+    """Pictures of a view.
+
+    Attributes:
+        truth, rendering, error, depth: of one size. The error is black at 0 and brightest at :data:`ERROR_RANGE`.
+        depth_range: the nearest and the farthest distance that the colours of the depth tell apart, in units of the
+            recording.
+    """
+
+    truth: Image.Image
+    rendering: Image.Image
+    error: Image.Image
+    depth: Image.Image
+    depth_range: tuple[float, float]
+
+
+def chosen_views(psnr: Sequence[float]) -> dict[int, str]:
+    """Return the views to show and why, by index: the worst, the median and the best one, and every n-th.
+
+    Args:
+        psnr: of each view.
+
+    Example:
+        >>> chosen_views([20.0, 22.0, 21.0])
+        {0: 'worst', 2: 'median', 1: 'best'}
+    """
+    order = np.argsort(psnr, kind="stable")
+    chosen = {int(order[0]): "worst"}
+    chosen.setdefault(int(order[len(order) // 2]), "median")
+    chosen.setdefault(int(order[-1]), "best")
+    every = -(-len(order) // (_MOST_CHOSEN - len(chosen)))
+    ordinal = f"every {every}th" if every > 3 else {1: "all", 2: "every second", 3: "every third"}[every]
+    for index in range(0, len(order), every):
+        chosen.setdefault(index, ordinal)
+    return chosen
+
+
+@torch.no_grad()
+def picture_views(pipeline: AENeRFPipeline, indices: Sequence[int]) -> tuple[dict[int, ViewPictures], list[float]]:
+    """Render reference views from where they are placed.
+
+    Args:
+        pipeline: of the run, in evaluation mode.
+        indices: of the views.
+
+    Returns:
+        The pictures by index; and the contrast of each channel over all pixels of these views: the standard deviation
+        of the rendered log-radiance, before colour correction, as a share of that of the images.
+    """
+    model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
+    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    pictures: dict[int, ViewPictures] = {}
+    rendered, true = [], []
+    with progress_bar() as progress:
+        task = progress.add_task("Rendering views", total=len(indices))
+        for index in indices:
+            outputs = model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(pipeline.device))
+            image = dataset.get_image_float32(index).to(pipeline.device)
+            pictures[index] = _pictures(outputs, model.reference_display(image), scale)
+            rendered.append(outputs["log_radiance"].flatten(0, 1).double())
+            # As the colour correction is fitted.
+            true.append(torch.log(model.reference_radiance(image).flatten(0, 1).double() + 1e-3))
+            progress.advance(task)
+    contrast = torch.cat(rendered).std(0) / torch.cat(true).std(0).clamp_min(1e-9)
+    return pictures, contrast.tolist()
+
+
+def _pictures(outputs: dict[str, Any], truth: torch.Tensor, scale: float) -> ViewPictures:
+    rendering, depth = outputs["rgb"], outputs["depth"] / scale
+    error = (rendering - truth).abs().mean(-1, keepdim=True)
+    seen = depth[outputs["accumulation"] > 0.5]
+    near, far = torch.quantile(seen, seen.new_tensor([_BEYOND, 1 - _BEYOND])).tolist() if len(seen) else (0.0, 1.0)
+    return ViewPictures(
+        to_image(truth),
+        to_image(rendering),
+        to_image(colormaps.apply_colormap((error / ERROR_RANGE).clamp(0, 1), colormaps.ColormapOptions("inferno"))),
+        to_image(
+            colormaps.apply_depth_colormap(
+                depth, accumulation=outputs["accumulation"], near_plane=near, far_plane=max(far, near + 1e-9)
+            )
+        ),
+        (near, far),
+    )

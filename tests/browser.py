@@ -1,0 +1,119 @@
+"""A headless Chromium without a network, for the tests that look at pages."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import websockets.sync.client
+
+_OPTIONS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--remote-debugging-port=0",
+)  # fmt: skip
+
+
+class Page:
+    """A page of the browser, driven by the DevTools protocol.
+
+    Attributes:
+        complaints: errors of the console and of scripts, and requests that failed or went to the network.
+    """
+
+    def __init__(self, socket: websockets.sync.client.ClientConnection) -> None:
+        self._socket, self._number = socket, 0
+        self.complaints: list[str] = []
+
+    def send(self, method: str, **parameters: Any) -> dict[str, Any]:
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=60))
+            if answer.get("id") == self._number:
+                assert "error" not in answer, answer
+                return answer["result"]
+            self._note(answer)
+
+    def _note(self, event: dict[str, Any]) -> None:
+        parameters = event.get("params", {})
+        if event["method"] == "Runtime.exceptionThrown":
+            self.complaints.append(str(parameters["exceptionDetails"]))
+        elif event["method"] == "Log.entryAdded" and parameters["entry"]["level"] in ("error", "warning"):
+            self.complaints.append(str(parameters["entry"]))
+        elif event["method"] == "Runtime.consoleAPICalled" and parameters["type"] in ("error", "warning"):
+            self.complaints.append(str(parameters["args"]))
+        elif event["method"] == "Network.requestWillBeSent":
+            url = parameters["request"]["url"]
+            if not url.startswith(("file:", "data:", "blob:")):
+                self.complaints.append(url)
+
+    def evaluate(self, script: str) -> Any:
+        """Returns the value of a JavaScript expression."""
+        result = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def open(self, path: Path, width: int = 1280, height: int = 900) -> None:
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.send(f"{domain}.enable")
+        self.send("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0)
+        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.send("Page.navigate", url=path.resolve().as_uri())
+        self.wait_for("document.readyState === 'complete'")
+
+    def wait_for(self, condition: str) -> None:
+        deadline = time.monotonic() + 60
+        while not self.evaluate(condition):
+            assert time.monotonic() < deadline, condition
+            time.sleep(0.1)
+
+    def screenshot(self, path: Path, selector: str | None = None) -> None:
+        """Saves a picture of the whole page, or of the first element that a selector names."""
+        box = (
+            f"document.querySelector({selector!r}).getBoundingClientRect()"
+            if selector
+            else ("document.documentElement.getBoundingClientRect()")
+        )
+        x, y, width, height = self.evaluate(
+            f"(() => {{ const b = {box}; return [b.x + scrollX, b.y + scrollY, b.width, b.height]; }})()"
+        )
+        clip = {"x": x, "y": y, "width": width, "height": height, "scale": 1}
+        taken = self.send("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
+        path.write_bytes(base64.b64decode(taken["data"]))
+
+
+@contextmanager
+def chromium(folder: Path) -> Iterator[Page]:
+    """A page of a new browser that keeps its files in a folder. Skips the test where there is no Chromium."""
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("there is no Chromium to open the page with")
+    profile = folder / "chromium"
+    with (folder / "chromium.log").open("w") as log:
+        browser = subprocess.Popen(
+            [program, *_OPTIONS, f"--user-data-dir={profile}", "about:blank"], stdout=log, stderr=log
+        )
+        try:
+            port_file = profile / "DevToolsActivePort"
+            deadline = time.monotonic() + 60
+            while not (port_file.exists() and port_file.read_text().count("\n")):
+                assert browser.poll() is None, (folder / "chromium.log").read_text()[-2000:]
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            port = port_file.read_text().split()[0]
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=30) as answer:
+                address = next(one for one in json.load(answer) if one["type"] == "page")["webSocketDebuggerUrl"]
+            with websockets.sync.client.connect(address, max_size=None) as socket:
+                yield Page(socket)
+        finally:
+            browser.terminate()
+            browser.wait(timeout=30)

@@ -1,0 +1,66 @@
+"""Events between the frames of a video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.export.event_pictures import RenderedEvents, recorded_between
+
+
+class Pieces(EventFile):
+    """Events that come in pieces of a given size."""
+
+    def __init__(self, events: EventStream, size: int) -> None:
+        super().__init__(Path("made"), events.width, events.height)
+        self._events, self._size = events, size
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        for begin in range(0, len(self._events), self._size):
+            yield self._events[begin : begin + self._size]
+
+    def require(self) -> None:
+        pass
+
+    def time_span(self) -> tuple[int, int]:
+        return int(self._events.t[0]), int(self._events.t[-1])
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+def test_recorded_events_are_those_between_two_times(size: int) -> None:
+    generator = np.random.default_rng(0)
+    events = EventStream(
+        generator.integers(0, 5, 200).astype(np.uint16),
+        generator.integers(0, 4, 200).astype(np.uint16),
+        np.sort(generator.integers(0, 1000, 200)),
+        generator.choice([-1, 1], 200).astype(np.int8),
+        5,
+        4,
+    )
+    # Before the first event, between events, at an event, and beyond the last.
+    times = np.array([-50, 100, 101, int(events.t[120]), 900, 2000, 3000])
+    pictures = list(recorded_between(Pieces(events, size), times))
+    assert len(pictures) == len(times) - 1
+    for picture, first, last in zip(pictures, times[:-1], times[1:], strict=True):
+        expected = np.zeros((4, 5), np.int64)
+        chosen = (events.t >= first) & (events.t < last)
+        np.add.at(expected, (events.y[chosen], events.x[chosen]), events.p[chosen])
+        np.testing.assert_array_equal(picture, expected)
+
+
+def test_renderings_trigger_events_as_the_sensor_does() -> None:
+    sensor = SensorModel(positive_contrast_threshold=0.5, negative_contrast_threshold=0.25, bayer_pattern="RGGB")
+    rendered = RenderedEvents(sensor, 2, 2)
+    log_radiance = np.zeros((2, 2, 3))
+    assert not rendered(log_radiance).any()
+    # Red rises, green falls, blue stays. A pixel sees its own filter alone.
+    log_radiance[..., 0], log_radiance[..., 1] = 1.2, -0.6
+    np.testing.assert_array_equal(rendered(log_radiance), [[2, -2], [-2, 0]])
+    # What is left of the change counts on: 0.2 and 0.3 more are one threshold.
+    log_radiance[..., 0] = 1.5
+    np.testing.assert_array_equal(rendered(log_radiance), [[1, 0], [0, 0]])

@@ -1,0 +1,130 @@
+"""Where exported cameras are, when they are, and what mesh the depths make."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_pipelines import make_pipeline, make_pipeline_config
+
+from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import homogeneous
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.export import mesh
+from aenerf_ns.export.placing import corrected_poses, placed_views
+from aenerf_ns.export.rendering import points_seen
+from aenerf_ns.export.times import spread_times, times_at_rate, times_of_seconds
+from aenerf_ns.files.placed_images import PlacedImage
+from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.training.pipeline import AENeRFPipeline
+
+SECOND = 10**9
+
+
+@pytest.fixture
+def pipeline(tmp_path: Path) -> AENeRFPipeline:
+    """A run whose correction is far from none. Its first test view was taken on the trajectory."""
+    make_pipeline_config(tmp_path / "made")
+    file = tmp_path / "made" / "transforms.json"
+    meta = json.loads(file.read_text())
+    next(frame for frame in meta["frames"] if "test" in frame["file_path"])["timestamp"] = 0.25
+    file.write_text(json.dumps(meta))
+    made = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
+    torch.nn.init.normal_(made.model.camera_optimizer.twists.control_twists, std=0.05)
+    return made.eval()
+
+
+def test_images_are_at_the_corrected_poses(pipeline: AENeRFPipeline) -> None:
+    placed = placed_views(pipeline)
+    assert [(image.name, image.split) for image, _ in placed] == [
+        ("val/00000.png", "val"), ("val/00001.png", "val"),
+        ("test/00000.png", "test"), ("test/00001.png", "test"), ("test/00002.png", "test"),
+    ]  # fmt: skip
+    assert all(file.is_file() for _, file in placed)
+    recording = pipeline.datamanager.dataparser.recording
+    timed, untimed = placed[2][0].camera_to_world, placed[3][0].camera_to_world
+    given = recording.reference_views["test"]
+    corrected = corrected_poses(pipeline, torch.tensor([SECOND // 4]))[0]
+    on_rig = (
+        np.linalg.inv(homogeneous(recording.trajectory.interpolate(SECOND // 4))) @ given[0].camera_to_world.numpy()
+    )
+    np.testing.assert_allclose(timed, homogeneous(corrected).numpy() @ on_rig, atol=1e-9)
+    # As the evaluation places it: renderings from there are compared with the image.
+    cameras = pipeline.datamanager.reference_views("test").cameras
+    expected = pipeline.in_recording(pipeline.model.camera_optimizer.apply_to_camera(cameras).double())
+    np.testing.assert_allclose(untimed[:3], expected[1], atol=1e-5)
+    np.testing.assert_allclose(timed[:3], expected[0], atol=1e-5)
+    # And back.
+    np.testing.assert_allclose(
+        pipeline.in_scene(torch.from_numpy(timed)[None])[0],
+        pipeline.model.camera_optimizer.apply_to_camera(cameras)[0],
+        atol=1e-5,
+    )
+
+
+def test_points_lie_on_the_rays_of_their_pixels(pipeline: AENeRFPipeline) -> None:
+    pipeline.model.field.average_init_density = 1e3
+    images = [image for image, _ in placed_views(pipeline)]
+    points = points_seen(pipeline, images, 40)
+    assert 20 < len(points.positions) <= 40
+    for position, index, (column, row) in zip(points.positions, points.images, points.pixels, strict=True):
+        image: PlacedImage = images[index]
+        x, y, z = (np.linalg.inv(image.camera_to_world) @ [*position, 1.0])[:3]
+        lens = image.camera
+        assert z > 0
+        assert (lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy) == pytest.approx((column, row), abs=1e-3)
+
+
+def test_a_recording_without_images_has_no_cameras_to_export(tmp_path: Path) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "test", num_views=-1, true_world=lambda poses: poses)
+    with pytest.raises(DataError, match="it has no images; aenerf export-frames renders"):
+        placed_views(pipeline)
+
+
+def test_times_leave_gaps_out(pipeline: AENeRFPipeline) -> None:
+    dataset = pipeline.datamanager.train_dataset
+    window = TimeWindow(0, SECOND, ((SECOND // 10, SECOND // 2),))
+    dataset.metadata[SCENE] = replace(dataset.scene, window=window)
+    times = spread_times(pipeline, 60)
+    assert window.contains(times).all()
+    # In equal steps, but for the gap: a sixth of the time is before it.
+    assert int((times <= SECOND // 10).sum()) == 10
+    assert (np.diff(times)[np.diff(times) < SECOND // 10] - SECOND // 100 <= 1).all()
+    assert times_at_rate(pipeline, 20).tolist() == [0, 5 * 10**7, 10**8, *range(SECOND // 2, SECOND + 1, 5 * 10**7)]
+    assert times_of_seconds(pipeline, [0.05, 0.75]).tolist() == [5 * 10**7, 75 * 10**7]
+    for seconds in (0.2, 1.5, float("nan"), float("inf")):
+        with pytest.raises(DataError, match="is not in the run's time, 0 to 1 s"):
+            times_of_seconds(pipeline, [seconds])
+    with pytest.raises(DataError, match="a rate of 0"):
+        times_at_rate(pipeline, 0)
+
+
+def test_a_mesh_is_in_the_units_of_the_recording(pipeline: AENeRFPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What a camera sees of a ball before it: the distance along the ray to its near side.
+    center, radius = np.array([0.0, 0.1, 1.5]), 0.4
+
+    def render(_: object, lens: EventCamera, pose: torch.Tensor) -> dict[str, torch.Tensor]:
+        directions = lens.pixel_directions()[0] * [1, -1, -1] @ pose[:3, :3].numpy().T
+        to_center = center - pose[:3, 3].numpy()
+        along = directions @ to_center
+        half_chord = radius**2 - (to_center @ to_center - along**2)
+        depth = np.where(half_chord > 0, along - np.sqrt(half_chord.clip(0)), 0.0)
+        color = np.broadcast_to([1.0, 0.5, 0.0], directions.shape)
+        return {"rgb": torch.from_numpy(color.copy()).float(), "depth": torch.from_numpy(depth[..., None])}
+
+    monkeypatch.setattr(mesh, "render", render)
+    lens = EventCamera(96, 72, 80.0, 80.0, 48.0, 36.0)
+    parser = pipeline.datamanager.dataparser
+    monkeypatch.setitem(vars(parser), "recording", replace(parser.recording, event_camera=lens))
+    made = mesh.extract_mesh(pipeline, num_views=5, resolution=48)
+    distance = np.linalg.norm(made.vertices - center, axis=1)
+    assert len(made.faces) > 500
+    # To a voxel and a pixel: the visible cap is less than a metre wide.
+    assert np.abs(distance - radius).mean() < 0.01
+    assert np.quantile(np.abs(distance - radius), 0.95) < 0.03
+    assert (made.colors[distance < radius + 0.01] == [255, 128, 0]).mean() > 0.9

@@ -1,0 +1,151 @@
+"""The figures of a report, before they are shown."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_trainings import train_small_model
+
+from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotation
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
+from aenerf_ns.errors import DataError
+from aenerf_ns.report.comparison import confidence_interval, paired_differences, protocol_differences
+from aenerf_ns.report.measuring import RunReport
+from aenerf_ns.report.pair_residuals import _by_length, _by_tile
+from aenerf_ns.report.run_files import describe_state, read_record, read_scalars
+from aenerf_ns.report.trajectory_errors import as_evo_prints, correction_components
+from aenerf_ns.report.view_pictures import chosen_views
+
+SECOND = 10**9
+
+
+def test_errors_are_those_that_evo_prints(random_poses: torch.Tensor) -> None:
+    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed")
+    from evo.core.trajectory import PosePath3D
+
+    times = np.linspace(0, 7 * SECOND, 101).astype(np.int64)
+    reference = Trajectory(times, Trajectory(SECOND * np.arange(8), random_poses).interpolate(times))
+    poses = perturb(reference, rotation_degrees=3.0, translation=0.2, correlation_time=0.3, seed=1).camera_to_worlds
+    poses[..., 3] *= 1.7
+    found = as_evo_prints(poses, reference.camera_to_worlds)
+    paths = [
+        PosePath3D(
+            positions_xyz=p[..., 3].numpy(),
+            orientations_quat_wxyz=quaternion_from_rotation(p[..., :3])[:, [3, 0, 1, 2]].numpy(),
+        )
+        for p in (reference.camera_to_worlds, poses)
+    ]
+    paths[1].align(paths[0], correct_scale=True)
+    relation = metrics.PoseRelation
+    for name, metric in (
+        ("ate", metrics.APE(relation.translation_part)),
+        ("rpe_translation", metrics.RPE(relation.translation_part)),
+        ("rpe_rotation_degrees", metrics.RPE(relation.rotation_angle_deg)),
+    ):
+        metric.process_data(tuple(paths))
+        assert found[name] == pytest.approx(metric.get_all_statistics(), rel=1e-6), name
+
+
+def test_a_correction_is_told_by_its_components(random_poses: torch.Tensor) -> None:
+    twist = torch.tensor([0.01, -0.02, 0.03, 0.02, 0.0, -0.01], dtype=torch.float64)
+    found = correction_components(random_poses, (homogeneous(random_poses) @ motion_from_twist(twist))[:, :3])
+    assert list(found) == [f"{kind} {axis}" for kind in ("translation", "rotation") for axis in "xyz"]
+    for name, expected in zip(found, [*twist[:3], *torch.rad2deg(twist[3:])], strict=True):
+        # The twist's translation turns with it: a difference of second order.
+        assert found[name] == pytest.approx([float(expected)] * 8, abs=6e-4), name
+
+
+def test_residuals_are_grouped_by_length_and_tile() -> None:
+    length = np.array([1] * 20 + [3] * 20 + [100] * 5)
+    residual = np.arange(45.0)
+    rows = _by_length(length, residual)
+    # Five pairs say too little.
+    assert rows == [
+        {"events": "1", "num_pairs": 20, "mean_residual": 9.5},
+        {"events": "3 to 4", "num_pairs": 20, "mean_residual": 29.5},
+    ]
+
+    class Sensor:
+        width, height = 24, 12
+
+    # Tiles of two pixels: the last one on the sensor, and one beside the first.
+    pixel = np.array([24 * 12 - 1] * 10 + [2] * 10)
+    tiles = _by_tile(pixel, np.array([1.0] * 10 + [3.0] * 10), Sensor)
+    assert (len(tiles), len(tiles[0])) == (6, 12)
+    assert tiles[5][11] == 1.0
+    assert tiles[0][1] == 3.0
+    assert sum(value is not None for row in tiles for value in row) == 2
+
+
+def test_the_worst_the_median_and_the_best_view_are_shown() -> None:
+    chosen = chosen_views([20.0 + index % 7 for index in range(30)])
+    assert [chosen[index] for index in (0, 27)] == ["worst", "best"]
+    assert list(chosen.values()).count("median") == 1
+    assert len(chosen) <= 9
+    assert set(chosen.values()) == {"worst", "median", "best", "every 5th"}
+    assert chosen_views([20.0]) == {0: "worst"}
+
+
+def report_of(name: str, psnr: list[float], **changes: object) -> RunReport:
+    views = [{"file": f"{index}.png", "placed": {"psnr": value}} for index, value in enumerate(psnr)]
+    evaluation = {"color_correction": "affine", "test_poses": "as given", "views": views, **changes}
+    truths = {view["file"]: index for index, view in enumerate(views)}
+    return RunReport(name, Path(name), {}, evaluation=evaluation, truths=truths)
+
+
+def test_differences_are_paired_by_view() -> None:
+    first, second = report_of("a", [20, 21, 25]), report_of("b", [21, 23, 26])
+    (row,) = paired_differences([first, second])
+    assert (row["run"], row["minus"], row["num_views"]) == ("b", "a", 3)
+    assert row["mean"] == pytest.approx(4 / 3)
+    # Student's t with two degrees of freedom: 4.303 standard errors.
+    half = 4.302653 * np.std([1, 2, 1], ddof=1) / 3**0.5
+    assert row["interval"] == pytest.approx((4 / 3 - half, 4 / 3 + half), rel=1e-6)
+    assert confidence_interval(np.array([1.0])) is None
+    # Another image under the same name is another view.
+    second.truths["2.png"] = 99
+    assert paired_differences([first, second])[0]["num_views"] == 2
+
+
+def test_protocols_that_differ_are_named() -> None:
+    same = [report_of("a", [20, 21]), report_of("b", [22, 23])]
+    assert protocol_differences(same) == []
+    other = report_of("c", [20, 21, 22], color_correction="network")
+    colors, views = protocol_differences([same[0], other])
+    assert colors == "color correction: affine (a), network (c)"
+    assert views == "test views: 2 (a) and 3 (c), of which 2 are the same image"
+
+
+def test_what_a_run_wrote_is_read_back(tmp_path: Path) -> None:
+    folder = train_small_model(tmp_path, "run", 3).base_dir
+    record, scalars = read_record(folder), read_scalars(folder)
+    assert describe_state(record) == "finished: all 3 steps"
+    assert scalars is not None
+    steps, values = scalars["Train Loss Dict/reconstruction_loss"]
+    assert steps == [0]
+    assert values[0] > 0
+    # A run of an earlier version has neither.
+    assert read_record(tmp_path) is read_scalars(tmp_path) is None
+    assert "earlier version" in describe_state(None)
+    for name, content in (("run.json", "[]"), ("run.json", "{"), ("scalars.csv", "step,name,value\n1,loss\n")):
+        broken = tmp_path / f"broken_{len(content)}"
+        broken.mkdir()
+        (broken / name).write_text(content)
+        with pytest.raises(DataError, match=name):
+            (read_record if name == "run.json" else read_scalars)(broken)
+    long = tmp_path / "scalars.csv"
+    with long.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(("step", "name", "value"))
+        rows.writerows((step, "loss", step) for step in range(4001))
+    thinned = read_scalars(tmp_path)
+    assert thinned is not None
+    assert thinned["loss"][0][:2] == [0, 5]
+    killed = json.dumps({"state": "training", "steps": 0, "planned_steps": 2000, "first_step": 0})
+    assert "killed" in describe_state(json.loads(killed))

@@ -1,0 +1,76 @@
+"""What a run keeps of its own training, beside its checkpoints."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+
+import pytest
+from small_trainings import train_small_model
+
+from aenerf_ns.training import environment
+from aenerf_ns.training.trainer import AENeRFTrainer
+
+
+def test_a_command_is_recorded_as_it_is_typed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["benchmarks/paper/__main__.py", "--output", "bench"])
+    for name in ("benchmarks.paper.__main__", "benchmarks.paper"):
+        monkeypatch.setattr(sys.modules["__main__"], "__spec__", ModuleSpec(name, None))
+        assert environment.environment()["command"] == "python -m benchmarks.paper --output bench"
+
+
+def test_a_commit_is_that_of_this_package_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    git = ("git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b")
+    module = tmp_path / "package" / "environment.py"
+    module.parent.mkdir()
+    module.write_text("")
+    monkeypatch.setattr(environment, "__file__", str(module))
+    assert environment.environment()["commit"] is None
+    subprocess.run([*git, "init", "--quiet"], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "of something else"], check=True)
+    assert environment.environment()["commit"] is None
+    subprocess.run([*git, "add", "package"], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--message", "of this"], check=True)
+    commit = environment.environment()["commit"]
+    assert len(commit) == 7
+    module.write_text("changed")
+    assert environment.environment()["commit"] == f"{commit}+changes"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert environment.environment()["commit"] is None
+
+
+def test_a_training_records_its_end_and_its_scalars(tmp_path: Path) -> None:
+    trainer = train_small_model(tmp_path, "whole", 12)
+    record = json.loads((trainer.base_dir / "run.json").read_text())
+    assert record["state"] == "finished"
+    assert (record["first_step"], record["steps"], record["planned_steps"], record["seed"]) == (0, 12, 12, 42)
+    assert record["seconds"] > 0
+    assert record["peak_memory_bytes"]["host"] > 1e7
+    with (trainer.base_dir / "scalars.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    losses = {int(row["step"]): float(row["value"]) for row in rows if row["name"] == "Train Loss"}
+    assert list(losses) == [0, 10]
+    assert all(value > 0 for value in losses.values())
+    names = {row["name"] for row in rows}
+    assert "Train Loss Dict/reconstruction_loss" in names
+    assert not any("time" in name for name in names)
+
+
+def test_a_training_that_breaks_off_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = AENeRFTrainer.train_iteration
+
+    def interrupted(self: AENeRFTrainer, number: int) -> object:
+        if number == 5:
+            raise KeyboardInterrupt
+        return step(self, number)
+
+    monkeypatch.setattr(AENeRFTrainer, "train_iteration", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train_small_model(tmp_path, "broken", 12)
+    (file,) = tmp_path.rglob("run.json")
+    record = json.loads(file.read_text())
+    assert (record["state"], record["steps"]) == ("stopped", 5)
