@@ -153,7 +153,9 @@ class RecordingPanel(nn.Module):
                 self._place(client, pose)
                 client.camera.fov = self._view.vertical_field_of_view
         events = self._view.events(seconds, count)
-        self.events_picture.content = self._view.described_picture(events, seconds)
+        if is_new:
+            # Training changes no events.
+            self.events_picture.content = self._view.described_picture(events, seconds)
         scene = self._viewer.viser_server.scene
         camera = self._view.camera
         wxyz, position = self._in_viewer(pose)

@@ -112,7 +112,8 @@ class RecordingView:
         picture = polarity_picture(columns, rows, events.polarities, width, height)
         scale = _PICTURE_WIDTH / width
         interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
-        return cv2.resize(picture, (_PICTURE_WIDTH, max(round(scale * height), 1)), interpolation=interpolation)
+        size = (_PICTURE_WIDTH, max(round(scale * height), 1))
+        return cv2.resize(picture, size, interpolation=interpolation).astype(np.uint8, copy=False)
 
     def described_picture(self, events: EventTimeline, seconds: float) -> str:
         """Return the picture of events around a time with their span, in Markdown."""
