@@ -65,6 +65,7 @@ class Mesh:
             seconds = run_script(Path(), "aenerf", "export-mesh", str(self.run), "--output", str(mesh_file), *options)
             run_script(Path(), "aenerf", "export-trajectory", str(self.run), "--output", str(poses_file))
             mesh = trimesh.load(mesh_file)
+            assert isinstance(mesh, trimesh.Trimesh)
             corrected = read_tum_trajectory(poses_file)
         truth = read_tum_trajectory(self.data / "trajectory_ground_truth.txt")
         times = corrected.knots_covered_by(truth)

@@ -147,7 +147,7 @@ def _views(report: RunReport, pipeline: AENeRFPipeline, shown: dict[int, str] | 
     if all(view["time_ns"] is None for view in report.views):
         report.missing.append("Camera speed at the test views: they were not taken on the trajectory.")
     for index, view in enumerate(report.views):
-        report.truths[view["file"]] = zlib.crc32(np.ascontiguousarray(data.eval_dataset.get_numpy_image(index)))
+        report.truths[view["file"]] = zlib.crc32(data.eval_dataset.get_numpy_image(index).tobytes())
     report.chosen = shown or chosen_views([view["placed"]["psnr"] for view in report.views])
     known = [index for index in report.chosen if index < len(report.views)]
     report.pictures, report.contrast = picture_views(pipeline, known)
