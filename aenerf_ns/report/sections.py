@@ -54,10 +54,11 @@ def _header(report: RunReport) -> dict[str, str]:
 def verdict(reports: Sequence[RunReport]) -> str:
     """Return what each run came to, in sentences."""
     return "".join(
-        f'<div class="verdict">{f"<b>{escape(report.name)}</b>" if len(reports) > 1 else ""}'
+        f'<div class="verdict" style="border-color:{color(index)}">'
+        + (f"<b>{escape(report.name)}</b>" if len(reports) > 1 else "")
         + "".join(f"<p>{escape(line)}</p>" for line in _verdict(report))
         + "</div>"
-        for report in reports
+        for index, report in enumerate(reports)
     )
 
 
