@@ -16,6 +16,7 @@ from aenerf_ns.cli.arguments import Automatic, CheckArguments
 from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.picture import polarity_picture
+from aenerf_ns.files.given_paths import created
 from aenerf_ns.recording.scene import SCENE
 
 _PICTURE_HEIGHT = 480
@@ -68,8 +69,6 @@ def _write_picture(path: Path, warped: WarpedEvents) -> None:
     rows, columns = np.nonzero(net)
     picture = polarity_picture(columns, rows, net[rows, columns], net.shape[1], net.shape[0])
     enlarged = max(_PICTURE_HEIGHT // net.shape[0], 1)
-    try:
+    with created(path, "--picture"):
         Image.fromarray(picture.repeat(enlarged, 0).repeat(enlarged, 1)).save(path)
-    except (OSError, ValueError) as error:
-        raise DataError(path, f"it cannot be written ({error})", "choose another --picture, ending with .png") from None
     _print(f"{path}: events as they came, and warped")
