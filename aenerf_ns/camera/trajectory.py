@@ -270,11 +270,13 @@ def require_rigid(poses: Tensor, source: str | Path) -> None:
     rotations = poses[:, :3, :3]
     error = (rotations @ rotations.mT - torch.eye(3, dtype=poses.dtype, device=poses.device)).abs().amax((1, 2))
     error = torch.maximum(error, (torch.linalg.det(rotations) - 1).abs())
+    if poses.shape[1] == 4:
+        error = torch.maximum(error, (poses[:, 3] - poses.new_tensor([0, 0, 0, 1])).abs().amax(1))
     if error.max() > _MAX_RIGIDITY_ERROR:
         raise DataError(
             source,
             f"pose {int(error.argmax())} is not a rigid motion (it is off by {float(error.max()):.2g})",
-            "give rotations without scale or reflection",
+            "give rotations without scale or reflection, and a last row of 0 0 0 1",
         )
 
 

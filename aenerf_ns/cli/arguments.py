@@ -14,7 +14,7 @@ import tyro
 
 from aenerf_ns.cli.operands import Dataset, RunConfig
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.events.sensor import BayerPattern, SensorModel, require_event_sensor_size
 from aenerf_ns.files.boundary import require_file
 from aenerf_ns.files.given_paths import require_new, require_writable
 from aenerf_ns.files.layouts import LAYOUTS
@@ -26,6 +26,27 @@ if TYPE_CHECKING:
     from aenerf_ns.events.filters import EventFilters
 
 _SIMULATE = "aenerf simulate"
+# Wider than anybody needs. Beyond them a simulation would run for days, or fill the memory.
+_RANGES = {
+    "width": (1, 1 << 14),
+    "height": (1, 1 << 14),
+    "duration": (1e-3, 1e5),
+    "pose_rate": (1e-3, 1e6),
+    "frame_rate": (1e-3, 1e6),
+    "exposure": (1e-9, 1e3),
+    "max_displacement": (1e-2, 1e2),
+    "pose_noise_degrees": (0, 180),
+    "pose_noise_translation": (0, 1e6),
+    "pose_noise_correlation_time": (1e-6, 1e6),
+    "train_images": (0, 100_000),
+    "validation_views": (0, 100_000),
+    "test_views": (0, 100_000),
+    "contrast_threshold_spread": (0, 10),
+    "leak_rate": (0, 1e6),
+    "shot_noise_rate": (0, 1e6),
+}
+# Readers take no more of them.
+_MAX_POSES = 1_000_000
 _FOR_SCENES = ("scene", "speed", "width", "height", "duration", "pose_rate", "exposure")
 _FOR_VIDEOS = ("interpolation", "trajectory", "intrinsics", "calibration", "event_camera")
 
@@ -300,9 +321,6 @@ class SimulateArguments:
     def judge(self) -> None:
         """Raise a DataError if the output is in the way, a file is missing, or options are impossible together."""
         require_new(self.output)
-        counts = (self.train_images, self.validation_views, self.test_views)
-        if min(counts) < 0:
-            raise DataError(_SIMULATE, f"numbers of images {counts}", "they must not be negative")
         self._refuse_options_without_effect()
         self.sensor()
         if self.video is None:
@@ -310,20 +328,24 @@ class SimulateArguments:
                 require_scene_file(Path(self.scene))
         else:
             self._judge_video(self.video)
-        for name, value in self._positive().items():
-            if value is not None and not 0 < value < math.inf:
-                raise DataError(_SIMULATE, f"--{name.replace('_', '-')} {value:g}", "give a positive number")
+        self._judge_numbers()
         noise = (self.pose_noise_degrees, self.pose_noise_translation)
-        if not all(0 <= size < math.inf for size in (*noise, *vars(self.noise).values())):
-            raise DataError(_SIMULATE, f"noise of {(*noise, *vars(self.noise).values())}", "give numbers from 0 on")
         if self.poses == "colmap" and any(noise):
             remedy = "leave the pose noise out, because COLMAP makes errors of its own"
             raise DataError(_SIMULATE, f"pose noise {noise} with --poses colmap", remedy)
         _require_seed(self.seed, _SIMULATE)
 
-    def _positive(self) -> dict[str, float | None]:
-        names = ("width", "height", "duration", "pose_rate", "frame_rate", "exposure", "max_displacement")
-        return {name: getattr(self, name) for name in (*names, "pose_noise_correlation_time")}
+    def _judge_numbers(self) -> None:
+        for name, value in {**vars(self), **vars(self.noise)}.items():
+            if name in _RANGES and value is not None:
+                low, high = _RANGES[name]
+                if not low <= value <= high:
+                    remedy = f"give a number from {low:g} to {high:g}"
+                    raise DataError(_SIMULATE, f"--{name.replace('_', '-')} {value:g}", remedy)
+        require_event_sensor_size(self.width, self.height, _SIMULATE)
+        num_poses = self.pose_rate * (self.duration or 0)
+        if num_poses > _MAX_POSES:
+            raise DataError(_SIMULATE, f"{num_poses:.3g} poses", "give a lower --pose-rate or a shorter --duration")
 
     def _judge_video(self, video: Path) -> None:
         with reading(video):

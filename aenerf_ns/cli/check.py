@@ -15,6 +15,7 @@ from aenerf_ns.checking.report import Report
 from aenerf_ns.cli.arguments import Automatic, CheckArguments
 from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
 from aenerf_ns.errors import DataError
+from aenerf_ns.files.given_paths import created
 from aenerf_ns.recording.scene import SCENE
 
 
@@ -61,8 +62,6 @@ def _print(line: str) -> None:
 
 
 def _write_picture(path: Path, warped: WarpedEvents) -> None:
-    try:
+    with created(path, "--picture"):
         Image.fromarray(warped_picture(warped)).save(path)
-    except (OSError, ValueError) as error:
-        raise DataError(path, f"it cannot be written ({error})", "choose another --picture, ending with .png") from None
     _print(f"{path}: events as they came, and warped")

@@ -53,6 +53,8 @@ class EventFilters:
     def __post_init__(self) -> None:
         if not 0 < self.pixel_share <= 1:
             raise ValueError(f"the share of pixels must be above 0 and at most 1, not {self.pixel_share}")
+        if self.shortest_interval > LAST_TIME:
+            raise ValueError(f"the shortest interval is {self.shortest_interval} ns, longer than any recording")
         if self.shortest_interval < 0:
             raise ValueError(f"the shortest interval must not be negative, not {self.shortest_interval} ns")
         if self.start is not None and self.end is not None and self.start > self.end:

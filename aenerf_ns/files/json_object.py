@@ -74,7 +74,9 @@ class JsonObject:
                 )
         text = read_text(path, _MAX_BYTES)
         try:
-            values = json.loads(text, parse_float=_decimal, parse_int=_integer, parse_constant=_no_number)
+            values = json.loads(
+                text, parse_float=_decimal, parse_int=_integer, parse_constant=_no_number, object_pairs_hook=_object
+            )
         except (ValueError, RecursionError) as error:
             raise DataError(path, f"not valid JSON ({error})", "correct it there") from None
         if not isinstance(values, dict):
@@ -219,6 +221,15 @@ def _integer(text: str) -> int:
     if len(text) > 20 or abs(int(text)) > _MAX_INTEGER:
         raise ValueError(f"the number {text[:40]} is too large")
     return int(text)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Refuse a key that stands twice, of which Python would take the last one without a word."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the key {max(names, key=names.count)[:40]!r} stands there twice")
+    return values
 
 
 def _no_number(text: str) -> NoReturn:

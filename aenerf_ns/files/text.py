@@ -79,6 +79,9 @@ def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:
         DataError: a field is not a number.
     """
     try:
+        # Python reads 1_0 as 10.
+        if any("_" in field for row in rows for field in row):
+            raise ValueError("a number with an underscore")
         return np.array(rows, dtype=np.float64)
     except ValueError as error:
         raise DataError(path, f"not a number ({error})", "write plain decimal numbers") from None
@@ -94,7 +97,7 @@ def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[
     for index, field in enumerate(fields):
         try:
             time = Decimal(field) * NANOSECONDS[unit]
-            good = abs(time) < MAX_TIME
+            good = abs(time) < MAX_TIME and "_" not in field
         except ArithmeticError:
             good = False
         if not good:

@@ -73,6 +73,9 @@ class EventDataParser(DataParser):
         Raises:
             DataError: a file is missing or its content cannot be used.
         """
+        longest = self.config.max_pose_gap_ns
+        if longest is not None and longest <= 0:
+            raise DataError(str(self.config.data), f"max_pose_gap_ns is {longest}", "give a positive number")
         try:
             with reading(Path(self.config.data)):
                 recording = self.read_recording()
@@ -191,8 +194,6 @@ class EventDataParser(DataParser):
     def _pose_gaps(self, recording: Recording, start: int, end: int, say: bool) -> tuple[tuple[int, int], ...]:
         """Return where within the time window the poses are too far apart for interpolation."""
         longest = self.config.max_pose_gap_ns
-        if longest is not None and longest <= 0:
-            raise DataError(str(self.config.data), f"max_pose_gap_ns is {longest}", "give a positive number")
         longest = recording.max_pose_gap if longest is None else longest
         gaps = [gap for gap in recording.trajectory.window(longest).gaps if gap[0] < end and gap[1] > start]
         if longest is not None and gaps and say:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -411,8 +412,18 @@ def test_a_benchmark_that_is_killed_alone_takes_its_command_along_and_starts_aga
 def test_a_benchmark_that_is_killed_at_twenty_moments_is_finished_by_the_next_start(tmp_path: Path) -> None:
     command = small_bench(tmp_path, "losses")
     bench, environment = tmp_path / "bench", {**ENVIRONMENT, "OMP_NUM_THREADS": "1"}
+    begin = time.monotonic()
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
+    while not list(bench.glob("runs/*.json")):
+        assert process.poll() is None
+        time.sleep(0.2)
+    of_one_run = time.monotonic() - begin
+    process.kill()
+    process.wait()
+    assert_gone(process.pid)
+    shutil.rmtree(bench)
     stages, finished = set(), {}
-    for moment in np.linspace(1, 39, 20):
+    for moment in np.linspace(0, of_one_run, 20):
         begin = time.monotonic()
         process = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
         with contextlib.suppress(subprocess.TimeoutExpired):

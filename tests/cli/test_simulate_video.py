@@ -199,9 +199,9 @@ LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
         ((), {"intrinsics": (0.0, 21.0, 11.5, 7.5)}, "--intrinsics: fx must be from"),
         ((), {"pose_noise_degrees": 1.0}, "without poses to add it to; give --trajectory"),
         ((), {"positive_contrast_threshold": 0.0}, "positive_contrast_threshold must be from"),
-        ((), {"max_displacement": 0.0}, "max_displacement must be positive"),
+        ((), {"max_displacement": 0.0}, "--max-displacement 0; give a number from 0.01 to 100"),
         ((), {"positive_contrast_threshold": 9.0, "negative_contrast_threshold": 9.0}, "no pixel changes by a"),
-        ((), {"frame_rate": 0.0}, "a frame rate of 0.0; give a positive"),
+        ((), {"frame_rate": 0.0}, "--frame-rate 0; give a number from 0.001"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(
