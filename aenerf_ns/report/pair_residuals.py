@@ -69,7 +69,8 @@ def _histogram(measured: np.ndarray, rendered: np.ndarray) -> dict[str, Any]:
     both = np.concatenate([measured, rendered])
     end = float(np.abs(np.quantile(both, [_BEYOND, 1 - _BEYOND])).max())
     edges = np.linspace(-end, end, _BINS + 1)
-    counts, _, _ = np.histogram2d(np.clip(rendered, -end, end), np.clip(measured, -end, end), bins=edges)
+    ends = [(-end, end), (-end, end)]
+    counts, _, _ = np.histogram2d(np.clip(rendered, -end, end), np.clip(measured, -end, end), bins=_BINS, range=ends)
     return {"edges": edges.tolist(), "histogram": counts.astype(int).tolist()}
 
 
