@@ -68,9 +68,9 @@ def pair_residuals(pipeline: AENeRFPipeline) -> dict[str, Any] | None:
 def _histogram(measured: np.ndarray, rendered: np.ndarray) -> dict[str, Any]:
     both = np.concatenate([measured, rendered])
     end = float(np.abs(np.quantile(both, [_BEYOND, 1 - _BEYOND])).max())
-    span = [[-end, end], [-end, end]]
-    clipped = (np.clip(values, -end, end) for values in (rendered, measured))
-    counts, edges, _ = np.histogram2d(*clipped, bins=_BINS, range=span)
+    edges = np.linspace(-end, end, _BINS + 1)
+    ends = [(-end, end), (-end, end)]
+    counts, _, _ = np.histogram2d(np.clip(rendered, -end, end), np.clip(measured, -end, end), bins=_BINS, range=ends)
     return {"edges": edges.tolist(), "histogram": counts.astype(int).tolist()}
 
 
