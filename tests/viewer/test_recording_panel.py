@@ -276,10 +276,12 @@ def test_training_draws_rarely_and_only_for_a_browser(workspace: Path, monkeypat
         with browser_of(viewer) as browser:
             browser.wait_for("SetCameraPositionMessage")
             wait_until(lambda: len(drawn) == 1)
+            began = time.monotonic()
             panel.after_step()
-            # Drawing took 0.03 s, a hundredth of the time until it is next allowed.
+            took = time.monotonic() - began
             assert len(drawn) == 2
-            assert panel._due - time.monotonic() == pytest.approx(0.03 * 99, rel=0.2)
+            # Drawing took at least 0.03 s, a hundredth of the time until it is next allowed.
+            assert 0.03 * 99 <= panel._due - began - 0.03 <= took * 100
             panel.after_step()
             assert len(drawn) == 2
 
