@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import socket
 from pathlib import Path
 
@@ -34,11 +35,13 @@ class OutputLock:
 
     Attributes:
         output: the folder.
+        partial: where the owner makes the folder before it gets its name. It is removed when the context ends.
     """
 
     def __init__(self, output: Path) -> None:
         self.output = output
-        self._file = output.with_name(f".{output.name}.partial.lock")
+        self.partial = output.with_name(f".{output.name}.partial")
+        self._file = self.partial.with_name(f"{self.partial.name}.lock")
         try:
             require_new(self.output)
             output.parent.mkdir(parents=True, exist_ok=True)
@@ -102,4 +105,6 @@ class OutputLock:
         return self
 
     def __exit__(self, *_: object) -> None:
+        # A signal may have come before whoever made the folder could remove it.
+        shutil.rmtree(self.partial, ignore_errors=True)
         self.release()

@@ -50,9 +50,9 @@ class _FolderWriter(ABC):
     """
 
     def __init__(self, folder: Path | OutputLock) -> None:
-        self._own_lock = OutputLock(folder) if isinstance(folder, Path) else None
-        self._folder = folder = folder if isinstance(folder, Path) else folder.output
-        self._partial = folder.with_name(f".{folder.name}.partial")
+        lock = OutputLock(folder) if isinstance(folder, Path) else folder
+        self._own_lock = lock if isinstance(folder, Path) else None
+        self._folder, self._partial = lock.output, lock.partial
         # Of a process that was killed, because the lock is held.
         shutil.rmtree(self._partial, ignore_errors=True)
         try:
@@ -61,7 +61,7 @@ class _FolderWriter(ABC):
         except OSError as error:
             shutil.rmtree(self._partial, ignore_errors=True)
             self._unlock()
-            raise cannot_be_created(folder, error) from None
+            raise cannot_be_created(self._folder, error) from None
 
     def __enter__(self: _Writer) -> _Writer:
         return self

@@ -26,6 +26,7 @@ from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.structure_from_motion import EstimatedPoses
 from aenerf_ns.recording.video import Video, open_video
+from aenerf_ns.simulator.options import SensorNoise
 from aenerf_ns.simulator.video_events import video_events
 
 WIDTH, HEIGHT, FRAME = 24, 16, 40_000_000
@@ -100,7 +101,7 @@ def test_the_command_makes_a_dataset_of_a_video_with_its_poses(
     assert recording.ground_truth is None
     torch.testing.assert_close(recording.trajectory.camera_to_worlds, make_poses().camera_to_worlds)
     # The events are those of the sensor that the options describe.
-    intervals = video_events(open_video(frames), recording.sensor, command.SensorNoise(leak_rate=2.0), "linear", seed=4)
+    intervals = video_events(open_video(frames), recording.sensor, SensorNoise(leak_rate=2.0), "linear", seed=4)
     expected = np.concatenate([interval.events.t for interval in intervals])
     assert len(expected) > 500
     np.testing.assert_array_equal(times_of(recording), expected)

@@ -34,10 +34,10 @@ def test_a_bomb_is_one_line(name: str, whole: dict[str, Path]) -> None:
     try:
         change(folder)
         with little_memory():
-            begin = time.perf_counter()
+            begin = time.process_time()
             with pytest.raises(DataError) as error:
                 read_everything(config_of_recording(folder))
-            seconds = time.perf_counter() - begin
+            seconds = time.process_time() - begin
     finally:
         shutil.rmtree(folder)
     print(error.value)
