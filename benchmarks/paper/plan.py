@@ -184,7 +184,7 @@ def plan(
 
     length, runs = _STEPS[scale] if steps is None else steps, []
     end = "-small" if scale == "tiny" else ""
-    images = ("--method", "high-pass")
+    images: tuple[str, ...] = ("--method", "high-pass")
     if e2vid_weights is not None:
         images = ("--method", "e2vid", "--weights", str(e2vid_weights.resolve()))
 
