@@ -135,32 +135,16 @@ def test_vector_becomes_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert recording.event_camera == expected
 
 
-IMAGE_DEFINITION = """std_msgs/Header header
-uint32 height
-uint32 width
-string encoding
-uint8 is_bigendian
-uint32 step
-uint8[] data
-================================================================================
-MSG: std_msgs/Header
-uint32 seq
-time stamp
-string frame_id
-"""
-
-
 def test_frames_of_a_bag_become_files_with_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rosbag1 = pytest.importorskip("rosbags.rosbag1")
+    rosbag1, typesys = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
     monkeypatch.chdir(tmp_path)
     Path("recording").mkdir()
     # Two frames of 3 x 2 pixels, whose rows are padded to 4 bytes.
     frames = np.arange(16, dtype=np.uint8).reshape(2, 2, 4)
     stamps = [EPOCH * 1_000 + 7, EPOCH * 1_000 + 40_000_007]
     with rosbag1.Writer(Path("recording/events.bag")) as writer:
-        pictures = writer.add_connection(
-            "/dvs/image_raw", "sensor_msgs/msg/Image", msgdef=IMAGE_DEFINITION, md5sum="0" * 32
-        )
+        pictures = writer.add_connection("/dvs/image_raw", "sensor_msgs/msg/Image", typestore=store)
         for stamp, frame in zip(stamps, frames, strict=True):
             end = string("mono8") + b"\0" + struct.pack("<2I", 4, frame.size) + frame.tobytes()
             writer.write(pictures, stamp, message_header(stamp, (3, 2)) + end)
