@@ -33,10 +33,13 @@ def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
         if not path.is_file():
             raise DataError(path, "there is no such file", "give the camchain that Kalibr wrote")
     chain = read_plain_yaml(path)
-    is_chain = isinstance(chain, dict) and all(isinstance(value, dict) for value in chain.values())
-    if not chain or not is_chain or not all(isinstance(name, str) for name in chain):
+    if not isinstance(chain, dict) or not all(isinstance(name, str) for name in chain):
         raise DataError(path, "not a list of cameras", "give the camchain that Kalibr wrote")
     require_shallow(path, chain)
+    # Some datasets add matrices beside the cameras, such as MVSEC its T_cam0_lidar.
+    chain = {name: value for name, value in chain.items() if isinstance(value, dict)}
+    if not chain:
+        raise DataError(path, "not a list of cameras", "give the camchain that Kalibr wrote")
     cameras: dict[str, tuple[EventCamera, Tensor]] = {}
     from_first = torch.eye(4, dtype=torch.float64)
     for name in sorted(chain):
