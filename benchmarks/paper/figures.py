@@ -166,7 +166,7 @@ def _curves(runs: Sequence[Run], figures: Mapping[str, dict[str, Any]], file: Pa
 
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    axes.set_prop_cycle(color=colormaps["tab20"].colors)
+    axes.set_prop_cycle(color=list(colormaps["tab20"](range(20))))
     for run in runs:
         if figures[run.name]["curve"]:
             axes.plot(*zip(*figures[run.name]["curve"], strict=True), marker=".", label=run.row)
