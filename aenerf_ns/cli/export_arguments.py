@@ -18,6 +18,11 @@ from aenerf_ns.files.given_paths import require_new, require_writable
 _MESH_FILES = (".ply", ".glb", ".obj")
 
 
+def _require_some(command: str, name: str, count: int) -> None:
+    if count < 1:
+        raise DataError(command, f"{count} {name}", "give one or more")
+
+
 @dataclass
 class ExportCamerasArguments:
     """Write the cameras of a recording's images, at the corrected poses of a trained run, so that a trainer of splats
@@ -33,8 +38,9 @@ class ExportCamerasArguments:
     """The most points of the scene to write, of those that the run renders. Trainers of splats begin with them."""
 
     def judge(self) -> None:
-        """Raise a DataError if the output is in the way."""
+        """Raise a DataError if the output is in the way, or no points are asked for."""
         require_new(self.output)
+        _require_some("aenerf export-cameras", "points", self.num_points)
 
 
 @dataclass
@@ -53,8 +59,9 @@ class ExportFramesArguments:
     """The most points of the scene to write."""
 
     def judge(self) -> None:
-        """Raise a DataError if the output is in the way, or times are given twice."""
+        """Raise a DataError if the output is in the way, times are given twice, or no points are asked for."""
         require_new(self.output)
+        _require_some("aenerf export-frames", "points", self.num_points)
         if self.times and self.rate is not None:
             raise DataError("aenerf export-frames", "--rate and --times are given", "leave out one of the two")
 
@@ -80,6 +87,7 @@ class ExportMeshArguments:
         require_writable(self.output, "--output")
         if not 8 <= self.resolution <= 2048:
             raise DataError("aenerf export-mesh", f"a resolution of {self.resolution}", "give one from 8 to 2048")
+        _require_some("aenerf export-mesh", "views", self.num_views)
 
 
 @dataclass

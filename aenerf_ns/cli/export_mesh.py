@@ -8,6 +8,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.cli.export_arguments import ExportMeshArguments
 from aenerf_ns.cli.trained_run import open_run
+from aenerf_ns.files.given_paths import created
 
 
 @dataclass
@@ -25,8 +26,8 @@ class ExportMesh(ExportMeshArguments):
         _, pipeline, _ = open_run(self.load_config, test_mode="inference")
         mesh = extract_mesh(pipeline, self.num_views, self.resolution)
         written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-        self.output.parent.mkdir(parents=True, exist_ok=True)
-        written.export(self.output)
+        with created(self.output, "--output"):
+            written.export(self.output)
         sides = " x ".join(f"{side:.3g}" for side in written.extents)
         CONSOLE.print(
             f"{self.output}: {len(mesh.faces)} triangles, {sides} units of the recording.",

@@ -59,6 +59,9 @@ def _carried_over(pipeline: AENeRFPipeline, views: list[ReferenceView]) -> Tenso
     for view in views:
         if view.time is not None and given.start <= view.time <= given.end:
             on_rig = torch.linalg.inv(homogeneous(given.interpolate(view.time))) @ view.camera_to_world
+            if correction.has_ground_truth:
+                # From the units of the true trajectory to those of the corrected poses.
+                on_rig[:3, 3] *= alignment.scale
             poses.append(homogeneous(corrected_poses(pipeline, torch.tensor([view.time])))[0] @ on_rig)
         else:
             poses.append(homogeneous(alignment(view.camera_to_world[:3])))

@@ -160,9 +160,11 @@ def _opened_ros2(path: Path, stack: ExitStack) -> rosbag2.Reader:
 
 def _require_tables(path: Path) -> None:
     """Raise a ValueError for a database with anything but plain tables. A view could compute rows without end."""
+    if set("%?#") & set(str(path)):
+        raise ValueError("its path holds %, ? or #, which SQLite takes for parts of an address: rename it")
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
-            items = database.execute("SELECT type, name, sql FROM sqlite_master LIMIT 100").fetchall()
+            items = database.execute("SELECT type, name, sql FROM sqlite_master LIMIT 101").fetchall()
             kinds = {kind for kind, *_ in items}
             tables = [name for kind, name, _ in items if kind == "table"]
             columns = [
@@ -172,6 +174,8 @@ def _require_tables(path: Path) -> None:
         raise ValueError(str(error)) from None
     virtual = any(str(sql).upper().startswith("CREATE VIRTUAL") for *_, sql in items)
     # The last value of a row tells whether a column is computed.
+    if len(items) > 100:
+        raise ValueError("its database has more than 100 tables")
     if not kinds <= {"table", "index"} or virtual or any(row[-1] for row in columns):
         raise ValueError("its database computes what it holds")
 

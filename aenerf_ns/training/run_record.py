@@ -17,6 +17,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread, decorate_all
 from torch import Tensor
 
+from aenerf_ns.training.checkpoints import move_whole
 from aenerf_ns.training.environment import environment
 
 RUN_FILE, SCALARS_FILE = "run.json", "scalars.csv"
@@ -70,7 +71,9 @@ class RunRecord:
             "seconds": time.monotonic() - self._began,
             "peak_memory_bytes": memory,
         }
-        self._path.write_text(json.dumps(self._record, indent=2) + "\n", "utf8")
+        partial = self._path.with_name(f"{RUN_FILE}.partial")
+        partial.write_text(json.dumps(self._record, indent=2) + "\n", "utf8")
+        move_whole(partial, self._path)
 
 
 @decorate_all([check_main_thread])

@@ -99,6 +99,7 @@ class AENeRFTrainer(Trainer):
             elif config.load_checkpoint is not None:
                 require_whole(config.load_checkpoint)
         self._record: RunRecord | None = None
+        self._ends = False
         super().__init__(config, local_rank, world_size)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -124,9 +125,8 @@ class AENeRFTrainer(Trainer):
                 raise
 
     def _after_train(self) -> None:
-        num_steps = self.step + 1 - self._start_step
-        # Before the framework waits for the user to end the viewer.
-        self._record_end("finished" if num_steps == self.config.max_num_iterations else "stopped", num_steps)
+        # The framework saves the last checkpoint, and then waits for the user to end the viewer.
+        self._ends = True
         super()._after_train()
 
     def _record_end(self, state: str, num_steps: int) -> None:
@@ -164,6 +164,9 @@ class AENeRFTrainer(Trainer):
             for other in folder.glob("*.ckpt"):
                 if other != path:
                     other.unlink()
+        if self._ends:
+            num_steps = self.step + 1 - self._start_step
+            self._record_end("finished" if num_steps == self.config.max_num_iterations else "stopped", num_steps)
 
 
 @contextmanager

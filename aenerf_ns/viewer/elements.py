@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerElement
 from viser import ClientHandle, GuiMarkdownHandle, ViserServer
@@ -51,19 +50,13 @@ class DownloadButton(ViewerButton):
     def __init__(self, name: str, make: Callable[[ClientHandle], tuple[str, bytes]]) -> None:
         super().__init__(name, cb_hook=self._send)
         self._make = make
-        self._client: ClientHandle | None = None
 
     def install(self, viser_server: ViserServer) -> None:
         """Add the element to the viewer."""
         self._create_gui_handle(viser_server)
 
-        def click(event: Any) -> None:
-            # Nerfstudio wraps the hook so that it waits until no training step runs, but hands it no browser.
-            self._client = event.client
-            self.cb_hook(self)
+        # Nerfstudio wraps the hook so that it waits until no training step runs, and passes its argument on.
+        self.gui_handle.on_click(lambda event: self.cb_hook(event.client))
 
-        self.gui_handle.on_click(click)
-
-    def _send(self, _: ViewerButton) -> None:
-        if self._client is not None:
-            self._client.send_file_download(*self._make(self._client))
+    def _send(self, client: ClientHandle) -> None:
+        client.send_file_download(*self._make(client))

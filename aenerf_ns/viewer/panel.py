@@ -202,6 +202,8 @@ class RecordingPanel(nn.Module):
         self._due = 0.0
         # In a thread, because a training step may run, and viser holds a lock here that the step's end may wait for.
         threading.Thread(target=self._draw_between_steps, daemon=True).start()
+        # It ended if no browser looked on for a moment, as while a page is loaded anew.
+        self._play()
 
     def _draw_between_steps(self) -> None:
         with self._no_step():
