@@ -19,6 +19,7 @@ from aenerf_ns.files.boundary import require_file
 from aenerf_ns.files.given_paths import require_new, require_writable
 from aenerf_ns.files.layouts import LAYOUTS
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
+from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL
 from aenerf_ns.reconstruction.weights import require_weights
 from aenerf_ns.simulator.options import BUILT_IN, Interpolation, SensorNoise, require_scene_file
 
@@ -62,7 +63,7 @@ Region = Annotated[
     ),
 ]
 
-# What an image is saved as, by the ending of its name.
+# Endings of the names of images, by which their formats are known.
 _PICTURES = (".png", ".jpg", ".jpeg")
 
 
@@ -189,7 +190,7 @@ class ReconstructArguments:
     e2vid: the networks of Scheerlinck et al. (2020) and Rebecq et al. (2021), whose weights you have."""
     weights: Path | None = None
     """Weights file of the network, as its authors distribute it."""
-    events_per_pixel: float = 0.35
+    events_per_pixel: float = EVENTS_PER_PIXEL
     """Events between two images, as a share of the sensor's pixels."""
     format: FormatName = field(default_factory=Automatic)
 

@@ -1,4 +1,4 @@
-"""What the ``config.yml`` of a trained run may name.
+"""Check of the names in the ``config.yml`` of a trained run.
 
 The file is opened by a loader of YAML that makes any object and calls any function that the file names. So it is read
 as text before it is opened.

@@ -1,1 +1,1 @@
-"""What goes on to other tools from a trained run: cameras, frames, points, meshes and videos."""
+"""Exports of a trained run to other tools: cameras, frames, points, meshes and videos."""

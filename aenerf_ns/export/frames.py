@@ -41,7 +41,7 @@ def export_frames(pipeline: AENeRFPipeline, folder: Path, times: Tensor, num_poi
     """
     lens = pipeline.datamanager.dataparser.recording.event_camera
     directions, _ = lens.pixel_directions()
-    # What a distance along the ray counts along the optical axis, which looks along -z.
+    # Distances along the optical axis are distances along the ray times these. The axis looks along -z.
     along_axis = torch.from_numpy(-directions[..., 2:])
     poses = homogeneous(corrected_poses(pipeline, times))
     for name in (IMAGE_FOLDER, DEPTH_FOLDER):

@@ -224,7 +224,7 @@ def _integer(text: str) -> int:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Refuse a key that stands twice, of which Python would take the last one without a word."""
+    """Refuse a key that stands twice. Python would silently take the last one."""
     values = dict(pairs)
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]

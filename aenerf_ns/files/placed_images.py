@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL
 
 IMAGE_FOLDER, SPARSE_FOLDER, TRANSFORMS_FILE, POINTS_FILE = "images", "sparse/0", "transforms.json", "points.ply"
-"""What the written folders and files are called, as the trainers of splats and NeRFs look for them."""
+"""Names of the written folders and files. Trainers of splats and NeRFs look for these names."""
 
 _SPLITS = ("train", "val", "test")
-# From OpenCV's axes (x right, y down, z forward) to OpenGL's.
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ def write_transforms(folder: Path, images: Sequence[PlacedImage], points: SeenPo
         frame = {
             "file_path": f"{IMAGE_FOLDER}/{image.name}",
             **_transforms_camera(image.camera),
-            "transform_matrix": (image.camera_to_world @ _OPENGL).tolist(),
+            "transform_matrix": (image.camera_to_world @ OPENCV_TO_OPENGL.numpy()).tolist(),
         }
         if image.depth is not None:
             frame["depth_file_path"] = image.depth

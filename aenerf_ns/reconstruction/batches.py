@@ -8,6 +8,9 @@ import numpy as np
 
 from aenerf_ns.events.stream import EventStream
 
+EVENTS_PER_PIXEL = 0.35
+"""Events in a batch, as a share of the sensor's pixels, with which the authors of E2VID run it."""
+
 
 def batches_of(chunks: Iterable[EventStream], num_events: int) -> Iterator[EventStream]:
     """Yield the events of a stream in disjoint batches of ``num_events``. A last batch of fewer events is left out.

@@ -18,9 +18,6 @@ from aenerf_ns.reconstruction.high_pass import HighPassFilter
 from aenerf_ns.reconstruction.networks import NUM_BINS, ReconstructionNetwork
 from aenerf_ns.reconstruction.voxels import normalized, voxel_grid
 
-EVENTS_PER_PIXEL = 0.35
-"""Events in a batch, as a share of the sensor's pixels, with which the authors of E2VID run it."""
-
 # The authors sharpen images: by this amount, with a blur of this standard deviation and size in pixels.
 _SHARPENING, _BLUR, _BLUR_SIZE = 0.3, 1.0, 5
 

@@ -1,4 +1,4 @@
-"""What a report says of a run: everything is measured or read here, and shown elsewhere."""
+"""Measure or read all that a report says of a run. Other files show it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MOST_POSES = 600
 
 @dataclass
 class RunReport:
-    """What is known of a run.
+    """All that a report says of a run.
 
     Attributes:
         name: of the run, by which the page tells runs apart.
@@ -65,7 +65,7 @@ class RunReport:
 
     @property
     def views(self) -> list[dict[str, Any]]:
-        """What is known of each reference view; see :func:`~aenerf_ns.training.view_metrics.describe_views`."""
+        """Describe each reference view; see :func:`~aenerf_ns.training.view_metrics.describe_views`."""
         return self.evaluation.get("views", [])
 
     def as_json(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a run wrote of its own training: how it was made, and the scalars it logged."""
+"""Read the files that a run wrote of its own training: how it was made, and the scalars that it logged."""
 
 from __future__ import annotations
 

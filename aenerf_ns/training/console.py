@@ -10,7 +10,7 @@ from nerfstudio.utils.decorators import check_main_thread, decorate_all
 from nerfstudio.utils.printing import human_format
 from nerfstudio.utils.writer import LocalWriter, _format_time
 
-# What the framework's log calls the losses and the metrics of a step, and the columns' headings.
+# Names of the losses and metrics of a step in the framework's log, and the columns' headings.
 _LOSS, _LOSSES, _METRICS, _VIEW = "Train Loss", "Train Loss Dict", "Train Metrics Dict", "Eval Images Metrics"
 _LOSS_HEADINGS = {"pose_correction_penalty": "Penalty"}
 _METRIC_HEADINGS = {

@@ -1,4 +1,4 @@
-"""What a run keeps of its own training beside checkpoints: ``run.json`` and ``scalars.csv`` in its folder."""
+"""Write ``run.json`` and ``scalars.csv`` into the folder of a run: how it was made, and the scalars that it logged."""
 
 from __future__ import annotations
 

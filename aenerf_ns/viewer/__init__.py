@@ -1,1 +1,1 @@
-"""What this project adds to Nerfstudio's viewer: events, trajectories, live figures and exports."""
+"""Additions to Nerfstudio's viewer: events, trajectories, live figures and exports."""

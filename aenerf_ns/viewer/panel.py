@@ -50,7 +50,7 @@ class RecordingPanel(nn.Module):
         self._view = view
         self._viewer: Viewer | None = None
         self._due = 0.0
-        # What the picture and the points were last made for, so that a slider's moves do not queue up.
+        # State that the picture and the points were last made for, so that a slider's moves do not queue up.
         self._drawn: tuple[Any, ...] | None = None
         # Not the middle of the recording: a camera of the training cameras, evenly spread, would hide the scene.
         self._first_time = round(0.4 * view.duration, 3)

@@ -1,4 +1,4 @@
-"""What the viewer shows of a recording beside the scene, as arrays, texts and files."""
+"""Make the arrays, texts and files of a recording that the viewer shows beside the scene."""
 
 from __future__ import annotations
 

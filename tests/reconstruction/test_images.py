@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL
 from aenerf_ns.reconstruction.high_pass import HighPassFilter
-from aenerf_ns.reconstruction.images import EVENTS_PER_PIXEL, FilteredImages, images_of
+from aenerf_ns.reconstruction.images import FilteredImages, images_of
 from aenerf_ns.simulator.esim import EventSimulator
 
 SIZE = 32
