@@ -145,14 +145,13 @@ def differences(reports: Sequence[RunReport], paired: Sequence[dict[str, Any]], 
 
 def _left_out(reports: Sequence[RunReport], shared: Sequence[str]) -> str:
     """Return which views are not in all runs."""
-    lines = [
-        f"<li>{escape(name)}: {len(files)}: {escape(', '.join(files))}</li>"
-        for name, files in views_left_out(reports, shared).items()
-    ]
-    if not lines:
+    left_out = views_left_out(reports, shared)
+    if not left_out:
         return ""
-    said = f"{len(shared)} test views are in all runs, as the same image of the same name. The others are left out."
-    return f"<details><summary>{said}</summary><ul>{''.join(lines)}</ul></details>"
+    counts = ", ".join(f"{len(files)} of {escape(name)}" for name, files in left_out.items())
+    lines = "".join(f"<li>{escape(name)}: {escape(', '.join(files))}</li>" for name, files in left_out.items())
+    said = f"{len(shared)} test views are in all runs, as the same image of the same name. Left out: {counts}."
+    return f"<details><summary>{said}</summary><ul>{lines}</ul></details>"
 
 
 def view_table(reports: Sequence[RunReport]) -> str:

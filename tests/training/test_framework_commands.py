@@ -26,7 +26,7 @@ import trimesh
 import websockets.sync.client
 import yaml
 from browser import chromium
-from commands import CPU, newest_config, run, simulate
+from commands import CPU, newest_config, run
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.trainer import writer
 from nerfstudio.scripts import train
@@ -41,6 +41,7 @@ from aenerf_ns.cli.export_mesh import ExportMesh
 from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.export_video import ExportVideo
 from aenerf_ns.cli.report import Report
+from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.pipeline import AENeRFPipeline
@@ -61,7 +62,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="module")
 def trained(workspace: Path) -> Path:
     """config.yml of a run on a tiny simulated room, whose events are gone since."""
-    data = simulate(workspace / "room")
+    data = workspace / "room"
+    Simulate(output=data, width=48, height=36, train_images=4, validation_views=4, test_views=3).main()
     run(
         "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", str(STEPS),
         "--steps-per-save", "200", "--data", data,
@@ -292,9 +294,12 @@ def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
         assert row["lpips_placed"] == ""
     assert "LPIPS: not asked for" in page
     with chromium(workspace) as browser:
-        browser.open(workspace / "report" / "report.html")
+        browser.open_file(workspace / "report" / "report.html")
         browser.wait_for("[...document.querySelectorAll('.plotly-graph-div')].every((plot) => plot._fullLayout)")
         assert browser.evaluate("document.querySelectorAll('.plotly-graph-div').length") >= 8
+        # No plot reaches over its neighbour.
+        wide = "[...document.querySelectorAll('.plotly-graph-div')].filter((one) => one.scrollWidth > one.clientWidth)"
+        assert browser.evaluate(f"{wide}.length") == 0
         assert browser.evaluate("[...document.images].every((image) => image.naturalWidth > 0)")
         # Truth, rendering, error and depth of three views, and the check's picture.
         assert browser.evaluate("document.images.length") == 13
