@@ -48,7 +48,7 @@ from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 # Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.
-STEPS = 200
+STEPS = 300
 PSNR_MARGIN = 3.0
 
 
@@ -67,7 +67,7 @@ def trained(workspace: Path) -> Path:
     Simulate(output=data, width=48, height=36, train_images=4, validation_views=4, test_views=3).main()
     run(
         "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", str(STEPS),
-        "--steps-per-save", "150", "--data", data,
+        "--steps-per-save", "200", "--data", data,
         cwd=workspace,
     )  # fmt: skip
     (data / "events.h5").rename(data / "events.gone")
