@@ -1,4 +1,4 @@
-"""A headless Chromium without a network, for the tests that look at pages."""
+"""A headless Chromium, for the tests that look at pages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,12 @@ import websockets.sync.client
 _OPTIONS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--remote-debugging-port=0",
+    # The viewer draws with WebGL, and asks for a logo and for statistics elsewhere.
+    "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage",
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )  # fmt: skip
+# Keys by their codes.
+_KEYS = {"End": 35}
 
 
 class Page:
@@ -62,19 +67,29 @@ class Page:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
-    def open(self, path: Path, width: int = 1280, height: int = 900) -> None:
+    def open_file(self, path: Path, width: int = 1280, height: int = 900) -> None:
+        """Opens a file with the network off."""
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
         self.send("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0)
+        self.open(path.resolve().as_uri(), width, height)
+
+    def open(self, address: str, width: int = 1280, height: int = 900) -> None:
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-        self.send("Page.navigate", url=path.resolve().as_uri())
+        self.send("Page.navigate", url=address)
         self.wait_for("document.readyState === 'complete'")
 
-    def wait_for(self, condition: str) -> None:
-        deadline = time.monotonic() + 60
-        while not self.evaluate(condition):
-            assert time.monotonic() < deadline, condition
-            time.sleep(0.1)
+    def wait_for(self, condition: str) -> Any:
+        """Waits until a JavaScript expression is true, and returns its value."""
+        return eventually(lambda: self.evaluate(condition))
+
+    def press(self, key: str) -> None:
+        """Presses a key in the element that has the focus."""
+        for kind in ("keyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=_KEYS[key])
+
+    def save_downloads_in(self, folder: Path) -> None:
+        self.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
 
     def screenshot(self, path: Path, selector: str | None = None) -> None:
         """Saves a picture of the whole page, or of the first element that a selector names."""
@@ -89,6 +104,15 @@ class Page:
         clip = {"x": x, "y": y, "width": width, "height": height, "scale": 1}
         taken = self.send("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
         path.write_bytes(base64.b64decode(taken["data"]))
+
+
+def eventually(condition: Callable[[], Any]) -> Any:
+    """Waits for a condition, and returns what it gives."""
+    deadline = time.monotonic() + 60
+    while not (found := condition()):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    return found
 
 
 @contextmanager

@@ -81,6 +81,12 @@ def viewer_of(pipeline: AENeRFPipeline, folder: Path) -> Iterator[Viewer]:
         viewer.init_scene(pipeline.datamanager.train_dataset, "training")
         yield viewer
     finally:
+        # Threads that render while the process ends would break it off.
+        machines = list(viewer.render_statemachines.values())
+        for machine in machines:
+            machine.running = False
+        for machine in machines:
+            machine.join()
         viewer.viser_server.stop()
         writer.GLOBAL_BUFFER.clear()
 
@@ -89,7 +95,9 @@ def viewer_of(pipeline: AENeRFPipeline, folder: Path) -> Iterator[Viewer]:
 def browser_of(viewer: Viewer) -> Iterator[Browser]:
     """Connect with what passes for a browser."""
     port = viewer.viser_server.get_port()
-    with websockets.sync.client.connect(f"ws://127.0.0.1:{port}", max_size=None) as connection:
+    # Closing would wait until all messages that nobody reads are there.
+    address = f"ws://127.0.0.1:{port}"
+    with websockets.sync.client.connect(address, max_size=None, close_timeout=0.1) as connection:
         browser = Browser(connection)
         browser.look_from((0.0, 0.0, 3.0))
         yield browser
@@ -115,17 +123,20 @@ class Browser:
 
     def wait_for(self, kind: str, **fields: Any) -> dict[str, Any]:
         """Return the next message of a kind with some values. Messages before it are passed over."""
-        passed = []
+        return self.until(kind, **fields)[-1]
+
+    def until(self, kind: str, **fields: Any) -> list[dict[str, Any]]:
+        """Return all messages up to the next one of a kind with some values."""
+        passed: list[dict[str, Any]] = []
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline:
             while self._waiting:
-                message = self._waiting.pop(0)
+                passed.append(message := self._waiting.pop(0))
                 if message["type"] == kind and all(message[name] == value for name, value in fields.items()):
-                    return message
-                passed.append(message["type"])
+                    return passed
             received = msgspec.msgpack.decode(self._connection.recv(timeout=30, decode=False))
             self._waiting += received["messages"] if isinstance(received, dict) else received
-        raise AssertionError(f"no {kind} among {passed}")
+        raise AssertionError(f"no {kind} among {[message['type'] for message in passed]}")
 
     def _send(self, kind: str, **fields: Any) -> None:
         self._connection.send(msgspec.msgpack.encode({"type": kind, **fields}))

@@ -219,10 +219,15 @@ class EvaluateArguments:
     """Fit this colour correction on the run's data and use it; by default the correction stored with the run."""
     render_output: Path | None = None
     """Folder for pictures, from the test poses as placed: truth beside reconstruction, accumulation, depth."""
+    nerfbaselines: Path | None = None
+    """Folder to create in the layout of nerfbaselines: results.json, and the predictions that `nerfbaselines evaluate`
+    reads, from the test poses as placed."""
 
     def judge(self) -> None:
-        """Raise a DataError if the output cannot be written."""
+        """Raise a DataError if the output cannot be written, or the folder for nerfbaselines is in the way."""
         require_writable(self.output, "--output")
+        if self.nerfbaselines is not None:
+            require_new(self.nerfbaselines, "--nerfbaselines")
 
 
 @dataclass

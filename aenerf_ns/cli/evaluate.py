@@ -40,6 +40,12 @@ class Evaluate(EvaluateArguments):
         if results["num_views"] == 0:
             CONSOLE.print(f"{self.output}: errors of the poses; there are no views to evaluate on.")
             return
+        if self.nerfbaselines is not None:
+            # Imported lazily, because few evaluations need it.
+            from aenerf_ns.export.predictions import export_predictions
+
+            with created(self.nerfbaselines, "--nerfbaselines"):
+                export_predictions(pipeline, self.nerfbaselines, config, results["views"])
         refined = results.get("refined_test_poses")
         figures = {"placed": results} | ({"refined": refined} if refined else {})
         shown = "; ".join(

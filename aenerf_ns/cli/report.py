@@ -20,6 +20,7 @@ from aenerf_ns.files.given_paths import cannot_be_created
 
 if TYPE_CHECKING:
     from aenerf_ns.report.measuring import RunReport
+    from aenerf_ns.report.protocol import Protocol
 
 
 @dataclass
@@ -30,31 +31,39 @@ class Report(ReportArguments):
         """Measure the runs and write the page."""
         self.judge()
         # Imported lazily, because these imports take seconds.
-        from aenerf_ns.report.comparison import paired_differences, protocol_differences
+        from aenerf_ns.report.comparison import paired_differences, views_left_out
         from aenerf_ns.report.measuring import measure_run
         from aenerf_ns.report.page import make_page
+        from aenerf_ns.report.protocol import protocol_differences, read_protocol, shared_views
 
-        reports: list[RunReport] = []
-        configs: list[TrainerConfig] = []
+        # Measuring takes long, and only one run at a time is sure to fit in the memory. So the runs are opened twice.
+        opened: list[tuple[TrainerConfig, Protocol]] = []
         for run in self.runs:
             config, pipeline, _ = open_run(run)
-            configs.append(config)
-            # The views of the first run, so that the same ones are beside each other.
-            shown = reports[0].chosen if reports else None
-            reports.append(measure_run(str(run), config, pipeline, shown or None))
+            opened.append((config, read_protocol(pipeline)))
             del pipeline
             gc.collect()
-        for report, name in zip(reports, _names(configs), strict=True):
-            report.name = name
-        mixed = protocol_differences(reports)
+        names = _names([config for config, _ in opened])
+        protocols = [protocol for _, protocol in opened]
+        mixed = protocol_differences(names, protocols)
         if mixed and not self.allow_different_protocols:
             raise DataError(
-                str(self.runs[1]),
-                f"it was measured differently from {self.runs[0]}: {'; '.join(mixed)}",
+                "aenerf report",
+                f"the runs are measured differently: {'; '.join(mixed)}",
                 "evaluate both alike, or give --allow-different-protocols",
             )
-        paired = paired_differences(reports)
-        page = make_page(reports, paired, mixed)
+        shared = shared_views(protocols)
+        reports: list[RunReport] = []
+        for run, name in zip(self.runs, names, strict=True):
+            config, pipeline, _ = open_run(run)
+            # The views of the first run, so that the same ones are beside each other.
+            shown = reports[0].chosen if reports and shared else None
+            reports.append(measure_run(name, config, pipeline, shared, shown))
+            del pipeline
+            gc.collect()
+        paired = paired_differences(reports, shared)
+        left_out = views_left_out(reports, shared)
+        page = make_page(reports, paired, mixed, shared)
         try:
             self.output.mkdir(parents=True, exist_ok=True)
             (self.output / "report.html").write_text(page, "utf8")
@@ -62,6 +71,7 @@ class Report(ReportArguments):
             figures = {
                 "runs": [report.as_json() for report in reports],
                 "paired_differences": paired,
+                "views_not_in_all_runs": left_out,
                 "protocol_differences": mixed,
             }
             (self.output / "report.json").write_text(json.dumps(figures, indent=1) + "\n", "utf8")

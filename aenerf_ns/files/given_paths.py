@@ -34,14 +34,19 @@ def require_run(run: Path) -> Path:
     return config
 
 
-def require_new(output: Path) -> None:
-    """Raise a DataError if the folder that a command will write exists, or cannot have this name."""
+def require_new(output: Path, option: str = "--output") -> None:
+    """Raise a DataError if the folder that a command will write exists, or cannot have this name.
+
+    Args:
+        output: the folder.
+        option: the option that names the folder.
+    """
     try:
         exists = output.exists()
     except (OSError, ValueError) as error:
-        raise cannot_be_created(output, error) from None
+        raise cannot_be_created(output, error, option) from None
     if exists:
-        raise DataError(output, "the folder exists already", "remove it or choose another --output")
+        raise DataError(output, "the folder exists already", f"remove it or choose another {option}")
 
 
 def require_writable(output: Path, option: str) -> None:

@@ -277,11 +277,6 @@ class PoseCorrection(CameraOptimizer):
         with torch.no_grad():
             return align(self.pose(self._compared_seconds), self._reference_poses)
 
-    @property
-    def compared_seconds(self) -> Tensor:
-        """The (N,) float64 times of :meth:`compared_poses`, in seconds since the trajectory's start."""
-        return self._compared_seconds
-
     def compared_poses(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return estimated, corrected and reference poses (N, 3, 4) at the same times, in scene units."""
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Comparing runs: whether they were measured alike, and how far they are apart view by view."""
+"""How far runs are apart, view by view."""
 
 from __future__ import annotations
 
@@ -12,50 +12,32 @@ from scipy import stats
 from aenerf_ns.report.measuring import RunReport
 
 
-def protocol_differences(reports: Sequence[RunReport]) -> list[str]:
-    """Return in words how the runs were measured differently; none if their figures can be compared."""
-    first, *others = reports
-    found = []
-    for other in others:
-        for what in ("color_correction", "test_poses"):
-            ours, theirs = (report.evaluation.get(what) for report in (first, other))
-            if ours != theirs:
-                named = what.replace("_", " ")
-                found.append(f"{named}: {ours} ({first.name}), {theirs} ({other.name})")
-        missing = set(first.truths.items()) ^ set(other.truths.items())
-        if missing:
-            found.append(
-                f"test views: {len(first.truths)} ({first.name}) and {len(other.truths)} ({other.name}), of which "
-                f"{len(set(first.truths.items()) & set(other.truths.items()))} are the same image"
-            )
-    return found
-
-
-def paired_differences(reports: Sequence[RunReport]) -> list[dict[str, Any]]:
+def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> list[dict[str, Any]]:
     """Return how the metrics of each later run differ from the first run's on the same views.
 
+    Args:
+        reports: of the runs.
+        shared: the files of the views that all runs have; other views are left out.
+
     Returns:
-        For each run, each protocol ("placed", "refined") and each metric that both have: the mean difference, its 95 %
-        confidence interval by Student's t over the views (None with fewer than two), and the number of views.
+        For each later run, each protocol ("placed", "refined") and each metric that both runs have: the mean
+        difference, its 95 % confidence interval by Student's t over the views (None with fewer than two), and the
+        number of views.
     """
     first, *others = reports
     ours = {view["file"]: view for view in first.views}
     rows = []
     for other in others:
-        shared = [
-            (ours[view["file"]], view)
-            for view in other.views
-            if first.truths.get(view["file"]) == other.truths.get(view["file"])
-        ]
+        theirs = {view["file"]: view for view in other.views}
         for protocol in ("placed", "refined"):
             for metric in ("psnr", "ssim", "lpips"):
                 pairs = [
-                    (one[protocol][metric], two[protocol][metric])
-                    for one, two in shared
-                    if metric in one.get(protocol, {}) and metric in two.get(protocol, {})
+                    (ours[file][protocol][metric], theirs[file][protocol][metric])
+                    for file in shared
+                    if all(metric in views[file].get(protocol, {}) for views in (ours, theirs))
                 ]
                 if pairs:
-                    differences = np.array([theirs - own for own, theirs in pairs])
+                    differences = np.array([later - earlier for earlier, later in pairs])
                     rows.append(
                         {
                             "run": other.name,
@@ -68,6 +50,12 @@ def paired_differences(reports: Sequence[RunReport]) -> list[dict[str, Any]]:
                         }
                     )
     return rows
+
+
+def views_left_out(reports: Sequence[RunReport], shared: Sequence[str]) -> dict[str, list[str]]:
+    """Return the files of the views that are not in all runs, by the name of the run, where there are any."""
+    left_out = {report.name: [v["file"] for v in report.views if v["file"] not in set(shared)] for report in reports}
+    return {name: files for name, files in left_out.items() if files}
 
 
 def confidence_interval(values: np.ndarray) -> tuple[float, float] | None:

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
-from aenerf_ns.camera.alignment import align
 from aenerf_ns.report.pair_residuals import pair_residuals
+from aenerf_ns.report.poses import measure_poses
 from aenerf_ns.report.run_files import read_record, read_scalars
-from aenerf_ns.report.trajectory_errors import as_evo_prints, correction_components, errors_over_time
 from aenerf_ns.report.view_pictures import ViewPictures, chosen_views, picture_views
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-_MOST_POSES = 600
 
 
 @dataclass
@@ -36,13 +32,12 @@ class RunReport:
         record: see :func:`~aenerf_ns.report.run_files.read_record`.
         scalars: see :func:`~aenerf_ns.report.run_files.read_scalars`.
         evaluation: what ``ns-eval`` writes as results.
-        truths: a checksum of each reference view's image, by the view's file.
         contrast: of each channel; see :func:`~aenerf_ns.report.view_pictures.picture_views`.
-        chosen: why a view is shown, by its index.
-        pictures: by the index of the view.
+        chosen: why a view is shown, by its file.
+        pictures: by the file of the view.
         data: the check's lines and problems, the rate of the events and the account of the pairs.
         check_picture: of the check, or None.
-        poses: positions and errors along the trajectory; see :func:`_poses`.
+        poses: positions and errors along the trajectory; see :func:`~aenerf_ns.report.poses.measure_poses`.
         pairs: see :func:`~aenerf_ns.report.pair_residuals.pair_residuals`.
         missing: what was not measured, and why.
     """
@@ -53,10 +48,9 @@ class RunReport:
     record: dict[str, Any] | None = None
     scalars: dict[str, tuple[list[int], list[float]]] | None = None
     evaluation: dict[str, Any] = field(default_factory=dict)
-    truths: dict[str, int] = field(default_factory=dict)
     contrast: list[float] = field(default_factory=list)
-    chosen: dict[int, str] = field(default_factory=dict)
-    pictures: dict[int, ViewPictures] = field(default_factory=dict)
+    chosen: dict[str, str] = field(default_factory=dict)
+    pictures: dict[str, ViewPictures] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
     check_picture: Image.Image | None = None
     poses: dict[str, Any] = field(default_factory=dict)
@@ -86,7 +80,11 @@ class RunReport:
 
 
 def measure_run(
-    name: str, config: TrainerConfig, pipeline: AENeRFPipeline, shown: dict[int, str] | None = None
+    name: str,
+    config: TrainerConfig,
+    pipeline: AENeRFPipeline,
+    candidates: Sequence[str] = (),
+    shown: dict[str, str] | None = None,
 ) -> RunReport:
     """Measure a trained run.
 
@@ -94,7 +92,8 @@ def measure_run(
         name: of the run.
         config: of the run.
         pipeline: of the run, as it is opened to be tested.
-        shown: the views to show, and why; None chooses them by this run's metrics.
+        candidates: the files of the views that may be shown; none means that all may.
+        shown: the files of the views to show, and why; None chooses among the candidates by this run's metrics.
     """
     pipeline.eval()
     folder = config.get_base_dir()
@@ -104,10 +103,10 @@ def measure_run(
         missing.append("Commit, command, machine, seconds and peak memory: the run was made by an earlier version.")
     if report.scalars is None:
         missing.append("Curves: the run was made by an earlier version, which kept no scalars.")
-    _views(report, pipeline, shown)
+    _views(report, pipeline, candidates, shown)
     _data(report, pipeline)
     pipeline.eval()
-    report.poses = _poses(pipeline)
+    report.poses = measure_poses(pipeline)
     if report.poses["errors"] is None:
         missing.append("Pose errors: the recording has no true poses.")
     return report
@@ -130,7 +129,9 @@ def _settings(config: TrainerConfig, pipeline: AENeRFPipeline) -> dict[str, Any]
     }
 
 
-def _views(report: RunReport, pipeline: AENeRFPipeline, shown: dict[int, str] | None) -> None:
+def _views(
+    report: RunReport, pipeline: AENeRFPipeline, candidates: Sequence[str], shown: dict[str, str] | None
+) -> None:
     data = pipeline.datamanager
     if not data.has_reference_views and not pipeline.model.camera_optimizer.has_ground_truth:
         report.missing.append("PSNR, SSIM and LPIPS: the recording has no test views.")
@@ -146,11 +147,14 @@ def _views(report: RunReport, pipeline: AENeRFPipeline, shown: dict[int, str] | 
         report.missing.append("Metrics from refined test poses: --pipeline.refine-test-poses False.")
     if all(view["time_ns"] is None for view in report.views):
         report.missing.append("Camera speed at the test views: they were not taken on the trajectory.")
-    for index, view in enumerate(report.views):
-        report.truths[view["file"]] = zlib.crc32(data.eval_dataset.get_numpy_image(index).tobytes())
-    report.chosen = shown or chosen_views([view["placed"]["psnr"] for view in report.views])
-    known = [index for index in report.chosen if index < len(report.views)]
-    report.pictures, report.contrast = picture_views(pipeline, known)
+    if shown is None:
+        views = [view for view in report.views if not candidates or view["file"] in candidates]
+        chosen = chosen_views([view["placed"]["psnr"] for view in views])
+        shown = {views[index]["file"]: reason for index, reason in chosen.items()}
+    report.chosen = shown
+    indices = {view["file"]: index for index, view in enumerate(report.views)}
+    pictures, report.contrast = picture_views(pipeline, [indices[file] for file in shown])
+    report.pictures = dict(zip(shown, pictures, strict=True))
 
 
 def _data(report: RunReport, pipeline: AENeRFPipeline) -> None:
@@ -192,38 +196,3 @@ def _data(report: RunReport, pipeline: AENeRFPipeline) -> None:
 
 def _per_second(counts: NDArray[np.int64], start: int, end: int) -> list[float]:
     return (counts * (len(counts) / max(end - start, 1) * 1e9)).tolist()
-
-
-def _poses(pipeline: AENeRFPipeline) -> dict[str, Any]:
-    """Return positions, errors and corrections along the trajectory, thinned.
-
-    Positions are (N, 3) in units of the recording, with z up as far as the cameras tell, and aligned to the true
-    trajectory where it is known. Errors are None where it is not.
-    """
-    correction = pipeline.model.camera_optimizer
-    scene_poses = correction.compared_poses()
-    estimated, corrected, reference = (pipeline.in_recording(poses) for poses in scene_poses)
-    every = -(-len(estimated) // _MOST_POSES)
-    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
-    to_true = correction.alignment()
-    positions = {"estimated": scene_poses[0], "corrected": to_true(scene_poses[1].double())}
-    found: dict[str, Any] = {"seconds": correction.compared_seconds[::every].tolist(), "errors": None, "evo": None}
-    if correction.has_ground_truth:
-        positions["true"] = scene_poses[2]
-        both = {"estimated": estimated, "corrected": corrected}
-        found["evo"] = {name: as_evo_prints(poses, reference) for name, poses in both.items()}
-        found["errors"] = {
-            name: {kind: values[::every] for kind, values in errors_over_time(poses, reference).items()}
-            for name, poses in both.items()
-        }
-        positions["estimated"] = align(scene_poses[0], scene_poses[2])(scene_poses[0].double())
-    found["positions"] = {name: (poses[::every, :, 3].cpu() / scale).tolist() for name, poses in positions.items()}
-    found["correction"] = None
-    if correction.is_learned:
-        found["correction"] = {
-            name: values[::every] for name, values in correction_components(estimated, corrected).items()
-        }
-    with torch.no_grad():
-        speeds, turn_rates = pipeline.camera_speeds(correction.compared_seconds[::every])
-    found["speed"], found["turn_rate_degrees"] = speeds.tolist(), turn_rates.tolist()
-    return found

@@ -23,20 +23,23 @@ from aenerf_ns.report.view_pictures import ERROR_RANGE
 _WIDEST, _QUALITY = 480, 88
 
 
-def make_page(reports: Sequence[RunReport], paired: Sequence[dict[str, Any]], mixed: Sequence[str]) -> str:
+def make_page(
+    reports: Sequence[RunReport], paired: Sequence[dict[str, Any]], mixed: Sequence[str], shared: Sequence[str]
+) -> str:
     """Return the HTML of a report.
 
     Args:
         reports: of one or more runs.
         paired: see :func:`~aenerf_ns.report.comparison.paired_differences`.
         mixed: how the runs were measured differently, in words.
+        shared: the files of the views that all runs have.
     """
     sections: list[tuple[str, str]] = [
         ("Runs" if len(reports) > 1 else "Run", header(reports)),
-        ("Verdict", verdict(reports) + differences(reports, paired)),
+        ("Verdict", verdict(reports) + differences(reports, paired, shared)),
         ("Data", "".join(_data(report) for report in _of_different_data(reports))),
         ("Curves", _plot(plots.curves(reports), "No run kept its scalars.")),
-        ("Views", _views(reports)),
+        ("Views", _views(reports, shared)),
         ("Poses", _poses(reports)),
         ("Events, rendered and measured", _pairs(reports)),
         ("Not measured", account(reports)),
@@ -46,7 +49,7 @@ def make_page(reports: Sequence[RunReport], paired: Sequence[dict[str, Any]], mi
     warning = ""
     if mixed:
         lines = "".join(f"<li>{escape(line)}</li>" for line in mixed)
-        said = "<b>These runs were measured differently. Do not compare them.</b>"
+        said = "<b>These runs were measured differently. Do not compare their means.</b>"
         warning = f'<div class="warning">{said}<ul>{lines}</ul></div>'
     body = f"<h1>{escape(title)}</h1><nav>{links}</nav>{warning}" + "".join(
         f'<h2 id="section{number}">{escape(name)}</h2>{content}' for number, (name, content) in enumerate(sections)
@@ -100,26 +103,29 @@ def _data(report: RunReport) -> str:
     return "".join(parts)
 
 
-def _views(reports: Sequence[RunReport]) -> str:
-    first = next((report for report in reports if report.pictures), None)
-    if first is None:
+def _views(reports: Sequence[RunReport], shared: Sequence[str]) -> str:
+    if not any(report.pictures for report in reports):
         return "<p>There are no views with images.</p>"
     parts = [
         f"<p>The mean absolute difference of display values in [0, 1] is shown from 0 (black) to {ERROR_RANGE:g} "
         "(brightest). The cameras are as placed. Depth is along the ray, in units of the recording.</p>"
     ]
-    for index, reason in first.chosen.items():
-        rows = "".join(_view(report, index, named=len(reports) > 1) for report in reports if index in report.pictures)
-        parts.append(f'<div class="view"><h3>{escape(first.views[index]["file"])} ({reason})</h3>{rows}</div>')
+    named = len(reports) > 1
+    # Runs without a view in common are shown one after the other.
+    for group in [reports] if shared else [[report] for report in reports]:
+        for file, reason in group[0].chosen.items():
+            rows = "".join(_view(report, file, named) for report in group)
+            parts.append(f'<div class="view"><h3>{escape(file)} ({reason})</h3>{rows}</div>')
     return "".join(parts) + view_table(reports)
 
 
-def _view(report: RunReport, index: int, named: bool) -> str:
-    pictures, metrics = report.pictures[index], report.views[index]["placed"]
+def _view(report: RunReport, file: str, named: bool) -> str:
+    pictures = report.pictures[file]
+    metrics = next(view["placed"] for view in report.views if view["file"] == file)
     near, far = pictures.depth_range
     captions = {
         "truth": "truth",
-        "rendering": f"rendering: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics.get('ssim', float('nan')):.3f}",
+        "rendering": f"rendering: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}",
         "error": f"error, 0 to {ERROR_RANGE:g}",
         "depth": f"depth, {near:.2f} to {far:.2f}",
     }
@@ -137,7 +143,8 @@ def _poses(reports: Sequence[RunReport]) -> str:
             for kind, values in kinds.items():
                 cells = "".join(f'<td class="number">{value:.4g}</td>' for value in values.values())
                 rows.append(
-                    f"<tr><td>{escape(report.name)}</td><td>{name}</td><td>{kind.replace('_', ' ')}</td>{cells}</tr>"
+                    f"<tr><td>{escape(report.name)}</td><td>{name}</td><td>{kind.replace('_', ' ')}</td>"
+                    f'<td class="number">{report.poses["num_poses"]}</td>{cells}</tr>'
                 )
     parts = [
         "<p>In units of the recording, aligned to the true trajectory by Sim(3) where it is known. z points up as far "
@@ -150,10 +157,11 @@ def _poses(reports: Sequence[RunReport]) -> str:
         )
         parts.append(
             "<h3>Absolute and relative errors, as evo_ape and evo_rpe print them with -as</h3>"
-            f'<div class="scroll"><table><thead><tr><th>run</th><th>poses</th><th>error</th>{heads}</tr></thead>'
+            '<div class="scroll"><table><thead><tr><th>run</th><th>poses</th><th>error</th>'
+            f'<th class="number">number</th>{heads}</tr></thead>'
             f"<tbody>{''.join(rows)}</tbody></table></div>"
-            '<p class="small">Relative errors are from each given pose to the next. They grow with the distance '
-            "between the poses.</p>"
+            '<p class="small">Over all given poses that the true ones cover. Relative errors are from each of these '
+            "poses to the next. They grow with the distance between the poses.</p>"
         )
     parts.append(
         _plot(plots.pose_errors(reports), "The errors of the poses are not known: the recording has no true poses.")

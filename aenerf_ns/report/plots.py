@@ -224,9 +224,11 @@ def residual_by_tile(report: RunReport) -> go.Figure:
 
 
 def _styled(figure: go.Figure, height: int) -> go.Figure:
+    top, bottom = 40, 70
     figure.update_layout(
-        height=height, template="plotly_white", margin={"l": 60, "r": 20, "t": 40, "b": 50}, font={"size": 12},
-        legend={"orientation": "h", "y": -0.16},
+        height=height, template="plotly_white", margin={"l": 60, "r": 20, "t": top, "b": bottom}, font={"size": 12},
+        # Below the title of the lowest axis, however high the plot is.
+        legend={"orientation": "h", "yanchor": "top", "y": -45 / (height - top - bottom)},
     )  # fmt: skip
     figure.update_annotations(font_size=12)
     return figure

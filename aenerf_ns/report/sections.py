@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import Any
 
+from aenerf_ns.report.comparison import views_left_out
 from aenerf_ns.report.measuring import RunReport
 from aenerf_ns.report.plots import color
 from aenerf_ns.report.run_files import describe_state
@@ -81,14 +82,14 @@ def _verdict(report: RunReport) -> list[str]:
             "right; less means that events were missed, that the thresholds are stated too low, or that the run was "
             "short."
         )
-    errors = found.get("pose_errors")
-    if errors:
+    errors, evo = found.get("pose_errors"), report.poses["evo"]
+    if errors and evo:
         before, after = errors["estimated"], errors["corrected"]
         lines.append(
             f"Pose errors: {before['rotation_error_degrees']:.2f}° and {before['translation_error']:.4g} units of the "
             f"recording before training, {after['rotation_error_degrees']:.2f}° and {after['translation_error']:.4g} "
-            f"after (means after alignment); absolute trajectory error {before['ate_rmse_sim3']:.4g} before, "
-            f"{after['ate_rmse_sim3']:.4g} after."
+            f"after (means after alignment); absolute trajectory error {evo['estimated']['ate']['rmse']:.4g} "
+            f"before, {evo['corrected']['ate']['rmse']:.4g} after."
         )
     diagnosis = found.get("pose_diagnosis")
     if diagnosis:
@@ -108,12 +109,18 @@ def _metrics(metrics: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def differences(reports: Sequence[RunReport], paired: Sequence[dict[str, Any]]) -> str:
-    """Return the table of paired differences, empty for a single run."""
+def differences(reports: Sequence[RunReport], paired: Sequence[dict[str, Any]], shared: Sequence[str]) -> str:
+    """Return the table of paired differences and what is left out of it, empty for a single run.
+
+    Args:
+        reports: of the runs.
+        paired: see :func:`~aenerf_ns.report.comparison.paired_differences`.
+        shared: the files of the views that all runs have.
+    """
     if len(reports) < 2:
         return ""
     if not paired:
-        return "<p>The runs share no test views, so there are no paired differences.</p>"
+        return "<p>No test view is in all runs, so there are no paired differences.</p>"
     rows = []
     for row in paired:
         digits = _DIGITS[row["metric"]]
@@ -132,8 +139,19 @@ def differences(reports: Sequence[RunReport], paired: Sequence[dict[str, Any]]) 
         "<th class=number>95 % interval</th>"
         f"<th>zero is outside</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
         '<p class="small">Student\'s t over the views. The interval says how far other views might differ, not other '
-        "seeds.</p>"
+        f"seeds.</p>{_left_out(reports, shared)}"
     )
+
+
+def _left_out(reports: Sequence[RunReport], shared: Sequence[str]) -> str:
+    """Return which views are not in all runs."""
+    left_out = views_left_out(reports, shared)
+    if not left_out:
+        return ""
+    counts = ", ".join(f"{len(files)} of {escape(name)}" for name, files in left_out.items())
+    lines = "".join(f"<li>{escape(name)}: {escape(', '.join(files))}</li>" for name, files in left_out.items())
+    said = f"{len(shared)} test views are in all runs, as the same image of the same name. Left out: {counts}."
+    return f"<details><summary>{said}</summary><ul>{lines}</ul></details>"
 
 
 def view_table(reports: Sequence[RunReport]) -> str:

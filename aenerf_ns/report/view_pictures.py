@@ -61,7 +61,7 @@ def chosen_views(psnr: Sequence[float]) -> dict[int, str]:
 
 
 @torch.no_grad()
-def picture_views(pipeline: AENeRFPipeline, indices: Sequence[int]) -> tuple[dict[int, ViewPictures], list[float]]:
+def picture_views(pipeline: AENeRFPipeline, indices: Sequence[int]) -> tuple[list[ViewPictures], list[float]]:
     """Render reference views from where they are placed.
 
     Args:
@@ -69,19 +69,18 @@ def picture_views(pipeline: AENeRFPipeline, indices: Sequence[int]) -> tuple[dic
         indices: of the views.
 
     Returns:
-        The pictures by index; and the contrast of each channel over all pixels of these views: the standard deviation
-        of the rendered log-radiance, before colour correction, as a share of that of the images.
+        The pictures of each view; and the contrast of each channel over all pixels of these views: the standard
+        deviation of the rendered log-radiance, before colour correction, as a share of that of the images.
     """
     model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
     scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
-    pictures: dict[int, ViewPictures] = {}
-    rendered, true = [], []
+    pictures, rendered, true = [], [], []
     with progress_bar() as progress:
         task = progress.add_task("Rendering views", total=len(indices))
         for index in indices:
             outputs = model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(pipeline.device))
             image = dataset.get_image_float32(index).to(pipeline.device)
-            pictures[index] = _pictures(outputs, model.reference_display(image), scale)
+            pictures.append(_pictures(outputs, model.reference_display(image), scale))
             rendered.append(outputs["log_radiance"].flatten(0, 1).double())
             # As the colour correction is fitted.
             true.append(torch.log(model.reference_radiance(image).flatten(0, 1).double() + 1e-3))

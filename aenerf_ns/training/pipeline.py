@@ -351,7 +351,7 @@ class AENeRFPipeline(VanillaPipeline):
             )
 
     @property
-    def _test_poses(self) -> str:
+    def test_poses(self) -> str:
         """How the cameras of the reference views are placed."""
         if self.model.camera_optimizer.has_ground_truth:
             return "Sim(3) of the corrected to the true trajectory"
@@ -388,7 +388,7 @@ class AENeRFPipeline(VanillaPipeline):
             metrics |= self.model.camera_optimizer.offsets()
             metrics["pose_errors"] = self.pose_errors()
             metrics["pose_diagnosis"] = self._pose_diagnosis
-            metrics["test_poses"] = self._test_poses
+            metrics["test_poses"] = self.test_poses
             if metrics["num_views"] and self.config.refine_test_poses:
                 refined = self._measure(RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader))
                 metrics["refined_test_poses"] = self._metrics_of_refined_test_poses(refined, get_std)
@@ -416,7 +416,7 @@ class AENeRFPipeline(VanillaPipeline):
         metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in OF_THE_PICTURE}
         if self.model.image_metrics.lpips_absent is not None:
             metrics["lpips"] = None
-        how = f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {self._test_poses}"
+        how = f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {self.test_poses}"
         return {**metrics, "test_poses": how}
 
     def _checked(self, metrics: dict[str, Any]) -> dict[str, Any]:

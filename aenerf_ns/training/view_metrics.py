@@ -92,6 +92,13 @@ def picture_names(files: Sequence[Path]) -> list[str]:
     return [f"{index:04d}_{stem}" for index, stem in enumerate(stems)]
 
 
+def view_files(pipeline: AENeRFPipeline) -> list[str]:
+    """Return the file of each reference view, relative to the dataset where it lies within."""
+    data = Path(pipeline.datamanager.get_datapath())
+    files = pipeline.datamanager.eval_dataset.image_filenames
+    return [str(file.relative_to(data) if file.is_relative_to(data) else file) for file in files]
+
+
 def describe_views(
     pipeline: AENeRFPipeline, placed: Sequence[dict[str, float]], refined: Sequence[dict[str, float]] | None
 ) -> list[dict[str, Any]]:
@@ -103,22 +110,21 @@ def describe_views(
         refined: the same from photometrically refined poses, or None where they were not refined.
 
     Returns:
-        Of each view its ``file``, relative to the dataset where it lies within, and its metrics ``placed`` and
+        Of each view its ``file`` (:func:`view_files`), and its metrics ``placed`` and
         ``refined``. Of a view on the trajectory also ``time_ns``, on the clock of the events, and of the corrected
         trajectory then ``camera_speed``, in units of the recording per second, and
         ``camera_turn_rate_degrees``, per second. They are None of a view off the trajectory.
     """
     dataset = pipeline.datamanager.eval_dataset
-    data = Path(pipeline.datamanager.get_datapath())
     seconds = dataset.reference_seconds
     on_trajectory = seconds.isfinite()
     speeds, turn_rates = pipeline.camera_speeds(seconds.nan_to_num(0.0))
     start = dataset.scene.trajectory.start
     views = []
-    for index, file in enumerate(dataset.image_filenames):
+    for index, file in enumerate(view_files(pipeline)):
         timed = bool(on_trajectory[index])
         view: dict[str, Any] = {
-            "file": str(file.relative_to(data) if file.is_relative_to(data) else file),
+            "file": file,
             "time_ns": start + round(float(seconds[index]) * 1e9) if timed else None,
             "camera_speed": float(speeds[index]) if timed else None,
             "camera_turn_rate_degrees": float(turn_rates[index]) if timed else None,

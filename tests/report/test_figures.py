@@ -9,15 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import make_stream
+from small_pipelines import make_pipeline
 from small_trainings import train_small_model
 
+from aenerf_ns.camera.lens import EventCamera
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotation
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
-from aenerf_ns.report.comparison import confidence_interval, paired_differences, protocol_differences
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.report.comparison import confidence_interval, paired_differences, views_left_out
 from aenerf_ns.report.measuring import RunReport
 from aenerf_ns.report.pair_residuals import _by_length, _by_tile
+from aenerf_ns.report.poses import measure_poses
+from aenerf_ns.report.protocol import Protocol, protocol_differences, shared_views
 from aenerf_ns.report.run_files import describe_state, read_record, read_scalars
 from aenerf_ns.report.trajectory_errors import as_evo_prints, correction_components
 from aenerf_ns.report.view_pictures import chosen_views
@@ -92,34 +99,74 @@ def test_the_worst_the_median_and_the_best_view_are_shown() -> None:
     assert chosen_views([20.0]) == {0: "worst"}
 
 
-def report_of(name: str, psnr: list[float], **changes: object) -> RunReport:
+def test_errors_are_those_of_evo_over_all_poses_of_the_files(random_poses: torch.Tensor, tmp_path: Path) -> None:
+    pytest.importorskip("evo.core.metrics", reason="evo is not installed")
+    from evo.core import metrics, sync
+    from evo.tools.file_interface import read_tum_trajectory_file
+
+    # More poses than the training compares, and many more than are drawn.
+    times = np.linspace(0, 7 * SECOND, 2501).astype(np.int64)
+    true = Trajectory(times, Trajectory(SECOND * np.arange(8), random_poses).interpolate(times))
+    given = perturb(true, rotation_degrees=3.0, translation=0.2, correlation_time=0.05, seed=1)
+    with NativeDatasetWriter(tmp_path / "data", EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb") as writer:
+        writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 7 * SECOND, -1)], 6, 4))
+        writer.add_trajectories(given, true)
+    found = measure_poses(make_pipeline(tmp_path / "data", "test"))
+    assert found["num_poses"] == 2501
+    assert all(
+        len(found["errors"]["estimated"][kind]) == len(found["seconds"]) == 501 for kind in found["errors"]["estimated"]
+    )
+    paths = sync.associate_trajectories(
+        *(
+            read_tum_trajectory_file(tmp_path / "data" / f"trajectory_{name}.txt")
+            for name in ("ground_truth", "estimated")
+        )
+    )
+    paths[1].align(paths[0], correct_scale=True)
+    for name, metric in (
+        ("ate", metrics.APE(metrics.PoseRelation.translation_part)),
+        ("rpe_translation", metrics.RPE(metrics.PoseRelation.translation_part)),
+        ("rpe_rotation_degrees", metrics.RPE(metrics.PoseRelation.rotation_angle_deg)),
+    ):
+        metric.process_data(paths)
+        expected = metric.get_all_statistics()
+        # The scene's transform is of float32.
+        assert found["evo"]["estimated"][name] == pytest.approx(expected, rel=1e-4, abs=1e-5 * expected["max"]), name
+
+
+def report_of(name: str, psnr: list[float]) -> RunReport:
     views = [{"file": f"{index}.png", "placed": {"psnr": value}} for index, value in enumerate(psnr)]
-    evaluation = {"color_correction": "affine", "test_poses": "as given", "views": views, **changes}
-    truths = {view["file"]: index for index, view in enumerate(views)}
-    return RunReport(name, Path(name), {}, evaluation=evaluation, truths=truths)
+    return RunReport(name, Path(name), {}, evaluation={"views": views})
 
 
-def test_differences_are_paired_by_view() -> None:
+def test_differences_are_paired_by_the_views_files() -> None:
     first, second = report_of("a", [20, 21, 25]), report_of("b", [21, 23, 26])
-    (row,) = paired_differences([first, second])
+    # The order of the views says nothing.
+    second.views.reverse()
+    (row,) = paired_differences([first, second], ["0.png", "1.png", "2.png"])
     assert (row["run"], row["minus"], row["num_views"]) == ("b", "a", 3)
     assert row["mean"] == pytest.approx(4 / 3)
     # Student's t with two degrees of freedom: 4.303 standard errors.
     half = 4.302653 * np.std([1, 2, 1], ddof=1) / 3**0.5
     assert row["interval"] == pytest.approx((4 / 3 - half, 4 / 3 + half), rel=1e-6)
     assert confidence_interval(np.array([1.0])) is None
-    # Another image under the same name is another view.
-    second.truths["2.png"] = 99
-    assert paired_differences([first, second])[0]["num_views"] == 2
+    shared = ["1.png", "2.png"]
+    (row,) = paired_differences([first, second], shared)
+    assert (row["num_views"], row["mean"]) == (2, 1.5)
+    assert views_left_out([first, second], shared) == {"a": ["0.png"], "b": ["0.png"]}
+    assert paired_differences([first, second], []) == []
 
 
 def test_protocols_that_differ_are_named() -> None:
-    same = [report_of("a", [20, 21]), report_of("b", [22, 23])]
-    assert protocol_differences(same) == []
-    other = report_of("c", [20, 21, 22], color_correction="network")
-    colors, views = protocol_differences([same[0], other])
+    first = Protocol("affine", "as given", {"0.png": 10, "1.png": 11})
+    assert protocol_differences(["a", "b"], [first, first]) == []
+    # Another image under the same name is another view.
+    other = Protocol("network", "as given", {"2.png": 12, "1.png": 11, "0.png": 99})
+    colors, views = protocol_differences(["a", "c"], [first, other])
     assert colors == "color correction: affine (a), network (c)"
-    assert views == "test views: 2 (a) and 3 (c), of which 2 are the same image"
+    assert views == "test views: 2 (a) and 3 (c), of which 1 are the same image of the same name"
+    assert shared_views([first, other]) == ["1.png"]
+    assert shared_views([first]) == ["0.png", "1.png"]
 
 
 def test_what_a_run_wrote_is_read_back(tmp_path: Path) -> None:

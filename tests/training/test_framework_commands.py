@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import json
 import os
 import re
+import shutil
 import socket
 import subprocess
 import sys
 import time
 import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -22,16 +24,25 @@ import pytest
 import torch
 import trimesh
 import websockets.sync.client
+import yaml
 from browser import chromium
-from commands import CPU, newest_config, run, simulate
+from commands import CPU, newest_config, run
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.trainer import writer
+from nerfstudio.scripts import train
+from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.scripts.exporter import ExportPointCloud
+from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, SpiralRender
 from PIL import Image
 
+from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_cameras import ExportCameras
 from aenerf_ns.cli.export_frames import ExportFrames
 from aenerf_ns.cli.export_mesh import ExportMesh
+from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.export_video import ExportVideo
 from aenerf_ns.cli.report import Report
+from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.pipeline import AENeRFPipeline
@@ -42,14 +53,18 @@ PSNR_MARGIN = 3.0
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("workspace")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder that all commands are started in."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("workspace"))
+        yield Path.cwd()
 
 
 @pytest.fixture(scope="module")
 def trained(workspace: Path) -> Path:
     """config.yml of a run on a tiny simulated room, whose events are gone since."""
-    data = simulate(workspace / "room")
+    data = workspace / "room"
+    Simulate(output=data, width=48, height=36, train_images=4, validation_views=4, test_views=3).main()
     run(
         "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", str(STEPS),
         "--steps-per-save", "200", "--data", data,
@@ -59,41 +74,50 @@ def trained(workspace: Path) -> Path:
     return newest_config(workspace / "outputs")
 
 
-def evaluate(config: Path, workspace: Path, name: str) -> dict:
-    output = workspace / f"{name}.json"
-    pictures = workspace / f"{name}_pictures"
-    run("ns-eval", "--load-config", config, "--output-path", output, "--render-output-path", pictures, cwd=workspace)
-    assert {path.name for path in pictures.glob("eval_img_*.png")} == {f"eval_img_{view:05d}.png" for view in range(3)}
-    return json.loads(output.read_text())
+@contextmanager
+def events_of(data: Path) -> Iterator[None]:
+    """Put the events of a dataset back for a while."""
+    (data / "events.gone").rename(data / "events.h5")
+    yield
+    (data / "events.h5").rename(data / "events.gone")
+
+
+def train_again(config: Path, name: str, **settings: Any) -> Path:
+    """Train in this process with some other settings, and return the new run's config.yml. Starting takes long."""
+    changed = yaml.load(config.read_text(), Loader=yaml.Loader)
+    changed.experiment_name, changed.timestamp = name, "{timestamp}"
+    for setting, value in settings.items():
+        setattr(changed, setting, value)
+    try:
+        with events_of(changed.data):
+            train.main(changed)
+    finally:
+        # The framework keeps them for good.
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
+    return newest_config(Path("outputs") / name)
 
 
 @pytest.fixture(scope="module")
-def untrained(trained: Path, workspace: Path) -> Path:
+def untrained(trained: Path) -> Path:
     """config.yml of a run of one step on the same data."""
-    data = workspace / "room"
-    (data / "events.gone").rename(data / "events.h5")
-    run(
-        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "1", "--data", data,
-        "--experiment-name", "untrained", cwd=workspace,
-    )  # fmt: skip
-    (data / "events.h5").rename(data / "events.gone")
-    return newest_config(workspace / "outputs" / "untrained")
+    return train_again(trained, "untrained", max_num_iterations=1)
 
 
 @pytest.fixture
-def with_events(trained: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The run, while its events are there again, in the folder that it was trained from."""
-    monkeypatch.chdir(workspace)
-    data = workspace / "room"
-    (data / "events.gone").rename(data / "events.h5")
-    yield trained
-    (data / "events.h5").rename(data / "events.gone")
+def with_events(trained: Path, workspace: Path) -> Iterator[Path]:
+    """The run, while its events are there again."""
+    with events_of(workspace / "room"):
+        yield trained
 
 
 @pytest.fixture(scope="module")
 def evaluated(trained: Path, workspace: Path) -> dict:
     """What ns-eval says of the run that all tests look at."""
-    return evaluate(trained, workspace, "trained")
+    output, pictures = workspace / "trained.json", workspace / "pictures"
+    run("ns-eval", "--load-config", trained, "--output-path", output, "--render-output-path", pictures, cwd=workspace)
+    assert {path.name for path in pictures.glob("eval_img_*.png")} == {f"eval_img_{view:05d}.png" for view in range(3)}
+    return json.loads(output.read_text())
 
 
 def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, untrained: Path, workspace: Path) -> None:
@@ -117,17 +141,21 @@ def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, un
         for metric in ("psnr", "ssim"):
             mean = np.mean([view[name][metric] for view in views])
             assert figures[metric] == pytest.approx(mean, rel=1e-5)
-    worse = evaluate(untrained, workspace, "untrained")["results"]
+    ComputePSNR(untrained, workspace / "untrained.json").main()
+    worse = json.loads((workspace / "untrained.json").read_text())["results"]
     assert results["psnr"] > worse["psnr"] + PSNR_MARGIN
     assert results["ssim"] > worse["ssim"]
 
 
-def test_a_run_is_evaluated_under_other_protocols(trained: Path, evaluated: dict, workspace: Path) -> None:
+def test_a_run_is_evaluated_under_other_protocols(
+    trained: Path, evaluated: dict, workspace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     checkpoint = next(trained.parent.rglob("*.ckpt"))
     before = (trained.read_bytes(), checkpoint.read_bytes())
     output, pictures = workspace / "network" / "metrics.json", workspace / "network" / "pictures"
-    options = ("--color-correction", "network", "--render-output", pictures)
-    said = run("aenerf", "evaluate", "--load-config", trained, "--output", output, *options, cwd=workspace)
+    predictions = workspace / "network" / "nerfbaselines"
+    Evaluate(trained, output, "network", pictures, predictions).main()
+    said = capsys.readouterr().out
     written = json.loads(output.read_text())
     # The layout of ns-eval, and what it was computed with.
     assert written.pop("protocol") == {"color_correction": "network", "color_correction_of_run": "affine"}
@@ -141,18 +169,20 @@ def test_a_run_is_evaluated_under_other_protocols(trained: Path, evaluated: dict
     assert 0 < abs(results["psnr"] - of_run["psnr"]) < 3
     assert len(list(pictures.glob("eval_img_*.png"))) == 3
     assert (trained.read_bytes(), checkpoint.read_bytes()) == before
-    missing = ("aenerf", "evaluate", "--load-config", "nothing.yml", "--output", output)
-    assert "nothing.yml: there is no such file" in run(*missing, cwd=workspace, fails=True)
+    # What nerfbaselines reads: pictures whose errors are the metrics, but for the rounding to 8 bits.
+    for index, view in enumerate(results["views"]):
+        rendering, truth = (
+            np.asarray(Image.open(predictions / "predictions" / kind / f"{index:05d}.png")) / 255
+            for kind in ("color", "gt-color")
+        )
+        psnr = -10 * np.log10(np.square(rendering - truth).mean())
+        assert psnr == pytest.approx(view["placed"]["psnr"], abs=0.02)
+    metrics = json.loads((predictions / "results.json").read_text())["metrics"]
+    assert metrics == {name: pytest.approx(results[name], abs=1e-5) for name in ("psnr", "ssim")}
 
 
 def test_resuming_continues_from_the_checkpoint(trained: Path, workspace: Path) -> None:
-    data = workspace / "room"
-    (data / "events.gone").rename(data / "events.h5")
-    run(
-        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "5", "--data", data,
-        "--experiment-name", "resumed", "--load-dir", trained.parent / "nerfstudio_models", cwd=workspace,
-    )  # fmt: skip
-    (data / "events.h5").rename(data / "events.gone")
+    train_again(trained, "resumed", max_num_iterations=5, load_dir=trained.parent / "nerfstudio_models")
     (checkpoint,) = (workspace / "outputs" / "resumed").rglob("*.ckpt")
     assert checkpoint.name == f"step-{STEPS + 4:09d}.ckpt"
     before = torch.load(next(trained.parent.rglob("*.ckpt")), weights_only=True)
@@ -168,13 +198,12 @@ def test_resuming_continues_from_the_checkpoint(trained: Path, workspace: Path) 
 def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspace: Path) -> None:
     given = read_tum_trajectory(workspace / "room" / "trajectory_estimated.txt")
     for poses, rate, times in (
-        ("estimated", (), given.times),
-        ("corrected", (), given.times),
-        ("ground-truth", ("--rate", "100"), torch.arange(0, given.end + 1, 10_000_000)),
+        ("estimated", None, given.times),
+        ("corrected", None, given.times),
+        ("ground-truth", 100.0, torch.arange(0, given.end + 1, 10_000_000)),
     ):
         output = workspace / "exported" / "poses.txt"
-        options = ("--poses", poses, *rate)
-        run("aenerf", "export-trajectory", "--load-config", trained, "--output", output, *options, cwd=workspace)
+        ExportTrajectory(trained, output, poses, rate).main()
         exported = read_tum_trajectory(output)
         assert torch.equal(exported.times, times)
         difference = (exported.camera_to_worlds - given.interpolate(times)).abs().max()
@@ -184,14 +213,9 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
         else:
             # The given ones, but for the framework's float32 transform.
             assert difference < 1e-6
-    missing = ("aenerf", "export-trajectory", "--load-config", "nothing.yml", "--output", output)
-    assert "nothing.yml: there is no such file" in run(*missing, cwd=workspace, fails=True)
 
 
-def test_cameras_frames_and_a_mesh_go_on_to_other_tools(
-    trained: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(workspace)
+def test_cameras_frames_and_a_mesh_go_on_to_other_tools(trained: Path, workspace: Path) -> None:
     ExportCameras(trained.parent, workspace / "cameras", num_points=500).main()
     model = pycolmap.Reconstruction(str(workspace / "cameras" / "sparse" / "0"))
     # All images but those outside the events, at the corrected poses, where the given ones are the true ones.
@@ -243,6 +267,18 @@ def test_a_video_shows_events_rendering_and_images(with_events: Path, workspace:
     assert np.corrcoef(recorded.ravel(), rendered.ravel())[0, 1] > 0.2
 
 
+def test_a_point_cloud_is_in_the_world_of_the_recording(with_events: Path, workspace: Path) -> None:
+    ExportPointCloud(
+        with_events, workspace / "cloud", num_points=2000, normal_method="open3d", save_world_frame=True
+    ).main()
+    cloud = trimesh.load(workspace / "cloud" / "point_cloud.ply")
+    assert len(cloud.vertices) > 1900
+    # The same surfaces as those of the mesh, whose test places it.
+    lowest, highest = np.percentile(cloud.vertices, (5, 95), axis=0)
+    assert 2 < (highest - lowest).max() < 5
+    assert np.abs((lowest + highest) / 2 - [0, 0, 1.2]).max() < 0.6
+
+
 def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
     Report((with_events.parent,), workspace / "report").main()
     page = (workspace / "report" / "report.html").read_text()
@@ -261,9 +297,12 @@ def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
         assert row["lpips_placed"] == ""
     assert "LPIPS: not asked for" in page
     with chromium(workspace) as browser:
-        browser.open(workspace / "report" / "report.html")
+        browser.open_file(workspace / "report" / "report.html")
         browser.wait_for("[...document.querySelectorAll('.plotly-graph-div')].every((plot) => plot._fullLayout)")
         assert browser.evaluate("document.querySelectorAll('.plotly-graph-div').length") >= 8
+        # No plot reaches over its neighbour.
+        wide = "[...document.querySelectorAll('.plotly-graph-div')].filter((one) => one.scrollWidth > one.clientWidth)"
+        assert browser.evaluate(f"{wide}.length") == 0
         assert browser.evaluate("[...document.images].every((image) => image.naturalWidth > 0)")
         # Truth, rendering, error and depth of three views, and the check's picture.
         assert browser.evaluate("document.images.length") == 13
@@ -281,44 +320,70 @@ def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
         assert browser.complaints == []
 
 
-def test_runs_are_compared_if_they_were_measured_alike(
-    trained: Path, untrained: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture(scope="module")
+def with_other_views(untrained: Path, workspace: Path) -> Path:
+    """config.yml of a copy of the untrained run on a copy of its data with another split of the views."""
+    shutil.copytree(workspace / "room", workspace / "other")
+    file = workspace / "other" / "transforms.json"
+    meta = json.loads(file.read_text())
+    # The first test view is another one, so that all others have another index.
+    meta["test_filenames"] = [meta["val_filenames"][0], *meta["test_filenames"][:2]]
+    file.write_text(json.dumps(meta))
+    shutil.copytree(untrained.parent, workspace / "outputs" / "other" / "aenerf-small" / "now")
+    config = yaml.load(untrained.read_text(), Loader=yaml.Loader)
+    config.experiment_name, config.timestamp = "other", "now"
+    config.data = config.pipeline.datamanager.dataparser.data = config.pipeline.datamanager.data = file.parent
+    config.save_config()
+    return config.get_base_dir() / "config.yml"
+
+
+def test_runs_with_other_test_views_are_not_compared_in_silence(
+    trained: Path, with_other_views: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(workspace)
-    Report((untrained, trained), workspace / "compared").main()
-    figures = json.loads((workspace / "compared" / "report.json").read_text())
-    psnr = {(row["test_poses"], row["metric"]): row for row in figures["paired_differences"]}["placed", "psnr"]
-    assert (psnr["run"], psnr["minus"], psnr["num_views"]) == ("room", "untrained", 3)
-    one, two = (report["evaluation"]["psnr"] for report in figures["runs"])
-    assert psnr["mean"] == pytest.approx(two - one, rel=1e-4)
-    assert psnr["interval"][0] < psnr["mean"] < psnr["interval"][1]
+    with monkeypatch.context() as patch:
+        # It is refused before anything is measured.
+        patch.setattr(AENeRFPipeline, "get_average_eval_image_metrics", None)
+        with pytest.raises(
+            DataError,
+            match=r"test views: 3 \(room\) and 3 \(other\), of which 2 are .* --allow-different-protocols",
+        ):
+            Report((trained, with_other_views), workspace / "mixed").main()
+    Report((trained, with_other_views), workspace / "mixed", allow_different_protocols=True).main()
+    figures = json.loads((workspace / "mixed" / "report.json").read_text())
+    assert figures["views_not_in_all_runs"] == {"room": ["images/test/00002.png"], "other": ["images/val/00000.png"]}
+    ours, theirs = ({v["file"]: v for v in one["evaluation"]["views"]} for one in figures["runs"])
+    row = next(row for row in figures["paired_differences"] if row["metric"] == "psnr")
+    files = [f"images/test/{index:05d}.png" for index in range(2)]
+    assert (row["run"], row["minus"], row["num_views"]) == ("other", "room", 2)
+    expected = np.mean([theirs[file]["placed"]["psnr"] - ours[file]["placed"]["psnr"] for file in files])
+    assert row["mean"] == pytest.approx(expected, rel=1e-5)
+    assert row["interval"][0] < row["mean"] < row["interval"][1]
+    page = (workspace / "mixed" / "report.html").read_text()
+    assert "These runs were measured differently" in page
+    assert "2 test views are in all runs" in page
     # Their events are gone, which the page says.
-    page = (workspace / "compared" / "report.html").read_text()
     assert "the events are no longer at" in page
-    assert page.count("<figcaption>truth</figcaption>") == 6
-
-    ways = itertools.count()
-    monkeypatch.setattr(AENeRFPipeline, "_test_poses", property(lambda _: f"placed in way {next(ways)}"))
-    with pytest.raises(
-        DataError, match=r"measured differently from .*: test poses: placed in way .* --allow-different"
-    ):
-        Report((untrained, trained), workspace / "mixed").main()
-    Report((untrained, trained), workspace / "mixed", allow_different_protocols=True).main()
-    assert "These runs were measured differently" in (workspace / "mixed" / "report.html").read_text()
+    # The same truth beside each rendering of a view.
+    pictures = re.findall(r'<img alt="" src="([^"]*)"><figcaption>truth</figcaption>', page)
+    assert len(pictures) == 4
+    assert [pictures[0], pictures[2]] == [pictures[1], pictures[3]]
 
 
-@pytest.mark.parametrize(
-    "mode",
-    [
-        ("interpolate", "--interpolation-steps", "2"),
-        ("spiral", "--seconds", "0.2"),
-    ],
-    ids=lambda mode: mode[0],
-)
-def test_rendering_a_video(mode: tuple[str, ...], trained: Path, workspace: Path) -> None:
-    video = workspace / f"{mode[0]}.mp4"
+def test_rendering_a_video_by_the_command(trained: Path, workspace: Path) -> None:
+    video = workspace / "interpolate.mp4"
+    mode = ("interpolate", "--interpolation-steps", "2")
     run("ns-render", *mode, "--load-config", trained, "--output-path", video, cwd=workspace)
-    frames = imageio.imread(video, plugin="pyav")
+    require_video(video)
+
+
+def test_rendering_a_spiral(trained: Path, workspace: Path) -> None:
+    video = workspace / "spiral.mp4"
+    SpiralRender(trained, video, seconds=0.2).main()
+    require_video(video)
+
+
+def require_video(file: Path) -> None:
+    frames = imageio.imread(file, plugin="pyav")
     assert len(frames) >= 3
     assert frames.shape[1:] == (36, 48, 3)
     assert frames.std() > 5
@@ -343,21 +408,17 @@ def test_rendering_a_camera_path_of_the_viewer(trained: Path, workspace: Path) -
         * 2,
     }
     (workspace / "path.json").write_text(json.dumps(path))
-    run(
-        "ns-render", "camera-path", "--load-config", trained, "--camera-path-filename", workspace / "path.json",
-        "--output-path", workspace / "path", "--output-format", "images", cwd=workspace,
-    )  # fmt: skip
+    RenderCameraPath(
+        trained, workspace / "path", camera_path_filename=workspace / "path.json", output_format="images"
+    ).main()
     frames = [imageio.imread(file) for file in sorted((workspace / "path").glob("*.jpg"))]
     assert [frame.shape for frame in frames] == [(36, 48, 3)] * 2
 
 
 def test_rendering_the_dataset(trained: Path, workspace: Path) -> None:
-    run(
-        "ns-render", "dataset", "--load-config", trained, "--output-path", workspace / "dataset", "--split", "test",
-        "--rendered-output-names", "rgb", "gt-rgb", "depth", "accumulation", "raw-log_radiance", cwd=workspace,
-    )  # fmt: skip
-    names = {path.relative_to(workspace / "dataset" / "test").parts[0] for path in (workspace / "dataset").rglob("*.*")}
-    assert names == {"rgb", "gt-rgb", "depth", "accumulation", "raw-log_radiance"}
+    names = ["rgb", "gt-rgb", "depth", "accumulation", "raw-log_radiance"]
+    DatasetRender(trained, workspace / "dataset", split="test", rendered_output_names=names).main()
+    assert {path.relative_to("dataset/test").parts[0] for path in Path("dataset").rglob("*.*")} == set(names)
     assert len(list((workspace / "dataset").rglob("*.jpg"))) == 3 * 4
 
 

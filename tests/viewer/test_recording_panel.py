@@ -78,8 +78,10 @@ def test_nerfstudio_collects_the_elements_in_the_order_of_their_use(viewer: View
 def test_a_browser_first_sees_the_scene_from_a_corrected_pose(browser: Browser, pipeline: AENeRFPipeline) -> None:
     seconds = pipeline.recording.at_time.value
     pose = pipeline.model.camera_optimizer.pose(torch.tensor([seconds], dtype=torch.float64))[0].detach().numpy()
-    look_at = browser.wait_for("SetCameraLookAtMessage")["look_at"]
-    position = browser.wait_for("SetCameraPositionMessage")["position"]
+    *before, placed = browser.until("SetCameraPositionMessage")
+    position = placed["position"]
+    # On a slow machine, the browser is also sent where it looks before it is moved.
+    look_at = [message["look_at"] for message in before if message["type"] == "SetCameraLookAtMessage"][-1]
     np.testing.assert_allclose(position, SCALE * pose[:, 3], atol=1e-6)
     forward = np.subtract(look_at, position)
     np.testing.assert_allclose(forward / np.linalg.norm(forward), -pose[:, 2], atol=1e-3)
@@ -232,12 +234,13 @@ def test_buttons_send_files_to_the_browser_that_clicks(
     assert torch.equal(written.times, correction.trajectory.times)
     expected = pipeline.in_recording(correction.pose(correction.trajectory.seconds(written.times)).detach())
     torch.testing.assert_close(written.camera_to_worlds, expected, atol=1e-9, rtol=0)
+    viewer.control_panel._max_res.value = 96
     browser.click(pipeline.recording.write_snapshot)
     assert browser.wait_for("FileTransferStart")["filename"] == "snapshot_rgb_000000.png"
     picture = Image.open(io.BytesIO(browser.wait_for("FileTransferPart")["content"]))
-    # The browser's aspect is 1.5, the viewer's highest resolution 512.
-    assert picture.size == (512, 341)
-    camera = pipeline.recording.control.get_camera(341, 512)
+    # The browser's aspect is 1.5, the viewer's highest resolution 96.
+    assert picture.size == (96, 64)
+    camera = pipeline.recording.control.get_camera(64, 96)
     with viewer.train_lock:
         expected = 255 * pipeline.model.eval().get_outputs_for_camera(camera)["rgb"].numpy()
     np.testing.assert_allclose(np.asarray(picture, float), expected, atol=0.51)

@@ -1,0 +1,52 @@
+"""The renderings of a run's test views, beside their truth and with their metrics, for nerfbaselines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
+from PIL import Image
+
+from aenerf_ns.files.nerfbaselines import PREDICTIONS, RESULTS_FILE, describe_run, write_predictions, write_results
+from aenerf_ns.progress import progress_bar
+from aenerf_ns.training.pipeline import AENeRFPipeline
+from aenerf_ns.training.view_metrics import OF_THE_PICTURE, picture_names, to_image
+
+
+def export_predictions(
+    pipeline: AENeRFPipeline, folder: Path, config: TrainerConfig, views: list[dict[str, Any]]
+) -> None:
+    """Write the test views as ``predictions``, and their metrics as ``results.json``, in the layout of nerfbaselines.
+
+    The cameras are as the evaluation places them, not refined.
+
+    Args:
+        pipeline: of the run, as it is opened to be tested.
+        folder: to create.
+        config: of the run.
+        views: one or more; see :func:`~aenerf_ns.training.view_metrics.describe_views`.
+    """
+    names = picture_names(pipeline.datamanager.eval_dataset.image_filenames)
+    info = describe_run(config.method_name, pipeline.datamanager.get_datapath().name, config.max_num_iterations)
+    write_predictions(folder / PREDICTIONS, _rendered(pipeline, names), info)
+    # The evaluator reads the views in the order of their names.
+    placed = [view["placed"] for _, view in sorted(zip(names, views, strict=True), key=lambda pair: pair[0])]
+    metrics = {name: [one[name] for one in placed] for name in OF_THE_PICTURE if name in placed[0]}
+    write_results(folder / RESULTS_FILE, folder / PREDICTIONS, info, metrics)
+
+
+@torch.no_grad()
+def _rendered(pipeline: AENeRFPipeline, names: list[str]) -> Iterator[tuple[str, Image.Image, Image.Image]]:
+    """Yield name, rendering and truth of each test view."""
+    pipeline.eval()
+    model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
+    with progress_bar() as progress:
+        task = progress.add_task("Rendering predictions", total=len(names))
+        for index, name in enumerate(names):
+            outputs = model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(pipeline.device))
+            truth = model.reference_display(dataset.get_image_float32(index).to(pipeline.device))
+            yield name, to_image(outputs["rgb"]), to_image(truth)
+            progress.advance(task)

@@ -1,0 +1,63 @@
+"""How runs are measured, which is known before anything is measured, and which views all runs have."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from aenerf_ns.training.pipeline import AENeRFPipeline
+from aenerf_ns.training.view_metrics import view_files
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How a run is measured.
+
+    Attributes:
+        color_correction: how the colours of the renderings are corrected.
+        test_poses: how the test cameras are placed.
+        truths: a checksum of each test view's image, by the view's file.
+    """
+
+    color_correction: str
+    test_poses: str
+    truths: dict[str, int]
+
+
+def read_protocol(pipeline: AENeRFPipeline) -> Protocol:
+    """Return how a run will be measured, as it is opened to be tested."""
+    truths = {}
+    if pipeline.datamanager.has_reference_views:
+        dataset = pipeline.datamanager.eval_dataset
+        for index, file in enumerate(view_files(pipeline)):
+            truths[file] = zlib.crc32(dataset.get_numpy_image(index).tobytes())
+    return Protocol(pipeline.model.color_correction.description, pipeline.test_poses, truths)
+
+
+def protocol_differences(names: Sequence[str], protocols: Sequence[Protocol]) -> list[str]:
+    """Return in words how runs are measured differently from the first; none if their figures can be compared.
+
+    Args:
+        names: of the runs.
+        protocols: of the runs.
+    """
+    found = []
+    for name, other in zip(names[1:], protocols[1:], strict=True):
+        for what in ("color_correction", "test_poses"):
+            ours, theirs = (getattr(protocol, what) for protocol in (protocols[0], other))
+            if ours != theirs:
+                found.append(f"{what.replace('_', ' ')}: {ours} ({names[0]}), {theirs} ({name})")
+        same = shared_views([protocols[0], other])
+        if not len(same) == len(protocols[0].truths) == len(other.truths):
+            found.append(
+                f"test views: {len(protocols[0].truths)} ({names[0]}) and {len(other.truths)} ({name}), of which "
+                f"{len(same)} are the same image of the same name"
+            )
+    return found
+
+
+def shared_views(protocols: Sequence[Protocol]) -> list[str]:
+    """Return the files of the test views that all runs have, with the same image, in the order of the first run."""
+    first, *others = (protocol.truths for protocol in protocols)
+    return [file for file, truth in first.items() if all(other.get(file) == truth for other in others)]
