@@ -26,6 +26,7 @@ from aenerf_ns.events.sensor import LUMINANCE, SensorModel
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.frames import frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.simulation import RAYS_PER_PIXEL
 from benchmarks.common import write_result
 from benchmarks.paper.plan import scene_name
 
@@ -70,7 +71,8 @@ class SimulationCost:
         wall = time.perf_counter()
         for parameter, stamp in zip(parameters[: self.frames], times, strict=False):
             begin = time.process_time()
-            image = scene.renderer.render(scene.path(float(parameter)), intrinsics, self.width, self.height, 4)[0]
+            pose = scene.path(float(parameter))
+            image = scene.renderer.render(pose, intrinsics, self.width, self.height, RAYS_PER_PIXEL)[0]
             middle = time.process_time()
             columns.append(simulator(image, int(stamp)))
             rendering, simulating = rendering + middle - begin, simulating + time.process_time() - middle

@@ -22,9 +22,12 @@ from aenerf_ns.simulator.options import SensorNoise
 from aenerf_ns.simulator.paths import SpeedProfile
 from aenerf_ns.simulator.scene import SimulationScene
 
-# Rays per pixel: with 4, aliasing of the frames triggers few events; with 16, references have no visible noise.
-_EVENT_SAMPLES = 4
-_REFERENCE_SAMPLES = 16
+# An edge that crosses a pixel hides its rays one by one. With 4 rays, each of these steps fires events of its own.
+RAYS_PER_PIXEL = 16
+"""Rays per pixel of the pictures that events are made of, and of the reference pictures."""
+
+# Exposures are means of many pictures, which smooth these steps.
+_RAYS_OF_EXPOSURES = 4
 
 
 class ReferencePicture(NamedTuple):
@@ -112,7 +115,7 @@ class Simulation:
         frames = zip(self._frames, self._times, strict=True)
         with progress_bar() as progress:
             for parameter, time in progress.track(frames, total=len(self._frames), description="Simulating events"):
-                image = self._render(self._scene.path(float(parameter)), _EVENT_SAMPLES)
+                image = self._render(self._scene.path(float(parameter)), RAYS_PER_PIXEL)
                 yield EventStream(*self._simulator(image, int(time)), camera.width, camera.height, "simulation")
 
     def frame_times(self, frame_rate: float, exposure: float) -> NDArray[np.int64]:
@@ -155,14 +158,14 @@ class Simulation:
         steps = max(int(np.ceil(ends[1] - ends[0])), 1)
         seconds = middle + exposure * ((np.arange(steps) + 0.5) / steps - 0.5)
         parameters = self._profile.parameter(seconds).clip(0, 1)
-        radiance = [self._render(self._scene.path(float(s)), _EVENT_SAMPLES) for s in parameters]
+        radiance = [self._render(self._scene.path(float(s)), _RAYS_OF_EXPOSURES) for s in parameters]
         seen = to_channels(torch.from_numpy(np.mean(radiance, axis=0)), self._sensor.num_channels)
         return _display(seen.squeeze(-1))
 
     def reference_picture(self, camera_to_world: NDArray[np.float64] | Tensor) -> ReferencePicture:
         """Render the picture from a (4, 4) pose, without noise or blur."""
         pose = np.asarray(camera_to_world)
-        seen = to_channels(torch.from_numpy(self._render(pose, _REFERENCE_SAMPLES)), self._sensor.num_channels)
+        seen = to_channels(torch.from_numpy(self._render(pose, RAYS_PER_PIXEL)), self._sensor.num_channels)
         seen = seen.expand(-1, -1, 3)
         linear = (encode(seen, "linear") * 65535).round().numpy().astype(np.uint16)
         return ReferencePicture(_display(seen), linear, self._view(pose, 1)[1])

@@ -22,6 +22,7 @@ from aenerf_ns.events.sensor import LUMINANCE
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.frames import frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.simulation import RAYS_PER_PIXEL
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
@@ -154,7 +155,7 @@ def test_simulated_events_are_thresholds_apart(box_file: Path) -> None:
     scene = open_scene(name)
     intrinsics = scene.intrinsics(24, 18)
     frames = frame_parameters(scene, intrinsics, 24, 18, 1.0)
-    pictures = np.stack([scene.renderer.render(scene.path(s), intrinsics, 24, 18, 4)[0] for s in frames])
+    pictures = np.stack([scene.renderer.render(scene.path(s), intrinsics, 24, 18, RAYS_PER_PIXEL)[0] for s in frames])
     level = np.log((pictures * LUMINANCE).sum(-1, dtype=np.float64) + 1e-3)
     times = np.rint(frames * 1e9)
     pixels = 0
