@@ -13,6 +13,9 @@ from aenerf_ns.files.boundary import read_text
 # Calibrations and the metadata of bags have 1 kB a camera or topic. PyYAML reads 0.1 MB in a second.
 _MAX_BYTES = 1 << 17
 
+YAML_ERRORS = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""What PyYAML raises for a malformed file. A value that a tag does not fit ends in Python's own errors."""
+
 
 class _Loader(yaml.SafeLoader):
     """Refuse aliases. Few of them make a value of any size, or one that holds itself."""
@@ -33,5 +36,5 @@ def read_plain_yaml(path: Path) -> Any:
         return yaml.load(read_text(path, _MAX_BYTES), _Loader)
     except DataError:
         raise
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except YAML_ERRORS as error:
         raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "copy it again") from None
