@@ -150,7 +150,9 @@ def _light(values: JsonObject) -> tuple[Environment, list[AreaLight]] | None:
         environment = sky(*_radiance(light, "sky", (2, 3)))
     else:
         file = light.file("environment")
-        environment = load_environment(file, light.number("turn_degrees", -360, 360, 0.0), light.number("gain", *_SCALES, 1.0))
+        environment = load_environment(
+            file, light.number("turn_degrees", -360, 360, 0.0), light.number("gain", *_SCALES, 1.0)
+        )
     num_lamps = len(light.get("lamps", list, []))
     if num_lamps > _MOST_LAMPS:
         raise light.error("lamps", f"has {num_lamps} entries", f"give at most {_MOST_LAMPS}")

@@ -55,7 +55,9 @@ def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) 
     except DataError:
         raise
     except OSError as error:
-        raise DataError(error.filename or path, f"cannot be read ({reason(error)})", "check its name and rights") from None
+        raise DataError(
+            error.filename or path, f"cannot be read ({reason(error)})", "check its name and rights"
+        ) from None
     except Exception as error:  # a malformed file raises exceptions of any kind in trimesh
         raise DataError(path, f"cannot be read ({error})", "export the mesh again") from error
 
