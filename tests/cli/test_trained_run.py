@@ -104,7 +104,9 @@ def test_a_run_of_another_version_is_told_as_such(text: str, tmp_path: Path) -> 
         (b"a: [1", "it cannot be read"),
         (b"\xff\xfe\xff", "not text in UTF-8"),
         (b"a: \x00", "it cannot be read"),
-        (b"[" * 10_000, "it cannot be read"),
+        (b"[" * 10_000, "it has 10,000 opening brackets"),
+        (b"[" * 2000, "it cannot be read"),
+        (b"a: !!int many", "it is no configuration of a run"),
     ],
 )
 def test_what_is_no_configuration_is_one_line(contents: bytes, problem: str, tmp_path: Path) -> None:
