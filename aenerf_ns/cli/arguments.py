@@ -233,8 +233,10 @@ class EvaluateArguments:
     """Folder for pictures, from the test poses as placed: truth beside reconstruction, accumulation, depth."""
 
     def judge(self) -> None:
-        """Raise a DataError if the output cannot be written."""
+        """Raise a DataError if the output or the pictures cannot be written."""
         require_writable(self.output, "--output")
+        if self.render_output is not None:
+            require_writable(self.render_output / "0000.png", "--render-output")
 
 
 @dataclass

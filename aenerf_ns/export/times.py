@@ -60,7 +60,7 @@ def times_of_seconds(pipeline: AENeRFPipeline, seconds: Sequence[float]) -> Tens
         DataError: a time is not in the time window of the run.
     """
     window = pipeline.datamanager.train_dataset.scene.window
-    times = [round(one * 1e9) if math.isfinite(one) else -1 for one in seconds]
+    times = [round(one * 1e9) if math.isfinite(one * 1e9) else window.start - 1 for one in seconds]
     for one, time in zip(seconds, times, strict=True):
         if not window.contains(time):
             raise DataError(
