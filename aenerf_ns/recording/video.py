@@ -17,7 +17,7 @@ from aenerf_ns.errors import DataError, reading
 from aenerf_ns.recording.images import image_size_and_mode, read_image, require_8_bits
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list
 
-# OpenCV and its ffmpeg print errors of their own beside the one line. The number stands for silence.
+# OpenCV's ffmpeg prints errors of its own beside the one line, as OpenCV does. The number stands for silence.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
@@ -139,9 +139,8 @@ class _VideoFile(Video):
         # Of all backends only this one: others take the numbers in a file's name for a pattern of many files.
         with reading(self._path):
             self._path.open("rb").close()
-        level = cv2.setLogLevel(0)
+        cv2.setLogLevel(0)
         capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
-        cv2.setLogLevel(level)
         if not capture.isOpened():
             raise DataError(self._path, "not a video that can be read", "convert it to MP4, or give a folder of images")
         return capture
