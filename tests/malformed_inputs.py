@@ -163,12 +163,24 @@ def huge_chunk(folder: Path) -> None:
         column.id.write_direct_chunk((0,), b"\x78\x9c" + first + zeros)
 
 
+def chunk(kind: bytes, data: bytes) -> bytes:
+    """A part of a PNG."""
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def animation(name: str) -> Change:
+    """A picture that says to be the first of 2^32, of which the next has no size."""
+
+    def change(folder: Path) -> None:
+        content = (folder / name).read_bytes()
+        parts = chunk(b"acTL", struct.pack(">II", 2**32 - 1, 0)) + chunk(b"fcTL", bytes(26))
+        (folder / name).write_bytes(content[:33] + parts + content[33:])
+
+    return change
+
+
 def png(width: int, height: int) -> bytes:
     """A black picture of one bit a pixel."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     packer = zlib.compressobj(9)
     row = bytes(1 + (width + 7) // 8)
     data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
@@ -710,6 +722,7 @@ MALFORMED: dict[str, dict[str, tuple[str, Change]]] = {
         "text": (_NATIVE, write_text("images/val/00000.png", "no image")),
         "16 bits": (_NATIVE, saved_as("PNG", "images/val/00000.png", mode="I;16")),
         "another size among the train views": (_NATIVE, saved_as("PNG", "images/train/00001.png", (3, 2))),
+        "an animation of 2^32 pictures": (_NATIVE, animation("images/val/00000.png")),
         "half of a JPEG": (
             _NATIVE,
             all_of(
@@ -727,6 +740,10 @@ MALFORMED: dict[str, dict[str, tuple[str, Change]]] = {
         "a camera that is itself": (_OWN, camchain("cam0: &a\n  intrinsics: *a\n")),
         "a number for a name": (_OWN, camchain("0: {}\n1: {}\n")),
         "an unknown tag": (_OWN, camchain("cam0: !!python/object/apply:os.getcwd []\n")),
+        "a timestamp that is none": (_OWN, camchain(CAM0 + "  x: !!timestamp never\n")),
+        "a whole number that is none": (_OWN, camchain(CAM0 + "  x: !!int many\n")),
+        "a character beyond Unicode": (_OWN, camchain(CAM0 + '  x: "\\UFFFFFFFF"\n')),
+        "a distortion of 1e200": (_OWN, camchain(CAM0.replace("[0.0, 0.0, 0.0, 0.0]", "[1.0e+200, 0, 0, 0]"))),
         "a date": (_OWN, camchain(CAM0.replace("[60, 40]", "2020-01-01"))),
         "a set": (_OWN, camchain(CAM0.replace("[60, 40]", "!!set {60, 40}"))),
         "letters": (_OWN, camchain(CAM0.replace("[60, 40]", "[a, b]"))),

@@ -37,7 +37,7 @@ MAY_USE = {
         "viewer",
     },
     # What training and checking left behind, measured and shown.
-    "report": {"errors", "progress", "camera", "supervision", "training", "checking"},
+    "report": {"errors", "progress", "camera", "files", "supervision", "training", "checking"},
     "simulator": {"errors", "progress", "events", "camera", "files", "recording"},
     # What other tools take from a trained run. Of the simulator only the loader of Open3D.
     "export": {"errors", "progress", "events", "camera", "files", "recording", "training", "simulator"},

@@ -128,10 +128,12 @@ class EventCamera:
             plane = cv2.undistortPointsIter(pixels, matrix, distortion, np.eye(3), np.eye(3), criteria)
             points = np.concatenate([plane, np.ones_like(plane[..., :1])], -1)
             projected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0]
-        error = np.linalg.norm(projected - pixels, axis=-1).reshape(shape)
         plane = plane.reshape(*shape, 2)
         directions = np.stack([plane[..., 0], -plane[..., 1], np.full(plane.shape[:2], -1.0)], -1)
-        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        # A distortion that is absurd leaves points that are infinite. Such a pixel has no direction.
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.linalg.norm(projected - pixels, axis=-1).reshape(shape)
+            directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         return directions, error < _MAX_ROUND_TRIP_ERROR
 
     def cropped(self, x: int, y: int, width: int, height: int) -> EventCamera:

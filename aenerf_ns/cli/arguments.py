@@ -5,7 +5,6 @@ Nothing here imports torch or the framework, which take seconds. The classes of 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,7 +20,7 @@ from aenerf_ns.files.layouts import LAYOUTS
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL
 from aenerf_ns.reconstruction.weights import require_weights
-from aenerf_ns.simulator.options import BUILT_IN, Interpolation, SensorNoise, require_scene_file
+from aenerf_ns.simulator.options import BUILT_IN, DURATIONS, Interpolation, SensorNoise, require_scene_file
 
 if TYPE_CHECKING:
     from aenerf_ns.events.filters import EventFilters
@@ -31,7 +30,7 @@ _SIMULATE = "aenerf simulate"
 _RANGES = {
     "width": (1, 1 << 14),
     "height": (1, 1 << 14),
-    "duration": (1e-3, 1e5),
+    "duration": DURATIONS,
     "pose_rate": (1e-3, 1e6),
     "frame_rate": (1e-3, 1e6),
     "exposure": (1e-9, 1e3),
@@ -48,6 +47,8 @@ _RANGES = {
 }
 # Readers take no more of them.
 _MAX_POSES = 1_000_000
+_MOST_EVENTS_PER_PIXEL = 1e6
+_MOST_TOLD = 10**300
 _FOR_SCENES = ("scene", "speed", "width", "height", "duration", "pose_rate", "exposure")
 _FOR_VIDEOS = ("interpolation", "trajectory", "intrinsics", "calibration", "event_camera")
 
@@ -70,6 +71,17 @@ _PICTURES = (".png", ".jpg", ".jpeg")
 def _require_seed(seed: int, source: str) -> None:
     if not 0 <= seed < 2**63:
         raise DataError(source, f"--seed {seed}", "give a whole number from 0 on")
+
+
+def told(value: float) -> str:
+    """Return a number for a message. Formats turn whole numbers into float64, which cannot hold all of them."""
+    return str(value) if isinstance(value, int) and abs(value) > _MOST_TOLD else f"{value:g}"
+
+
+def require_rate(command: str, rate: float) -> None:
+    """Raise a DataError for a rate a second that no run can have."""
+    if not 0 < rate <= 1e9:
+        raise DataError(command, f"a rate of {rate}", "give one above 0 and up to 1e9")
 
 
 @dataclass
@@ -197,8 +209,8 @@ class ReconstructArguments:
     def judge(self) -> None:
         """Raise a DataError if the output is in the way, a number is impossible, or weights do not fit the method."""
         require_new(self.output)
-        if not 0 < self.events_per_pixel < math.inf:
-            remedy = "give a positive --events-per-pixel"
+        if not 0 < self.events_per_pixel <= _MOST_EVENTS_PER_PIXEL:
+            remedy = f"give an --events-per-pixel above 0 and up to {_MOST_EVENTS_PER_PIXEL:g}"
             raise DataError("aenerf reconstruct", f"{self.events_per_pixel} events a pixel", remedy)
         if self.method == "high-pass":
             if self.weights is not None:
@@ -224,8 +236,10 @@ class EvaluateArguments:
     reads, from the test poses as placed."""
 
     def judge(self) -> None:
-        """Raise a DataError if the output cannot be written, or the folder for nerfbaselines is in the way."""
+        """Raise a DataError if an output cannot be written, or the folder for nerfbaselines is in the way."""
         require_writable(self.output, "--output")
+        if self.render_output is not None:
+            require_writable(self.render_output / "0000.png", "--render-output")
         if self.nerfbaselines is not None:
             require_new(self.nerfbaselines, "--nerfbaselines")
 
@@ -246,8 +260,8 @@ class ExportTrajectoryArguments:
 
     def judge(self) -> None:
         """Raise a DataError if the output cannot be written, or the rate is impossible."""
-        if self.rate is not None and not 0 < self.rate <= 1e9:
-            raise DataError("aenerf export-trajectory", f"a rate of {self.rate}", "give one above 0 and up to 1e9")
+        if self.rate is not None:
+            require_rate("aenerf export-trajectory", self.rate)
         require_writable(self.output, "--output")
 
 
@@ -347,9 +361,13 @@ class SimulateArguments:
                 low, high = _RANGES[name]
                 if not low <= value <= high:
                     remedy = f"give a number from {low:g} to {high:g}"
-                    raise DataError(_SIMULATE, f"--{name.replace('_', '-')} {value:g}", remedy)
+                    raise DataError(_SIMULATE, f"--{name.replace('_', '-')} {told(value)}", remedy)
         require_event_sensor_size(self.width, self.height, _SIMULATE)
-        num_poses = self.pose_rate * (self.duration or 0)
+        self.require_few_poses(self.duration or 0)
+
+    def require_few_poses(self, duration: float) -> None:
+        """Raise a DataError if the trajectories of a duration in seconds have more poses than readers take."""
+        num_poses = self.pose_rate * duration
         if num_poses > _MAX_POSES:
             raise DataError(_SIMULATE, f"{num_poses:.3g} poses", "give a lower --pose-rate or a shorter --duration")
 

@@ -24,6 +24,9 @@ class Evaluate(EvaluateArguments):
         used = self.color_correction or of_run
         if self.color_correction is not None:
             pipeline.replace_color_correction(used)
+        if self.render_output is not None:
+            with created(self.render_output, "--render-output"):
+                self.render_output.mkdir(exist_ok=True)
         results = pipeline.get_average_eval_image_metrics(output_path=self.render_output, get_std=True)
         evaluation = {
             "experiment_name": config.experiment_name,

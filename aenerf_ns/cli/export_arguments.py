@@ -11,6 +11,7 @@ from typing import Annotated
 
 import tyro
 
+from aenerf_ns.cli.arguments import require_rate, told
 from aenerf_ns.cli.operands import RunConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.given_paths import require_new, require_writable
@@ -18,9 +19,13 @@ from aenerf_ns.files.given_paths import require_new, require_writable
 _MESH_FILES = (".ply", ".glb", ".obj")
 
 
-def _require_some(command: str, name: str, count: int) -> None:
-    if count < 1:
-        raise DataError(command, f"{count} {name}", "give one or more")
+# More than anybody needs. They would fill the memory.
+_MOST_POINTS, _MOST_VIEWS = 10_000_000, 10_000
+
+
+def _require_some(command: str, name: str, count: int, most: int) -> None:
+    if not 1 <= count <= most:
+        raise DataError(command, f"{told(count)} {name}", f"give from 1 to {most:,}")
 
 
 @dataclass
@@ -40,7 +45,7 @@ class ExportCamerasArguments:
     def judge(self) -> None:
         """Raise a DataError if the output is in the way, or no points are asked for."""
         require_new(self.output)
-        _require_some("aenerf export-cameras", "points", self.num_points)
+        _require_some("aenerf export-cameras", "points", self.num_points, _MOST_POINTS)
 
 
 @dataclass
@@ -61,9 +66,11 @@ class ExportFramesArguments:
     def judge(self) -> None:
         """Raise a DataError if the output is in the way, times are given twice, or no points are asked for."""
         require_new(self.output)
-        _require_some("aenerf export-frames", "points", self.num_points)
+        _require_some("aenerf export-frames", "points", self.num_points, _MOST_POINTS)
         if self.times and self.rate is not None:
             raise DataError("aenerf export-frames", "--rate and --times are given", "leave out one of the two")
+        if self.rate is not None:
+            require_rate("aenerf export-frames", self.rate)
 
 
 @dataclass
@@ -87,7 +94,7 @@ class ExportMeshArguments:
         require_writable(self.output, "--output")
         if not 8 <= self.resolution <= 2048:
             raise DataError("aenerf export-mesh", f"a resolution of {self.resolution}", "give one from 8 to 2048")
-        _require_some("aenerf export-mesh", "views", self.num_views)
+        _require_some("aenerf export-mesh", "views", self.num_views, _MOST_VIEWS)
 
 
 @dataclass
@@ -106,10 +113,11 @@ class ExportVideoArguments:
 
     def judge(self) -> None:
         """Raise a DataError if the output cannot be written, or the frame rate is impossible."""
-        if not 0 < self.frame_rate <= 1000:
-            raise DataError(
-                "aenerf export-video", f"a frame rate of {self.frame_rate}", "give one above 0 and up to 1000"
-            )
+        if self.output.suffix.lower() != ".mp4":
+            raise DataError(self.output, "not a video file", "choose another --output, ending with .mp4")
+        if not 0.1 <= self.frame_rate <= 1000:
+            raise DataError("aenerf export-video", f"a frame rate of {self.frame_rate}", "give one from 0.1 to 1000")
+        require_rate("aenerf export-video", self.rate)
         require_writable(self.output, "--output")
 
 

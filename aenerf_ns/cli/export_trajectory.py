@@ -22,6 +22,9 @@ class ExportTrajectory(ExportTrajectoryArguments):
     def main(self) -> None:
         """Load the run and write its poses."""
         self.judge()
+        # Imported lazily, because this import takes seconds.
+        from aenerf_ns.export.times import regular_times
+
         _, pipeline, _ = open_run(self.load_config, test_mode="inference")
         correction = pipeline.model.camera_optimizer
         estimated = correction.trajectory
@@ -35,7 +38,7 @@ class ExportTrajectory(ExportTrajectoryArguments):
             trajectory = trajectory.to(pipeline.device).between(estimated.start, estimated.end)
         times = trajectory.times
         if self.rate is not None:
-            times = torch.arange(trajectory.start, trajectory.end + 1, round(1e9 / self.rate), device=times.device)
+            times = regular_times(trajectory.start, trajectory.end, self.rate).to(times.device)
         source = correction if self.poses == "corrected" else trajectory
         with torch.no_grad():
             poses = source.pose(trajectory.seconds(times))

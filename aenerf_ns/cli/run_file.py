@@ -15,8 +15,8 @@ from typing import Any
 import yaml
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.boundary import read_text
 from aenerf_ns.files.given_paths import require_run
+from aenerf_ns.files.plain_yaml import YAML_ERRORS, read_yaml_text
 
 _YAML = "tag:yaml.org,2002:"
 _PLAIN = {
@@ -67,10 +67,10 @@ def _tags(config: Path) -> list[tuple[str, int]]:
     try:
         tags = [
             (event.tag, event.start_mark.line + 1)
-            for event in yaml.parse(read_text(config, _MAX_BYTES), Loader=yaml.Loader)
+            for event in yaml.parse(read_yaml_text(config, _MAX_BYTES), Loader=yaml.Loader)
             if getattr(event, "tag", None) is not None
         ]
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except YAML_ERRORS as error:
         if isinstance(error, DataError):
             raise
         raise DataError(config, f"it cannot be read ({error})", _REMEDY) from None

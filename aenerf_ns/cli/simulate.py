@@ -18,7 +18,7 @@ from aenerf_ns.cli.arguments import SimulateArguments
 from aenerf_ns.cli.dataset_format import training_command
 from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
 from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
@@ -50,6 +50,8 @@ class Simulate(SimulateArguments):
 
     def _simulate_scene(self, lock: OutputLock) -> None:
         scene = open_scene(self.scene, self.seed)
+        duration = scene.duration if self.duration is None else self.duration
+        self.require_few_poses(duration)
         for note in scene.notes:
             CONSOLE.print(note, highlight=False, markup=False)
         held_out: dict[Split, torch.Tensor] = {
@@ -64,7 +66,7 @@ class Simulate(SimulateArguments):
                 camera,
                 sensor,
                 self.speed,
-                scene.duration if self.duration is None else self.duration,
+                duration,
                 self.max_displacement,
                 self.seed,
                 self.noise,
@@ -120,6 +122,7 @@ class Simulate(SimulateArguments):
 
     def _simulate_video(self, source: Path, lock: OutputLock) -> None:
         video = open_video(source, self.frame_rate)
+        require_event_sensor_size(video.width, video.height, str(source))
         camera = self._video_camera(video)
         try:
             sensor = self.sensor()

@@ -26,7 +26,8 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
         The run's configuration, its pipeline, and the checkpoint that was loaded.
 
     Raises:
-        DataError: there is no such file, opening it could run foreign code, or the run is of another method.
+        DataError: there is no such file, opening it could run foreign code, the run is of another method, it has no
+            whole checkpoint, or a value in its files is impossible.
     """
     config = require_run(run)
     require_known_tags(config)
@@ -35,7 +36,27 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
 
     from aenerf_ns.training.pipeline import AENeRFPipeline
 
-    opened, pipeline, checkpoint, _ = eval_setup(config, test_mode=test_mode)
+    try:
+        opened, pipeline, checkpoint, _ = eval_setup(
+            config, test_mode=test_mode, update_config_callback=_require_checkpoints
+        )
+    except DataError:
+        raise
+    except Exception as error:
+        # The framework and torch stumble over values of a wrong kind in any way.
+        told = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise DataError(config, f"the run cannot be opened ({told})", "copy the run again, or train again") from error
     if not isinstance(pipeline, AENeRFPipeline):
         raise DataError(config, f"the run is of method {opened.method_name}", "use ns-eval and ns-export")
+    for name, value in pipeline.named_parameters():
+        if not value.isfinite().all():
+            raise DataError(checkpoint, f"its {name} is not finite", "load an earlier one, or train again")
     return opened, pipeline, checkpoint
+
+
+def _require_checkpoints(config: TrainerConfig) -> TrainerConfig:
+    """Raise a DataError for a run without checkpoints, which the framework tells in several lines."""
+    folder = config.get_checkpoint_dir()
+    if not folder.is_dir():
+        raise DataError(folder, "there is no such folder", "copy the run's checkpoints, or train again")
+    return config

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -21,9 +22,21 @@ def new_video(path: Path, width: int, height: int, frame_rate: float) -> Generat
         imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
         raise DataError(path.name, f"there is no ffmpeg to write it ({error})", "install ffmpeg") from None
+    pictures = _written(path, width, height, frame_rate)
+    next(pictures)
+    return pictures
+
+
+def _written(path: Path, width: int, height: int, frame_rate: float) -> Generator[None, bytes | None, None]:
+    # ffmpeg complains of a video without pictures.
+    picture = yield
     # H.264 stores colours for blocks of 2 x 2 pixels: an odd size is scaled by a fraction of a pixel.
-    video = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=frame_rate, macro_block_size=2, ffmpeg_log_level="error"
-    )
-    video.send(None)
-    return video
+    with closing(
+        imageio_ffmpeg.write_frames(
+            str(path), (width, height), fps=frame_rate, macro_block_size=2, ffmpeg_log_level="error"
+        )
+    ) as video:
+        video.send(None)
+        while True:
+            video.send(picture)
+            picture = yield

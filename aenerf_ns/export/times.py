@@ -11,6 +11,8 @@ from torch import Tensor
 from aenerf_ns.errors import DataError
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
+_MOST_TIMES = 1_000_000
+
 
 def spread_times(pipeline: AENeRFPipeline, count: int) -> Tensor:
     """Return (count,) times in nanoseconds, evenly spread over the time window of a run, its gaps left out."""
@@ -25,6 +27,21 @@ def spread_times(pipeline: AENeRFPipeline, count: int) -> Tensor:
     return ends[piece] - (passed[piece] - places)
 
 
+def regular_times(start: int, end: int, rate: float) -> Tensor:
+    """Return times in nanoseconds from a start to an end, so many a second.
+
+    Raises:
+        DataError: the rate is not positive, or gives more times than a reader of trajectories takes.
+    """
+    if not 0 < rate <= 1e9:
+        raise DataError("aenerf", f"a rate of {rate}", "give one above 0 and up to 1e9 a second")
+    count = (end - start) * 1e-9 * rate
+    if count > _MOST_TIMES:
+        raise DataError("aenerf", f"a rate of {rate:g} gives {count:.3g} times", f"give one that gives {_MOST_TIMES:,}")
+    # An interval beyond the end gives the start alone.
+    return torch.arange(start, end + 1, max(round(min(1e9 / rate, end - start + 1)), 1))
+
+
 def times_at_rate(pipeline: AENeRFPipeline, rate: float) -> Tensor:
     """Return times in nanoseconds, so many a second, in the time window of a run but not in its gaps.
 
@@ -32,9 +49,7 @@ def times_at_rate(pipeline: AENeRFPipeline, rate: float) -> Tensor:
         DataError: the rate is not positive, or too high for the run.
     """
     window = pipeline.datamanager.train_dataset.scene.window
-    if not 0 < rate <= 1e6:
-        raise DataError("aenerf", f"a rate of {rate}", "give one above 0 and up to 1e6 a second")
-    times = torch.arange(window.start, window.end + 1, max(round(1e9 / rate), 1))
+    times = regular_times(window.start, window.end, rate)
     return times[torch.from_numpy(window.contains(times))]
 
 
@@ -45,7 +60,7 @@ def times_of_seconds(pipeline: AENeRFPipeline, seconds: Sequence[float]) -> Tens
         DataError: a time is not in the time window of the run.
     """
     window = pipeline.datamanager.train_dataset.scene.window
-    times = [round(one * 1e9) if math.isfinite(one) else -1 for one in seconds]
+    times = [round(one * 1e9) if math.isfinite(one * 1e9) else window.start - 1 for one in seconds]
     for one, time in zip(seconds, times, strict=True):
         if not window.contains(time):
             raise DataError(

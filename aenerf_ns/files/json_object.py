@@ -6,7 +6,6 @@ The import of torch takes seconds. So it waits until a matrix or a camera is rea
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Collection, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -140,11 +139,11 @@ class JsonObject:
         """Tell whether there is a value of ``name`` that has this type."""
         return isinstance(self._values.get(name), kind)
 
-    def positive(self, name: str, *default: float) -> float:
-        """Return the number ``name``, which must be positive and finite."""
+    def number(self, name: str, low: float, high: float, *default: float) -> float:
+        """Return the number ``name``, which must be from the lower bound to the higher one."""
         value = self.get(name, float, *default)
-        if not 0 < value < math.inf:
-            raise self.error(name, f"is {value:g}", "give a positive number")
+        if not low <= value <= high:
+            raise self.error(name, f"is {value:g}", f"give a number from {low:g} to {high:g}")
         return value
 
     def choice(self, name: str, known: Sequence[str], *default: str) -> str:

@@ -13,6 +13,12 @@ from aenerf_ns.files.boundary import read_text
 # Calibrations and the metadata of bags have 1 kB a camera or topic. PyYAML reads 0.1 MB in a second.
 _MAX_BYTES = 1 << 17
 
+# For each bracket that is open, PyYAML takes time at every token.
+_MOST_BRACKETS = 2000
+
+YAML_ERRORS = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""What PyYAML raises for a malformed file. A value that a tag does not fit ends in Python's own errors."""
+
 
 class _Loader(yaml.SafeLoader):
     """Refuse aliases. Few of them make a value of any size, or one that holds itself."""
@@ -23,6 +29,19 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
+def read_yaml_text(path: Path, max_bytes: int) -> str:
+    """Return the text of a YAML file.
+
+    Raises:
+        DataError: the file is missing, too large, or not text, or it has more brackets than such a file can have.
+    """
+    text = read_text(path, max_bytes)
+    brackets = text.count("[") + text.count("{")
+    if brackets > _MOST_BRACKETS:
+        raise DataError(path, f"it has {brackets:,} opening brackets", f"such a file has at most {_MOST_BRACKETS:,}")
+    return text
+
+
 def read_plain_yaml(path: Path) -> Any:
     """Return the value of a YAML file.
 
@@ -30,8 +49,8 @@ def read_plain_yaml(path: Path) -> Any:
         DataError: the file is missing, too large, or not valid YAML, or it has aliases.
     """
     try:
-        return yaml.load(read_text(path, _MAX_BYTES), _Loader)
+        return yaml.load(read_yaml_text(path, _MAX_BYTES), _Loader)
     except DataError:
         raise
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except YAML_ERRORS as error:
         raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "copy it again") from None

@@ -6,6 +6,11 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
+from aenerf_ns.errors import DataError
+
+# SSIM's window of 11 pixels is mirrored at the edges.
+_SMALLEST = 6
+
 
 class ImageMetrics:
     """PSNR, SSIM and, when asked for, LPIPS of an image.
@@ -29,7 +34,15 @@ class ImageMetrics:
         Args:
             predicted: (H, W, 3).
             reference: (H, W, 3).
+
+        Raises:
+            DataError: the image is smaller than SSIM's window.
         """
+        height, width = reference.shape[:2]
+        if min(height, width) < _SMALLEST:
+            raise DataError(
+                "evaluation", f"images of {width} x {height} pixels", f"give {_SMALLEST} or more, which SSIM needs"
+            )
         # Imported lazily: every ns-* command imports this module, and torchmetrics is slow to import.
         from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -28,6 +29,7 @@ from torch.nn import Parameter
 
 from aenerf_ns.camera.image_encoding import decode, encode, to_channels
 from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.errors import DataError
 from aenerf_ns.method.box_collider import BoxCollider
 from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
@@ -112,6 +114,7 @@ class AENeRFModel(Model):
         """Build the networks, the samplers, the supervision and the colour correction."""
         scene: Scene = self.kwargs["metadata"][SCENE]
         config = self.config
+        _require_possible(config)
         self.sensor = scene.sensor
         self.image_encoding = scene.image_encoding
         contraction = config.scene_contraction
@@ -367,6 +370,17 @@ class AENeRFModel(Model):
         rendered = [self(rays[begin : begin + chunk]) for begin in range(0, len(rays), chunk)]
         self.train(was_training)
         return [torch.cat([outputs[name] for outputs in rendered]) for name in names]
+
+
+def _require_possible(config: AENeRFModelConfig) -> None:
+    """Raise a DataError for planes that no ray can meet, and for chunks of no rays."""
+    near, far = config.near_plane, config.far_plane
+    if not 0 <= near < far < math.inf:
+        raise DataError(
+            "model", f"near_plane {near:g} and far_plane {far:g}", "give a finite far plane above the near one"
+        )
+    if config.eval_num_rays_per_chunk < 1:
+        raise DataError("model", f"eval_num_rays_per_chunk {config.eval_num_rays_per_chunk}", "give one or more rays")
 
 
 def _is_of_batch(ray_bundle: RayBundle) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -54,15 +55,19 @@ def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwo
     networks: dict[NetworkName, type[ReconstructionNetwork]] = {"e2vid": E2VID, "firenet": FireNet}
     weights, remedy = require_weights(name, weights), _remedy(name)
     try:
-        content = torch.load(weights, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            # Of the kind of pickle, before the error.
+            warnings.simplefilter("ignore")
+            content = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as error:
         # torch.load raises errors of many kinds, with advice to trust the file.
         raise DataError(weights, f"not a file of plain weights ({type(error).__name__})", remedy) from None
-    if not isinstance(content, dict) or not isinstance(content.get("state_dict"), dict):
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
         raise DataError(weights, "it holds no state_dict", remedy)
     network = networks[name]()
     try:
-        network.load_state_dict(content["state_dict"], strict=True)
+        network.load_state_dict(state, strict=True)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines()]
         raise DataError(weights, f"its weights are not {name}'s ({' '.join(lines)})", remedy) from None

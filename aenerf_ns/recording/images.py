@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -58,8 +59,11 @@ def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:
 @contextmanager
 def _opened(file: Path) -> Iterator[Image.Image]:
     try:
-        with Image.open(file, formats=_FORMATS) as image:
-            yield image
+        with warnings.catch_warnings():
+            # What PIL warns of is either harmless, or an error a moment later.
+            warnings.simplefilter("ignore")
+            with Image.open(file, formats=_FORMATS) as image:
+                yield image
     # PIL's readers raise whatever they stumble over.
     except Exception as error:
         raise DataError(file, f"not a PNG or JPEG image that can be read ({error})", "copy it again") from None

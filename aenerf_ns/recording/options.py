@@ -13,6 +13,7 @@ from torch import Tensor
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.text import MAX_TIME
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 
 
@@ -39,12 +40,19 @@ class EventDataParserConfig(DataParserConfig):
     value that the dataset states; where it states none, poses are interpolated however far apart they are."""
 
     def setup(self, **kwargs: Any) -> Any:
-        """Return the dataparser."""
+        """Return the dataparser.
+
+        Raises:
+            DataError: a whole number among the options is beyond all times.
+        """
         for option in fields(self):
-            path = getattr(self, option.name)
-            if isinstance(path, Path):
+            value = getattr(self, option.name)
+            if isinstance(value, Path):
                 # A run's saved configuration is also read in other working directories.
-                setattr(self, option.name, path.absolute())
+                setattr(self, option.name, value.absolute())
+            if isinstance(value, int) and abs(value) > MAX_TIME:
+                name = f"--{option.name.replace('_', '-')}"
+                raise DataError(str(self.data), f"{name} is {value}", "give nanoseconds, which have 19 digits at most")
         return super().setup(**kwargs)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,9 +13,12 @@ import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.recording.images import image_size_and_mode, read_image, require_8_bits
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list
+
+# OpenCV's ffmpeg prints errors of its own beside the one line, as OpenCV does. The number stands for silence.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 class Video(ABC):
@@ -117,7 +121,10 @@ class _VideoFile(Video):
             CONSOLE.print(
                 f"{source}: {len(milliseconds)} of the {stated} frames that it states can be decoded.", soft_wrap=True
             )
-        times = np.rint(np.array(milliseconds) * 1e6).astype(np.int64)
+        known = np.isfinite(milliseconds)
+        if frame_rate is None and not known.all():
+            raise DataError(source, "it states no times of its frames", "state their rate as --frame-rate")
+        times = np.rint(np.where(known, milliseconds, 0) * 1e6).astype(np.int64)
         super().__init__(source, (frame.shape[1], frame.shape[0]), times, frame_rate)
 
     def _read(self) -> Iterator[NDArray[np.uint8]]:
@@ -130,6 +137,9 @@ class _VideoFile(Video):
 
     def _open(self) -> cv2.VideoCapture:
         # Of all backends only this one: others take the numbers in a file's name for a pattern of many files.
+        with reading(self._path):
+            self._path.open("rb").close()
+        cv2.setLogLevel(0)
         capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         if not capture.isOpened():
             raise DataError(self._path, "not a video that can be read", "convert it to MP4, or give a folder of images")

@@ -12,6 +12,8 @@ BUILT_IN = ("room", "object", "shiny_object")
 """Names of the built-in scenes."""
 MESH_SUFFIXES = (".glb", ".obj", ".ply")
 """Endings of names of mesh files."""
+DURATIONS = (1e-3, 1e5)
+"""Shortest and longest duration in seconds."""
 Interpolation = Literal["linear", "flow"]
 """How the log-radiance changes between two frames of a video."""
 

@@ -14,7 +14,7 @@ from aenerf_ns.files.json_object import JsonObject
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.free_space import FreeSpace
-from aenerf_ns.simulator.options import MESH_SUFFIXES, require_scene_file
+from aenerf_ns.simulator.options import DURATIONS, MESH_SUFFIXES, require_scene_file
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight, baked_mesh, light_mesh
@@ -37,6 +37,10 @@ _ROUGHEST = 0.5
 """Highest roughness. The narrow lobe that reflections assume does not describe rougher surfaces."""
 _BRIGHTEST = 0.9
 """Radiance that the brightest surface in probes of the path is scaled to, with room for brighter ones between them."""
+
+# Wider than any scene needs. Beyond them float32, in which rays are traced, overflows, or the work never ends.
+_SCALES, _FOCAL_RATIOS, _TURNS = (1e-6, 1e6), (0.01, 100.0), (1e-3, 1000.0)
+_LARGEST, _MOST_LAMPS, _MOST_KNOTS = 1e6, 100, 10_000
 
 _KEYS = {"mesh", "up", "scale", "materials", "light", "background", "path", "focal_ratio", "box", "credits"}
 _PATH_KEYS = {
@@ -70,17 +74,17 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
     else:
         values = JsonObject.read(path, _REMEDY)
         values.refuse_keys_except(_KEYS)
-    file = path.parent / values.get("mesh", str)
+    file = values.file("mesh")
     up = values.choice("up", ("y", "z"), "y" if file.suffix.lower() == ".glb" else "z")
-    scale = values.positive("scale", 1.0)
+    scale = values.number("scale", *_SCALES, 1.0)
     light = _light(values)
     gloss = _gloss(values, light is None)
     background = _background(values, light)
     route = values.block("path") if "path" in values else JsonObject(path, {"kind": "around"}, remedy=_REMEDY)
     kind = route.choice("kind", tuple(_PATH_KEYS))
     route.refuse_keys_except(_PATH_KEYS[kind])
-    duration = route.positive("duration", _DURATION)
-    focal_ratio = values.positive("focal_ratio", _FOCAL_RATIO[kind])
+    duration = route.number("duration", *DURATIONS, _DURATION)
+    focal_ratio = values.number("focal_ratio", *_FOCAL_RATIOS, _FOCAL_RATIO[kind])
     box = _box(values, kind)
 
     mesh = load_mesh(file, up == "y", gloss)
@@ -145,9 +149,14 @@ def _light(values: JsonObject) -> tuple[Environment, list[AreaLight]] | None:
     if "sky" in light:
         environment = sky(*_radiance(light, "sky", (2, 3)))
     else:
-        file = values.path.parent / light.get("environment", str)
-        environment = load_environment(file, light.get("turn_degrees", float, 0.0), light.positive("gain", 1.0))
-    return environment, [_lamp(light.entry_block("lamps", i)) for i in range(len(light.get("lamps", list, [])))]
+        file = light.file("environment")
+        environment = load_environment(
+            file, light.number("turn_degrees", -360, 360, 0.0), light.number("gain", *_SCALES, 1.0)
+        )
+    num_lamps = len(light.get("lamps", list, []))
+    if num_lamps > _MOST_LAMPS:
+        raise light.error("lamps", f"has {num_lamps} entries", f"give at most {_MOST_LAMPS}")
+    return environment, [_lamp(light.entry_block("lamps", i)) for i in range(num_lamps)]
 
 
 def _gloss(values: JsonObject, is_baked: bool) -> dict[str, Gloss]:
@@ -164,10 +173,7 @@ def _gloss(values: JsonObject, is_baked: bool) -> dict[str, Gloss]:
 
 
 def _number_up_to(values: JsonObject, name: str, highest: float) -> float:
-    number = values.get(name, float)
-    if not 0 <= number <= highest:
-        raise values.error(name, f"is {number:g}", f"give a number from 0 to {highest:g}")
-    return number
+    return values.number(name, 0, highest)
 
 
 def _lamp(lamp: JsonObject) -> AreaLight:
@@ -207,8 +213,8 @@ def _views(values: JsonObject, kind: str, bounds: Array, caster: RayCaster) -> _
     route: Callable[[float], Array]
     if kind == "around":
         centre = _array(values, "centre", (3,)) if "centre" in values else bounds.mean(axis=0)
-        radius = values.positive("radius", 0.5 * _RADII * float(np.linalg.norm(bounds[1] - bounds[0])))
-        route = partial(paths.object_path, turns=values.positive("turns", 4.0), radius=radius, centre=centre)
+        radius = values.number("radius", *_SCALES, 0.5 * _RADII * float(np.linalg.norm(bounds[1] - bounds[0])))
+        route = partial(paths.object_path, turns=values.number("turns", *_TURNS, 4.0), radius=radius, centre=centre)
         space = FreeSpace(caster, min(CLEARANCE, 0.13 * radius))
         views = _Views(
             route,
@@ -259,7 +265,12 @@ def _exposed(scene: SimulationScene, renderer: Renderer) -> Renderer:
 
 
 def _array(values: JsonObject, name: str, shape: tuple[int | None, ...]) -> Array:
-    return values.numbers(name, values.get(name, list), shape).numpy()
+    array = values.numbers(name, values.get(name, list), shape).numpy()
+    if np.abs(array).max(initial=0) > _LARGEST:
+        raise values.error(name, f"has {np.abs(array).max():g}", f"give numbers up to {_LARGEST:g}")
+    if len(array) > _MOST_KNOTS:
+        raise values.error(name, f"has {len(array)} rows", f"give at most {_MOST_KNOTS}")
+    return array
 
 
 def _radiance(values: JsonObject, name: str, shape: tuple[int | None, ...]) -> Array:

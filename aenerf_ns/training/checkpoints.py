@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import pickle
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -69,17 +69,30 @@ def _newest_first(folder: Path) -> list[Path]:
 def _fault(path: Path) -> str | None:
     """Return in one line why a checkpoint cannot be loaded, or None if it can."""
     try:
+        if path.exists() and not path.is_file():
+            return "it is no file"
         with zipfile.ZipFile(path) as archive:
+            # torch.save never does. Little may unpack to any size.
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                return "it is compressed"
             # torch.load does not compare the checksums.
             damaged = archive.testzip()
         if damaged is not None:
             return f"{damaged} is damaged"
-        # Without reading the tensors.
-        entries = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except (OSError, RuntimeError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
-        return (error.strerror if isinstance(error, OSError) else None) or str(error).partition("\n")[0]
+        with warnings.catch_warnings():
+            # Of the kind of pickle, before the error.
+            warnings.simplefilter("ignore")
+            # Without reading the tensors.
+            entries = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except OSError as error:
+        return error.strerror or str(error)
+    # A malformed file raises exceptions of any kind in torch.
+    except Exception as error:
+        return str(error).partition("\n")[0] or type(error).__name__
     if not isinstance(entries, dict) or not entries.keys() >= _ENTRIES:
         return "it is no checkpoint of a training"
+    if not isinstance(entries["step"], int) or entries["step"] < 0 or not isinstance(entries["pipeline"], dict):
+        return "its step or its weights are of the wrong kind"
     return None
 
 

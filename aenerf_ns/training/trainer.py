@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -16,7 +16,7 @@ from nerfstudio.utils import comms
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.errors import errors_as_one_line
+from aenerf_ns.errors import DataError, errors_as_one_line
 from aenerf_ns.training.checkpoints import checkpoint_to_load, move_whole, require_whole, step_of
 from aenerf_ns.training.device import require_device
 from aenerf_ns.training.run_record import RunRecord, ScalarWriter
@@ -75,8 +75,20 @@ class AENeRFTrainerConfig(TrainerConfig):
             partial.write_text(yaml.dump(self), "utf8")
             move_whole(partial, path)
         except OSError as error:
-            partial.unlink(missing_ok=True)
+            with suppress(OSError):
+                partial.unlink()
             raise SystemExit(_cannot_be_written(path, error)) from None
+
+
+def _require_work(config: TrainerConfig) -> None:
+    """Raise a DataError for a training of no steps, or of steps without rays."""
+    numbers = {
+        "max-num-iterations": config.max_num_iterations,
+        "pipeline.datamanager.train-num-rays-per-batch": config.pipeline.datamanager.train_num_rays_per_batch,
+    }
+    for name, value in numbers.items():
+        if value < 1:
+            raise DataError("ns-train", f"--{name} {value}", "give one or more")
 
 
 class AENeRFTrainer(Trainer):
@@ -92,6 +104,7 @@ class AENeRFTrainer(Trainer):
     def __init__(self, config: AENeRFTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         config.schedule_length = config.schedule_length or config.max_num_iterations
         with errors_as_one_line():
+            _require_work(config)
             if config.load_dir is not None:
                 # As one path, because commands that open the run would look for a load_step among its own checkpoints.
                 config.load_checkpoint = checkpoint_to_load(config.load_dir, config.load_step)
@@ -104,7 +117,7 @@ class AENeRFTrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up the training."""
-        with _full_disk_as_one_line(self.base_dir):
+        with errors_as_one_line(), _full_disk_as_one_line(self.base_dir):
             super().setup(test_mode)
         # The framework counts its percentages and its time left from step 0, also in a run that goes on.
         writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations

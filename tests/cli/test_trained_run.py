@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
+from small_trainings import train_small_model
 
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_cameras import ExportCameras
@@ -17,6 +20,7 @@ from aenerf_ns.cli.export_trajectory import ExportTrajectory
 from aenerf_ns.cli.export_video import ExportVideo
 from aenerf_ns.cli.report import Report
 from aenerf_ns.cli.run_file import require_known_tags
+from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.errors import DataError
 from aenerf_ns.method_configs.aenerf import aenerf
@@ -104,7 +108,9 @@ def test_a_run_of_another_version_is_told_as_such(text: str, tmp_path: Path) -> 
         (b"a: [1", "it cannot be read"),
         (b"\xff\xfe\xff", "not text in UTF-8"),
         (b"a: \x00", "it cannot be read"),
-        (b"[" * 10_000, "it cannot be read"),
+        (b"[" * 10_000, "it has 10,000 opening brackets"),
+        (b"[" * 2000, "it cannot be read"),
+        (b"a: !!int many", "it is no configuration of a run"),
     ],
 )
 def test_what_is_no_configuration_is_one_line(contents: bytes, problem: str, tmp_path: Path) -> None:
@@ -114,3 +120,46 @@ def test_what_is_no_configuration_is_one_line(contents: bytes, problem: str, tmp
     assert "\n" not in str(refused.value)
     with pytest.raises(DataError, match="there is no such file"):
         Evaluate(load_config=tmp_path / "nothing.yml", output=tmp_path / "out").main()
+
+
+def damaged(run: Path, name: str, old: str, new: str) -> Path:
+    text = (run / name).read_text()
+    assert old in text
+    (run / name).write_text(text.replace(old, new, 1))
+    return run
+
+
+def test_a_run_with_values_of_a_wrong_kind_is_one_line(tmp_path: Path) -> None:
+    run = train_small_model(tmp_path, "run", 2).base_dir
+    (checkpoint,) = run.glob("nerfstudio_models/*")
+    for old, new, problem in (
+        ("timestamp: now", "timestamp: [now]", "there is no such folder"),
+        ("near_plane: 0.05", "near_plane: close", "the run cannot be opened"),
+        ("near_plane: 0.05", "near_plane: .nan", "near_plane nan"),
+        ("log2_hashmap_size: 10", "log2_hashmap_size: 60", "the run cannot be opened"),
+        ("eval_num_rays_per_chunk: 8192", "eval_num_rays_per_chunk: 0", "eval_num_rays_per_chunk 0"),
+        ("method_name: aenerf", "method_name: !!int many", "the run cannot be opened"),
+    ):
+        text = (run / "config.yml").read_text()
+        with pytest.raises(DataError, match=problem) as refused:
+            open_run(damaged(run, "config.yml", old, new))
+        assert "\n" not in str(refused.value)
+        (run / "config.yml").write_text(text)
+    entries = torch.load(checkpoint, weights_only=False)
+    for change, problem in (
+        ({"pipeline": {}}, "the run cannot be opened"),
+        ({"pipeline": {**entries["pipeline"], "_model.field.aabb": torch.zeros(7)}}, "the run cannot be opened"),
+        ({"pipeline": {key: not_finite(key, value) for key, value in entries["pipeline"].items()}}, "is not finite"),
+    ):
+        torch.save({**entries, **change}, checkpoint)
+        with pytest.raises(DataError, match=problem) as refused:
+            open_run(run)
+        assert "\n" not in str(refused.value)
+    shutil.rmtree(checkpoint.parent)
+    with pytest.raises(DataError, match="nerfstudio_models: there is no such folder; copy the run's checkpoints"):
+        open_run(run)
+
+
+def not_finite(key: str, value: object) -> object:
+    is_network = ".field." in key and isinstance(value, torch.Tensor) and value.is_floating_point()
+    return value * torch.nan if is_network and not key.endswith("aabb") else value

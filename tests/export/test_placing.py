@@ -102,6 +102,10 @@ def test_times_leave_gaps_out(pipeline: AENeRFPipeline) -> None:
             times_of_seconds(pipeline, [seconds])
     with pytest.raises(DataError, match="a rate of 0"):
         times_at_rate(pipeline, 0)
+    with pytest.raises(DataError, match="a rate of 1e\\+09 gives 1e\\+09 times"):
+        times_at_rate(pipeline, 1e9)
+    # Less than one time in the run.
+    assert times_at_rate(pipeline, 1e-300).tolist() == [0]
 
 
 def test_a_mesh_is_in_the_units_of_the_recording(pipeline: AENeRFPipeline, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -180,12 +180,18 @@ def test_what_a_run_wrote_is_read_back(tmp_path: Path) -> None:
     # A run of an earlier version has neither.
     assert read_record(tmp_path) is read_scalars(tmp_path) is None
     assert "earlier version" in describe_state(None)
-    for name, content in (("run.json", "[]"), ("run.json", "{"), ("scalars.csv", "step,name,value\n1,loss\n")):
-        broken = tmp_path / f"broken_{len(content)}"
-        broken.mkdir()
-        (broken / name).write_text(content)
-        with pytest.raises(DataError, match=name):
-            (read_record if name == "run.json" else read_scalars)(broken)
+    broken = {"run.json": ["[]", "{", "[" * 100_000, '{"steps": ' + "9" * 5000 + "}"]}
+    values = {"state": "asleep", "steps": "many", "planned_steps": [1], "seconds": None, "started": 7, "machine": []}
+    broken["run.json"] += [json.dumps({**record, name: value}) for name, value in values.items()]
+    broken["scalars.csv"] = [f"step,name,value\n{line}\n" for line in ("1,loss", "a,loss,1", f"1,{'l' * 10**6},2")]
+    for name, contents in broken.items():
+        for number, content in enumerate(contents):
+            place = tmp_path / f"broken_{name}_{number}"
+            place.mkdir()
+            (place / name).write_text(content)
+            with pytest.raises(DataError, match=name) as raised:
+                (read_record if name == "run.json" else read_scalars)(place)
+            assert "\n" not in str(raised.value)
     long = tmp_path / "scalars.csv"
     with long.open("w", newline="") as file:
         rows = csv.writer(file)

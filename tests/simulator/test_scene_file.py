@@ -38,7 +38,18 @@ DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [
         ({"mesh": "scene.json"}, "unknown kind of mesh '.json'"),
         ({"mesh": 3}, "mesh is 3, not of type str"),
         ({"up": "x"}, 'up is "x"; give "y" or "z"'),
-        ({"scale": -1}, "scale is -1; give a positive number"),
+        ({"mesh": "../box.glb"}, "it names ../box.glb, outside the folder"),
+        ({"mesh": "m" * 5000 + ".glb"}, "cannot be read (File name too long)"),
+        ({"scale": -1}, "scale is -1; give a number from 1e-06 to 1e+06"),
+        ({"scale": 1e300}, "scale is 1e+300; give a number from"),
+        ({"focal_ratio": 1e300}, "focal_ratio is 1e+300; give a number from 0.01 to 100"),
+        ({"path": {"kind": "around", "radius": 1e30}}, "radius is 1e+30; give a number from"),
+        ({"path": {"kind": "around", "turns": 1e9}}, "turns is 1e+09; give a number from 0.001 to 1000"),
+        ({"path": {"kind": "around", "duration": 1e300}}, "duration is 1e+300; give a number from 0.001 to 100000"),
+        ({"path": {"kind": "around", "centre": [0, 0, 1e30]}}, "centre has 1e+30; give numbers up to 1e+06"),
+        ({"path": {**WALK, "positions": [[0, 0, 0]] * 20_000}}, "positions has 20000 rows; give at most 10000"),
+        ({"light": {"sky": [[1] * 3, [1e300] * 3]}}, "light.sky has 1e+300; give numbers up to 1e+06"),
+        ({"light": {**DAY, "lamps": DAY["lamps"] * 101}}, "light.lamps has 101 entries; give at most 100"),
         ({"colour": 1}, "unknown key 'colour'"),
         ({"light": "bright"}, 'light is "bright"; give "baked"'),
         ({"light": {}}, 'light has none or both of "sky" and "environment"'),
@@ -75,6 +86,36 @@ def test_bad_scene_files_end_in_one_line(box_file: Path, values: dict, told: str
     message = str(raised.value)
     assert told in message
     assert "\n" not in message
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("m.obj", f"mtllib \n{TRIANGLE}"),
+        ("m.obj", f"usemtl \n{TRIANGLE}"),
+        ("m.obj", f"mtllib {'m' * 5000}\n{TRIANGLE}"),
+        ("m.obj", f"mtllib .\n{TRIANGLE}"),
+        ("m.obj", TRIANGLE.replace("3\n", "99\n")),
+        ("m.ply", "ply\n"),
+        ("m.glb", ""),
+    ],
+)
+def test_a_malformed_mesh_is_one_line(name: str, content: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(DataError) as raised:
+        open_scene(str(tmp_path / name))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_panorama_without_its_pixels_is_one_line(box_file: Path, capfd: pytest.CaptureFixture) -> None:
+    box_file.with_name("e.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 16\n")
+    with pytest.raises(DataError, match="not a Radiance picture"):
+        open_scene(scene_file(box_file, light={"environment": "e.hdr"}))
+    assert not capfd.readouterr().err
 
 
 @pytest.mark.parametrize("path", [{"kind": "around", "radius": 1.1}, WALK], ids=["around", "walk"])

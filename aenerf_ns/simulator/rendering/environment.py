@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading
+from aenerf_ns.files.boundary import require_at_most
 from aenerf_ns.simulator.arrays import Array
 
+# 16384 x 8192 pixels, uncompressed.
+_MAX_BYTES = 1 << 29
 _COARSE_ROWS = 32
 _SKY_ROWS = 512
 _BRIGHT = 4.0
@@ -76,10 +79,19 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
     """
     import cv2
 
-    if not path.is_file():
-        raise DataError(path, "the environment does not exist", "check the name")
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content[:2].tobytes() == b"#?" else None
+    with reading(path):
+        if not path.is_file():
+            raise DataError(path, "the environment does not exist", "check the name")
+        require_at_most(path, _MAX_BYTES)
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    # OpenCV prints errors of its own beside the one line.
+    level = cv2.setLogLevel(0)
+    try:
+        picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content[:2].tobytes() == b"#?" else None
+    except cv2.error:
+        picture = None
+    finally:
+        cv2.setLogLevel(level)
     if picture is None or picture.ndim != 3 or picture.dtype != np.float32:
         raise DataError(path, "not a Radiance picture", "give an equirectangular .hdr file")
     rows, columns = picture.shape[:2]

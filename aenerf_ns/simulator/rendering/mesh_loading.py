@@ -13,11 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.camera.image_encoding import decode
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, reading, reason
+from aenerf_ns.files.boundary import require_at_most
 from aenerf_ns.simulator.arrays import Array, Texture
 from aenerf_ns.simulator.options import MESH_SUFFIXES
 from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh
 from aenerf_ns.simulator.rendering.polygons import triangulated_obj
+
+# Of meshes that a ray caster takes.
+_MAX_BYTES = 1 << 30
 
 UNCOLOURED = 0.5
 """Albedo of a surface that has no colour in its file."""
@@ -38,41 +42,53 @@ def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) 
         DataError: the file, or a file that it refers to, is missing or cannot be read, or it has no surface, or no
             material of a name in ``gloss``.
     """
-    import trimesh
-
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise DataError(path, f"unknown kind of mesh {suffix!r}", f"give one of {', '.join(MESH_SUFFIXES)}")
-    if not path.is_file():
-        raise DataError(path, "the file does not exist", "check the name")
-    content = path.read_bytes()
+    with reading(path):
+        if not path.is_file():
+            raise DataError(path, "the file does not exist", "check the name")
+        require_at_most(path, _MAX_BYTES)
+        content = path.read_bytes()
+    try:
+        return _mesh(path, content, y_up, gloss or {})
+    except DataError:
+        raise
+    except OSError as error:
+        raise DataError(
+            error.filename or path, f"cannot be read ({reason(error)})", "check its name and rights"
+        ) from None
+    except Exception as error:  # a malformed file raises exceptions of any kind in trimesh
+        raise DataError(path, f"cannot be read ({error})", "export the mesh again") from error
+
+
+def _mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Gloss]) -> Mesh:
+    """Return the mesh in the content of a file."""
+    import trimesh
+
+    suffix = path.suffix.lower()
     if suffix == ".glb":
         _check_glb(path, content)
     elif suffix == ".obj":
         _check_obj(path, content.decode("utf-8", errors="replace"))
-    try:
-        if suffix == ".obj":
-            content = triangulated_obj(content.decode("utf-8", errors="replace")).encode()
-        scene = trimesh.load_scene(
-            BytesIO(content),
-            file_type=suffix[1:],
-            resolver=trimesh.resolvers.FilePathResolver(str(path)),
-            process=False,
-        )
-        nodes = list(scene.graph.nodes_geometry)
-        # trimesh makes a part of each material of an .obj file, in reversed order.
-        placed = [scene.graph[name] for name in (reversed(nodes) if suffix == ".obj" else nodes)]
-        meshes = [
-            (scene.geometry[name], np.asarray(transform, np.float64))
-            for transform, name in placed
-            if len(getattr(scene.geometry[name], "faces", ()))
-        ]
-    except Exception as error:  # a malformed file raises exceptions of any kind in trimesh
-        raise DataError(path, f"cannot be read ({error})", "export the mesh again") from error
+        content = triangulated_obj(content.decode("utf-8", errors="replace")).encode()
+    scene = trimesh.load_scene(
+        BytesIO(content),
+        file_type=suffix[1:],
+        resolver=trimesh.resolvers.FilePathResolver(str(path)),
+        process=False,
+    )
+    nodes = list(scene.graph.nodes_geometry)
+    # trimesh makes a part of each material of an .obj file, in reversed order.
+    placed = [scene.graph[name] for name in (reversed(nodes) if suffix == ".obj" else nodes)]
+    meshes = [
+        (scene.geometry[name], np.asarray(transform, np.float64))
+        for transform, name in placed
+        if len(getattr(scene.geometry[name], "faces", ()))
+    ]
     if not meshes:
         raise DataError(path, "there is no surface in it", "give a mesh of triangles, not points or lines")
     textures: dict[int, tuple[int, Texture]] = {}
-    gloss = gloss or {}
     names = [_material_name(mesh.visual) for mesh, _ in meshes]
     for name in gloss:
         if name not in names:
