@@ -144,6 +144,10 @@ def test_a_run_with_values_of_a_wrong_kind_is_one_line(tmp_path: Path) -> None:
         with pytest.raises(DataError, match=problem) as refused:
             open_run(damaged(run, "config.yml", old, new))
         assert "\n" not in str(refused.value)
+        if problem == "the run cannot be opened":
+            error = refused.value.__cause__
+            assert f"({type(error).__name__}: " in str(refused.value)
+            assert str(refused.value).endswith("ns-eval --load-config shows the traceback")
         (run / "config.yml").write_text(text)
     entries = torch.load(checkpoint, weights_only=False)
     for change, problem in (
