@@ -84,8 +84,9 @@ def test_what_could_run_is_refused_before_the_file_is_opened(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("config.yml").write_text(text)
+    output = Path("out.mp4" if command is ExportVideo else "out.ply")
     with pytest.raises(DataError, match=r"^config.yml: line \d names .*; give the config.yml of a trained run"):
-        command(Path("config.yml"), output=Path("out.ply")).main()
+        command(Path("config.yml"), output=output).main()
     assert not Path("executed").exists()
 
 

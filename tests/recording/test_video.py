@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -168,9 +169,19 @@ def test_one_image_is_no_video(tmp_path: Path) -> None:
 
 
 def test_frames_without_times_need_a_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Timeless(cv2.VideoCapture):
+    opened = cv2.VideoCapture
+
+    class Timeless:
+        """Has a capture. To inherit from OpenCV's class breaks Python's memory."""
+
+        def __init__(self, *arguments: Any) -> None:
+            self._capture = opened(*arguments)
+
         def get(self, prop: int) -> float:
-            return np.nan if prop == cv2.CAP_PROP_POS_MSEC else super().get(prop)
+            return np.nan if prop == cv2.CAP_PROP_POS_MSEC else self._capture.get(prop)
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._capture, name)
 
     path = write_video(tmp_path / "video.avi", make_frames(3))
     monkeypatch.setattr(cv2, "VideoCapture", Timeless)
