@@ -51,7 +51,9 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
         raise DataError(config, f"the run is of method {opened.method_name}", "use ns-eval and ns-export")
     for name, value in pipeline.named_parameters():
         if not value.isfinite().all():
-            raise DataError(checkpoint, f"its {name} is not finite", "remove it if there is an earlier one, or train again")
+            raise DataError(
+                checkpoint, f"its {name} is not finite", "remove it if there is an earlier one, or train again"
+            )
     return opened, pipeline, checkpoint
 
 

@@ -164,7 +164,7 @@ def test_one_image_is_no_video(tmp_path: Path) -> None:
     Image.fromarray(make_frames(1)[0]).save(tmp_path / "0.png")
     # OpenCV gives its only frame a time that no whole number of nanoseconds can hold.
     for frame_rate in (None, 30.0):
-        with pytest.raises(DataError, match="0.png: 1 frames; events happen between frames"):
+        with pytest.raises(DataError, match=r"0\.png: 1 frames; events happen between frames"):
             open_video(tmp_path / "0.png", frame_rate)
 
 
@@ -185,6 +185,6 @@ def test_frames_without_times_need_a_rate(tmp_path: Path, monkeypatch: pytest.Mo
 
     path = write_video(tmp_path / "video.avi", make_frames(3))
     monkeypatch.setattr(cv2, "VideoCapture", Timeless)
-    with pytest.raises(DataError, match="video.avi: it states no times of its frames; state their rate"):
+    with pytest.raises(DataError, match=r"video\.avi: it states no times of its frames; state their rate"):
         open_video(path)
     assert open_video(path, 10.0).times.tolist() == [0, 100_000_000, 200_000_000]
