@@ -114,7 +114,7 @@ class ExportVideoArguments:
     def judge(self) -> None:
         """Raise a DataError if the output cannot be written, or the frame rate is impossible."""
         if self.output.suffix.lower() != ".mp4":
-            raise DataError(self.output, "not a video file", "choose another --output, ending with .mp4")
+            raise DataError(self.output, "only videos of the kind .mp4 are written", "end the --output with .mp4")
         if not 0.1 <= self.frame_rate <= 1000:
             raise DataError("aenerf export-video", f"a frame rate of {self.frame_rate}", "give one from 0.1 to 1000")
         require_rate("aenerf export-video", self.rate)

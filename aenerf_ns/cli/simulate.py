@@ -122,7 +122,7 @@ class Simulate(SimulateArguments):
 
     def _simulate_video(self, source: Path, lock: OutputLock) -> None:
         video = open_video(source, self.frame_rate)
-        require_event_sensor_size(video.width, video.height, str(source))
+        require_event_sensor_size(video.width, video.height, source, "scale the frames down")
         camera = self._video_camera(video)
         try:
             sensor = self.sensor()

@@ -45,12 +45,15 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
     except Exception as error:
         # The framework and torch stumble over values of a wrong kind in any way.
         told = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise DataError(config, f"the run cannot be opened ({told})", "copy the run again, or train again") from error
+        remedy = "copy the run again, or train again; ns-eval --load-config shows the traceback"
+        raise DataError(config, f"the run cannot be opened ({told})", remedy) from error
     if not isinstance(pipeline, AENeRFPipeline):
         raise DataError(config, f"the run is of method {opened.method_name}", "use ns-eval and ns-export")
     for name, value in pipeline.named_parameters():
         if not value.isfinite().all():
-            raise DataError(checkpoint, f"its {name} is not finite", "load an earlier one, or train again")
+            raise DataError(
+                checkpoint, f"its {name} is not finite", "remove it if there is an earlier one, or train again"
+            )
     return opened, pipeline, checkpoint
 
 

@@ -79,11 +79,13 @@ class SensorModel:
         return RGGB[y % 2, x % 2].astype(np.int64)
 
 
-def require_event_sensor_size(width: int, height: int, source: str | Path) -> None:
+def require_event_sensor_size(
+    width: int, height: int, source: str | Path, remedy: str = "give the size of the sensor"
+) -> None:
     """Raise a DataError for a number of pixels that no event sensor has, before anything of that size is allocated."""
     if width * height > _MAX_PIXELS:
         raise DataError(
             source,
             f"an event sensor of {width} x {height} pixels is too large",
-            f"give the size of the sensor, at most {_MAX_PIXELS:,} pixels",
+            f"{remedy}, at most {_MAX_PIXELS:,} pixels",
         )

@@ -37,7 +37,8 @@ def regular_times(start: int, end: int, rate: float) -> Tensor:
         raise DataError("aenerf", f"a rate of {rate}", "give one above 0 and up to 1e9 a second")
     count = (end - start) * 1e-9 * rate
     if count > _MOST_TIMES:
-        raise DataError("aenerf", f"a rate of {rate:g} gives {count:.3g} times", f"give one that gives {_MOST_TIMES:,}")
+        remedy = f"give one that gives at most {_MOST_TIMES:,}"
+        raise DataError("aenerf", f"a rate of {rate:g} gives {count:.3g} times", remedy)
     # An interval beyond the end gives the start alone.
     return torch.arange(start, end + 1, max(round(min(1e9 / rate, end - start + 1)), 1))
 

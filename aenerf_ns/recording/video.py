@@ -14,6 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
+from aenerf_ns.files.text import MAX_TIME
 from aenerf_ns.recording.images import image_size_and_mode, read_image, require_8_bits
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list
 
@@ -121,8 +122,9 @@ class _VideoFile(Video):
             CONSOLE.print(
                 f"{source}: {len(milliseconds)} of the {stated} frames that it states can be decoded.", soft_wrap=True
             )
-        known = np.isfinite(milliseconds)
-        if frame_rate is None and not known.all():
+        # Some containers state none, or the largest number there is.
+        known = np.abs(milliseconds) < MAX_TIME * 1e-6
+        if frame_rate is None and len(known) > 1 and not known.all():
             raise DataError(source, "it states no times of its frames", "state their rate as --frame-rate")
         times = np.rint(np.where(known, milliseconds, 0) * 1e6).astype(np.int64)
         super().__init__(source, (frame.shape[1], frame.shape[0]), times, frame_rate)

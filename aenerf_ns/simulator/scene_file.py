@@ -179,6 +179,8 @@ def _number_up_to(values: JsonObject, name: str, highest: float) -> float:
 def _lamp(lamp: JsonObject) -> AreaLight:
     lamp.refuse_keys_except({"centre", "half_u", "half_v", "radiance"})
     centre, half_u, half_v = (_array(lamp, key, (3,)) for key in ("centre", "half_u", "half_v"))
+    if not np.cross(half_u, half_v).any():
+        raise lamp.error("half_u", "spans no rectangle with half_v", "give two directions")
     return AreaLight(centre, half_u, half_v, _radiance(lamp, "radiance", (3,)))
 
 

@@ -312,6 +312,9 @@ def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
         ("reconstruct F --output O --events-per-pixel 1e300", 1, "aenerf reconstruct: 1e+300 events a pixel; give an"),
         ("export-frames C --output O --rate nan", 1, "aenerf export-frames: a rate of nan; give one above 0"),
         ("export-video C --output O.mp4 --rate 0", 1, "aenerf export-video: a rate of 0.0; give one above 0"),
+        ("export-video C --output O.mp4 --frame-rate 0", 1, "aenerf export-video: a frame rate of 0.0; give one from"),
+        ("export-video C --output O.gif", 1, "O.gif: only videos of the kind .mp4 are written; end the --output with"),
+        ("evaluate C --output O --render-output W", 1, "W/0000.png: it cannot be created (Not a directory); choose"),
         (
             "export-cameras C --output O --num-points 1000000000000",
             1,

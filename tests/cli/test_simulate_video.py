@@ -231,3 +231,14 @@ def test_poses_of_another_clock_are_refused(frames: Path, tmp_path: Path) -> Non
 def test_options_for_videos_are_refused_for_scenes(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="--interpolation has no meaning for a scene; leave the option out"):
         simulate(tmp_path / "out", interpolation="linear")
+
+
+def test_frames_larger_than_any_event_sensor_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "large"
+    folder.mkdir()
+    for index in range(2):
+        Image.new("L", (3840, 2160)).save(folder / f"{index}.png", compress_level=1)
+    (folder / "images.txt").write_text("0 0.png\n1 1.png\n")
+    with pytest.raises(DataError, match=r"an event sensor of 3840 x 2160 pixels is .*; scale the frames down, at"):
+        Simulate(tmp_path / "dataset", video=folder).main()
+    assert not list(tmp_path.glob("*dataset*"))

@@ -84,8 +84,9 @@ def test_what_could_run_is_refused_before_the_file_is_opened(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("config.yml").write_text(text)
+    output = Path("out.mp4" if command is ExportVideo else "out.ply")
     with pytest.raises(DataError, match=r"^config.yml: line \d names .*; give the config.yml of a trained run"):
-        command(Path("config.yml"), output=Path("out.ply")).main()
+        command(Path("config.yml"), output=output).main()
     assert not Path("executed").exists()
 
 
@@ -144,6 +145,10 @@ def test_a_run_with_values_of_a_wrong_kind_is_one_line(tmp_path: Path) -> None:
         with pytest.raises(DataError, match=problem) as refused:
             open_run(damaged(run, "config.yml", old, new))
         assert "\n" not in str(refused.value)
+        if problem == "the run cannot be opened":
+            error = refused.value.__cause__
+            assert f"({type(error).__name__}: " in str(refused.value)
+            assert str(refused.value).endswith("ns-eval --load-config shows the traceback")
         (run / "config.yml").write_text(text)
     entries = torch.load(checkpoint, weights_only=False)
     for change, problem in (

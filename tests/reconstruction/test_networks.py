@@ -123,6 +123,7 @@ def test_a_file_that_cannot_be_used_ends_with_one_line(name: NetworkName, tmp_pa
         (tmp_path / ("n" * 300), "n: it cannot be read"),
         (save(tmp_path / "code.pth", name, config=Foreign()), "code.pth: not a file of plain weights"),
         (save(tmp_path / "empty.pth", name, state_dict=None), "empty.pth: it holds no state_dict"),
+        (save(tmp_path / "number.pth", name, state_dict={1: torch.zeros(1)}), "number.pth: it holds no state_dict"),
         (
             save(tmp_path / "more.pth", name, state_dict={**weights, "other": torch.zeros(1)}),
             f"its weights are not {name}'s .*other",

@@ -155,6 +155,14 @@ def test_a_pose_gap_must_be_positive(tmp_path: Path) -> None:
         parse(config_of("event-recording-data", truth.data, max_pose_gap_ns=0))
 
 
+@pytest.mark.parametrize("option", ["start_time_ns", "end_time_ns", "max_pose_gap_ns", "refractory_period_ns"])
+@pytest.mark.parametrize("value", [10**19, -(10**400)])
+def test_a_time_beyond_64_bits_is_one_line(option: str, value: int, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=f"--{option.replace('_', '-')} is -?1000.*; give nanoseconds") as refused:
+        config_of("event-recording-data", tmp_path, **{option: value}).setup()
+    assert "\n" not in str(refused.value)
+
+
 def test_windows_hold_the_events_of_the_time_window_and_read_the_file_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -107,6 +108,12 @@ def file_with(content: bytes) -> Callable[[Path], Path]:
     return write
 
 
+def cut_file(path: Path) -> Path:
+    video = write_video(path / "video.avi", make_frames(5))
+    video.write_bytes(video.read_bytes()[:4000])
+    return video
+
+
 SMALLER, DEEP = np.zeros((HEIGHT, WIDTH - 1), np.uint8), np.zeros((HEIGHT, WIDTH), np.uint16)
 
 
@@ -116,6 +123,8 @@ SMALLER, DEEP = np.zeros((HEIGHT, WIDTH - 1), np.uint8), np.zeros((HEIGHT, WIDTH
         (lambda path: path / "none.mp4", "none.mp4: there is no such video; give a file"),
         (file_with(b""), "video.mp4: not a video that can be read; convert it"),
         (file_with(bytes(range(256)) * 40), "video.mp4: not a video that can be read; convert it"),
+        (cut_file, "video.avi: (not a video that can be read|no frame of it can be decoded|[01] frames)"),
+        (file_with(b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n"), "video.mp4: not a video that can be read"),
         (lambda path: write_video(path / "video.avi", make_frames(1)), "video.avi: 1 frames; events happen between"),
         (lambda path: path, "images.txt: there is no such file"),
         (folder_with([]), "images.txt: it lists no frames; write a line"),
@@ -133,10 +142,14 @@ SMALLER, DEEP = np.zeros((HEIGHT, WIDTH - 1), np.uint8), np.zeros((HEIGHT, WIDTH
         ),
     ],
 )
-def test_an_unusable_video_is_told_in_one_line(write: Callable[[Path], Path], message: str, tmp_path: Path) -> None:
+def test_an_unusable_video_is_told_in_one_line(
+    write: Callable[[Path], Path], message: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(DataError, match=message) as told:
         list(open_video(write(tmp_path)))
     assert "\n" not in str(told.value)
+    # OpenCV and ffmpeg print from C.
+    assert not capfd.readouterr().err
 
 
 @pytest.mark.parametrize("frame_rate", [0.0, -1.0, float("nan"), float("inf"), 1e10])
@@ -144,3 +157,34 @@ def test_an_impossible_rate_is_refused(frame_rate: float, tmp_path: Path) -> Non
     folder = write_folder(tmp_path / "frames", make_frames(2), ["0", "1"])
     with pytest.raises(DataError, match="frames: "):
         open_video(folder, frame_rate)
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_image_is_no_video(tmp_path: Path) -> None:
+    Image.fromarray(make_frames(1)[0]).save(tmp_path / "0.png")
+    # OpenCV gives its only frame a time that no whole number of nanoseconds can hold.
+    for frame_rate in (None, 30.0):
+        with pytest.raises(DataError, match=r"0\.png: 1 frames; events happen between frames"):
+            open_video(tmp_path / "0.png", frame_rate)
+
+
+def test_frames_without_times_need_a_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = cv2.VideoCapture
+
+    class Timeless:
+        """Has a capture. To inherit from OpenCV's class breaks Python's memory."""
+
+        def __init__(self, *arguments: Any) -> None:
+            self._capture = opened(*arguments)
+
+        def get(self, prop: int) -> float:
+            return np.nan if prop == cv2.CAP_PROP_POS_MSEC else self._capture.get(prop)
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._capture, name)
+
+    path = write_video(tmp_path / "video.avi", make_frames(3))
+    monkeypatch.setattr(cv2, "VideoCapture", Timeless)
+    with pytest.raises(DataError, match=r"video\.avi: it states no times of its frames; state their rate"):
+        open_video(path)
+    assert open_video(path, 10.0).times.tolist() == [0, 100_000_000, 200_000_000]

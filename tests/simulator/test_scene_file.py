@@ -50,6 +50,7 @@ DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [
         ({"path": {**WALK, "positions": [[0, 0, 0]] * 20_000}}, "positions has 20000 rows; give at most 10000"),
         ({"light": {"sky": [[1] * 3, [1e300] * 3]}}, "light.sky has 1e+300; give numbers up to 1e+06"),
         ({"light": {**DAY, "lamps": DAY["lamps"] * 101}}, "light.lamps has 101 entries; give at most 100"),
+        ({"light": {**DAY, "lamps": [{**DAY["lamps"][0], "half_v": [0, 0, 0]}]}}, "half_u spans no rectangle with"),
         ({"colour": 1}, "unknown key 'colour'"),
         ({"light": "bright"}, 'light is "bright"; give "baked"'),
         ({"light": {}}, 'light has none or both of "sky" and "environment"'),
@@ -91,6 +92,8 @@ def test_bad_scene_files_end_in_one_line(box_file: Path, values: dict, told: str
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 
+# What libraries warn of would stand beside the one line.
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -99,6 +102,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
         ("m.obj", f"mtllib {'m' * 5000}\n{TRIANGLE}"),
         ("m.obj", f"mtllib .\n{TRIANGLE}"),
         ("m.obj", TRIANGLE.replace("3\n", "99\n")),
+        ("m.obj", TRIANGLE.replace("v 1", "v inf")),
         ("m.ply", "ply\n"),
         ("m.glb", ""),
     ],
@@ -111,11 +115,17 @@ def test_a_malformed_mesh_is_one_line(name: str, content: str, tmp_path: Path) -
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_panorama_without_its_pixels_is_one_line(box_file: Path, capfd: pytest.CaptureFixture) -> None:
-    box_file.with_name("e.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 16\n")
+@pytest.mark.parametrize("size", ["-Y 8 +X 16", "-Y 1000000 +X 2000000"])
+def test_a_panorama_without_its_pixels_is_one_line(
+    size: str, box_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("OPENCV_TEMP_PATH", str(tmp_path / "temporary"))
+    box_file.with_name("e.hdr").write_bytes(f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n{size}\n".encode())
     with pytest.raises(DataError, match="not a Radiance picture"):
         open_scene(scene_file(box_file, light={"environment": "e.hdr"}))
     assert not capfd.readouterr().err
+    assert not list((tmp_path / "temporary").iterdir())
 
 
 @pytest.mark.parametrize("path", [{"kind": "around", "radius": 1.1}, WALK], ids=["around", "walk"])

@@ -10,6 +10,7 @@ import torch
 from torchvision.models import alexnet
 
 from aenerf_ns.camera.image_encoding import decode, encode, to_channels
+from aenerf_ns.errors import DataError
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.supervision.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
 
@@ -79,6 +80,9 @@ def test_psnr_by_hand_and_lpips_is_absent_unless_asked_for() -> None:
     assert 0 < values["ssim"] < 1
     assert "lpips" not in values
     assert metrics.lpips_absent is not None
+    assert "ssim" in metrics(reference[:6, :6], reference[:6, :6])
+    with pytest.raises(DataError, match="images of 16 x 5 pixels; give 6 or more, which SSIM needs"):
+        metrics(reference[:5], reference[:5])
 
 
 def replace_downloads(monkeypatch: pytest.MonkeyPatch, download: Callable[..., object]) -> None:

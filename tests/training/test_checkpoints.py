@@ -8,6 +8,8 @@ import resource
 import shutil
 import signal
 import time
+import warnings
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,6 +64,27 @@ def _replace_by_folder(path: Path) -> None:
     path.mkdir()
 
 
+def _compress(path: Path) -> None:
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+def _with(**entries: object) -> Callable[[Path], None]:
+    return lambda path: torch.save({**torch.load(path, weights_only=False), **entries}, path)
+
+
+def _archive_of(pickled: bytes) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("archive/data.pkl", pickled)
+            archive.writestr("archive/version", b"3\n")
+
+    return write
+
+
 FAULTS: dict[str, Callable[[Path], Any]] = {
     "empty": _truncated(0),
     "half": _truncated(0.5),
@@ -72,6 +95,12 @@ FAULTS: dict[str, Callable[[Path], Any]] = {
     "a pickle": lambda path: path.write_bytes(pickle.dumps({"step": 3})),
     "something else's": lambda path: torch.save({"weights": torch.zeros(3)}, path),
     "code": lambda path: torch.save({"step": _Code(), "pipeline": {}}, path),
+    "compressed": _compress,
+    "a step of text": _with(step="three"),
+    "a negative step": _with(step=-5),
+    "weights in a list": _with(pipeline=[]),
+    "a pickle that takes what is not there": _archive_of(b"\x80\x02h\x05."),
+    "a pickle without its end": _archive_of(b"\x80\x02}"),
 }
 
 
@@ -85,7 +114,10 @@ def test_a_broken_newest_checkpoint_is_named_and_passed_over(
     assert checkpoint_to_load(folder) == newest
     assert capsys.readouterr().out == ""
     FAULTS[fault](newest)
-    assert checkpoint_to_load(folder) == folder / "step-000000002.ckpt"
+    with warnings.catch_warnings():
+        # What torch warns of would stand beside the one line.
+        warnings.simplefilter("error")
+        assert checkpoint_to_load(folder) == folder / "step-000000002.ckpt"
     said = capsys.readouterr().out
     assert said.count("\n") == 1
     assert said.startswith(f"{folder}: broken checkpoints: {newest.name} (")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from small_pipelines import make_pipeline_config
 from small_trainings import train_small_model
 
 from aenerf_ns.camera.rotation import rotation_from_vector
+from aenerf_ns.method_configs.aenerf import aenerf
 
 
 def without_formatting(output: str) -> str:
@@ -69,3 +71,14 @@ def test_a_run_that_goes_on_ends_at_a_hundred_percent(tmp_path: Path, capsys: py
     train_small_model(tmp_path, "second", 15, load_dir=first.checkpoint_dir)
     shown = re.findall(r"^(\d+) \((\d+)\.00%\)", without_formatting(capsys.readouterr().out), re.MULTILINE)
     assert set(shown) == {("10", "40"), ("20", "80")}
+
+
+def test_a_training_without_steps_or_rays_is_one_line() -> None:
+    config = deepcopy(aenerf.config)
+    config.max_num_iterations = 0
+    with pytest.raises(SystemExit, match=r"^Error: ns-train: --max-num-iterations 0; give one or more$"):
+        config.setup(local_rank=0, world_size=1)
+    config.max_num_iterations = 1
+    config.pipeline.datamanager.train_num_rays_per_batch = 0
+    with pytest.raises(SystemExit, match=r"^Error: ns-train: --pipeline.datamanager.train-num-rays-per-batch 0; give"):
+        config.setup(local_rank=0, world_size=1)

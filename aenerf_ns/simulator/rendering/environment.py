@@ -83,11 +83,13 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
         if not path.is_file():
             raise DataError(path, "the environment does not exist", "check the name")
         require_at_most(path, _MAX_BYTES)
-        content = np.frombuffer(path.read_bytes(), np.uint8)
+        with path.open("rb") as file:
+            begin = file.read(2)
     # OpenCV prints errors of its own beside the one line.
     level = cv2.setLogLevel(0)
     try:
-        picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content[:2].tobytes() == b"#?" else None
+        # From the file, because imdecode leaves temporary files behind for pictures that are too large.
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if begin == b"#?" else None
     except cv2.error:
         picture = None
     finally:

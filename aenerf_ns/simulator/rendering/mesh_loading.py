@@ -152,7 +152,9 @@ def _part(
             index = textures[id(image)][0]
     else:
         colour = np.full((len(vertices), 3), UNCOLOURED)
-    turned = vertices @ transform[:3, :3].T + transform[:3, 3]
+    # Infinite vertices are refused later, where the whole mesh is known.
+    with np.errstate(invalid="ignore", over="ignore"):
+        turned = vertices @ transform[:3, :3].T + transform[:3, 3]
     if np.linalg.det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return turned, faces, uv, colour, np.full(len(faces), index)
