@@ -363,11 +363,15 @@ class SimulateArguments:
                     remedy = f"give a number from {low:g} to {high:g}"
                     raise DataError(_SIMULATE, f"--{name.replace('_', '-')} {told(value)}", remedy)
         require_event_sensor_size(self.width, self.height, _SIMULATE)
-        self.require_few_poses(self.duration or 0)
+        if self.duration is not None:
+            self.require_poses(self.duration)
 
-    def require_few_poses(self, duration: float) -> None:
-        """Raise a DataError if the trajectories of a duration in seconds have more poses than readers take."""
+    def require_poses(self, duration: float) -> None:
+        """Raise a DataError if the trajectories of a duration in seconds have one pose, or more than readers take."""
         num_poses = self.pose_rate * duration
+        # The last pose is at the end, and one that is closer to it than half an interval is left out.
+        if num_poses <= 0.5:
+            raise DataError(_SIMULATE, f"--pose-rate {self.pose_rate:g} gives one pose", "give a higher --pose-rate")
         if num_poses > _MAX_POSES:
             raise DataError(_SIMULATE, f"{num_poses:.3g} poses", "give a lower --pose-rate or a shorter --duration")
 

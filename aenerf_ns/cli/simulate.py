@@ -51,7 +51,7 @@ class Simulate(SimulateArguments):
     def _simulate_scene(self, lock: OutputLock) -> None:
         scene = open_scene(self.scene, self.seed)
         duration = scene.duration if self.duration is None else self.duration
-        self.require_few_poses(duration)
+        self.require_poses(duration)
         for note in scene.notes:
             CONSOLE.print(note, highlight=False, markup=False)
         held_out: dict[Split, torch.Tensor] = {

@@ -336,6 +336,11 @@ def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
             1,
             "aenerf simulate: 1e+09 poses; give a lower --pose",
         ),
+        (
+            "simulate --output O --duration 0.05 --pose-rate 10",
+            1,
+            "aenerf simulate: --pose-rate 10 gives one pose; give a higher --pose-rate",
+        ),
         ("simulate --output O --train-images 1000000000000", 1, "aenerf simulate: --train-images 1e+12; give a number"),
         ("simulate --output O --width 9999 --height 9999", 1, "aenerf simulate: an event sensor of 9999 x 9999 pixels"),
         (
