@@ -32,7 +32,8 @@ aenerf = MethodSpecification(
         ),
         optimizers={
             "encodings": {
-                "optimizer": FusedAdamOptimizerConfig(lr=1e-2, eps=1e-15),
+                # A field that learns slowly holds on to wrong poses (docs/experiments.md).
+                "optimizer": FusedAdamOptimizerConfig(lr=8e-2, eps=1e-15),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
             "networks": {
