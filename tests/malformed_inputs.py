@@ -169,7 +169,7 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def animation(name: str) -> Change:
-    """A picture that says to be the first of 2^32, of which the next has no size."""
+    """A picture that claims to be the first of 2^32 frames. The next frame has no size."""
 
     def change(folder: Path) -> None:
         content = (folder / name).read_bytes()

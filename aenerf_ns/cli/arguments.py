@@ -17,6 +17,7 @@ from aenerf_ns.events.sensor import BayerPattern, SensorModel, require_event_sen
 from aenerf_ns.files.boundary import require_file
 from aenerf_ns.files.given_paths import require_new, require_writable
 from aenerf_ns.files.layouts import LAYOUTS
+from aenerf_ns.files.text import MAX_ROWS
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL
 from aenerf_ns.reconstruction.weights import require_weights
@@ -45,8 +46,6 @@ _RANGES = {
     "leak_rate": (0, 1e6),
     "shot_noise_rate": (0, 1e6),
 }
-# Readers take no more of them.
-_MAX_POSES = 1_000_000
 _MOST_EVENTS_PER_PIXEL = 1e6
 _MOST_TOLD = 10**300
 _FOR_SCENES = ("scene", "speed", "width", "height", "duration", "pose_rate", "exposure")
@@ -372,7 +371,7 @@ class SimulateArguments:
         # The last pose is at the end, and one that is closer to it than half an interval is left out.
         if num_poses <= 0.5:
             raise DataError(_SIMULATE, f"--pose-rate {self.pose_rate:g} gives one pose", "give a higher --pose-rate")
-        if num_poses > _MAX_POSES:
+        if num_poses > MAX_ROWS:
             raise DataError(_SIMULATE, f"{num_poses:.3g} poses", "give a lower --pose-rate or a shorter --duration")
 
     def _judge_video(self, video: Path) -> None:

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.files.text import MAX_ROWS
 from aenerf_ns.training.pipeline import AENeRFPipeline
-
-_MOST_TIMES = 1_000_000
 
 
 def spread_times(pipeline: AENeRFPipeline, count: int) -> Tensor:
@@ -36,8 +35,8 @@ def regular_times(start: int, end: int, rate: float) -> Tensor:
     if not 0 < rate <= 1e9:
         raise DataError("aenerf", f"a rate of {rate}", "give one above 0 and up to 1e9 a second")
     count = (end - start) * 1e-9 * rate
-    if count > _MOST_TIMES:
-        remedy = f"give one that gives at most {_MOST_TIMES:,}"
+    if count > MAX_ROWS:
+        remedy = f"give one that gives at most {MAX_ROWS:,}"
         raise DataError("aenerf", f"a rate of {rate:g} gives {count:.3g} times", remedy)
     # An interval beyond the end gives the start alone.
     return torch.arange(start, end + 1, max(round(min(1e9 / rate, end - start + 1)), 1))

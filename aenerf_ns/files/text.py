@@ -25,8 +25,9 @@ MAX_TIME = 4 * 10**18
 # Longer than any line of a file of events.
 _TAIL_BYTES = 4096
 
-# Of a table of rows, which is read as a whole: poses at 1000 Hz for a quarter of an hour.
-_MAX_BYTES, _MAX_ROWS = 1 << 27, 1_000_000
+MAX_ROWS = 1_000_000
+"""Rows of a table, which is read as a whole: poses at 1000 Hz for a quarter of an hour."""
+_MAX_BYTES = 1 << 27
 
 
 def read_rows(path: Path, columns: str) -> list[list[str]]:
@@ -53,8 +54,8 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
                 raise DataError(
                     path, f"line {number} has {len(fields)} fields", f"each line must hold the {expected}: {columns}"
                 )
-            if len(rows) == _MAX_ROWS:
-                raise DataError(path, f"it has more than {_MAX_ROWS:,} rows", "cut the recording, or leave rows out")
+            if len(rows) == MAX_ROWS:
+                raise DataError(path, f"it has more than {MAX_ROWS:,} rows", "cut the recording, or leave rows out")
             rows.append(fields)
     return rows
 

@@ -56,7 +56,7 @@ def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwo
     weights, remedy = require_weights(name, weights), _remedy(name)
     try:
         with warnings.catch_warnings():
-            # Of the kind of pickle, before the error.
+            # torch warns of the kind of pickle before it raises the error.
             warnings.simplefilter("ignore")
             content = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as error:

@@ -60,7 +60,7 @@ def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:
 def _opened(file: Path) -> Iterator[Image.Image]:
     try:
         with warnings.catch_warnings():
-            # What PIL warns of is either harmless, or an error a moment later.
+            # A warning of PIL is either harmless, or an error a moment later.
             warnings.simplefilter("ignore")
             with Image.open(file, formats=_FORMATS) as image:
                 yield image

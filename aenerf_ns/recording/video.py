@@ -138,10 +138,10 @@ class _VideoFile(Video):
             yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
 
     def _open(self) -> cv2.VideoCapture:
-        # Of all backends only this one: others take the numbers in a file's name for a pattern of many files.
         with reading(self._path):
             self._path.open("rb").close()
         cv2.setLogLevel(0)
+        # Of all backends only this one: others take the numbers in a file's name for a pattern of many files.
         capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         if not capture.isOpened():
             raise DataError(self._path, "not a video that can be read", "convert it to MP4, or give a folder of images")

@@ -51,8 +51,8 @@ def protocol_differences(names: Sequence[str], protocols: Sequence[Protocol]) ->
         same = shared_views([protocols[0], other])
         if not len(same) == len(protocols[0].truths) == len(other.truths):
             found.append(
-                f"test views: {len(protocols[0].truths)} ({names[0]}) and {len(other.truths)} ({name}), of which "
-                f"{len(same)} are the same image of the same name"
+                f"test views: {len(protocols[0].truths)} ({names[0]}) and {len(other.truths)} ({name}); both runs have "
+                f"{len(same)} images of the same name and content"
             )
     return found
 

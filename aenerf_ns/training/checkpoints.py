@@ -80,7 +80,7 @@ def _fault(path: Path) -> str | None:
         if damaged is not None:
             return f"{damaged} is damaged"
         with warnings.catch_warnings():
-            # Of the kind of pickle, before the error.
+            # torch warns of the kind of pickle before it raises the error.
             warnings.simplefilter("ignore")
             # Without reading the tensors.
             entries = torch.load(path, map_location="cpu", weights_only=True, mmap=True)

@@ -32,7 +32,7 @@ def whole() -> Iterator[dict[str, Path]]:
         yield folders
 
 
-# What libraries warn of would stand beside the one line.
+# A warning of a library would print a second line.
 @pytest.mark.filterwarnings("error::RuntimeWarning", "error::UserWarning")
 @pytest.mark.parametrize(("group", "name"), CASES, ids=lambda value: value.replace(" ", "_"))
 def test_a_malformed_dataset_is_one_line(group: str, name: str, whole: dict[str, Path]) -> None:

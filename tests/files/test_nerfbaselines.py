@@ -25,7 +25,7 @@ def test_predictions_and_results_are_laid_out_as_nerfbaselines_does(tmp_path: Pa
 
     write_results(tmp_path / "results.json", folder, info, {"psnr": [30.25, 20.1], "ssim": [0.7, 0.5]})
     results = json.loads((tmp_path / "results.json").read_text())
-    # What nerfbaselines 1.2.12 makes of these metrics.
+    # nerfbaselines 1.2.12 computes these values from these metrics.
     assert results["metrics"] == {"psnr": 25.175, "ssim": 0.6}
     assert results["metrics_raw"] == {"psnr": "AADyQc3MoEE=", "ssim": "MzMzPwAAAD8="}
     assert results["metrics_sha256"] == "457960527a1bb69ba7985afbd9d7f1ac934c4d4cfb2c8df20d33ee96a33be702"

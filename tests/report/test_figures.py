@@ -164,7 +164,7 @@ def test_protocols_that_differ_are_named() -> None:
     other = Protocol("network", "as given", {"2.png": 12, "1.png": 11, "0.png": 99})
     colors, views = protocol_differences(["a", "c"], [first, other])
     assert colors == "color correction: affine (a), network (c)"
-    assert views == "test views: 2 (a) and 3 (c), of which 1 are the same image of the same name"
+    assert views == "test views: 2 (a) and 3 (c); both runs have 1 images of the same name and content"
     assert shared_views([first, other]) == ["1.png"]
     assert shared_views([first]) == ["0.png", "1.png"]
 

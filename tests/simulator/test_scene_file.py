@@ -92,7 +92,7 @@ def test_bad_scene_files_end_in_one_line(box_file: Path, values: dict, told: str
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 
-# What libraries warn of would stand beside the one line.
+# A warning of a library would print a second line.
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
     ("name", "content"),

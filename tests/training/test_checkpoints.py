@@ -115,7 +115,7 @@ def test_a_broken_newest_checkpoint_is_named_and_passed_over(
     assert capsys.readouterr().out == ""
     FAULTS[fault](newest)
     with warnings.catch_warnings():
-        # What torch warns of would stand beside the one line.
+        # A warning of torch would print a second line.
         warnings.simplefilter("error")
         assert checkpoint_to_load(folder) == folder / "step-000000002.ckpt"
     said = capsys.readouterr().out

@@ -169,7 +169,7 @@ def test_a_run_is_evaluated_under_other_protocols(
     assert 0 < abs(results["psnr"] - of_run["psnr"]) < 3
     assert len(list(pictures.glob("eval_img_*.png"))) == 3
     assert (trained.read_bytes(), checkpoint.read_bytes()) == before
-    # What nerfbaselines reads: pictures whose errors are the metrics, but for the rounding to 8 bits.
+    # nerfbaselines measures the written pictures. It finds our metrics, except for the rounding to 8 bits.
     for index, view in enumerate(results["views"]):
         rendering, truth = (
             np.asarray(Image.open(predictions / "predictions" / kind / f"{index:05d}.png")) / 255
