@@ -345,7 +345,8 @@ def test_runs_with_other_test_views_are_not_compared_in_silence(
         patch.setattr(AENeRFPipeline, "get_average_eval_image_metrics", None)
         with pytest.raises(
             DataError,
-            match=r"test views: 3 \(room\) and 3 \(other\), of which 2 are .* --allow-different-protocols",
+            match=r"test views: 3 \(room\) and 3 \(other\); both runs have 2 images of the same name and content; "
+            ".* --allow-different-protocols",
         ):
             Report((trained, with_other_views), workspace / "mixed").main()
     Report((trained, with_other_views), workspace / "mixed", allow_different_protocols=True).main()
