@@ -12,6 +12,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import tyro
 
@@ -40,6 +41,8 @@ class RealPoses:
     """Root mean square of the added translations, in the units of the recording."""
     correlation_time: float = 0.05
     """Seconds over which the added errors are alike."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the added errors and of the trainings."""
     train: str = ""
     """More options of ns-train."""
 
@@ -50,13 +53,18 @@ class RealPoses:
         data = ("--data", str(self.recording.resolve()), "ecd-data", "--trajectory", "perturbed.txt")
         with TemporaryDirectory() as name:
             folder = Path(name)
-            perturbed = perturb(given, self.degrees, self.translation, self.correlation_time, seed=0)
-            write_tum_trajectory(folder / "perturbed.txt", perturbed)
-            figures = {}
-            for mode in self.modes:
-                options = ("--pipeline.model.camera-optimizer.mode", mode, *shlex.split(self.train))
-                train(folder, mode, self.method, self.steps, options, data)
-                figures[mode] = evaluate(folder, mode)["pose_errors"]
+            figures: dict[str, list[dict[str, Any]]] = {mode: [] for mode in self.modes}
+            for seed in self.seeds:
+                perturbed = perturb(given, self.degrees, self.translation, self.correlation_time, seed)
+                write_tum_trajectory(folder / "perturbed.txt", perturbed)
+                for mode in self.modes:
+                    options = (
+                        "--pipeline.model.camera-optimizer.mode", mode, "--machine.seed", str(seed),
+                        *shlex.split(self.train),
+                    )  # fmt: skip
+                    run = f"{mode}_{seed}"
+                    train(folder, run, self.method, self.steps, options, data)
+                    figures[mode].append({"seed": seed, **evaluate(folder, run)["pose_errors"]})
         result = {"recording": self.recording.name, "steps": self.steps, "noise": noise, "pose_errors": figures}
         write_result(self.output, result)
 
