@@ -39,9 +39,9 @@ class PoseCorrectionConfig(CameraOptimizerConfig):
     _target: type = field(default_factory=lambda: PoseCorrection)
     mode: Literal["off", "network", "spline"] = "off"
     """How corrections vary in time: by the paper's network, by a cubic B-spline of twists, or not at all."""
-    trans_l2_penalty: float = 1e-2
+    trans_l2_penalty: float = 1.0
     """Weight of the mean squared translation of the corrections, in units of the trajectory's extent."""
-    rot_l2_penalty: float = 1e-2
+    rot_l2_penalty: float = 1.0
     """Weight of the mean squared rotation of the corrections, in radians."""
     knot_interval: float = 0.1
     """Seconds between the knots of the spline. It corrects errors that change more slowly than that."""
