@@ -47,7 +47,7 @@ _SHARPER_ERRORS, _SHARPER_FACTOR = 2.5, 1.03
 # The share of the loss of a constant field that is left. A stretch stands out if its share is so large, and so many
 # times the median. If the median itself is so large, either the poses are wrong or the training was short.
 _HIGH_SHARE, _HIGH_FACTOR = 0.15, 3.0
-_HIGH_MEDIAN = 0.08
+_HIGH_MEDIAN = 0.05
 # Poses still move if the last part of the run turns them by so many pixels, and by such a share of the correction.
 _MOVING_PIXELS, _MOVING_SHARE = 0.25, 0.1
 # The correction barely moves poses if it turns them by less than so many pixels, and shifts them by less than such a
