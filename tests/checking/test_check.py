@@ -267,18 +267,17 @@ def small_object(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("order", SHUFFLES)
-def test_the_real_recording_is_told_from_its_noise(order: str, slider_depth: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("order", [None, *SHUFFLES])
+def test_the_real_recording_is_told_from_its_noise(order: str | None, slider_depth: Path, tmp_path: Path) -> None:
     events = all_events(EcdDataParserConfig(data=slider_depth).setup().read_recording())
     folder = shutil.copytree(slider_depth, tmp_path / "made", copy_function=link)
     (folder / "events.txt").unlink()
-    for change, expected in ((None, 0), (SHUFFLES[order], 1)):
-        kept = events if change is None else change(events, np.random.default_rng(0))
-        columns = np.stack([kept.t * 1e-9, kept.x, kept.y, kept.p > 0], 1)
-        np.savetxt(folder / "events.txt", columns, fmt="%.9f %d %d %d")
-        status, output = run(folder)
-        assert status == expected, output
-        assert ("hardly sharper" in output) == bool(expected)
+    kept = events if order is None else SHUFFLES[order](events, np.random.default_rng(0))
+    columns = np.stack([kept.t * 1e-9, kept.x, kept.y, kept.p > 0], 1)
+    np.savetxt(folder / "events.txt", columns, fmt="%.9f %d %d %d")
+    status, output = run(folder)
+    assert status == (0 if order is None else 1), output
+    assert ("hardly sharper" in output) == (order is not None)
 
 
 def link(source: str, target: str) -> None:
