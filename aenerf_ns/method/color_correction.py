@@ -280,7 +280,9 @@ class NetworkColorCorrection(AffineColorCorrection):
         missing = encode(reference, self.encoding) - super().forward(log_radiance)
         with torch.enable_grad():
             learned = [(w.clone().requires_grad_(), b.clone().requires_grad_()) for w, b in self._layers]
-            optimizer = torch.optim.Adam([tensor for layer in learned for tensor in layer], lr=_LEARNING_RATE, fused=True)
+            optimizer = torch.optim.Adam(
+                [tensor for layer in learned for tensor in layer], lr=_LEARNING_RATE, fused=True
+            )
             scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS)
             for _ in range(_STEPS):
                 optimizer.zero_grad()
