@@ -42,7 +42,7 @@ class RealPoses:
     correlation_time: float = 0.05
     """Seconds over which the added errors are alike."""
     seeds: tuple[int, ...] = (0,)
-    """Seeds of the added errors and of the trainings."""
+    """Seeds of the added errors and of the trainings. Results without seeds were made with 0 and 42."""
     train: str = ""
     """More options of ns-train."""
 

@@ -267,7 +267,7 @@ def small_object(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("order", [None, *SHUFFLES])
+@pytest.mark.parametrize("order", [None, *SHUFFLES], ids=["as recorded", *SHUFFLES])
 def test_the_real_recording_is_told_from_its_noise(order: str | None, slider_depth: Path, tmp_path: Path) -> None:
     events = all_events(EcdDataParserConfig(data=slider_depth).setup().read_recording())
     folder = shutil.copytree(slider_depth, tmp_path / "made", copy_function=link)

@@ -195,7 +195,7 @@ GOOD: dict[str, Any] = {
     "turned_slices_sharper": 1,
     "stretches": [
         {"start_seconds": 0.4 * i, "end_seconds": 0.4 * (i + 1), "loss": share, "loss_of_constant_field": 2.0}
-        for i, share in enumerate((0.1, 0.2, 0.1, 0.06, 0.1))
+        for i, share in enumerate((0.08, 0.2, 0.08, 0.06, 0.08))
     ],
 }
 
@@ -230,7 +230,10 @@ def with_loss(index: int, loss: float | None) -> dict[str, Any]:
         ({"clock_change_share_of_limit": 0.95}, "the clock offset is at its limit of 0.05 s"),
         ({"clock_change_share_of_limit": 0.5}, "No sign of failure"),
         ({"penalty_share_of_loss": 0.3}, "the penalty on corrections is 30% of the reconstruction loss"),
-        ({"stretches": [{**s, "loss": 8 * s["loss"]} for s in GOOD["stretches"]]}, "Undecided, because 40% of the"),
+        ({"stretches": [{**s, "loss": 8 * s["loss"]} for s in GOOD["stretches"]]}, "Undecided, because 32% of the"),
+        ({"stretches": [{**s, "loss": 1.5 * s["loss"]} for s in GOOD["stretches"]]}, "Undecided, because 6% of the"),
+        # A share of 13 %.
+        (with_loss(3, 0.26), "No sign of failure"),
     ],
 )
 def test_the_summary_names_each_clear_sign(change: dict[str, Any], said: str) -> None:
