@@ -33,12 +33,6 @@ FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 settings.register_profile("suite", derandomize="AENERF_FUZZ_EXAMPLES" not in os.environ)
 settings.load_profile("suite")
 
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the longest files first. A process runs whole files, so the processes otherwise end at different times."""
-    items.sort(key=lambda item: item.path.parent.name != "training")
-
-
 # Third-party recordings, which are not part of the project.
 _SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
