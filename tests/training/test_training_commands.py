@@ -26,10 +26,16 @@ def room(workspace: Path) -> Path:
     return simulate(workspace / "room")
 
 
+# For tests in which it does not matter how exact the events are.
+FEW_FRAMES = ("--max-displacement", "2")
+
+
 def test_simulated_dataset_is_seeded(workspace: Path) -> None:
-    options = ("--speed", "hard", "--pose-noise-degrees", "1", "--pose-noise-translation", "0.05", "--pose-rate", "50")
-    first = simulate(workspace / "first", *options, "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03")
-    again = simulate(workspace / "again", *options, "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03")
+    options = (
+        "--speed", "hard", "--pose-noise-degrees", "1", "--pose-noise-translation", "0.05", "--pose-rate", "50",
+        "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03", *FEW_FRAMES,
+    )  # fmt: skip
+    first, again = (simulate(workspace / name, *options) for name in ("first", "again"))
     files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
     assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
     for name in files:
@@ -205,7 +211,7 @@ def test_training_that_diverges_ends_with_one_line(workspace: Path) -> None:
 
 def test_a_recording_without_reference_views_trains_and_says_so_at_evaluation(workspace: Path) -> None:
     none = ("--train-images", "0", "--validation-views", "0", "--test-views", "0")
-    data = simulate(workspace / "bare", *none, "--scene", "object")
+    data = simulate(workspace / "bare", *none, "--scene", "object", *FEW_FRAMES)
     run(
         "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "3", "--data", data,
         cwd=workspace,
