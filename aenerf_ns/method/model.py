@@ -54,6 +54,10 @@ _LARGEST_SHOWN_ERROR = 0.5
 # weighings. A weighing moves the field a little, so the weights must stay for the rest of the run.
 _OBSERVED_SHARE, _WEIGHING_INTERVAL = 0.3, 8
 
+# Room on each side of the scene box, as a share of its longest side, for a field that moves along with the poses. A
+# place that leaves the field's box has no density, so events at the border of a tight box would hold the poses back.
+_ROOM = 0.05
+
 
 @dataclass
 class AENeRFModelConfig(ModelConfig):
@@ -143,7 +147,7 @@ class AENeRFModel(Model):
             config.backbone,
             config.field,
             config.proposal,
-            self.scene_box.aabb,
+            self.scene_box.aabb if self.space is None else _with_room(self.scene_box.aabb),
             distortion,
             self.sensor.num_channels,
             config.average_init_density,
@@ -381,6 +385,12 @@ def _require_possible(config: AENeRFModelConfig) -> None:
         )
     if config.eval_num_rays_per_chunk < 1:
         raise DataError("model", f"eval_num_rays_per_chunk {config.eval_num_rays_per_chunk}", "give one or more rays")
+
+
+def _with_room(aabb: Tensor) -> Tensor:
+    """Return a (2, 3) box that has room on each side for a scene that moves along with the corrections of the poses."""
+    room = _ROOM * (aabb[1] - aabb[0]).max()
+    return torch.stack([aabb[0] - room, aabb[1] + room])
 
 
 def _is_of_batch(ray_bundle: RayBundle) -> bool:

@@ -133,6 +133,20 @@ def test_the_mlp_density_is_softplus_and_ends_at_the_box(contraction: str) -> No
     torch.testing.assert_close(model.field.density_fn(positions), expected)
 
 
+@pytest.mark.parametrize("mode", ["off", "spline"])
+def test_a_field_that_moves_along_has_room_beyond_the_box(mode: str) -> None:
+    model = make_model(bounded=True, camera_optimizer=PoseCorrectionConfig(mode=mode))
+    if model.space is not None:
+        model.space.follow()
+    # The box ends at 1, and a twentieth of its side is 0.1.
+    positions = torch.tensor([[[0.0, 0.0, 0.99]], [[0.0, -1.09, 0.0]], [[1.11, 0.0, 0.0]]])
+    densities = [network.density_fn(positions)[:, 0, 0] > 0 for network in (model.field, *model.proposal_networks)]
+    for has_density in densities:
+        assert has_density.tolist() == [True, mode == "spline", False]
+    # No ray is followed beyond the box, with either.
+    assert model.collider(make_rays()).nears.min() >= 2
+
+
 def test_rays_past_a_bounded_scene_see_the_background() -> None:
     model = make_model(bounded=True).eval()
     outputs = model(make_rays(away=True))
