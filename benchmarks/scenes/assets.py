@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
-import shutil
 import subprocess
 import tarfile
 import zipfile
@@ -13,8 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+from filelock import FileLock
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import binary_dilation
@@ -71,17 +72,21 @@ def fetch(package: Package, folder: Path) -> Path:
     """
     file = folder / package.file
     by_hand = f"run `{' '.join(package.command)}` where it works and put {package.file} into {folder}"
-    if not file.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            subprocess.run(package.command, cwd=folder, check=True, capture_output=True, text=True)
-        except FileNotFoundError as error:
-            raise DataError(file, f"missing, and there is no {package.command[0]} to fetch it with", by_hand) from error
-        except subprocess.CalledProcessError as error:
-            reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
-            raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
+    folder.mkdir(parents=True, exist_ok=True)
+    # Another process that builds scenes may be fetching the same file.
+    with FileLock(folder / f".{package.file}.lock"):
         if not file.is_file():
-            raise DataError(file, f"missing, because {package.command[0]} saved it under another name", by_hand)
+            try:
+                subprocess.run(package.command, cwd=folder, check=True, capture_output=True, text=True)
+            except FileNotFoundError as error:
+                raise DataError(
+                    file, f"missing, and there is no {package.command[0]} to fetch it with", by_hand
+                ) from error
+            except subprocess.CalledProcessError as error:
+                reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
+                raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
+            if not file.is_file():
+                raise DataError(file, f"missing, because {package.command[0]} saved it under another name", by_hand)
     found = hashlib.sha256(file.read_bytes()).hexdigest()
     if found != package.sha256:
         raise DataError(file, f"sha256 {found}, not the pinned {package.sha256}", f"remove it, then {by_hand}")
@@ -105,18 +110,25 @@ class Library:
         """Unpack the CC0 furniture and return its folder."""
         package = fetch(FURNITURE, self.folder)
         target = self.folder / package.stem
-        if not (target / _CATALOGUE).is_file():
-            shutil.rmtree(target, ignore_errors=True)
-            raw = self.folder / f"{package.stem}.raw"
-            try:
-                subprocess.run(("dpkg-deb", "-x", package, raw), check=True, capture_output=True, text=True)
-            except (FileNotFoundError, subprocess.CalledProcessError) as error:
-                raise DataError(
-                    package, f"cannot be unpacked by dpkg-deb ({error})", "install Debian's dpkg"
-                ) from error
-            with zipfile.ZipFile(raw / _FURNITURE_FILE) as archive:
-                archive.extractall(target)
-            shutil.rmtree(raw)
+        # Another process that builds scenes may be unpacking, too. A folder under its final name is whole.
+        with FileLock(self.folder / f".{package.stem}.lock"):
+            if not target.is_dir():
+                with TemporaryDirectory(dir=self.folder) as raw:
+                    unpack = ("dpkg-deb", "-x", str(package), raw)
+                    try:
+                        subprocess.run(unpack, check=True, capture_output=True, text=True)
+                    except FileNotFoundError as error:
+                        raise DataError(
+                            package, "there is no dpkg-deb to unpack it with", "install Debian's dpkg"
+                        ) from error
+                    except subprocess.CalledProcessError as error:
+                        reason = " ".join((error.stderr or "no message").split())[-300:]
+                        raise DataError(
+                            package, f"dpkg-deb cannot unpack it: {reason}", "see whether the disk is full"
+                        ) from error
+                    with zipfile.ZipFile(Path(raw) / _FURNITURE_FILE) as archive:
+                        archive.extractall(Path(raw) / "models")
+                    (Path(raw) / "models").rename(target)
         return target
 
     @cache  # noqa: B019
