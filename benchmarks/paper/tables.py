@@ -139,7 +139,8 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
             wanted = {name: _ROWS_OF[name][own_column if name == _AE_NERF else peers_column] for name in named}
             found = {name: some for name, row in wanted.items() if (some := _of(common, row=row))}
             means = {name: fmean(one["results"]["psnr"] for one in some) for name, some in found.items()}
-            orders.append(f"- here, {setting}: {_order(means)}")
+            if len(means) > 1:
+                orders.append(f"- here, {setting}: {_order(means)}")
         parts += [
             f"### Scenes of kind {kind}: {len({one['scene'] for one in common})}, {speed} speed",
             _markdown(["method", "the paper", *_SETTINGS], rows),
