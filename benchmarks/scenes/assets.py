@@ -71,26 +71,38 @@ def fetch(package: Package, folder: Path) -> Path:
         DataError: if the file cannot be fetched or is not the pinned version.
     """
     file = folder / package.file
-    by_hand = f"run `{' '.join(package.command)}` where it works and put {package.file} into {folder}"
-    folder.mkdir(parents=True, exist_ok=True)
-    # Another process that builds scenes may be fetching the same file.
-    with FileLock(folder / f".{package.file}.lock"):
-        if not file.is_file():
-            try:
-                subprocess.run(package.command, cwd=folder, check=True, capture_output=True, text=True)
-            except FileNotFoundError as error:
-                raise DataError(
-                    file, f"missing, and there is no {package.command[0]} to fetch it with", by_hand
-                ) from error
-            except subprocess.CalledProcessError as error:
-                reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
-                raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
+    if not file.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        # Another process that builds scenes may be fetching the same file.
+        with FileLock(folder / f".{package.file}.lock"):
             if not file.is_file():
-                raise DataError(file, f"missing, because {package.command[0]} saved it under another name", by_hand)
+                _fetch(package, file)
     found = hashlib.sha256(file.read_bytes()).hexdigest()
     if found != package.sha256:
-        raise DataError(file, f"sha256 {found}, not the pinned {package.sha256}", f"remove it, then {by_hand}")
+        reason = f"sha256 {found}, not the pinned {package.sha256}"
+        raise DataError(file, reason, f"remove it, then {_by_hand(package, folder)}")
     return file
+
+
+def _fetch(package: Package, file: Path) -> None:
+    """Write a package's file. A fetch that is cut off leaves no file under its name."""
+    by_hand = _by_hand(package, file.parent)
+    with TemporaryDirectory(dir=file.parent) as name:
+        try:
+            subprocess.run(package.command, cwd=name, check=True, capture_output=True, text=True)
+        except FileNotFoundError as error:
+            raise DataError(file, f"missing, and there is no {package.command[0]} to fetch it with", by_hand) from error
+        except subprocess.CalledProcessError as error:
+            reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
+            raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
+        fetched = Path(name) / package.file
+        if not fetched.is_file():
+            raise DataError(file, f"missing, because {package.command[0]} saved it under another name", by_hand)
+        fetched.rename(file)
+
+
+def _by_hand(package: Package, folder: Path) -> str:
+    return f"run `{' '.join(package.command)}` where it works and put {package.file} into {folder}"
 
 
 class Library:
@@ -110,25 +122,11 @@ class Library:
         """Unpack the CC0 furniture and return its folder."""
         package = fetch(FURNITURE, self.folder)
         target = self.folder / package.stem
-        # Another process that builds scenes may be unpacking, too. A folder under its final name is whole.
-        with FileLock(self.folder / f".{package.stem}.lock"):
-            if not target.is_dir():
-                with TemporaryDirectory(dir=self.folder) as raw:
-                    unpack = ("dpkg-deb", "-x", str(package), raw)
-                    try:
-                        subprocess.run(unpack, check=True, capture_output=True, text=True)
-                    except FileNotFoundError as error:
-                        raise DataError(
-                            package, "there is no dpkg-deb to unpack it with", "install Debian's dpkg"
-                        ) from error
-                    except subprocess.CalledProcessError as error:
-                        reason = " ".join((error.stderr or "no message").split())[-300:]
-                        raise DataError(
-                            package, f"dpkg-deb cannot unpack it: {reason}", "see whether the disk is full"
-                        ) from error
-                    with zipfile.ZipFile(Path(raw) / _FURNITURE_FILE) as archive:
-                        archive.extractall(Path(raw) / "models")
-                    (Path(raw) / "models").rename(target)
+        if not target.is_dir():
+            # Another process that builds scenes may be unpacking, too.
+            with FileLock(self.folder / f".{package.stem}.lock"):
+                if not target.is_dir():
+                    _unpack(package, target)
         return target
 
     @cache  # noqa: B019
@@ -207,6 +205,21 @@ class Library:
             "licence": _LICENCE,
         }
         return with_whole_sun(np.ascontiguousarray(picture[..., 2::-1], np.float32))
+
+
+def _unpack(package: Path, target: Path) -> None:
+    """Unpack the furniture of a Debian package. An unpacking that is cut off leaves no folder under its name."""
+    with TemporaryDirectory(dir=target.parent) as name:
+        try:
+            subprocess.run(("dpkg-deb", "-x", str(package), name), check=True, capture_output=True, text=True)
+        except FileNotFoundError as error:
+            raise DataError(package, "there is no dpkg-deb to unpack it with", "install Debian's dpkg") from error
+        except subprocess.CalledProcessError as error:
+            reason = " ".join((error.stderr or "no message").split())[-300:]
+            raise DataError(package, f"dpkg-deb cannot unpack it: {reason}", "see whether the disk is full") from error
+        with zipfile.ZipFile(Path(name) / _FURNITURE_FILE) as archive:
+            archive.extractall(Path(name) / "models")
+        (Path(name) / "models").rename(target)
 
 
 def with_whole_sun(panorama: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,5 +1,9 @@
 """The benchmark's scenes: geometry against truth, what they are composed of, and what a missing asset says."""
 
+import hashlib
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +186,41 @@ def test_missing_and_wrong_assets_say_what_to_do(tmp_path, monkeypatch):
     (tmp_path / assets.ENVIRONMENTS.file).write_bytes(b"another version")
     with pytest.raises(DataError, match=r"not the pinned .* remove it"):
         library.environment("park")
+
+
+def test_two_builds_at_once_unpack_the_furniture_once(tmp_path, monkeypatch):
+    archive = tmp_path / "models.sh3f"
+    with zipfile.ZipFile(archive, "w") as models:
+        models.writestr("PluginFurnitureCatalog.properties", "")
+    # Unpacks like dpkg-deb, slowly, and counts how often.
+    client = tmp_path / "bin" / "dpkg-deb"
+    client.parent.mkdir()
+    place = Path(assets._FURNITURE_FILE)
+    client.write_text(
+        f'#!/bin/sh\necho >> {tmp_path}/calls\n/bin/mkdir -p "$3/{place.parent}"\n/bin/sleep 0.3\n'
+        f'/bin/cp {archive} "$3/{place}"\n'
+    )
+    client.chmod(0o755)
+    monkeypatch.setenv("PATH", str(client.parent))
+    folder = tmp_path / "assets"
+    folder.mkdir()
+    package = folder / assets.FURNITURE.file
+    package.write_bytes(b"a package")
+    pinned = hashlib.sha256(b"a package").hexdigest()
+    monkeypatch.setattr(assets, "FURNITURE", replace(assets.FURNITURE, sha256=pinned))
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda library: library._furniture(), [assets.Library(folder), assets.Library(folder)]))
+    assert found == [folder / package.stem] * 2
+    assert (folder / package.stem / "PluginFurnitureCatalog.properties").is_file()
+    assert (tmp_path / "calls").read_text().count("\n") == 1
+    # A client that fails leaves nothing that a later build would take for the furniture.
+    client.write_text("#!/bin/sh\necho no space left >&2\nexit 2\n")
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / package.name).write_bytes(b"a package")
+    with pytest.raises(DataError, match="dpkg-deb cannot unpack it: no space left"):
+        assets.Library(other)._furniture()
+    assert [path.name for path in other.iterdir() if not path.name.startswith(".")] == [package.name]
 
 
 def test_a_sun_that_lost_its_colours_gets_those_of_the_sky_around_it() -> None:
