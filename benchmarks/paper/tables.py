@@ -112,9 +112,10 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
     named = [name for name, rows in _ROWS_OF.items() if any(_of(figures, row=row) for row in rows)]
     parts = [
         "PSNR: mean over scenes and seeds ± standard deviation over seeds, with test poses as placed / refined. Means "
-        "over what all rows of a table have in common. Of these methods only AE-NeRF corrects poses; the paper's PSNR "
-        "of AE-NeRF is with correction. The paper does not say on which poses it ran the others. In the other tables, "
-        "rows without a method's name are AE-NeRF's."
+        "over what all rows of a table have in common. Of these methods only AE-NeRF corrects poses. The column with "
+        "pose correction gives the others this project's. The paper's PSNR of AE-NeRF is with correction. The paper "
+        "does not say on which poses it ran the others. In the other tables, rows without a method's name are "
+        "AE-NeRF's."
     ]
     if HIGH_PASS in named:
         parts.append(
