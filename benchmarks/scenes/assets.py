@@ -8,7 +8,7 @@ import os
 import subprocess
 import tarfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -70,13 +70,7 @@ def fetch(package: Package, folder: Path) -> Path:
     Raises:
         DataError: if the file cannot be fetched or is not the pinned version.
     """
-    file = folder / package.file
-    if not file.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        # Another process that builds scenes may be fetching the same file.
-        with FileLock(folder / f".{package.file}.lock"):
-            if not file.is_file():
-                _fetch(package, file)
+    file = _made_once(folder / package.file, lambda empty: _fetch(package, folder, empty))
     found = hashlib.sha256(file.read_bytes()).hexdigest()
     if found != package.sha256:
         reason = f"sha256 {found}, not the pinned {package.sha256}"
@@ -84,21 +78,37 @@ def fetch(package: Package, folder: Path) -> Path:
     return file
 
 
-def _fetch(package: Package, file: Path) -> None:
-    """Write a package's file. A fetch that is cut off leaves no file under its name."""
-    by_hand = _by_hand(package, file.parent)
-    with TemporaryDirectory(dir=file.parent) as name:
-        try:
-            subprocess.run(package.command, cwd=name, check=True, capture_output=True, text=True)
-        except FileNotFoundError as error:
-            raise DataError(file, f"missing, and there is no {package.command[0]} to fetch it with", by_hand) from error
-        except subprocess.CalledProcessError as error:
-            reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
-            raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
-        fetched = Path(name) / package.file
-        if not fetched.is_file():
-            raise DataError(file, f"missing, because {package.command[0]} saved it under another name", by_hand)
-        fetched.rename(file)
+def _made_once(path: Path, make: Callable[[Path], Path]) -> Path:
+    """Return a file or folder that is made if it is missing. What is cut off leaves nothing under its name.
+
+    Args:
+        path: of the file or folder.
+        make: makes it in an empty folder, and returns where.
+    """
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Another process that builds scenes may be making it, too.
+        with FileLock(path.with_name(f".{path.name}.lock")):
+            if not path.exists():
+                with TemporaryDirectory(dir=path.parent) as empty:
+                    make(Path(empty)).rename(path)
+    return path
+
+
+def _fetch(package: Package, folder: Path, empty: Path) -> Path:
+    """Fetch a package's file for a folder into an empty one, and return it."""
+    file, by_hand = folder / package.file, _by_hand(package, folder)
+    try:
+        subprocess.run(package.command, cwd=empty, check=True, capture_output=True, text=True)
+    except FileNotFoundError as error:
+        raise DataError(file, f"missing, and there is no {package.command[0]} to fetch it with", by_hand) from error
+    except subprocess.CalledProcessError as error:
+        reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
+        raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
+    fetched = empty / package.file
+    if not fetched.is_file():
+        raise DataError(file, f"missing, because {package.command[0]} saved it under another name", by_hand)
+    return fetched
 
 
 def _by_hand(package: Package, folder: Path) -> str:
@@ -121,13 +131,7 @@ class Library:
     def _furniture(self) -> Path:
         """Unpack the CC0 furniture and return its folder."""
         package = fetch(FURNITURE, self.folder)
-        target = self.folder / package.stem
-        if not target.is_dir():
-            # Another process that builds scenes may be unpacking, too.
-            with FileLock(self.folder / f".{package.stem}.lock"):
-                if not target.is_dir():
-                    _unpack(package, target)
-        return target
+        return _made_once(self.folder / package.stem, lambda empty: _unpack(package, empty))
 
     @cache  # noqa: B019
     def _catalogue(self) -> dict[str, dict[str, str]]:
@@ -207,19 +211,19 @@ class Library:
         return with_whole_sun(np.ascontiguousarray(picture[..., 2::-1], np.float32))
 
 
-def _unpack(package: Path, target: Path) -> None:
-    """Unpack the furniture of a Debian package. An unpacking that is cut off leaves no folder under its name."""
-    with TemporaryDirectory(dir=target.parent) as name:
-        try:
-            subprocess.run(("dpkg-deb", "-x", str(package), name), check=True, capture_output=True, text=True)
-        except FileNotFoundError as error:
-            raise DataError(package, "there is no dpkg-deb to unpack it with", "install Debian's dpkg") from error
-        except subprocess.CalledProcessError as error:
-            reason = " ".join((error.stderr or "no message").split())[-300:]
-            raise DataError(package, f"dpkg-deb cannot unpack it: {reason}", "see whether the disk is full") from error
-        with zipfile.ZipFile(Path(name) / _FURNITURE_FILE) as archive:
-            archive.extractall(Path(name) / "models")
-        (Path(name) / "models").rename(target)
+def _unpack(package: Path, empty: Path) -> Path:
+    """Unpack the furniture of a Debian package into an empty folder, and return the folder of the models."""
+    try:
+        subprocess.run(("dpkg-deb", "-x", str(package), str(empty)), check=True, capture_output=True, text=True)
+    except FileNotFoundError as error:
+        raise DataError(package, "there is no dpkg-deb to unpack it with", "install Debian's dpkg") from error
+    except subprocess.CalledProcessError as error:
+        reason = " ".join((error.stderr or "no message").split())[-300:]
+        raise DataError(package, f"dpkg-deb cannot unpack it: {reason}", "see whether the disk is full") from error
+    models = empty / "models"
+    with zipfile.ZipFile(empty / _FURNITURE_FILE) as archive:
+        archive.extractall(models)
+    return models
 
 
 def with_whole_sun(panorama: NDArray[np.float32]) -> NDArray[np.float32]:
