@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from aenerf_ns.training.environment import environment
+from aenerf_ns.training.provenance import environment
 from benchmarks.owned import owned
 
 _Arguments = ParamSpec("_Arguments")

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 import tyro
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.events.sensor import SensorModel
@@ -40,7 +40,7 @@ _VARIANTS: dict[str, dict[str, Any]] = {
 
 def make_dataset(folder: Path, num_events: int) -> None:
     """Write a dataset of random events."""
-    camera = EventCamera(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2)
+    camera = CameraIntrinsics(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2)
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 1
     with NativeDatasetWriter(folder, camera, SensorModel(), "srgb") as writer:

@@ -16,7 +16,7 @@ from typing import Literal
 
 import tyro
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.simulator.open_scene import open_scene
@@ -58,7 +58,7 @@ class EstimatedPoses:
                 write_result(self.output, {**settings, "rows": rows})
 
     def _measure(self, scene: SimulationScene, speed: Literal["easy", "hard"], rate: float) -> dict:
-        camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
+        camera = CameraIntrinsics(self.width, self.height, *scene.intrinsics(self.width, self.height))
         simulation = Simulation(scene, camera, SensorModel(), speed, scene.duration, 0.5, self.seed)
         begin = time.perf_counter()
         truth = simulation.trajectory(pose_rate=250)

@@ -25,7 +25,7 @@ import trimesh
 import tyro
 
 from aenerf_ns.camera.alignment import align
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.rendering.embree import RayCaster
@@ -101,7 +101,7 @@ class Mesh:
         """Return true points (N, 3) that cameras at poses (M, 3, 4) see, evenly spread over their pictures."""
         meta = json.loads((self.data / "transforms.json").read_text("utf8"))["event_camera"]
         intrinsics = (meta[name] for name in ("fl_x", "fl_y", "cx", "cy"))
-        directions, _ = EventCamera(meta["width"], meta["height"], *intrinsics).pixel_directions()
+        directions, _ = CameraIntrinsics(meta["width"], meta["height"], *intrinsics).pixel_directions()
         # From OpenGL's axes to OpenCV's.
         in_camera = directions.reshape(-1, 3) * [1, -1, -1]
         generator = np.random.default_rng(0)

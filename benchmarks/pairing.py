@@ -21,15 +21,15 @@ import numpy as np
 import torch
 import tyro
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.events.pair_table import PIXEL_SHIFT, EventPairs
-from aenerf_ns.events.pairs import EVENTS_IN_MEMORY, pair_events
+from aenerf_ns.events.pair_store import PIXEL_SHIFT, EventPairs
+from aenerf_ns.events.pairing import EVENTS_IN_MEMORY, pair_events
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.events.time_window import TimeWindow
-from aenerf_ns.recording.scene import Scene
-from aenerf_ns.supervision.pairs import PairSampler, PairSamplerConfig, PairSupervisionConfig
+from aenerf_ns.recording.scene import SceneRecording
+from aenerf_ns.supervision.event_pairs import PairSampler, PairSamplerConfig, PairSupervisionConfig
 from benchmarks.common import in_own_process, peak_mib, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
@@ -69,10 +69,10 @@ def sampler(pairs: EventPairs) -> PairSampler:
     """Return the sampler of ``aenerf`` for these pairs, with a camera that stands still."""
     sensor = SensorModel()
     end = 200 * pairs.num_events
-    scene = Scene(
+    scene = SceneRecording(
         trajectory=Trajectory([0, end], torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)),
         ground_truth=None,
-        event_camera=EventCamera(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2),
+        event_camera=CameraIntrinsics(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2),
         event_file=SimpleNamespace(),  # type: ignore[arg-type]
         sensor=sensor,
         window=TimeWindow(),

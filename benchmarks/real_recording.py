@@ -18,7 +18,7 @@ import torch
 import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
-from aenerf_ns.supervision.pairs import PairSampler
+from aenerf_ns.supervision.event_pairs import PairSampler
 from aenerf_ns.training.pipeline import AENeRFPipeline
 from benchmarks.common import write_result
 

@@ -21,8 +21,9 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.events.sensor import LUMINANCE, SensorModel
+from aenerf_ns.camera.image_encoding import LUMINANCE
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.frames import frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene
@@ -58,7 +59,7 @@ class SimulationCost:
         begin = time.process_time()
         scene = open_scene(name)
         opening = time.process_time() - begin
-        camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
+        camera = CameraIntrinsics(self.width, self.height, *scene.intrinsics(self.width, self.height))
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         begin = time.process_time()
         parameters = frame_parameters(scene, intrinsics, self.width, self.height, 0.5)

@@ -9,7 +9,7 @@ import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_AT_TOP, Hdf5TableFile
@@ -22,7 +22,7 @@ from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_traj
 
 # The sequences do not contain their calibration. This is the authors' ("03_calib" in uzh-rpg/bundles-eds).
 # Distortion: k1, k2, p1, p2, k3.
-_EVENT_CAMERA = EventCamera(
+_EVENT_CAMERA = CameraIntrinsics(
     640,
     480,
     560.8520948927032,
@@ -32,7 +32,7 @@ _EVENT_CAMERA = EventCamera(
     "radial_tangential",
     (-0.09776467241921379, 0.2143738428636279, -0.004710710105172864, -0.004215916089401789, 0.0),
 )
-_FRAME_CAMERA = EventCamera(
+_FRAME_CAMERA = CameraIntrinsics(
     640,
     480,
     766.536025127154,
@@ -84,7 +84,7 @@ class EdsDataParser(EventDataParser):
             max_views=MAX_VIEWS,
         )
 
-    def _calibration(self) -> tuple[EventCamera, EventCamera, Tensor]:
+    def _calibration(self) -> tuple[CameraIntrinsics, CameraIntrinsics, Tensor]:
         """Return event camera, frame camera, and the (4, 4) motion from frame camera to event camera coordinates."""
         path = self.config.calibration
         if path is None:

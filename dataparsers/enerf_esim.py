@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
@@ -86,7 +86,7 @@ class ENeRFEsimDataParser(EventDataParser):
         )
 
 
-def _read_camera(path: Path) -> EventCamera:
+def _read_camera(path: Path) -> CameraIntrinsics:
     """Read the lens in LLFF's poses_bounds.npy: no distortion, and the principal point in the middle of the image."""
     bounds = load_npy(path)
     if bounds.ndim != 2 or bounds.shape[1] != 17 or len(bounds) == 0 or bounds.dtype.kind != "f":
@@ -95,7 +95,7 @@ def _read_camera(path: Path) -> EventCamera:
     height, width, focal = np.asarray(bounds[0, :15], dtype=np.float64).reshape(3, 5)[:, 4].tolist()
     try:
         # ESIM counts pixels from the centre of the first pixel.
-        return EventCamera(width, height, focal, focal, width / 2 + 0.5, height / 2 + 0.5)
+        return CameraIntrinsics(width, height, focal, focal, width / 2 + 0.5, height / 2 + 0.5)
     except ValueError as error:
         raise DataError(path, str(error), "its fifth column must hold height, width and focal length") from None
 

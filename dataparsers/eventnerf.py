@@ -13,14 +13,14 @@ import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory, require_rigid
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.files.boundary import read_text
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
 from aenerf_ns.files.layouts import eventnerf_splits
+from aenerf_ns.files.limits import read_text
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import ObjectDataParserConfig
@@ -180,7 +180,7 @@ def read_matrix(path: Path, *num_rows: int) -> np.ndarray:
     return matrix
 
 
-def read_intrinsics(folder: Path, width: int, height: int) -> EventCamera:
+def read_intrinsics(folder: Path, width: int, height: int) -> CameraIntrinsics:
     """Read the lens in the first file of a folder: a 4 x 4 matrix and perhaps a fifth line with k1 and k2.
 
     Raises:
@@ -192,8 +192,8 @@ def read_intrinsics(folder: Path, width: int, height: int) -> EventCamera:
     matrix = read_matrix(files[0], 4, 5).tolist()
     k1, k2 = matrix[4][:2] if len(matrix) == 5 else (0.0, 0.0)
     try:
-        # NeRF++ counts pixels from the edge of the image, as EventCamera does.
-        return EventCamera(
+        # NeRF++ counts pixels from the edge of the image, as CameraIntrinsics does.
+        return CameraIntrinsics(
             width,
             height,
             fx=matrix[0][0],

@@ -10,7 +10,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
@@ -119,7 +119,7 @@ class OwnRecordingDataParser(EventDataParser):
             )
         return found[0]
 
-    def _event_file(self, folder: Path, camera: EventCamera) -> EventFile:
+    def _event_file(self, folder: Path, camera: CameraIntrinsics) -> EventFile:
         path = self.config.events
         if path is None:
             found = sorted(folder / f"events{suffix}" for suffix in SUFFIXES)

@@ -10,7 +10,7 @@ import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from numpy.typing import NDArray
 
-from aenerf_ns.camera.lens import EventCamera, LensModel
+from aenerf_ns.camera.intrinsics import CameraIntrinsics, LensModel
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
@@ -87,7 +87,7 @@ def _word(path: Path, name: str) -> str:
     return str(array)
 
 
-def _read_calibration(path: Path) -> tuple[EventCamera, SensorModel]:
+def _read_calibration(path: Path) -> tuple[CameraIntrinsics, SensorModel]:
     matrix = _numbers(path, "intrinsics", (3, 3))
     distortion = _numbers(path, "distortion_params", (-1,)).tolist()
     lens: LensModel = "radial_tangential"
@@ -105,7 +105,7 @@ def _read_calibration(path: Path) -> tuple[EventCamera, SensorModel]:
     if not all(map(math.isfinite, single.values())):
         raise DataError(path, f"a value of {single} is not finite", "calibrate the camera")
     try:
-        camera = EventCamera(
+        camera = CameraIntrinsics(
             single["img_width"],  # type: ignore[arg-type]
             single["img_height"],  # type: ignore[arg-type]
             float(matrix[0, 0]),
@@ -143,7 +143,7 @@ def _read_poses(path: Path) -> Trajectory:
     return Trajectory(times.astype(np.int64), poses_from_quaternions(path, positions, quaternions), path)
 
 
-def _read_views(folder: Path) -> tuple[EventCamera | None, dict[Split, list[ReferenceView]]]:
+def _read_views(folder: Path) -> tuple[CameraIntrinsics | None, dict[Split, list[ReferenceView]]]:
     """Read the lens of the views, or None where there are no views, and the views of the val and the test split."""
     root = next((place for place in (folder / "views", folder.parent / "views") if place.is_dir()), None)
     camera, splits = None, {}
@@ -177,14 +177,14 @@ def _read_view(frame: JsonObject) -> ReferenceView:
     return ReferenceView(file, pose @ OPENCV_TO_OPENGL, None)
 
 
-def _view_camera(meta: JsonObject, image: Path) -> EventCamera:
+def _view_camera(meta: JsonObject, image: Path) -> CameraIntrinsics:
     width, height = image_size_and_mode(image)[0]
     try:
         if "camera_angle_x" in meta:
             focal = width / 2 / math.tan(meta.get("camera_angle_x", float) / 2)
-            return EventCamera(width, height, focal, focal, width / 2, height / 2)
+            return CameraIntrinsics(width, height, focal, focal, width / 2, height / 2)
         matrix = meta.numbers("intrinsics", meta.get("intrinsics", list), (3, 3)).tolist()
-        return EventCamera(
+        return CameraIntrinsics(
             width, height, fx=matrix[0][0], fy=matrix[1][1], cx=matrix[0][2] + 0.5, cy=matrix[1][2] + 0.5
         )
     except DataError:

@@ -10,7 +10,7 @@ import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
@@ -114,7 +114,7 @@ def _pose(meta: JsonObject) -> Tensor:
     return poses_from_quaternions(meta.path, values[:, :3], values[:, 3:])[0]
 
 
-def _camera(meta: JsonObject, index: int) -> EventCamera:
+def _camera(meta: JsonObject, index: int) -> CameraIntrinsics:
     block = meta.entry_block("intrinsics", index)
     model = block.get("camera_type", str)
     if model != "kb4":
@@ -122,7 +122,7 @@ def _camera(meta: JsonObject, index: int) -> EventCamera:
     values = block.block("intrinsics")
     width, height = meta.numbers(f"resolution[{index}]", meta.entry("resolution", index), (2,)).tolist()
     try:
-        return EventCamera(
+        return CameraIntrinsics(
             width,
             height,
             fx=values.get("fx", float),

@@ -10,7 +10,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.supervision.pairs import PairSamplerConfig
+from aenerf_ns.supervision.event_pairs import PairSamplerConfig
 from aenerf_ns.training.schedules import FusedAdamOptimizerConfig
 
 _base = deepcopy(aenerf.config)

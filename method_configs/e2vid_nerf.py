@@ -9,7 +9,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.supervision.frames import FrameSamplerConfig, FrameSupervisionConfig
+from aenerf_ns.supervision.peers.frames import FrameSamplerConfig, FrameSupervisionConfig
 
 _base = deepcopy(aenerf.config)
 

@@ -9,7 +9,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.supervision.windows import EvNeRFSupervisionConfig, WindowSamplerConfig
+from aenerf_ns.supervision.peers.windows import EvNeRFSupervisionConfig, WindowSamplerConfig
 
 _base = deepcopy(aenerf.config)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.method_configs.eventnerf import eventnerf
-from aenerf_ns.supervision.paev3d import FlowPatchSamplerConfig, PAEv3DSupervisionConfig
+from aenerf_ns.supervision.peers.paev3d import FlowPatchSamplerConfig, PAEv3DSupervisionConfig
 
 _base = deepcopy(eventnerf.config)
 

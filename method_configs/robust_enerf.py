@@ -9,7 +9,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.supervision.pairs import PairSamplerConfig
+from aenerf_ns.supervision.event_pairs import PairSamplerConfig
 
 _base = deepcopy(aenerf.config)
 

@@ -8,13 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import settings
 
 from aenerf_ns.camera.rotation import rotation_from_vector
-from aenerf_ns.events.stream import EventStream
 
 if TYPE_CHECKING:
     from aenerf_ns.simulator.scene import SimulationScene
@@ -27,8 +25,6 @@ if not torch.cuda.is_available():
     # Before anything imports Triton: it then interprets its kernels on the CPU.
     os.environ["TRITON_INTERPRET"] = "1"
 
-# Examples of each test that feeds readers with damaged and random input; many more when they are set to.
-FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 # The same examples in every run of the suite, so that a failure is that of a change. Longer runs look for new ones.
 settings.register_profile("suite", derandomize="AENERF_FUZZ_EXAMPLES" not in os.environ)
 settings.load_profile("suite")
@@ -71,14 +67,6 @@ def random_poses() -> torch.Tensor:
     return torch.cat([rotation_from_vector(vectors), positions], -1)
 
 
-def make_stream(rows: list[tuple[int, int, int, int]], width: int = 4, height: int = 3) -> EventStream:
-    """A stream of (x, y, t, p) rows."""
-    x, y, t, p = np.array(rows, dtype=np.int64).reshape(-1, 4).T
-    return EventStream(
-        x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), p.astype(np.int8), width, height, "made"
-    )
-
-
 @pytest.fixture(scope="module")
 def small_work() -> Iterator[None]:
     """Render with one thread, because the pictures are too small to share, and compute light at few points."""
@@ -113,7 +101,7 @@ def toy() -> SimulationScene:
 @pytest.fixture
 def box_file(tmp_path: Path) -> Path:
     """A mesh file with a textured box of 1.2 x 0.8 x 0.6 m."""
-    from small_meshes import painted_box
+    from helpers.small_meshes import painted_box
 
     painted_box().export(tmp_path / "box.glb")
     return tmp_path / "box.glb"

@@ -12,7 +12,7 @@ import pytest
     "module",
     [
         "aenerf_ns.camera.alignment",
-        "aenerf_ns.camera.lens",
+        "aenerf_ns.camera.intrinsics",
         "aenerf_ns.camera.trajectory",
         "aenerf_ns.files.open",
         "aenerf_ns.simulator.esim",

@@ -14,14 +14,16 @@ ROOT = Path(__file__).parents[1]
 MAY_USE = {
     "errors": set(),
     "progress": set(),
-    "events": {"errors"},
+    "camera": {"errors"},
+    "events": {"errors", "camera"},
     # Events in, images out: where the camera was, and what the images are for, is not its business.
     "reconstruction": {"errors", "events"},
-    "camera": {"errors", "events"},
     "files": {"errors", "events", "camera"},
     "recording": {"errors", "progress", "events", "camera", "files"},
+    # Poses of a recording from its frames: a tool, which only commands and the simulator use.
+    "poses_from_frames": {"errors", "progress", "camera", "files", "recording"},
     "checking": {"progress", "events", "camera", "recording"},
-    "supervision": {"errors", "events", "camera", "recording", "checking"},
+    "supervision": {"errors", "events", "camera", "recording"},
     "method": {"errors", "camera", "recording", "supervision"},
     # What the viewer shows of a run. It only looks: the pipeline hands it what it needs.
     "viewer": {"errors", "events", "camera", "files", "recording", "method"},
@@ -38,7 +40,7 @@ MAY_USE = {
     },
     # What training and checking left behind, measured and shown.
     "report": {"errors", "progress", "camera", "files", "supervision", "training", "checking"},
-    "simulator": {"errors", "progress", "events", "camera", "files", "recording"},
+    "simulator": {"errors", "progress", "events", "camera", "files", "poses_from_frames"},
     # What other tools take from a trained run. Of the simulator only the loader of Open3D.
     "export": {"errors", "progress", "events", "camera", "files", "recording", "training", "simulator"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
@@ -51,6 +53,7 @@ MAY_USE = {
         "camera",
         "files",
         "recording",
+        "poses_from_frames",
         "method",
         "training",
         "checking",

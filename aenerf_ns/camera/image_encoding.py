@@ -9,7 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.events.sensor import LUMINANCE
+# A monochrome sensor sees the Rec. 709 luminance of linear RGB.
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+
 
 ImageEncoding = Literal["srgb", "linear"]
 _Image = TypeVar("_Image", Tensor, NDArray[np.float64])

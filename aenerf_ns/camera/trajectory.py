@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from aenerf_ns.camera.pose_spline import pose_polynomials, rotation_from_products
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.time_window import TimeWindow
 
 # Multiplying camera-to-world poses by it from the right turns OpenCV camera axes (x right, y down, z forward) into
 # Nerfstudio's OpenGL camera axes (x right, y up, z backward), and back.

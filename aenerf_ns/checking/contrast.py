@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
-from aenerf_ns.checking.event_images import TILE, accumulate, best_of, image_size, tile_contrast
 from aenerf_ns.checking.hypotheses import (
     ALTERNATIVES,
     CLOCK_OFFSETS,
@@ -31,8 +31,8 @@ from aenerf_ns.checking.hypotheses import (
     Hypothesis,
     clock_hypothesis,
 )
+from aenerf_ns.events.event_images import TILE, accumulate, best_of, image_size, tile_contrast
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.events.time_window import TimeWindow
 
 # From one depth to the next, events at the ends of a slice move by this many pixels.
 _DEPTH_STEP = 1.5
@@ -83,7 +83,7 @@ class WarpedSlice:
         return _contrast([self])
 
 
-def num_slices(num_events: int, camera: EventCamera) -> int:
+def num_slices(num_events: int, camera: CameraIntrinsics) -> int:
     """Return how many runs of :func:`slice_size` events are taken from a recording.
 
     A short recording is one run, with all its events.
@@ -91,7 +91,7 @@ def num_slices(num_events: int, camera: EventCamera) -> int:
     return 1 if num_events <= _NUM_SLICES * slice_size(camera) else _NUM_SLICES
 
 
-def slice_size(camera: EventCamera) -> int:
+def slice_size(camera: CameraIntrinsics) -> int:
     """Return the largest number of events in a slice."""
     width, height, _ = image_size(camera.width, camera.height)
     return int(_DENSITIES[-1] * width * height)
@@ -110,7 +110,9 @@ class WarpedEvents:
         given: the slices, warped by the given poses.
     """
 
-    def __init__(self, runs: list[EventStream], trajectory: Trajectory, camera: EventCamera, seed: int = 0) -> None:
+    def __init__(
+        self, runs: list[EventStream], trajectory: Trajectory, camera: CameraIntrinsics, seed: int = 0
+    ) -> None:
         self._trajectory = trajectory
         self._width, self._height, self._binning = image_size(camera.width, camera.height)
         self._camera = camera

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 
 from aenerf_ns.camera.alignment import rotation_angle
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.checking.contrast import WarpedEvents, num_slices, slice_size
 from aenerf_ns.checking.hypotheses import Comparison
 from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.progress import progress_bar, tracked
 from aenerf_ns.recording.recording import Recording
 

@@ -14,9 +14,9 @@ import tyro
 from aenerf_ns.cli.operands import Dataset, RunConfig
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.sensor import BayerPattern, SensorModel, require_event_sensor_size
-from aenerf_ns.files.boundary import require_file
-from aenerf_ns.files.given_paths import require_new, require_writable
 from aenerf_ns.files.layouts import LAYOUTS
+from aenerf_ns.files.limits import require_file
+from aenerf_ns.files.output_paths import require_new, require_writable
 from aenerf_ns.files.text import MAX_ROWS
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL

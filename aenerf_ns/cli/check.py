@@ -15,8 +15,8 @@ from aenerf_ns.checking.report import Report
 from aenerf_ns.cli.arguments import Automatic, CheckArguments
 from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import created
-from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.files.output_paths import created
+from aenerf_ns.recording.scene import SCENE_KEY
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Check(CheckArguments):
         parser = open_dataset(self.data, self.format)
         # Training and evaluation will ask for all three splits.
         outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
-        report = Report(parser.recording, outputs[0].metadata[SCENE].window, outputs[0].dataparser_scale, _print)
+        report = Report(parser.recording, outputs[0].metadata[SCENE_KEY].window, outputs[0].dataparser_scale, _print)
         command = training_command(self.data, self.format, report.planes)
         remark = " (near and far plane for a camera that stays that close)" if report.planes else ""
         _print(f"Train with{remark}: {command}")

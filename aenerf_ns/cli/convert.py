@@ -9,6 +9,7 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.arguments import Automatic, ConvertArguments
 from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
@@ -16,12 +17,11 @@ from aenerf_ns.cli.termination import ended_by_exception
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import FilteredEventFile, hot_pixel_summary
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.events.time_window import TimeWindow
+from aenerf_ns.poses_from_frames.structure_from_motion import compare_with_truth, estimate_poses
 from aenerf_ns.progress import tracked
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import FrameSequence, Recording
-from aenerf_ns.recording.structure_from_motion import compare_with_truth, estimate_poses
 from aenerf_ns.recording.views import thinned, views_on_trajectory
 from aenerf_ns.recording.writer import NativeDatasetWriter
 

@@ -9,7 +9,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.cli.arguments import EvaluateArguments
 from aenerf_ns.cli.trained_run import open_run
-from aenerf_ns.files.given_paths import created
+from aenerf_ns.files.output_paths import created
 
 
 @dataclass

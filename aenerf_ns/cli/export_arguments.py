@@ -14,7 +14,7 @@ import tyro
 from aenerf_ns.cli.arguments import require_rate, told
 from aenerf_ns.cli.operands import RunConfig
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import require_new, require_writable
+from aenerf_ns.files.output_paths import require_new, require_writable
 
 _MESH_FILES = (".ply", ".glb", ".obj")
 

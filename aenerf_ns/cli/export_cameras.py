@@ -9,7 +9,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.cli.export_arguments import ExportCamerasArguments
 from aenerf_ns.cli.trained_run import open_run
-from aenerf_ns.files.given_paths import cannot_be_created
+from aenerf_ns.files.output_paths import cannot_be_created
 
 
 @dataclass
@@ -20,10 +20,10 @@ class ExportCameras(ExportCamerasArguments):
         """Load the run and write cameras, points and images."""
         self.judge()
         # Imported lazily, because these imports take seconds.
+        from aenerf_ns.export.camera_model_files import IMAGE_FOLDER
         from aenerf_ns.export.frames import write_cameras
         from aenerf_ns.export.placing import placed_views
         from aenerf_ns.export.rendering import points_seen
-        from aenerf_ns.files.placed_images import IMAGE_FOLDER
 
         _, pipeline, _ = open_run(self.load_config, test_mode="inference")
         placed = placed_views(pipeline)

@@ -11,7 +11,7 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.arguments import ExportTrajectoryArguments
 from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import created
+from aenerf_ns.files.output_paths import created
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 
 

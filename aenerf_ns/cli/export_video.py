@@ -11,7 +11,7 @@ from aenerf_ns.cli.export_arguments import ExportVideoArguments
 from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.cli.video_file import new_video
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import cannot_be_created
+from aenerf_ns.files.output_paths import cannot_be_created
 
 
 @dataclass

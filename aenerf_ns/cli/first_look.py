@@ -25,8 +25,8 @@ from aenerf_ns.cli.export_arguments import (
 )
 from aenerf_ns.cli.run_file import require_plausible
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import require_dataset
 from aenerf_ns.files.layouts import LAYOUTS, look_over
+from aenerf_ns.files.output_paths import require_dataset
 
 OfDataset = CheckArguments | ConvertArguments | ReconstructArguments
 OfRun = (

@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from aenerf_ns.cli.export_arguments import ReportArguments
 from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import cannot_be_created
+from aenerf_ns.files.output_paths import cannot_be_created
 
 if TYPE_CHECKING:
     from aenerf_ns.report.measuring import RunReport

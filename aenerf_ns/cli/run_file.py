@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import require_run
+from aenerf_ns.files.output_paths import require_run
 from aenerf_ns.files.plain_yaml import YAML_ERRORS, read_yaml_text
 
 _YAML = "tag:yaml.org,2002:"

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.arguments import SimulateArguments
@@ -21,10 +21,10 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
 from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.poses_from_frames.structure_from_motion import estimate_poses
+from aenerf_ns.poses_from_frames.video import Video, open_video
 from aenerf_ns.recording.output_lock import OutputLock
 from aenerf_ns.recording.recording import Split
-from aenerf_ns.recording.structure_from_motion import estimate_poses
-from aenerf_ns.recording.video import Video, open_video
 from aenerf_ns.recording.views import evenly_spread
 from aenerf_ns.recording.writer import NativeDatasetWriter, PoselessRecordingWriter
 from aenerf_ns.simulator.open_scene import open_scene
@@ -59,7 +59,7 @@ class Simulate(SimulateArguments):
             "test": torch.from_numpy(scene.test_views(self.test_views, self.seed)),
         }
         try:
-            camera = EventCamera(self.width, self.height, *scene.intrinsics(self.width, self.height))
+            camera = CameraIntrinsics(self.width, self.height, *scene.intrinsics(self.width, self.height))
             sensor = self.sensor()
             simulation = Simulation(
                 scene,
@@ -103,7 +103,7 @@ class Simulate(SimulateArguments):
         )
 
     def _estimate(
-        self, simulation: Simulation, camera: EventCamera, truth: Trajectory
+        self, simulation: Simulation, camera: CameraIntrinsics, truth: Trajectory
     ) -> tuple[Trajectory, dict[str, Any] | None]:
         """Return the estimated trajectory and, if COLMAP estimated it, COLMAP's report."""
         noise = (self.pose_noise_degrees, self.pose_noise_translation)
@@ -144,7 +144,7 @@ class Simulate(SimulateArguments):
             soft_wrap=True,
         )
 
-    def _video_camera(self, video: Video) -> EventCamera | None:
+    def _video_camera(self, video: Video) -> CameraIntrinsics | None:
         """Return the lens of the video's camera, or None where no option states it."""
         if self.calibration is not None:
             camera = read_calibration(self.calibration, self.event_camera).event_camera
@@ -158,12 +158,12 @@ class Simulate(SimulateArguments):
             return camera
         if self.intrinsics is not None:
             try:
-                return EventCamera(video.width, video.height, *self.intrinsics)
+                return CameraIntrinsics(video.width, video.height, *self.intrinsics)
             except ValueError as error:
                 raise DataError("aenerf simulate", f"--intrinsics: {error}", "give fl_x fl_y cx cy in pixels") from None
         return None
 
-    def _video_poses(self, video: Video, camera: EventCamera | None) -> _VideoPoses | None:
+    def _video_poses(self, video: Video, camera: CameraIntrinsics | None) -> _VideoPoses | None:
         """Return where the video's camera was, or None where no option tells."""
         noise = (self.pose_noise_degrees, self.pose_noise_translation)
         if self.trajectory is not None:
@@ -226,7 +226,7 @@ class Simulate(SimulateArguments):
         self,
         lock: OutputLock,
         video: Video,
-        camera: EventCamera | None,
+        camera: CameraIntrinsics | None,
         sensor: SensorModel,
         intervals: Iterable[VideoInterval],
     ) -> str:
@@ -251,7 +251,7 @@ class Simulate(SimulateArguments):
 class _VideoPoses:
     """The lens and the poses of a video's camera, the true poses if others are estimated, and COLMAP's report."""
 
-    camera: EventCamera
+    camera: CameraIntrinsics
     estimated: Trajectory
     truth: Trajectory | None = None
     report: dict[str, Any] | None = None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from aenerf_ns.cli.run_file import require_known_tags
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import require_run
+from aenerf_ns.files.output_paths import require_run
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig

@@ -10,9 +10,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from aenerf_ns.camera.time_window import FIRST_TIME, LAST_TIME, TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.events.time_window import FIRST_TIME, LAST_TIME, TimeWindow
 
 _NEVER = np.iinfo(np.int64).min
 

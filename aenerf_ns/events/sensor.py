@@ -13,8 +13,6 @@ from aenerf_ns.errors import DataError
 
 BayerPattern = Literal["", "RGGB"]
 
-# A monochrome sensor sees the Rec. 709 luminance of linear RGB.
-LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 # The largest event sensors have 1 million pixels. The directions of so many pixels take 0.5 GB for a moment.
 _MAX_PIXELS = 1 << 22

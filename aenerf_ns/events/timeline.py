@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.events.pair_table import COUNT_MASK, NEGATIVE_SHIFT, PIXEL_SHIFT, REACH_MASK, REACH_SHIFT, EventPairs
-from aenerf_ns.events.windows import EventWindows
+from aenerf_ns.events.pair_store import COUNT_MASK, NEGATIVE_SHIFT, PIXEL_SHIFT, REACH_MASK, REACH_SHIFT, EventPairs
+from aenerf_ns.events.sorted_events import SortedEvents
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def timeline_of_pairs(pairs: EventPairs, most: int) -> EventTimeline:
     return EventTimeline(times[order], (numbers[order] >> PIXEL_SHIFT).astype(np.int32), polarities[order])
 
 
-def timeline_of_windows(windows: EventWindows, most: int) -> EventTimeline:
+def timeline_of_windows(windows: SortedEvents, most: int) -> EventTimeline:
     """Return at most ``most`` of the events that are kept for counting."""
     step = max(-(-len(windows.times) // most), 1)
     codes = windows.codes[::step]

@@ -11,9 +11,15 @@ from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import homogeneous
+from aenerf_ns.export.camera_model_files import (
+    IMAGE_FOLDER,
+    PlacedImage,
+    SeenPoints,
+    write_colmap_model,
+    write_transforms,
+)
 from aenerf_ns.export.placing import corrected_poses
 from aenerf_ns.export.rendering import points_seen, render
-from aenerf_ns.files.placed_images import IMAGE_FOLDER, PlacedImage, SeenPoints, write_colmap_model, write_transforms
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.views import IMAGE_LIST

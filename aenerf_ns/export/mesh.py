@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.export.placing import corrected_poses
@@ -61,7 +61,7 @@ def extract_mesh(pipeline: AENeRFPipeline, num_views: int, resolution: int) -> C
     """
     open3d = load_open3d()
     given = pipeline.datamanager.dataparser.recording.event_camera
-    lens = EventCamera(given.width, given.height, given.fx, given.fy, given.cx, given.cy)
+    lens = CameraIntrinsics(given.width, given.height, given.fx, given.fy, given.cx, given.cy)
     poses = homogeneous(corrected_poses(pipeline, spread_times(pipeline, num_views)))
     colors, depths = _views(pipeline, lens, poses)
     directions, _ = lens.pixel_directions()
@@ -103,7 +103,7 @@ def extract_mesh(pipeline: AENeRFPipeline, num_views: int, resolution: int) -> C
     )
 
 
-def _views(pipeline: AENeRFPipeline, lens: EventCamera, poses: Tensor) -> tuple[NDArray[np.float32], Tensor]:
+def _views(pipeline: AENeRFPipeline, lens: CameraIntrinsics, poses: Tensor) -> tuple[NDArray[np.float32], Tensor]:
     """Return display values (N, H, W, 3), and float64 distances (N, H, W) along the rays in units of the recording."""
     colors, depths = [], []
     with progress_bar() as progress:

@@ -11,7 +11,7 @@ from torch import Tensor
 from aenerf_ns.camera.alignment import align
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.placed_images import PlacedImage
+from aenerf_ns.export.camera_model_files import PlacedImage
 from aenerf_ns.recording.recording import SPLITS, ReferenceView, Split
 from aenerf_ns.recording.views import thinned, views_within
 from aenerf_ns.training.pipeline import AENeRFPipeline

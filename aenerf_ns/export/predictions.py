@@ -10,10 +10,10 @@ import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
-from aenerf_ns.files.nerfbaselines import PREDICTIONS, RESULTS_FILE, describe_run, write_predictions, write_results
+from aenerf_ns.export.nerfbaselines import PREDICTIONS, RESULTS_FILE, describe_run, write_predictions, write_results
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.training.pipeline import AENeRFPipeline
-from aenerf_ns.training.view_metrics import OF_THE_PICTURE, picture_names, to_image
+from aenerf_ns.training.view_metrics import IMAGE_METRICS, picture_names, to_image
 
 
 def export_predictions(
@@ -34,7 +34,7 @@ def export_predictions(
     write_predictions(folder / PREDICTIONS, _rendered(pipeline, names), info)
     # The evaluator reads the views in the order of their names.
     placed = [view["placed"] for _, view in sorted(zip(names, views, strict=True), key=lambda pair: pair[0])]
-    metrics = {name: [one[name] for one in placed] for name in OF_THE_PICTURE if name in placed[0]}
+    metrics = {name: [one[name] for one in placed] for name in IMAGE_METRICS if name in placed[0]}
     write_results(folder / RESULTS_FILE, folder / PREDICTIONS, info, metrics)
 
 

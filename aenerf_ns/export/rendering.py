@@ -11,8 +11,8 @@ from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.files.placed_images import PlacedImage, SeenPoints
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.export.camera_model_files import PlacedImage, SeenPoints
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
@@ -20,13 +20,13 @@ from aenerf_ns.training.pipeline import AENeRFPipeline
 OPAQUE = 0.5
 
 
-def scene_camera(pipeline: AENeRFPipeline, lens: EventCamera, poses: Tensor) -> Cameras:
+def scene_camera(pipeline: AENeRFPipeline, lens: CameraIntrinsics, poses: Tensor) -> Cameras:
     """Return cameras of the scene at poses (N, 4, 4) of the recording's world, OpenCV axes, on the run's device."""
     return lens.cameras(pipeline.in_scene(poses)).to(pipeline.device)
 
 
 @torch.no_grad()
-def render(pipeline: AENeRFPipeline, lens: EventCamera, pose: Tensor) -> dict[str, Tensor]:
+def render(pipeline: AENeRFPipeline, lens: CameraIntrinsics, pose: Tensor) -> dict[str, Tensor]:
     """Render a view.
 
     Args:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files.boundary import require_unpacked_size
+from aenerf_ns.files.limits import require_unpacked_size
 from aenerf_ns.files.sensor_size import sensor_size
 from aenerf_ns.files.unpacking import MAX_PIECE, require_unpacker, unpacked
 

@@ -13,7 +13,7 @@ from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from aenerf_ns.files.boundary import require_unpacked_size
+from aenerf_ns.files.limits import require_unpacked_size
 from aenerf_ns.files.plain_yaml import read_plain_yaml
 from aenerf_ns.files.unpacking import MAX_PIECE, unpacked
 

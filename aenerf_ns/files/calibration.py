@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.json_object import JsonObject, read_camera, read_image_encoding
@@ -29,8 +29,8 @@ class Calibration:
         image_encoding: whether the images' values are sRGB or linear in radiance.
     """
 
-    event_camera: EventCamera
-    frame_camera: EventCamera
+    event_camera: CameraIntrinsics
+    frame_camera: CameraIntrinsics
     frame_from_event: Tensor
     sensor: SensorModel
     image_encoding: ImageEncoding

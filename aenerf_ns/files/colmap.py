@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.boundary import require_at_most
+from aenerf_ns.files.limits import require_at_most
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions
 
 # Number of the image; rotation as qw qx qy qz and translation of world to camera; number of the camera.

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, require_event_file
-from aenerf_ns.files.boundary import require_file, require_unpacked_size
 from aenerf_ns.files.event_table import EventLayout, EventTableFile
+from aenerf_ns.files.limits import require_file, require_unpacked_size
 from aenerf_ns.files.text import TimeUnit
 
 # Robust e-NeRF.

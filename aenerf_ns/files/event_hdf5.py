@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
-from aenerf_ns.files.boundary import require_unpacked_size
 from aenerf_ns.files.event_table import EventLayout, EventTableFile
+from aenerf_ns.files.limits import require_unpacked_size
 from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
 
 if TYPE_CHECKING:

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.boundary import file_inside, read_text
+from aenerf_ns.files.limits import file_inside, read_text
 from aenerf_ns.files.text import MAX_TIME
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from aenerf_ns.camera.image_encoding import ImageEncoding
-    from aenerf_ns.camera.lens import EventCamera, LensModel
+    from aenerf_ns.camera.intrinsics import CameraIntrinsics, LensModel
 
 # For each camera model of Nerfstudio: the lens, and the names of its distortion parameters in OpenCV's order.
 LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
@@ -263,16 +263,16 @@ def _number_or_text(value: Any) -> float | str:
     return float(value) if isinstance(value, Decimal) else str(value)
 
 
-def read_camera(meta: JsonObject, width: str, height: str) -> EventCamera:
+def read_camera(meta: JsonObject, width: str, height: str) -> CameraIntrinsics:
     """Read a camera from Nerfstudio's names of intrinsics; ``width`` and ``height`` are the keys of its size."""
-    from aenerf_ns.camera.lens import EventCamera
+    from aenerf_ns.camera.intrinsics import CameraIntrinsics
 
     model = meta.get("camera_model", str, "OPENCV")
     if model not in LENS_MODELS:
         raise meta.error("camera_model", f"is {model!r}, not one of {', '.join(LENS_MODELS)}")
     lens, names = LENS_MODELS[model]
     try:
-        return EventCamera(
+        return CameraIntrinsics(
             meta.get(width, int),
             meta.get(height, int),
             fx=meta.get("fl_x", float),

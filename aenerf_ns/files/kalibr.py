@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from aenerf_ns.camera.lens import EventCamera, LensModel
+from aenerf_ns.camera.intrinsics import CameraIntrinsics, LensModel
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.json_object import JsonObject, require_shallow
 from aenerf_ns.files.plain_yaml import read_plain_yaml
@@ -19,7 +19,7 @@ _LENS_MODELS: dict[str, LensModel] = {
 }
 
 
-def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
+def read_camchain(path: Path) -> dict[str, tuple[CameraIntrinsics, Tensor]]:
     """Read the cameras of a camchain, by their names.
 
     Returns:
@@ -40,7 +40,7 @@ def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
     chain = {name: value for name, value in chain.items() if isinstance(value, dict)}
     if not chain:
         raise DataError(path, "not a list of cameras", "give the camchain that Kalibr wrote")
-    cameras: dict[str, tuple[EventCamera, Tensor]] = {}
+    cameras: dict[str, tuple[CameraIntrinsics, Tensor]] = {}
     from_first = torch.eye(4, dtype=torch.float64)
     for name in sorted(chain):
         meta = JsonObject(path, chain[name], f"{name}.")
@@ -51,7 +51,7 @@ def read_camchain(path: Path) -> dict[str, tuple[EventCamera, Tensor]]:
     return cameras
 
 
-def _camera(meta: JsonObject) -> EventCamera:
+def _camera(meta: JsonObject) -> CameraIntrinsics:
     if meta.get("camera_model", str, "pinhole") != "pinhole":
         raise meta.error("camera_model", f"is {meta.get('camera_model', str)!r}, not 'pinhole'")
     model = meta.get("distortion_model", str, "radtan")
@@ -67,6 +67,6 @@ def _camera(meta: JsonObject) -> EventCamera:
         distortion.append(0.0)
     try:
         # Kalibr puts the origin at the centre of the first pixel, this project at its corner.
-        return EventCamera(width, height, fx, fy, cx + 0.5, cy + 0.5, lens, tuple(distortion))
+        return CameraIntrinsics(width, height, fx, fy, cx + 0.5, cy + 0.5, lens, tuple(distortion))
     except ValueError as error:
         raise meta.error("intrinsics:", str(error)) from None

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.given_paths import require_dataset
 from aenerf_ns.files.json_object import JsonObject
 from aenerf_ns.files.open import SUFFIXES
+from aenerf_ns.files.output_paths import require_dataset
 from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, parse_numbers, parse_times, read_rows
 
 CALIBRATIONS = ("calibration.json", "camchain.yaml")

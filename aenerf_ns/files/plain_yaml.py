@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.boundary import read_text
+from aenerf_ns.files.limits import read_text
 
 # Calibrations and the metadata of bags have 1 kB a camera or topic. PyYAML reads 0.1 MB in a second.
 _MAX_BYTES = 1 << 17

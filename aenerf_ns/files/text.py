@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.boundary import require_at_most, require_file
+from aenerf_ns.files.limits import require_at_most, require_file
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}

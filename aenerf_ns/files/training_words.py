@@ -7,8 +7,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from aenerf_ns.errors import errors_as_one_line
-from aenerf_ns.files.given_paths import require_dataset
 from aenerf_ns.files.layouts import look_over
+from aenerf_ns.files.output_paths import require_dataset
 
 _PROGRAMS = ("ns-train", "ns-train.exe", "ns-train-script.py")
 

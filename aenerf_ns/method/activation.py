@@ -9,7 +9,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from aenerf_ns.method.compiled import is_float_in_memory, kernels_or_none
+from aenerf_ns.method.kernels.loader import is_float_in_memory, kernels_or_none
 
 
 class SharpSoftplus(nn.Softplus):

@@ -20,7 +20,7 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from torch import Tensor
 
 from aenerf_ns.method.activation import SharpSoftplus
-from aenerf_ns.method.encoding.hash_grid import HashEncoding, Implementation
+from aenerf_ns.method.hash_grid import HashEncoding, Implementation
 
 # The framework's trunc_exp cuts gradients at the same value, but it overflows, and it is a custom function without
 # forward-mode derivatives.
@@ -79,7 +79,7 @@ class DensityField(Field):
         spatial_distortion: contraction of space to a ball or cube of radius 2, or None for a bounded scene.
         encoding: of positions in the contracted space or box, which is scaled to [0, 1] along each axis.
         shape: of the network.
-        to_field_space: see :class:`.comoving.CoMovingSpace`, or None for a field that is fixed in the scene.
+        to_field_space: see :class:`.comoving.PoseFollowingWarp`, or None for a field that is fixed in the scene.
     """
 
     aabb: Tensor

@@ -28,22 +28,22 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from aenerf_ns.camera.image_encoding import decode, encode, to_channels
-from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.box_collider import BoxCollider
 from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
-from aenerf_ns.method.comoving import CoMovingSpace
 from aenerf_ns.method.field import to_unit_cube
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method.initial_samplers import EvenSampler, EvenThenDisparitySampler
 from aenerf_ns.method.networks import Backbone, FieldConfig, ProposalConfig, make_networks
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
+from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 from aenerf_ns.method.ray_losses import distortion_loss
 from aenerf_ns.method.temporal import log_radiance_rate
-from aenerf_ns.recording.scene import SCENE, Scene
+from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.supervision.base import Supervision, SupervisionConfig
-from aenerf_ns.supervision.pairs import PairSupervisionConfig
+from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
 
 # ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
@@ -109,14 +109,14 @@ class AENeRFModelConfig(ModelConfig):
 class AENeRFModel(Model):
     """Renders radiance along event rays and compares its logarithm with the events.
 
-    Needs the :class:`~aenerf_ns.recording.scene.Scene` in the dataparser's metadata.
+    Needs the :class:`~aenerf_ns.recording.scene.SceneRecording` in the dataparser's metadata.
     """
 
     config: AENeRFModelConfig
 
     def populate_modules(self) -> None:
         """Build the networks, the samplers, the supervision and the colour correction."""
-        scene: Scene = self.kwargs["metadata"][SCENE]
+        scene: SceneRecording = self.kwargs["metadata"][SCENE_KEY]
         config = self.config
         _require_possible(config)
         self.sensor = scene.sensor
@@ -139,7 +139,9 @@ class AENeRFModel(Model):
             ground_truth=deepcopy(scene.ground_truth),
         )
         self.space = (
-            CoMovingSpace(self.camera_optimizer, lambda positions: to_unit_cube(positions, distortion, self.field.aabb))
+            PoseFollowingWarp(
+                self.camera_optimizer, lambda positions: to_unit_cube(positions, distortion, self.field.aabb)
+            )
             if self.camera_optimizer.is_learned
             else None
         )

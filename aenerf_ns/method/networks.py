@@ -10,9 +10,9 @@ from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import Field
 from torch import Tensor
 
-from aenerf_ns.method.comoving import CoMovingSpace
-from aenerf_ns.method.encoding.hash_grid import HashEncoding, Implementation
 from aenerf_ns.method.field import DensityField, DensityShape, EventRadianceField, ProposalNetwork, RadianceShape
+from aenerf_ns.method.hash_grid import HashEncoding, Implementation
+from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 
 Backbone = Literal["hash", "mlp"]
 
@@ -72,7 +72,7 @@ def make_networks(
     spatial_distortion: SpatialDistortion | None,
     num_channels: int,
     average_init_density: float,
-    space: CoMovingSpace | None,
+    space: PoseFollowingWarp | None,
 ) -> tuple[EventRadianceField, list[Field]]:
     """Make the field, and the proposal networks in the order in which they are evaluated.
 

@@ -16,7 +16,7 @@ from nerfstudio.field_components.encodings import NeRFEncoding
 from torch import Tensor, nn
 
 from aenerf_ns.camera.alignment import Similarity, align
-from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS, REFERENCE_SECONDS, TRAJECTORY_SECONDS
+from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS, REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.rotation import TwistExponential
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 

@@ -13,16 +13,16 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS, TRAJECTORY_SECONDS
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS, TRAJECTORY_SECONDS
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.files.layouts import of_guessed_format
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import FrameSequence, Recording, Split
-from aenerf_ns.recording.scene import SCENE, Scene
+from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.recording.views import seconds_on_trajectory, thinned, viewer_cameras, views_within
 
 # In extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
@@ -92,7 +92,7 @@ class EventDataParser(DataParser):
         """Return whether training scales the poses of a recording that this parser has read."""
         return bool(self.config.auto_scale_poses) or recording.scene_box is not None
 
-    def _check_lens(self, camera: EventCamera, name: str) -> None:
+    def _check_lens(self, camera: CameraIntrinsics, name: str) -> None:
         """Raise a DataError for a lens whose distortion cannot be inverted at any pixel."""
         if not camera.sees():
             raise DataError(
@@ -153,7 +153,7 @@ class EventDataParser(DataParser):
             dataparser_scale=scale,
             alpha_color=None if recording.image_background is None else torch.tensor(recording.image_background),
             metadata={
-                SCENE: Scene(
+                SCENE_KEY: SceneRecording(
                     trajectory=trajectory,
                     ground_truth=ground_truth,
                     event_camera=recording.event_camera,

@@ -12,16 +12,16 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS
+from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pair_table import EventPairs
+from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.picture import PolaritySums, polarity_picture
+from aenerf_ns.events.sorted_events import SortedEvents, sort_events
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.events.timeline import EventTimeline, timeline_of_pairs, timeline_of_windows
-from aenerf_ns.events.windows import EventWindows, window_events
 from aenerf_ns.progress import tracked
-from aenerf_ns.recording.pair_file import PairFile
-from aenerf_ns.recording.scene import SCENE, Scene
+from aenerf_ns.recording.pair_cache import PairFile
+from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 
 # Events in a picture, as a share of the sensor's pixels: enough to show edges, too few to smear them.
 _PICTURE_DENSITY = 0.25
@@ -33,9 +33,9 @@ class EventDataset(InputDataset):
     """A split of a recording. Training cameras show an image or the events around them, the others show images."""
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> SceneRecording:
         """The recording in the frame of the scene."""
-        return self.metadata[SCENE]
+        return self.metadata[SCENE_KEY]
 
     @property
     def reference_seconds(self) -> Tensor:
@@ -56,7 +56,7 @@ class EventDataset(InputDataset):
         return self._pairs_and_pictures[0]
 
     @property
-    def windows(self) -> EventWindows:
+    def windows(self) -> SortedEvents:
         """All events in the time window, in the order of time. The first access reads the whole event file.
 
         Raises:
@@ -81,7 +81,7 @@ class EventDataset(InputDataset):
         found = file.find()
         if found is None:
             # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-            from aenerf_ns.events.pairs import EVENTS_IN_MEMORY
+            from aenerf_ns.events.pairing import EVENTS_IN_MEMORY
 
             count = events.count()
             # Several processes read a short recording side by side.
@@ -96,7 +96,7 @@ class EventDataset(InputDataset):
         self, file: PairFile, usable: NDArray[np.bool_], count: int | None
     ) -> tuple[EventPairs, NDArray[np.int16]]:
         """Make pairs and pictures, and keep them if they are in a file."""
-        from aenerf_ns.events.pairs import pair_events
+        from aenerf_ns.events.pairing import pair_events
 
         scene = self.scene
         events = scene.event_file
@@ -117,14 +117,14 @@ class EventDataset(InputDataset):
         return pairs, sums
 
     @cached_property
-    def _windows_and_pictures(self) -> tuple[EventWindows, NDArray[np.int16]]:
+    def _windows_and_pictures(self) -> tuple[SortedEvents, NDArray[np.int16]]:
         """The events, and for each camera the (height, width) sum of polarities around its time."""
         scene = self.scene
         scene.event_file.require()
         _, usable = scene.event_camera.pixel_directions()
         pictures = self._new_pictures()
         chunks = pictures.passed(self._chunks(scene.event_file.count()))
-        windows = window_events(chunks, window=scene.window, usable=usable)
+        windows = sort_events(chunks, window=scene.window, usable=usable)
         CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.")
         return windows, pictures.sums(*usable.shape)
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 from PIL import Image
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 
 # PIL reads many more formats. Some run other programs, such as Ghostscript.
 _FORMATS = ("PNG", "JPEG")
 
 
-def check_image(file: Path, camera: EventCamera) -> None:
+def check_image(file: Path, camera: CameraIntrinsics) -> None:
     """Raise a DataError for an image that Nerfstudio cannot read, or would read wrongly."""
     size, mode = image_size_and_mode(file)
     if size != (camera.width, camera.height):

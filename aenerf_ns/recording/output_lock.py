@@ -11,7 +11,7 @@ from pathlib import Path
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.given_paths import cannot_be_created, require_new
+from aenerf_ns.files.output_paths import cannot_be_created, require_new
 
 try:
     import fcntl

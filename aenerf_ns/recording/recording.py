@@ -9,7 +9,7 @@ from typing import Literal
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
@@ -49,9 +49,9 @@ class Capture:
     """
 
     event_file: EventFile
-    event_camera: EventCamera
+    event_camera: CameraIntrinsics
     sensor: SensorModel
-    frame_camera: EventCamera
+    frame_camera: CameraIntrinsics
     image_encoding: ImageEncoding
 
     def with_poses(

@@ -8,18 +8,18 @@ from pathlib import Path
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.events.time_window import TimeWindow
 
-SCENE = "scene"
-"""The key of the :class:`Scene` in the metadata of Nerfstudio's dataparser outputs and datasets."""
+SCENE_KEY = "scene"
+"""The key of the :class:`SceneRecording` in the metadata of Nerfstudio's dataparser outputs and datasets."""
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneRecording:
     """The part of a recording that the dataparser hands on.
 
     Attributes:
@@ -40,7 +40,7 @@ class Scene:
 
     trajectory: Trajectory
     ground_truth: Trajectory | None
-    event_camera: EventCamera
+    event_camera: CameraIntrinsics
     event_file: EventFile
     sensor: SensorModel
     window: TimeWindow

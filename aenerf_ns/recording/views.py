@@ -10,10 +10,10 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.events.time_window import TimeWindow
-from aenerf_ns.files.boundary import file_inside
+from aenerf_ns.files.limits import file_inside
 from aenerf_ns.files.text import TimeUnit, parse_times, read_rows
 from aenerf_ns.recording.recording import ReferenceView, Split
 

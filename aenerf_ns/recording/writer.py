@@ -16,13 +16,13 @@ from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.errors import DataError, reason
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
-from aenerf_ns.files.given_paths import cannot_be_created
 from aenerf_ns.files.json_object import LENS_MODELS
+from aenerf_ns.files.output_paths import cannot_be_created
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
@@ -119,12 +119,12 @@ class NativeDatasetWriter(_FolderWriter):
     def __init__(
         self,
         folder: Path | OutputLock,
-        event_camera: EventCamera,
+        event_camera: CameraIntrinsics,
         sensor: SensorModel,
         image_encoding: ImageEncoding,
         scene_box: NDArray[np.float64] | None = None,
         max_pose_gap: int | None = None,
-        frame_camera: EventCamera | None = None,
+        frame_camera: CameraIntrinsics | None = None,
         auto_scale_poses: bool = True,
     ) -> None:
         super().__init__(folder)
@@ -273,7 +273,7 @@ class PoselessRecordingWriter(_FolderWriter):
         events: its method ``append`` takes the events, piece by piece in the order of time.
     """
 
-    def __init__(self, folder: Path | OutputLock, camera: EventCamera | None, sensor: SensorModel) -> None:
+    def __init__(self, folder: Path | OutputLock, camera: CameraIntrinsics | None, sensor: SensorModel) -> None:
         super().__init__(folder)
         self._camera, self._sensor = camera, sensor
         self._images: list[str] = []
@@ -299,7 +299,7 @@ def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
     path.write_bytes(cv2.imencode(".png", values)[1].tobytes())
 
 
-def _event_camera(camera: EventCamera, sensor: SensorModel) -> dict[str, Any]:
+def _event_camera(camera: CameraIntrinsics, sensor: SensorModel) -> dict[str, Any]:
     return {
         "width": camera.width,
         "height": camera.height,
@@ -311,7 +311,7 @@ def _event_camera(camera: EventCamera, sensor: SensorModel) -> dict[str, Any]:
     }
 
 
-def _lens(camera: EventCamera) -> dict[str, Any]:
+def _lens(camera: CameraIntrinsics) -> dict[str, Any]:
     model, names = next((model, names) for model, (lens, names) in LENS_MODELS.items() if lens == camera.lens_model)
     return {
         "camera_model": model,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from aenerf_ns.supervision.pairs import PairSampler, PairSupervision
+from aenerf_ns.supervision.event_pairs import PairSampler, PairSupervision
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 _NUM_PAIRS = 20_000

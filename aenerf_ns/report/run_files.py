@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.boundary import require_at_most, require_file
 from aenerf_ns.files.json_object import JsonObject
+from aenerf_ns.files.limits import require_at_most, require_file
 from aenerf_ns.training.run_record import RUN_FILE, SCALARS_FILE
 
 # Points of a curve. More are not seen, and make the page large.

@@ -12,7 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.events.sensor import LUMINANCE, RGGB, SensorModel
+from aenerf_ns.camera.image_encoding import LUMINANCE
+from aenerf_ns.events.sensor import RGGB, SensorModel
 from aenerf_ns.simulator.options import SensorNoise
 
 MINIMUM_CONTRAST_THRESHOLD = 0.01

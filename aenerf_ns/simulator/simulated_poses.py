@@ -7,15 +7,15 @@ from typing import Any
 import torch
 
 from aenerf_ns.camera.alignment import pose_errors
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.recording.structure_from_motion import compare_with_truth, estimate_poses
+from aenerf_ns.poses_from_frames.structure_from_motion import compare_with_truth, estimate_poses
 from aenerf_ns.simulator.simulation import Simulation
 
 
 def poses_from_frames(
-    simulation: Simulation, camera: EventCamera, truth: Trajectory, frame_rate: float, exposure: float, seed: int
+    simulation: Simulation, camera: CameraIntrinsics, truth: Trajectory, frame_rate: float, exposure: float, seed: int
 ) -> tuple[Trajectory, dict[str, Any], str]:
     """Run COLMAP on the frames of a camera at the event sensor's place, as in a DAVIS.
 

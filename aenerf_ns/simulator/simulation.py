@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import encode, to_channels
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
@@ -64,7 +64,7 @@ class Simulation:
     def __init__(
         self,
         scene: SimulationScene,
-        camera: EventCamera,
+        camera: CameraIntrinsics,
         sensor: SensorModel,
         speed: Literal["easy", "hard"],
         easy_duration: float,

@@ -156,5 +156,5 @@ class Sampler(ABC):
         Returns:
             The rays, and what the sensor recorded of them. The rays are in the camera's frame: pose correction moves
             them to the world by their ``times`` (N, 1), in float64 seconds since the trajectory's start, and the
-            :data:`~aenerf_ns.camera.ray_tags.CAMERA_DIRECTIONS` among their metadata.
+            :data:`~aenerf_ns.camera.metadata_keys.CAMERA_DIRECTIONS` among their metadata.
         """

@@ -11,8 +11,8 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
-from aenerf_ns.recording.scene import Scene
+from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
+from aenerf_ns.recording.scene import SceneRecording
 
 
 class PixelRays:
@@ -28,7 +28,7 @@ class PixelRays:
         usable: (height, width) whether the lens model gives a pixel a direction.
     """
 
-    def __init__(self, scene: Scene, device: torch.device | str) -> None:
+    def __init__(self, scene: SceneRecording, device: torch.device | str) -> None:
         self.trajectory = deepcopy(scene.trajectory).to(device)
         camera = scene.event_camera
         directions, self.usable = camera.pixel_directions()

@@ -14,7 +14,7 @@ from torch import Tensor
 from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision
-from aenerf_ns.supervision.pairs import PairSamplerConfig
+from aenerf_ns.supervision.event_pairs import PairSamplerConfig
 
 
 @dataclass

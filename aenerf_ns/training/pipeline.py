@@ -30,7 +30,7 @@ from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
 from aenerf_ns.training.pose_refinement import NUM_STEPS, RefinedViews
 from aenerf_ns.training.training_state import TrainingState
 from aenerf_ns.training.view_metrics import (
-    OF_THE_PICTURE,
+    IMAGE_METRICS,
     average_metrics,
     describe_views,
     measure_views,
@@ -413,7 +413,7 @@ class AENeRFPipeline(VanillaPipeline):
         """Return the mean metrics of the reference views from refined poses, and how the poses were refined."""
         metrics = self._checked(average_metrics(refined, get_std))
         # The time to render includes no refinement, so it says nothing new.
-        metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in OF_THE_PICTURE}
+        metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in IMAGE_METRICS}
         if self.model.image_metrics.lpips_absent is not None:
             metrics["lpips"] = None
         how = f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {self.test_poses}"

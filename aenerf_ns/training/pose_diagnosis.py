@@ -13,10 +13,10 @@ from torch import Tensor
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
-from aenerf_ns.events.pair_table import COUNT_MASK, NEGATIVE_SHIFT, PIXEL_SHIFT, REACH_MASK, REACH_SHIFT, EventPairs
+from aenerf_ns.events.pair_store import COUNT_MASK, NEGATIVE_SHIFT, PIXEL_SHIFT, REACH_MASK, REACH_SHIFT, EventPairs
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.method.pose_correction import PoseCorrection
-from aenerf_ns.supervision.pairs import PairSampler
+from aenerf_ns.supervision.event_pairs import PairSampler
 
 if TYPE_CHECKING:
     from aenerf_ns.checking.hypotheses import Comparison

@@ -18,7 +18,7 @@ from nerfstudio.utils.decorators import check_main_thread, decorate_all
 from torch import Tensor
 
 from aenerf_ns.training.checkpoints import move_whole
-from aenerf_ns.training.environment import environment
+from aenerf_ns.training.provenance import environment
 
 RUN_FILE, SCALARS_FILE = "run.json", "scalars.csv"
 """The files' names in the folder of a run."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from aenerf_ns.method.model import AENeRFModel
     from aenerf_ns.training.pipeline import AENeRFPipeline
 
-OF_THE_PICTURE = ("psnr", "ssim", "lpips")
+IMAGE_METRICS = ("psnr", "ssim", "lpips")
 """The metrics that tell of a picture. The others tell how long it took."""
 
 
@@ -128,13 +128,13 @@ def describe_views(
             "time_ns": start + round(float(seconds[index]) * 1e9) if timed else None,
             "camera_speed": float(speeds[index]) if timed else None,
             "camera_turn_rate_degrees": float(turn_rates[index]) if timed else None,
-            "placed": _of_the_picture(placed[index]),
+            "placed": _image_metrics(placed[index]),
         }
         if refined is not None:
-            view["refined"] = _of_the_picture(refined[index])
+            view["refined"] = _image_metrics(refined[index])
         views.append(view)
     return views
 
 
-def _of_the_picture(metrics: dict[str, float]) -> dict[str, float]:
-    return {name: value for name, value in metrics.items() if name in OF_THE_PICTURE}
+def _image_metrics(metrics: dict[str, float]) -> dict[str, float]:
+    return {name: value for name, value in metrics.items() if name in IMAGE_METRICS}

@@ -29,7 +29,7 @@ from filelock import FileLock, Timeout
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.training.environment import environment
+from aenerf_ns.training.provenance import environment
 from benchmarks.common import script
 from benchmarks.owned import owned
 from benchmarks.paper.plan import CEILING, Dataset, Run, digest, scene_name

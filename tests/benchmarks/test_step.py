@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 import torch
-from commands import simulate
-from small_datasets import CAMERA, write_native
+from helpers.commands import simulate
+from helpers.small_datasets import CAMERA, write_native
 from torch.profiler import profile
 
 from benchmarks.step.worker import ranged, seconds_of_parts

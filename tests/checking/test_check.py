@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.small_datasets import START, write_native
 from PIL import Image
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from small_datasets import START, write_native
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory

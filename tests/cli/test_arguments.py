@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import run as run_command
+from helpers.commands import run as run_command
 
 from aenerf_ns.cli import first_look
 from aenerf_ns.cli.arguments import Automatic

@@ -17,9 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
-from PIL import Image
-from small_datasets import (
+from helpers.small_datasets import (
     ECD_FAULTS,
     END,
     NATIVE_FAULTS,
@@ -28,8 +26,10 @@ from small_datasets import (
     write_ecd,
     write_native,
 )
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import convert as command
@@ -42,9 +42,9 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.poses_from_frames.structure_from_motion import EstimatedPoses
 from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.recording.structure_from_motion import EstimatedPoses
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
 
@@ -199,7 +199,7 @@ def test_hot_pixels_are_named(tmp_path: Path) -> None:
 
 def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # COLMAP itself is tested elsewhere. This stand-in places all frames but the last.
-    def place(files: list[Path], times: list[int], camera: EventCamera, source: Path, seed: int) -> EstimatedPoses:
+    def place(files: list[Path], times: list[int], camera: CameraIntrinsics, source: Path, seed: int) -> EstimatedPoses:
         assert [file.name for file in files] == ["0.png", "1.png", "2.png", "3.png"]
         poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
         poses[:, 0, 3] = torch.arange(3)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_datasets import write_native
+from helpers.small_datasets import write_native
 
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.cli.simulate import Simulate

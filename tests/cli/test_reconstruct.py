@@ -9,9 +9,9 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from helpers.small_datasets import START, parse, write_native
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from small_datasets import START, parse, write_native
 
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous

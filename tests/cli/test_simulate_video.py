@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import main as program
 from aenerf_ns.cli import simulate as command
@@ -23,9 +23,9 @@ from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
+from aenerf_ns.poses_from_frames.structure_from_motion import EstimatedPoses
+from aenerf_ns.poses_from_frames.video import Video, open_video
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.recording.structure_from_motion import EstimatedPoses
-from aenerf_ns.recording.video import Video, open_video
 from aenerf_ns.simulator.options import SensorNoise
 from aenerf_ns.simulator.video_events import video_events
 
@@ -96,7 +96,7 @@ def test_the_command_makes_a_dataset_of_a_video_with_its_poses(
     assert f"ns-train aenerf --data {output}" in printed.get()
     parser = NativeDataParserConfig(data=output).setup()
     recording = parser.recording
-    assert recording.event_camera == recording.frame_camera == EventCamera(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 7.5)
+    assert recording.event_camera == recording.frame_camera == CameraIntrinsics(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 7.5)
     assert recording.sensor == SensorModel(0.3, 0.25)
     assert recording.ground_truth is None
     torch.testing.assert_close(recording.trajectory.camera_to_worlds, make_poses().camera_to_worlds)
@@ -132,11 +132,11 @@ def test_noise_is_added_to_the_given_poses(frames: Path, poses: Path, camchain: 
 def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # COLMAP itself is tested elsewhere. This stand-in places all frames but the last two.
     def place(
-        video: Video, times: NDArray[np.int64], camera: EventCamera | tuple[int, int], source: Path, seed: int
+        video: Video, times: NDArray[np.int64], camera: CameraIntrinsics | tuple[int, int], source: Path, seed: int
     ) -> EstimatedPoses:
         assert len(list(video)) == len(times) == 10
-        if not isinstance(camera, EventCamera):
-            camera = EventCamera(*camera, 22.0, 22.0, 12.0, 8.0, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))
+        if not isinstance(camera, CameraIntrinsics):
+            camera = CameraIntrinsics(*camera, 22.0, 22.0, 12.0, 8.0, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))
         placed = Trajectory(times[:8], torch.eye(4, dtype=torch.float64).repeat(8, 1, 1), source)
         return EstimatedPoses(times, placed, camera, [8], 9, 0.5, 100.0, 1.0)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from small_trainings import train_small_model
+from helpers.small_trainings import train_small_model
 
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export_cameras import ExportCameras

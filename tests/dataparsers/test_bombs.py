@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from bounded_reading import MAX_SECONDS, little_memory, readable_folder
-from dataset_faults import read_everything
-from vendor_recordings import BOMBS, RECORDINGS, config_of_recording
+from helpers.bounded_reading import MAX_SECONDS, little_memory, readable_folder
+from helpers.dataset_faults import read_everything
+from helpers.vendor_recordings import BOMBS, RECORDINGS, config_of_recording
 
 from aenerf_ns.errors import DataError
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_datasets import make_trajectory, parse, write_native
+from helpers.small_datasets import make_trajectory, parse, write_native
 
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.recording.scene import SCENE_KEY
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -96,7 +96,7 @@ def test_the_documented_format_reads_a_folder(tmp_path: Path) -> None:
 def test_the_documented_way_back_to_the_world_is_the_inverse(tmp_path: Path) -> None:
     outputs = parse(NativeDataParserConfig(data=write_native(tmp_path / "made")))
     outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
-    scene_opengl = outputs.metadata[SCENE].trajectory.camera_to_worlds.numpy()
+    scene_opengl = outputs.metadata[SCENE_KEY].trajectory.camera_to_worlds.numpy()
     (code,) = blocks("coordinate_frames.md", "python")
     code, count = re.subn(r'Path\("outputs/[^"]*"\)', "run", code)
     assert count == 1

@@ -6,23 +6,23 @@ from pathlib import Path
 
 import pytest
 import torch
-from dataset_faults import assert_one_clear_line, replace_line
-from small_datasets import (
+from helpers.dataset_faults import assert_one_clear_line, replace_line
+from helpers.small_datasets import (
     ECD_FAULTS,
     parse,
     write_ecd,
 )
-from unpacked_pairs import unpacked
+from helpers.unpacked_pairs import unpacked
 
+from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
 from aenerf_ns.camera.noise import perturb
-from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.recording.scene import SCENE_KEY
 
 
 def test_a_guessed_size_is_told_and_can_be_given(tmp_path: Path) -> None:
@@ -41,13 +41,13 @@ def test_a_guessed_size_is_told_and_can_be_given(tmp_path: Path) -> None:
 def test_ecd_text_reads(tmp_path: Path) -> None:
     config = EcdDataParserConfig(data=write_ecd(tmp_path / "made"))
     dataset = EventDataset(parse(config))
-    camera = dataset.metadata[SCENE].event_camera
+    camera = dataset.metadata[SCENE_KEY].event_camera
     # The format counts the principal point from the centre of the first pixel.
     assert (camera.width, camera.height, camera.cx, camera.cy) == (6, 4, 3.0, 2.0)
-    (chunk,) = dataset.metadata[SCENE].event_file.chunks()
+    (chunk,) = dataset.metadata[SCENE_KEY].event_file.chunks()
     assert chunk.t.tolist() == [10_000_000, 20_000_000, 30_000_000, 310_000_000]
     assert chunk.p.tolist() == [1, -1, 1, 1]
-    assert dataset.metadata[SCENE].window == TimeWindow(10_000_000, 310_000_000)
+    assert dataset.metadata[SCENE_KEY].window == TimeWindow(10_000_000, 310_000_000)
     assert [pair[3] for pair in unpacked(dataset.pairs)] == [20_000_000, 310_000_000]
     # Images at 0.05 and 0.25 s validate, 0.15 s tests, 0.35 s is after the last event.
     assert len(parse(config, "val").image_filenames) == 2
@@ -61,21 +61,21 @@ def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     write_tum_trajectory(tmp_path / "other.txt", other)
     config = EcdDataParserConfig(data=folder, trajectory=tmp_path / "other.txt")
     outputs, as_given = parse(config), parse(EcdDataParserConfig(data=folder))
-    assert as_given.metadata[SCENE].ground_truth is None
+    assert as_given.metadata[SCENE_KEY].ground_truth is None
     # In the scene's frame, which follows from the estimated poses; images have true ones.
     to_scene = homogeneous(outputs.dataparser_transform.double())
     for name, poses in (("ground_truth", truth), ("trajectory", other)):
-        times = getattr(outputs.metadata[SCENE], name).times
+        times = getattr(outputs.metadata[SCENE_KEY], name).times
         expected = to_scene @ homogeneous(poses.interpolate(times)) @ OPENCV_TO_OPENGL
         torch.testing.assert_close(
-            getattr(outputs.metadata[SCENE], name).camera_to_worlds, expected[:, :3], rtol=0, atol=1e-6
+            getattr(outputs.metadata[SCENE_KEY], name).camera_to_worlds, expected[:, :3], rtol=0, atol=1e-6
         )
     views = parse(config, "test").cameras
     expected = to_scene @ homogeneous(truth.interpolate([150_000_000])) @ OPENCV_TO_OPENGL
     torch.testing.assert_close(views.camera_to_worlds, expected[:, :3].float(), rtol=0, atol=1e-6)
     assert views.metadata is not None
     taken = views.metadata[REFERENCE_SECONDS][0, 0].item()
-    assert taken == pytest.approx(0.15 - 1e-9 * outputs.metadata[SCENE].trajectory.start)
+    assert taken == pytest.approx(0.15 - 1e-9 * outputs.metadata[SCENE_KEY].trajectory.start)
 
 
 def test_ecd_text_may_hold_comments_and_empty_lines(tmp_path: Path) -> None:
@@ -83,11 +83,11 @@ def test_ecd_text_may_hold_comments_and_empty_lines(tmp_path: Path) -> None:
     events = folder / "events.txt"
     events.write_text("# t x y p\n\n" + events.read_text() + "\n\n")
     dataset = EventDataset(parse(EcdDataParserConfig(data=folder)))
-    assert dataset.metadata[SCENE].window == TimeWindow(10_000_000, 310_000_000)
+    assert dataset.metadata[SCENE_KEY].window == TimeWindow(10_000_000, 310_000_000)
     assert dataset.pairs.num_events == 4
     replace_line("events.txt", 4, "0.03 9 3 1")(folder)
     with pytest.raises(DataError, match="line 5 has x = 9"):
-        list(dataset.metadata[SCENE].event_file.chunks())
+        list(dataset.metadata[SCENE_KEY].event_file.chunks())
 
 
 def test_the_real_recording_reads(slider_depth: Path) -> None:
@@ -96,12 +96,12 @@ def test_the_real_recording_reads(slider_depth: Path) -> None:
     pairs = dataset.pairs
     assert pairs.num_events == 50_000
     # The first pose is at 0.0223 s, the events begin at 0.0038 s.
-    assert dataset.metadata[SCENE].window == TimeWindow(22_291_582, 174_156_000)
+    assert dataset.metadata[SCENE_KEY].window == TimeWindow(22_291_582, 174_156_000)
     assert pairs.num_outside == 3_251
     assert len(pairs) + pairs.num_first + pairs.num_outside + pairs.num_merged == 50_000
     assert len(parse(config, "test").image_filenames) == 2
     # A linear slider: straight on, no turn.
-    poses = dataset.metadata[SCENE].trajectory.camera_to_worlds
+    poses = dataset.metadata[SCENE_KEY].trajectory.camera_to_worlds
     assert (poses[:, :, :3] - poses[:1, :, :3]).abs().max() < 1e-6
     assert torch.linalg.matrix_rank(poses[1:, :, 3] - poses[0, :, 3], atol=1e-4) == 1
 

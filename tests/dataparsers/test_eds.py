@@ -8,8 +8,8 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from dataset_faults import assert_one_clear_line, remove, write_text
-from published_datasets import (
+from helpers.dataset_faults import assert_one_clear_line, remove, write_text
+from helpers.published_datasets import (
     EPOCH,
     config_of,
     interpolated,
@@ -18,7 +18,7 @@ from published_datasets import (
     write_eds,
 )
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 
 
 def test_eds_views_are_those_of_the_frame_camera(tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_eds_views_are_those_of_the_frame_camera(tmp_path: Path) -> None:
     }
     (tmp_path / "chain.yaml").write_text(yaml.dump(chain))
     given = recording_of(config_of("eds-data", truth.data, calibration=tmp_path / "chain.yaml"))
-    assert given.event_camera == EventCamera(
+    assert given.event_camera == CameraIntrinsics(
         640, 480, 560.0, 561.0, 313.5, 217.5, distortion=(-0.1, 0.2, 0.003, 0.004, 0.0)
     )
     assert given.frame_camera.cx == 291.5

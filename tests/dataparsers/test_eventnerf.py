@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset_faults import assert_one_clear_line, edit_npz, remove, write_text
-from published_datasets import (
+from helpers.dataset_faults import assert_one_clear_line, edit_npz, remove, write_text
+from helpers.published_datasets import (
     DURATION,
     N_EVENTS,
     config_of,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from published_datasets import (
+from helpers.published_datasets import (
     N_EVENTS,
     WRITERS,
     Truth,
@@ -24,13 +24,13 @@ from published_datasets import (
     write_robust_enerf,
     write_tum_vie,
 )
-from small_datasets import AS_RECORDED, parse
+from helpers.small_datasets import AS_RECORDED, parse
 
 from aenerf_ns.dataparsers.formats import FORMATS, AutomaticDataParserConfig, recognise
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipelineConfig
 
@@ -100,10 +100,12 @@ def test_converted_to_the_native_format_nothing_changes(written: tuple[str, Trut
     before, after = parse(config).metadata, parse(NativeDataParserConfig(data=folder, **AS_RECORDED)).metadata
     # Equal lenses have equal rays.
     for key in ("event_camera", "sensor", "window", "image_encoding", "bounded"):
-        assert getattr(before[SCENE], key) == getattr(after[SCENE], key), key
-    assert torch.equal(before[SCENE].trajectory.times, after[SCENE].trajectory.times)
-    assert_same_poses(after[SCENE].trajectory.camera_to_worlds, before[SCENE].trajectory.camera_to_worlds.numpy())
-    before_events, after_events = (list(metadata[SCENE].event_file.chunks()) for metadata in (before, after))
+        assert getattr(before[SCENE_KEY], key) == getattr(after[SCENE_KEY], key), key
+    assert torch.equal(before[SCENE_KEY].trajectory.times, after[SCENE_KEY].trajectory.times)
+    assert_same_poses(
+        after[SCENE_KEY].trajectory.camera_to_worlds, before[SCENE_KEY].trajectory.camera_to_worlds.numpy()
+    )
+    before_events, after_events = (list(metadata[SCENE_KEY].event_file.chunks()) for metadata in (before, after))
     for column in "xytp":
         np.testing.assert_array_equal(
             *(np.concatenate([getattr(chunk, column) for chunk in events]) for events in (before_events, after_events))
@@ -136,7 +138,7 @@ def test_a_run_opens_without_events_and_in_another_folder(
     monkeypatch.chdir(tmp_path / "elsewhere")
     again = yaml.load(saved, Loader=yaml.Loader).setup(device="cpu", test_mode="inference", world_size=1, local_rank=0)
     assert torch.equal(manager.train_dataset.cameras.camera_to_worlds, again.train_dataset.cameras.camera_to_worlds)
-    assert manager.train_dataset.metadata[SCENE].window == again.train_dataset.metadata[SCENE].window
+    assert manager.train_dataset.metadata[SCENE_KEY].window == again.train_dataset.metadata[SCENE_KEY].window
     assert again.train_dataset.get_numpy_image(0).std() == 0
     for before, after in zip(manager.eval_dataset.image_filenames, again.eval_dataset.image_filenames, strict=True):
         assert before == after

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from bounded_reading import MAX_SECONDS, little_memory, read_whole, readable_folder, without_rights_of_root
-from dataset_faults import read_everything
-from malformed_inputs import FORMAT_WRITERS, MALFORMED
-from published_datasets import config_of
+from helpers.bounded_reading import MAX_SECONDS, little_memory, read_whole, readable_folder, without_rights_of_root
+from helpers.dataset_faults import read_everything
+from helpers.malformed_inputs import FORMAT_WRITERS, MALFORMED
+from helpers.published_datasets import config_of
 
 from aenerf_ns.errors import DataError
 

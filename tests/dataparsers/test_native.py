@@ -9,9 +9,8 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from conftest import make_stream
-from dataset_faults import assert_one_clear_line
-from small_datasets import (
+from helpers.dataset_faults import assert_one_clear_line
+from helpers.small_datasets import (
     AS_RECORDED,
     CAMERA,
     NATIVE_FAULTS,
@@ -21,6 +20,7 @@ from small_datasets import (
     parse,
     write_native,
 )
+from helpers.streams import make_stream
 
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -29,21 +29,21 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.recording.scene import SCENE_KEY
 
 
 def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     outputs = parse(NativeDataParserConfig(data=folder, **AS_RECORDED))
     metadata = outputs.metadata
-    assert metadata[SCENE].event_camera == CAMERA
-    assert metadata[SCENE].sensor == SENSOR
-    assert metadata[SCENE].image_encoding == "srgb"
-    assert not metadata[SCENE].bounded
+    assert metadata[SCENE_KEY].event_camera == CAMERA
+    assert metadata[SCENE_KEY].sensor == SENSOR
+    assert metadata[SCENE_KEY].image_encoding == "srgb"
+    assert not metadata[SCENE_KEY].bounded
     expected = make_trajectory()
-    assert torch.equal(metadata[SCENE].trajectory.times, expected.times)
+    assert torch.equal(metadata[SCENE_KEY].trajectory.times, expected.times)
     torch.testing.assert_close(
-        metadata[SCENE].trajectory.camera_to_worlds,
+        metadata[SCENE_KEY].trajectory.camera_to_worlds,
         (homogeneous(expected.camera_to_worlds) @ OPENCV_TO_OPENGL)[:, :3],
         rtol=0,
         atol=1e-11,
@@ -51,9 +51,9 @@ def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
     for split, values in (("val", [77]), ("test", [78, 79])):
         dataset = EventDataset(parse(NativeDataParserConfig(data=folder), split))
         assert [int(dataset.get_numpy_image(i)[0, 0, 0]) for i in range(len(dataset))] == values
-    events = list(metadata[SCENE].event_file.chunks())
-    assert sum(map(len, events)) == metadata[SCENE].event_file.count() == 200
-    assert metadata[SCENE].event_file.time_span() == (events[0].t[0], events[-1].t[-1])
+    events = list(metadata[SCENE_KEY].event_file.chunks())
+    assert sum(map(len, events)) == metadata[SCENE_KEY].event_file.count() == 200
+    assert metadata[SCENE_KEY].event_file.time_span() == (events[0].t[0], events[-1].t[-1])
 
 
 def test_a_frame_without_a_pose_gets_that_of_its_time(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_a_frame_without_a_pose_gets_that_of_its_time(tmp_path: Path) -> None:
 def test_options_take_the_place_of_the_sensors_values(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     options = {"positive_contrast_threshold": 0.7, "refractory_period_ns": 0}
-    assert parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE].sensor == SensorModel(
+    assert parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE_KEY].sensor == SensorModel(
         0.7, 0.2, 0, "RGGB"
     )
     with pytest.raises(DataError, match=r"positive_contrast_threshold must be from 0.0001 to 1000, not 0; .*options"):

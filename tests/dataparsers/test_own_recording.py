@@ -9,12 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import FUZZ_EXAMPLES
-from dataset_faults import assert_one_clear_line, edit_json, remove, write_text
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from numpy.typing import NDArray
-from published_datasets import (
+from helpers.dataset_faults import assert_one_clear_line, edit_json, remove, write_text
+from helpers.published_datasets import (
     CALIBRATION,
     EPOCH,
     assert_same_poses,
@@ -23,9 +19,13 @@ from published_datasets import (
     recording_of,
     write_own,
 )
+from helpers.streams import FUZZ_EXAMPLES
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.dataparsers.formats import recognise
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
@@ -90,8 +90,10 @@ def test_kalibrs_camchain_places_both_cameras(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="its cameras are cam0, cam1; name that of the events as --event-camera"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data))
     recording = recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1", frame_camera="cam0"))
-    assert recording.event_camera == EventCamera(60, 40, 50.0, 51.0, 30.0, 20.5, distortion=(-0.1, 0, 0, 0.01, 0))
-    assert recording.frame_camera == EventCamera(80, 60, 70.0, 71.0, 40.5, 30.5, "fisheye", (0.01, 0.02, 0.03, 0.04))
+    assert recording.event_camera == CameraIntrinsics(60, 40, 50.0, 51.0, 30.0, 20.5, distortion=(-0.1, 0, 0, 0.01, 0))
+    assert recording.frame_camera == CameraIntrinsics(
+        80, 60, 70.0, 71.0, 40.5, 30.5, "fisheye", (0.01, 0.02, 0.03, 0.04)
+    )
     # T_cn_cnm1 takes points from cam0, the frames, to cam1, the events.
     view = recording.reference_views["train"][1]
     np.testing.assert_allclose(view.camera_to_world.numpy(), truth.poses[5] @ make_poses(3)[2], rtol=0, atol=1e-9)

@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from dataset_faults import assert_one_clear_line, remove, write_text
-from published_datasets import (
+from helpers.dataset_faults import assert_one_clear_line, remove, write_text
+from helpers.published_datasets import (
     config_of,
     recording_of,
     write_paev3d,

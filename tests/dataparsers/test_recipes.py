@@ -9,10 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from bag_writers import message_header, string
-from numpy.typing import NDArray
-from PIL import Image
-from published_datasets import (
+from helpers.bag_writers import message_header, string
+from helpers.published_datasets import (
     EPOCH,
     N_POSES,
     assert_same_poses,
@@ -21,9 +19,11 @@ from published_datasets import (
     recording_of,
     write_poses,
 )
+from numpy.typing import NDArray
+from PIL import Image
 from test_documented_examples import blocks, run
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.recording import Recording
@@ -78,7 +78,7 @@ def test_mvsec_becomes_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     recording = recording_of(OwnRecordingDataParserConfig(data=Path("mvsec"), event_camera="cam0"))
     assert_same_events(recording, events)
     assert_same_poses(recording.trajectory.camera_to_worlds, make_poses())
-    lens = EventCamera(346, 260, 226.4, 226.1, 174.1, 134.2, "fisheye", (-0.05, -0.01, 0.02, -0.01))
+    lens = CameraIntrinsics(346, 260, 226.4, 226.1, 174.1, 134.2, "fisheye", (-0.05, -0.01, 0.02, -0.01))
     assert recording.event_camera == recording.frame_camera == lens
     (view,) = recording.reference_views["test"]
     np.testing.assert_allclose(view.camera_to_world.numpy(), make_poses()[10], rtol=0, atol=1e-6)
@@ -131,7 +131,7 @@ def test_vector_becomes_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     recording = recording_of(OwnRecordingDataParserConfig(**options))
     assert_same_events(recording, events)
     assert_same_poses(recording.trajectory.camera_to_worlds, make_poses())
-    expected = EventCamera(640, 480, 327.0, 328.0, 305.0, 235.5, distortion=(-0.03, 0.02, 0.001, -0.002, 0.1))
+    expected = CameraIntrinsics(640, 480, 327.0, 328.0, 305.0, 235.5, distortion=(-0.03, 0.02, 0.001, -0.002, 0.1))
     assert recording.event_camera == expected
 
 

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dataset_faults import assert_one_clear_line, edit_json, edit_npz, remove, write_text
-from published_datasets import (
+from helpers.dataset_faults import assert_one_clear_line, edit_json, edit_npz, remove, write_text
+from helpers.published_datasets import (
     N_POSES,
     config_of,
     recording_of,
     write_robust_enerf,
 )
-from small_datasets import parse
+from helpers.small_datasets import parse
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
 
@@ -31,7 +31,7 @@ def test_robust_enerf_states_its_sensor_and_views(tmp_path: Path) -> None:
     assert recording.event_camera.distortion == truth.distortion
     assert recording.scene_box is None
     focal = 25 / np.tan(0.4)
-    assert recording.frame_camera == EventCamera(50, 30, focal, focal, 25.0, 15.0)
+    assert recording.frame_camera == CameraIntrinsics(50, 30, focal, focal, 25.0, 15.0)
     # Camera-to-world with OpenGL's axes in the file.
     view = recording.reference_views["test"][1]
     np.testing.assert_allclose(view.camera_to_world.numpy(), truth.poses[1], rtol=0, atol=1e-12)
@@ -49,7 +49,7 @@ def test_robust_enerf_views_may_be_one_folder_up_and_have_intrinsics(tmp_path: P
         del meta["camera_angle_x"]
         path.write_text(json.dumps({**meta, "intrinsics": [[40.0, 0, 24.5], [0, 41.0, 14.0], [0, 0, 1.0]]}))
     recording = recording_of(config_of("robust-enerf-data", truth.data))
-    assert recording.frame_camera == EventCamera(50, 30, 40.0, 41.0, 25.0, 14.5)
+    assert recording.frame_camera == CameraIntrinsics(50, 30, 40.0, 41.0, 25.0, 14.5)
     assert len(recording.reference_views["val"]) == 2
 
 

@@ -17,16 +17,16 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from bounded_reading import little_memory, read_whole, readable_folder, without_rights_of_root
-from dataset_faults import read_everything
+from helpers.bounded_reading import little_memory, read_whole, readable_folder, without_rights_of_root
+from helpers.dataset_faults import read_everything
+from helpers.malformed_inputs import FORMAT_WRITERS, camchain, npy_header
+from helpers.published_datasets import config_of
+from helpers.vendor_recordings import RECORDINGS, config_of_recording
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from malformed_inputs import FORMAT_WRITERS, camchain, npy_header
-from published_datasets import config_of
 from test_own_recording import CAMCHAIN
-from vendor_recordings import RECORDINGS, config_of_recording
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 
 # Seconds that the search takes, and that reading one data set may take: a large lens alone takes some.
@@ -359,7 +359,7 @@ def search(folder: Path, seconds: float) -> int:
 @pytest.fixture(autouse=True)
 def lenses_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute the directions of each lens once: they take most of the time."""
-    monkeypatch.setattr(EventCamera, "pixel_directions", lru_cache(maxsize=16)(EventCamera.pixel_directions))
+    monkeypatch.setattr(CameraIntrinsics, "pixel_directions", lru_cache(maxsize=16)(CameraIntrinsics.pixel_directions))
 
 
 def test_a_broken_dataset_is_read_or_refused() -> None:

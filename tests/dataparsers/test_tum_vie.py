@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset_faults import assert_one_clear_line, edit_json, remove, replace_line
-from numpy.typing import NDArray
-from published_datasets import (
+from helpers.dataset_faults import assert_one_clear_line, edit_json, remove, replace_line
+from helpers.published_datasets import (
     EPOCH,
     assert_same_poses,
     config_of,
@@ -19,16 +18,17 @@ from published_datasets import (
     recording_of,
     write_tum_vie,
 )
+from helpers.small_datasets import parse
+from helpers.unpacked_pairs import unpacked
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from small_datasets import parse
-from unpacked_pairs import unpacked
 
 from aenerf_ns.dataparsers.formats import recognise
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.recording.scene import SCENE_KEY
 
 
 def test_tum_vie_has_two_calibrations_and_two_sides(tmp_path: Path, tum_vie_calibration: Path) -> None:
@@ -84,7 +84,7 @@ def test_events_in_a_gap_of_the_poses_are_left_out_also_after_conversion(
             " ".join(capsys.readouterr().out.split()).count("The poses have 1 gap(s) of more than 0.05 s, 1.0 s in")
             == 1
         )
-        assert outputs.metadata[SCENE].window.gaps == (gap,)
+        assert outputs.metadata[SCENE_KEY].window.gaps == (gap,)
         pairs = EventDataset(outputs).pairs
         times = truth.events["t"] * 1_000
         assert pairs.num_outside == int(((times > gap[0]) & (times < gap[1])).sum()) > 50
@@ -98,7 +98,7 @@ def test_events_in_a_gap_of_the_poses_are_left_out_also_after_conversion(
     views = recording_of(config).reference_views["train"]
     assert [view.file.name for view in views] == ["00000.jpg", "00002.jpg"]
     # Another limit may be given.
-    assert parse(replace(config, max_pose_gap_ns=2 * 10**9)).metadata[SCENE].window.gaps == ()
+    assert parse(replace(config, max_pose_gap_ns=2 * 10**9)).metadata[SCENE_KEY].window.gaps == ()
 
 
 def test_several_sequences_in_a_folder_are_told_apart(tmp_path: Path, tum_vie_calibration: Path) -> None:

@@ -11,20 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import make_stream
+from helpers.streams import make_stream
+from helpers.unpacked_pairs import unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from unpacked_pairs import unpacked
 
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pair_table import EventPairs
-from aenerf_ns.events.pairs import find_rows as find_rows_on_cpu
-from aenerf_ns.events.pairs import near_blocks, pair_events
+from aenerf_ns.events.pair_store import EventPairs
+from aenerf_ns.events.pairing import find_rows as find_rows_on_cpu
+from aenerf_ns.events.pairing import near_blocks, pair_events
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.events.time_window import TimeWindow
-from aenerf_ns.supervision.pairs import find_rows
+from aenerf_ns.supervision.event_pairs import find_rows
 
 WIDTH, HEIGHT = 4, 3
 # Small ranges, so that pixels repeat and times coincide.

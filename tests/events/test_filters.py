@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import make_stream
+from helpers.streams import make_stream
+from helpers.unpacked_pairs import unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from unpacked_pairs import unpacked
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile, count_events, find_hot_pixels
-from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.events.pairing import pair_events
 from aenerf_ns.events.stream import EventFile, EventStream
 
 WIDTH, HEIGHT = 6, 5
@@ -151,7 +151,7 @@ def test_hot_pixels_are_left_out_and_told() -> None:
 
 
 def test_a_cropped_camera_sees_the_same_directions() -> None:
-    camera = EventCamera(12, 10, 8.0, 8.5, 6.2, 4.9, "radial_tangential", (-0.1, 0.02, 0.001, 0.0, 0.0))
+    camera = CameraIntrinsics(12, 10, 8.0, 8.5, 6.2, 4.9, "radial_tangential", (-0.1, 0.02, 0.001, 0.0, 0.0))
     cropped = camera.cropped(3, 2, 7, 5)
     assert (cropped.width, cropped.height) == (7, 5)
     np.testing.assert_allclose(

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from conftest import make_stream
+from helpers.streams import make_stream
 
 from aenerf_ns.events.statistics import event_statistics
 from aenerf_ns.events.stream import EventStream

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.events.pairing import pair_events
+from aenerf_ns.events.sorted_events import sort_events
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.events.timeline import EventTimeline, timeline_of_pairs, timeline_of_windows
-from aenerf_ns.events.windows import window_events
 
 WIDTH, HEIGHT, NUM_EVENTS = 5, 4, 3000
 
@@ -65,7 +65,7 @@ def test_a_long_recording_is_thinned_evenly(stream: EventStream) -> None:
 
 def test_the_timeline_of_windows_has_every_event(stream: EventStream) -> None:
     usable = np.ones((HEIGHT, WIDTH), bool)
-    windows = window_events([stream], window=TimeWindow(0, 20_000_000), usable=usable)
+    windows = sort_events([stream], window=TimeWindow(0, 20_000_000), usable=usable)
     timeline = timeline_of_windows(windows, NUM_EVENTS)
     np.testing.assert_array_equal(timeline.times, stream.t)
     np.testing.assert_array_equal(timeline.polarities, stream.p)

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_pipelines import make_pipeline, make_pipeline_config
+from helpers.small_pipelines import make_pipeline, make_pipeline_config
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.export import mesh
+from aenerf_ns.export.camera_model_files import PlacedImage
 from aenerf_ns.export.placing import corrected_poses, placed_views
 from aenerf_ns.export.rendering import points_seen
 from aenerf_ns.export.times import spread_times, times_at_rate, times_of_seconds
-from aenerf_ns.files.placed_images import PlacedImage
-from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 SECOND = 10**9
@@ -89,7 +89,7 @@ def test_a_recording_without_images_has_no_cameras_to_export(tmp_path: Path) -> 
 def test_times_leave_gaps_out(pipeline: AENeRFPipeline) -> None:
     dataset = pipeline.datamanager.train_dataset
     window = TimeWindow(0, SECOND, ((SECOND // 10, SECOND // 2),))
-    dataset.metadata[SCENE] = replace(dataset.scene, window=window)
+    dataset.metadata[SCENE_KEY] = replace(dataset.scene, window=window)
     times = spread_times(pipeline, 60)
     assert window.contains(times).all()
     # In equal steps, but for the gap: a sixth of the time is before it.
@@ -112,7 +112,7 @@ def test_a_mesh_is_in_the_units_of_the_recording(pipeline: AENeRFPipeline, monke
     # What a camera sees of a ball before it: the distance along the ray to its near side.
     center, radius = np.array([0.0, 0.1, 1.5]), 0.4
 
-    def render(_: object, lens: EventCamera, pose: torch.Tensor) -> dict[str, torch.Tensor]:
+    def render(_: object, lens: CameraIntrinsics, pose: torch.Tensor) -> dict[str, torch.Tensor]:
         directions = lens.pixel_directions()[0] * [1, -1, -1] @ pose[:3, :3].numpy().T
         to_center = center - pose[:3, 3].numpy()
         along = directions @ to_center
@@ -122,7 +122,7 @@ def test_a_mesh_is_in_the_units_of_the_recording(pipeline: AENeRFPipeline, monke
         return {"rgb": torch.from_numpy(color.copy()).float(), "depth": torch.from_numpy(depth[..., None])}
 
     monkeypatch.setattr(mesh, "render", render)
-    lens = EventCamera(96, 72, 80.0, 80.0, 48.0, 36.0)
+    lens = CameraIntrinsics(96, 72, 80.0, 80.0, 48.0, 36.0)
     parser = pipeline.datamanager.dataparser
     monkeypatch.setitem(vars(parser), "recording", replace(parser.recording, event_camera=lens))
     made = mesh.extract_mesh(pipeline, num_views=5, resolution=48)

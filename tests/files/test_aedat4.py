@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from event_file_checks import (
+from helpers.event_file_checks import (
     assert_rejected,
     read,
     table,
 )
-from event_file_writers import (
+from helpers.event_file_writers import (
     ROWS,
     aedat4_file,
     sized,

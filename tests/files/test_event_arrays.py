@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from event_table_writers import (
+from helpers.event_table_writers import (
     HEIGHT,
     WIDTH,
     ZEROS,

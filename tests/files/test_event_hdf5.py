@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from event_table_writers import (
+from helpers.event_table_writers import (
     HEIGHT,
     WIDTH,
     ZEROS,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import FUZZ_EXAMPLES
+from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

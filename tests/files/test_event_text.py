@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import FUZZ_EXAMPLES
-from event_table_writers import (
+from helpers.event_table_writers import (
     HEIGHT,
     WIDTH,
     Columns,
@@ -19,6 +18,7 @@ from event_table_writers import (
     made_columns,
     write_csv,
 )
+from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 

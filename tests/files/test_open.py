@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writers import PACKET, START, array_bag, packet_messages, write_bag, write_bag2
-from conftest import FUZZ_EXAMPLES
-from event_file_checks import (
+from helpers.bag_writers import PACKET, START, array_bag, packet_messages, write_bag, write_bag2
+from helpers.event_file_checks import (
     EDITS,
     assert_rejected,
     attempt,
@@ -21,7 +20,7 @@ from event_file_checks import (
     table,
     vendor_file,
 )
-from event_file_writers import (
+from helpers.event_file_writers import (
     ENCODERS,
     HEADER2,
     HEADER3,
@@ -33,6 +32,7 @@ from event_file_writers import (
     dat,
     evt2,
 )
+from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from event_file_checks import (
+from helpers.event_file_checks import (
     assert_rejected,
 )
-from event_file_writers import (
+from helpers.event_file_writers import (
     ROWS,
     dat,
     words,

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from event_file_checks import (
+from helpers.event_file_checks import (
     assert_rejected,
     lapless,
     read,
 )
-from event_file_writers import (
+from helpers.event_file_writers import (
     HEADER2,
     HEADER3,
     ROWS,

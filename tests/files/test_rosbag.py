@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writers import (
+from helpers.bag_writers import (
     ARRAY,
     PACKET,
     START,
@@ -22,7 +22,7 @@ from bag_writers import (
     write_bag,
     write_bag2,
 )
-from event_file_checks import (
+from helpers.event_file_checks import (
     assert_one_line,
     assert_rejected,
     attempt,
@@ -30,7 +30,7 @@ from event_file_checks import (
     table,
     vendor_file,
 )
-from event_file_writers import (
+from helpers.event_file_writers import (
     HEIGHT,
     ROWS,
     WIDTH,

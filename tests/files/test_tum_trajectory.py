@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import FUZZ_EXAMPLES
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from small_datasets import (
+from helpers.small_datasets import (
     make_trajectory,
 )
+from helpers.streams import FUZZ_EXAMPLES
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.text import format_seconds, parse_times

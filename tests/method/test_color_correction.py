@@ -7,8 +7,8 @@ from typing import Literal, get_args
 
 import pytest
 import torch
+from helpers.small_pipelines import make_pipeline
 from nerfstudio.cameras.rays import RayBundle
-from small_pipelines import make_pipeline
 
 from aenerf_ns.camera.image_encoding import encode
 from aenerf_ns.method.color_correction import (

@@ -12,23 +12,23 @@ from typing import Any
 import pytest
 import torch
 import torch.utils.backend_registration
-from commands import run, simulate
+from helpers.commands import run, simulate
+from helpers.simulated_cuda import Counts, SimulatedCuda, device, to_device
+from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
+from helpers.small_pipelines import make_pipeline_config
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
-from simulated_cuda import Counts, SimulatedCuda, device, to_device
-from small_models import ALL_LOSSES, make_batch, make_model, make_rays
-from small_pipelines import make_pipeline_config
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.method.encoding.hash_grid import HashEncoding
+from aenerf_ns.method.hash_grid import HashEncoding
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.supervision.base import SupervisionConfig
-from aenerf_ns.supervision.paev3d import PAEv3DSupervisionConfig
-from aenerf_ns.supervision.pairs import PairSupervisionConfig
-from aenerf_ns.supervision.windows import EventNeRFSupervisionConfig, EvNeRFSupervisionConfig
+from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
+from aenerf_ns.supervision.peers.paev3d import PAEv3DSupervisionConfig
+from aenerf_ns.supervision.peers.windows import EventNeRFSupervisionConfig, EvNeRFSupervisionConfig
 
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 NEEDS_SIMULATION = pytest.mark.skipif(
@@ -197,7 +197,7 @@ def test_what_a_step_of_the_full_method_costs(
     with FakeTensorMode(allow_non_fake_inputs=True), SimulatedCuda() as gpu:
         if grid == "triton":
             pytest.importorskip("triton")
-            from aenerf_ns.method.encoding import hash_grid_triton
+            from aenerf_ns.method.kernels import hash_grid_triton
 
             monkeypatch.setattr(hash_grid_triton, "_fill_features", CountedKernel(gpu, 20))
             monkeypatch.setattr(hash_grid_triton, "_add_gradients", CountedKernel(gpu, 32))

@@ -13,14 +13,14 @@ from typing import Any
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
+from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from nerfstudio.field_components.encodings import HashEncoding as FrameworkHashEncoding
-from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.method import compiled
-from aenerf_ns.method.encoding import hash_grid
-from aenerf_ns.method.encoding.hash_grid import HashEncoding
+from aenerf_ns.method import hash_grid
+from aenerf_ns.method.hash_grid import HashEncoding
+from aenerf_ns.method.kernels import loader as compiled
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 
 OPTIONS = {"num_levels": 5, "min_res": 4, "max_res": 200, "log2_hashmap_size": 9}
@@ -61,7 +61,7 @@ def test_nothing_but_the_table_is_in_checkpoints(encodings: tuple) -> None:
     assert set(encodings[0].state_dict()) == {"hash_table"}
 
 
-NUMBA = "aenerf_ns.method.encoding.hash_grid_numba"
+NUMBA = "aenerf_ns.method.kernels.hash_grid_numba"
 
 
 @pytest.fixture(params=["numba", "triton"])
@@ -266,7 +266,7 @@ import sys
 from triton import compile
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from aenerf_ns.method.encoding.hash_grid_triton import _add_gradients, _fill_features
+from aenerf_ns.method.kernels.hash_grid_triton import _add_gradients, _fill_features
 types = {"num_points": "i32", "size": "i32", "block": "constexpr"}
 for kernel, absent in (
     (_fill_features, ()),

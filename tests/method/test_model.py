@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.viewer.utils import CameraState, get_camera
-from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig

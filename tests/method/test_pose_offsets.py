@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from small_models import ALL_LOSSES, make_batch, make_model, make_rays
+from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from torch import Tensor
 
 from aenerf_ns.camera.rotation import motion_from_twist

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.small_models import make_rays
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.model_components.losses import distortion_loss as framework_distortion_loss
 from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
-from small_models import make_rays
 
 from aenerf_ns.method.ray_losses import distortion_loss
 

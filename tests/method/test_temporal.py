@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
-from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 
 from aenerf_ns.camera.rotation import TwistExponential, cross_matrix, motion_from_twist, rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import torch
 import tyro
+from helpers.small_datasets import write_native
+from helpers.small_models import SMALL_FIELD, SMALL_PROPOSAL
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TrainerConfig
-from small_datasets import write_native
-from small_models import SMALL_FIELD, SMALL_PROPOSAL
 
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.native import NativeDataParserConfig

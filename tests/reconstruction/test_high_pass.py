@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import make_stream
+from helpers.streams import make_stream
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.reconstruction.high_pass import HighPassFilter

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import make_stream
+from helpers.streams import make_stream
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel

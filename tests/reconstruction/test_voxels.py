@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import make_stream
+from helpers.streams import make_stream
 
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.reconstruction.batches import batches_of

@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from published_datasets import DURATION, EPOCH, config_of, seconds, write_images, write_own
-from small_datasets import (
+from helpers.published_datasets import DURATION, EPOCH, config_of, seconds, write_images, write_own
+from helpers.small_datasets import (
     END,
     START,
     make_trajectory,
@@ -18,18 +18,18 @@ from small_datasets import (
     write_ecd,
     write_native,
 )
-from unpacked_pairs import unpacked
+from helpers.unpacked_pairs import unpacked
 
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.time_window import TimeWindow
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.recording.scene import SCENE
+from aenerf_ns.recording.scene import SCENE_KEY
 
 
 def test_all_splits_share_one_world_and_the_transform_is_the_one_reported(tmp_path: Path) -> None:
@@ -41,21 +41,23 @@ def test_all_splits_share_one_world_and_the_transform_is_the_one_reported(tmp_pa
     original = train.transform_poses_to_original_space(test.cameras.camera_to_worlds, "opencv")
     torch.testing.assert_close(original, make_trajectory().camera_to_worlds[[4, 5]].float(), rtol=0, atol=1e-5)
     # The framework's convention: cameras fit in a box of +/- 1 about the origin.
-    assert train.metadata[SCENE].trajectory.camera_to_worlds[:, :, 3].abs().max().item() == pytest.approx(1.0, rel=1e-2)
+    assert train.metadata[SCENE_KEY].trajectory.camera_to_worlds[:, :, 3].abs().max().item() == pytest.approx(
+        1.0, rel=1e-2
+    )
 
 
 def test_a_scene_box_sets_the_scale_and_bounds_the_scene(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made", np.array([[-1.0, -2.0, 0.0], [3.0, 4.0, 1.0]]))
     outputs = parse(NativeDataParserConfig(data=folder))
-    assert outputs.metadata[SCENE].bounded
+    assert outputs.metadata[SCENE_KEY].bounded
     torch.testing.assert_close(outputs.scene_box.aabb, torch.tensor([[-2 / 3, -1, -1 / 6], [2 / 3, 1, 1 / 6]]))
-    first = outputs.metadata[SCENE].trajectory.camera_to_worlds[0, :, 3]
+    first = outputs.metadata[SCENE_KEY].trajectory.camera_to_worlds[0, :, 3]
     torch.testing.assert_close(first, torch.tensor([-1.0, -1.0, 1.5], dtype=torch.float64) / 3)
 
 
 def test_training_cameras_show_images_where_they_were_taken_and_events_elsewhere(tmp_path: Path) -> None:
     dataset = EventDataset(parse(NativeDataParserConfig(data=write_native(tmp_path / "made"))))
-    has_image = dataset.metadata[SCENE].has_image
+    has_image = dataset.metadata[SCENE_KEY].has_image
     # The 21 knots, two of them image times, and one image between two knots.
     assert len(dataset) == 22
     assert [i for i, image in enumerate(has_image) if image] == [0, 2, 21]
@@ -69,16 +71,16 @@ def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> N
     folder = write_native(tmp_path / "made")
     start, end = START + 500_000_000, START + 1_050_000_000
     dataset = EventDataset(parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end)))
-    trajectory = dataset.metadata[SCENE].trajectory
+    trajectory = dataset.metadata[SCENE_KEY].trajectory
     assert (trajectory.start, trajectory.end) == (start, START + 1_100_000_000)
-    assert not any(dataset.metadata[SCENE].has_image)
+    assert not any(dataset.metadata[SCENE_KEY].has_image)
     intervals = [pair[2:4] for pair in unpacked(dataset.pairs)]
     assert min(begin for begin, _ in intervals) >= start
     assert max(last for _, last in intervals) <= end
     assert dataset.pairs.num_outside > 0
     # The window is cut to the poses.
     config = NativeDataParserConfig(data=folder, start_time_ns=0, end_time_ns=END + 10**12)
-    assert parse(config).metadata[SCENE].window == TimeWindow(START, END)
+    assert parse(config).metadata[SCENE_KEY].window == TimeWindow(START, END)
     with pytest.raises(DataError, match="nothing is left from 9 to 9 ns"):
         parse(NativeDataParserConfig(data=folder, start_time_ns=9, end_time_ns=9))
 

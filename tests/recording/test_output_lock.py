@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from small_datasets import CAMERA, SENSOR, write_native
+from helpers.small_datasets import CAMERA, SENSOR, write_native
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.output_lock import OutputLock

@@ -12,13 +12,13 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from PIL import Image
-from small_datasets import (
+from helpers.small_datasets import (
     CAMERA,
     SENSOR,
     make_trajectory,
     write_native,
 )
+from PIL import Image
 
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.cli.convert import Convert

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import make_stream
-from small_pipelines import make_pipeline
-from small_trainings import train_small_model
+from helpers.small_pipelines import make_pipeline
+from helpers.small_trainings import train_small_model
+from helpers.streams import make_stream
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotation
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
@@ -108,7 +108,9 @@ def test_errors_are_those_of_evo_over_all_poses_of_the_files(random_poses: torch
     times = np.linspace(0, 7 * SECOND, 2501).astype(np.int64)
     true = Trajectory(times, Trajectory(SECOND * np.arange(8), random_poses).interpolate(times))
     given = perturb(true, rotation_degrees=3.0, translation=0.2, correlation_time=0.05, seed=1)
-    with NativeDatasetWriter(tmp_path / "data", EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb") as writer:
+    with NativeDatasetWriter(
+        tmp_path / "data", CameraIntrinsics(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb"
+    ) as writer:
         writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 7 * SECOND, -1)], 6, 4))
         writer.add_trajectories(given, true)
     found = measure_poses(make_pipeline(tmp_path / "data", "test"))

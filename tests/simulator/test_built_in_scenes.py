@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
-from small_meshes import (
+from helpers.small_meshes import (
     ray_directions,
 )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_meshes import (
+from helpers.small_meshes import (
     ray_directions,
     scene_file,
 )

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from small_meshes import (
+from helpers.small_meshes import (
     BLACK,
     NIGHT,
     OVERHEAD,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from small_meshes import (
+from helpers.small_meshes import (
     BLACK,
     OVERHEAD,
     baked_mesh,

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from small_meshes import (
+from helpers.small_meshes import (
     BLACK,
     baked_mesh,
     joined,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from small_meshes import (
+from helpers.small_meshes import (
     WALK,
     plate,
 )
+from scipy.integrate import quad
 
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.free_space import FreeSpace

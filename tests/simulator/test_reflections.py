@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from small_meshes import BLACK, NIGHT, OVERHEAD, baked_mesh, joined, light_mesh, mesh_of, plate, ray_directions
+from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, baked_mesh, joined, light_mesh, mesh_of, plate, ray_directions
 
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.open_scene import built_in_scene

@@ -9,8 +9,7 @@ import numba
 import numpy as np
 import pytest
 import trimesh
-from scipy.stats import norm
-from small_meshes import (
+from helpers.small_meshes import (
     BLACK,
     OVERHEAD,
     baked_mesh,
@@ -20,6 +19,7 @@ from small_meshes import (
     plate,
     ray_directions,
 )
+from scipy.stats import norm
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import paths

@@ -9,16 +9,16 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from small_meshes import (
+from helpers.small_meshes import (
     WALK,
     painted_box,
     ray_directions,
     scene_file,
 )
 
+from aenerf_ns.camera.image_encoding import LUMINANCE
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.sensor import LUMINANCE
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.frames import frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from small_meshes import BLACK, OVERHEAD, baked_mesh, ray_directions
+from helpers.small_meshes import BLACK, OVERHEAD, baked_mesh, ray_directions
 
 from aenerf_ns.simulator import shapes
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas

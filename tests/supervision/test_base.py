@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.small_pipelines import make_pipeline_config
 from nerfstudio.cameras.rays import RayBundle
-from small_pipelines import make_pipeline_config
 from torch import Tensor, nn
 
-from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
 from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision, SupervisionConfig
 
 

@@ -9,18 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.small_datasets import AS_RECORDED, END, START, parse, write_native
+from helpers.small_models import CAMERA, EPOCH, make_scene
 from PIL import Image
-from small_datasets import AS_RECORDED, END, START, parse, write_native
-from small_models import CAMERA, EPOCH, make_scene
 
-from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
-from aenerf_ns.recording.scene import SCENE, Scene
-from aenerf_ns.supervision.frames import FrameSampler, FrameSamplerConfig, FrameSupervision, FrameSupervisionConfig
-from aenerf_ns.supervision.pairs import PairSupervisionConfig
+from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
+from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
+from aenerf_ns.supervision.peers.frames import (
+    FrameSampler,
+    FrameSamplerConfig,
+    FrameSupervision,
+    FrameSupervisionConfig,
+)
 
 SECONDS = (0.0, 0.25, 0.7)
 
@@ -29,7 +34,7 @@ SECONDS = (0.0, 0.25, 0.7)
 class Dataset:
     """A training dataset of images."""
 
-    scene: Scene
+    scene: SceneRecording
 
 
 def make_sampler(folder: Path, poses: torch.Tensor, pattern: BayerPattern = "", grey: bool = True) -> FrameSampler:
@@ -42,7 +47,7 @@ def make_sampler(folder: Path, poses: torch.Tensor, pattern: BayerPattern = "", 
         frames.append((EPOCH + round(seconds * 1e9), folder / f"{index}.png"))
     trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), poses)
     scene = make_scene(SensorModel(bayer_pattern=pattern), trajectory)
-    scene = Scene(**{**vars(scene), "frames": tuple(frames)})
+    scene = SceneRecording(**{**vars(scene), "frames": tuple(frames)})
     supervision = FrameSupervisionConfig().setup(sensor=scene.sensor, loss_coefficients={})
     return FrameSamplerConfig().setup(dataset=Dataset(scene), supervision=supervision, device="cpu")
 
@@ -91,7 +96,7 @@ def test_images_that_cannot_be_trained_on_end_with_one_line(random_poses: torch.
     Image.new("L", (5, 3)).save(tmp_path / "1.png")
     with pytest.raises(DataError, match=r"1.png: the image has 5 x 3 pixels, its camera 4 x 3"):
         sampler.prepare()
-    none = Dataset(Scene(**{**vars(sampler.dataset.scene), "frames": ()}))
+    none = Dataset(SceneRecording(**{**vars(sampler.dataset.scene), "frames": ()}))
     supervision = FrameSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={})
     with pytest.raises(DataError, match=r"no training images .*; make some with aenerf reconstruct"):
         FrameSamplerConfig().setup(dataset=none, supervision=supervision, device="cpu").prepare()
@@ -100,16 +105,16 @@ def test_images_that_cannot_be_trained_on_end_with_one_line(random_poses: torch.
 def test_a_dataset_hands_on_the_timed_training_images_of_the_event_camera(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
     config = NativeDataParserConfig(data=data, start_time_ns=START, end_time_ns=END, **AS_RECORDED)
-    frames = parse(config).metadata[SCENE].frames
+    frames = parse(config).metadata[SCENE_KEY].frames
     assert [(time, file.name) for time, file in frames] == [
         (START, "00000.png"),
         (START + 150_000_000, "00001.png"),
         (END, "00002.png"),
     ]
-    assert parse(config, "test").metadata[SCENE].frames == ()
+    assert parse(config, "test").metadata[SCENE_KEY].frames == ()
     config.start_time_ns, config.end_time_ns = START + 1, END - 1
-    assert [time for time, _ in parse(config).metadata[SCENE].frames] == [START + 150_000_000]
+    assert [time for time, _ in parse(config).metadata[SCENE_KEY].frames] == [START + 150_000_000]
     meta = json.loads((data / "transforms.json").read_text())
     meta["fl_x"] += 1
     (data / "transforms.json").write_text(json.dumps(meta))
-    assert parse(config).metadata[SCENE].frames == ()
+    assert parse(config).metadata[SCENE_KEY].frames == ()

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_models import EPOCH, make_scene
+from helpers.small_models import EPOCH, make_scene
 
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sorted_events import SortedEvents, sort_events
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.events.time_window import TimeWindow
-from aenerf_ns.events.windows import EventWindows, window_events
-from aenerf_ns.recording.scene import Scene
-from aenerf_ns.supervision.paev3d import (
+from aenerf_ns.recording.scene import SceneRecording
+from aenerf_ns.supervision.peers.paev3d import (
     FlowPatchSampler,
     FlowPatchSamplerConfig,
     PAEv3DSupervisionConfig,
@@ -29,7 +29,7 @@ from aenerf_ns.supervision.paev3d import (
 )
 
 WIDTH, HEIGHT = 9, 7
-CAMERA = EventCamera(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (0.0, 0.0, 0.0, 0.0, 0.0))
+CAMERA = CameraIntrinsics(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (0.0, 0.0, 0.0, 0.0, 0.0))
 KNOTS = EPOCH + 200_000_000 * np.arange(8)
 GAP = (int(KNOTS[3]), int(KNOTS[4]))
 ALL = torch.ones(3, dtype=torch.bool)
@@ -143,8 +143,8 @@ def test_gradients_are_finite_where_nothing_is_opaque_and_nothing_moves() -> Non
 class Windows:
     """A training dataset."""
 
-    scene: Scene
-    windows: EventWindows
+    scene: SceneRecording
+    windows: SortedEvents
 
 
 def make_events() -> EventStream:
@@ -163,11 +163,11 @@ def make_events() -> EventStream:
 
 
 def make_sampler(
-    random_poses: torch.Tensor, camera: EventCamera = CAMERA, events: EventStream | None = None, **options: Any
+    random_poses: torch.Tensor, camera: CameraIntrinsics = CAMERA, events: EventStream | None = None, **options: Any
 ) -> FlowPatchSampler:
     window = TimeWindow(int(KNOTS[0]), int(KNOTS[-1]), (GAP,))
     scene = replace(make_scene(SensorModel(), Trajectory(KNOTS, random_poses), camera), window=window)
-    windows = window_events([events or make_events()], window=window, usable=camera.pixel_directions()[1])
+    windows = sort_events([events or make_events()], window=window, usable=camera.pixel_directions()[1])
     return FlowPatchSamplerConfig(**{"longest_window": 0.0, **options}).setup(
         dataset=Windows(scene, windows),
         supervision=PAEv3DSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={}),
@@ -215,7 +215,7 @@ def test_displacements_are_those_of_the_flow_and_are_zero_where_nothing_happens(
         tiles = np.arange(3 * 3 * 2.0).reshape(3, 3, 2)
         return tiles + np.array([len(events), (events.t.mean() - EPOCH) * 1e-7]), 4
 
-    monkeypatch.setattr("aenerf_ns.checking.optical_flow.optical_flow", told_apart)
+    monkeypatch.setattr("aenerf_ns.events.optical_flow.optical_flow", told_apart)
     events = make_events()
     sampler = make_sampler(random_poses, pixels_per_window=64)
     rays, batch = sampler.sample(8 * 256)
@@ -235,7 +235,7 @@ def test_displacements_are_those_of_the_flow_and_are_zero_where_nothing_happens(
 
 
 def test_a_batch_of_another_kind_is_refused(random_poses: torch.Tensor) -> None:
-    from aenerf_ns.supervision.windows import EventNeRFSupervisionConfig
+    from aenerf_ns.supervision.peers.windows import EventNeRFSupervisionConfig
 
     with pytest.raises(DataError, match="its sampler draws patches and its supervision compares windows"):
         FlowPatchSamplerConfig().setup(
@@ -243,6 +243,6 @@ def test_a_batch_of_another_kind_is_refused(random_poses: torch.Tensor) -> None:
             supervision=EventNeRFSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={}),
             device="cpu",
         )
-    blind = EventCamera(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (-9.0, 0.0, 0.0, 0.0, 0.0))
+    blind = CameraIntrinsics(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (-9.0, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(DataError, match="it gives no patch of 2 x 2 pixels a direction"):
         make_sampler(random_poses, camera=blind)

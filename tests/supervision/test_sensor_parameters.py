@@ -6,18 +6,18 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import make_stream
+from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
+from helpers.streams import make_stream
 from nerfstudio.model_components.ray_samplers import UniformSampler
-from small_models import ALL_LOSSES, make_batch, make_model, make_rays
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
 from aenerf_ns.method.networks import FieldConfig
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.supervision.pairs import PairSupervisionConfig
+from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
 from aenerf_ns.supervision.sensor_parameters import SensorParameters
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipelineConfig
@@ -114,7 +114,9 @@ def test_they_form_a_parameter_group_and_are_logged() -> None:
 
 @pytest.mark.parametrize("learned", [False, True])
 def test_pairs_are_of_consecutive_events_where_the_refractory_period_is_learned(learned: bool, tmp_path: Path) -> None:
-    with NativeDatasetWriter(tmp_path / "data", EventCamera(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb") as writer:
+    with NativeDatasetWriter(
+        tmp_path / "data", CameraIntrinsics(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb"
+    ) as writer:
         writer.events.append(make_stream([(1, 1, t * 10**8, 1) for t in range(11)], 6, 4))
         poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
         poses[1, 0, 3] = 0.1

@@ -9,28 +9,28 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import make_stream
-from simulated_cuda import Counts, SimulatedCuda, device
-from small_models import CAMERA, EPOCH, make_rays, make_scene
+from helpers.simulated_cuda import Counts, SimulatedCuda, device
+from helpers.small_models import CAMERA, EPOCH, make_rays, make_scene
+from helpers.streams import make_stream
 
-from aenerf_ns.camera.lens import EventCamera
-from aenerf_ns.camera.ray_tags import CAMERA_DIRECTIONS
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sorted_events import SortedEvents, sort_events
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.events.time_window import TimeWindow
-from aenerf_ns.events.windows import EventWindows, window_events
-from aenerf_ns.recording.scene import Scene
+from aenerf_ns.recording.scene import SceneRecording
 from aenerf_ns.supervision.base import SupervisionConfig
-from aenerf_ns.supervision.pixel_rays import PixelRays
-from aenerf_ns.supervision.windows import (
+from aenerf_ns.supervision.peers.windows import (
     EventNeRFSupervisionConfig,
     EvNeRFSupervisionConfig,
     WindowSampler,
     WindowSamplerConfig,
     WindowSupervision,
 )
+from aenerf_ns.supervision.pixel_rays import PixelRays
 
 # Poses every 0.2 s; the middle interval is a gap.
 KNOTS = EPOCH + 200_000_000 * np.arange(8)
@@ -51,17 +51,17 @@ EVENTS = make_stream(
 class Windows:
     """A training dataset with events at three pixels."""
 
-    scene: Scene
-    windows: EventWindows
+    scene: SceneRecording
+    windows: SortedEvents
 
 
 def make_sampler(
-    random_poses: torch.Tensor, sensor: SensorModel | None = None, camera: EventCamera = CAMERA, **options: Any
+    random_poses: torch.Tensor, sensor: SensorModel | None = None, camera: CameraIntrinsics = CAMERA, **options: Any
 ) -> WindowSampler:
     sensor = sensor or SensorModel()
     window = TimeWindow(int(KNOTS[0]), int(KNOTS[-1]) - 50_000_000, (GAP,))
     scene = replace(make_scene(sensor, Trajectory(KNOTS, random_poses), camera), window=window)
-    events = window_events([EVENTS], window=window, usable=camera.pixel_directions()[1])
+    events = sort_events([EVENTS], window=window, usable=camera.pixel_directions()[1])
     return WindowSamplerConfig(**options).setup(
         dataset=Windows(scene, events),
         supervision=EventNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={}),
@@ -122,7 +122,7 @@ def test_windows_are_as_long_as_asked_for(
 
 def test_most_pixels_are_active_and_the_others_any_that_the_lens_sees(random_poses: torch.Tensor) -> None:
     # Of the pixels with events only (3, 1) has a direction.
-    camera = EventCamera(4, 3, 1.0, 1.0, 3.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.0, 0.0, 0.0))
+    camera = CameraIntrinsics(4, 3, 1.0, 1.0, 3.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.0, 0.0, 0.0))
     _, usable = camera.pixel_directions()
     assert usable[1].tolist() == [False, False, True, True]
     sampler = make_sampler(random_poses, camera=camera, longest_window=0.0, share_of_all_pixels=0.25)
@@ -196,7 +196,7 @@ def test_poses_with_gaps_alone_are_refused(random_poses: torch.Tensor) -> None:
     sampler = make_sampler(random_poses)
     at_poses = make_stream([(0, 0, int(time), 1) for time in KNOTS[:2]])
     window = TimeWindow(int(KNOTS[0]), int(KNOTS[1]), ((int(KNOTS[0]), int(KNOTS[1])),))
-    sampler.dataset.windows = window_events([at_poses], window=window, usable=np.ones((3, 4), bool))
+    sampler.dataset.windows = sort_events([at_poses], window=window, usable=np.ones((3, 4), bool))
     with pytest.raises(DataError, match="the poses: no two of them follow each other without a gap; give --max-pose"):
         sampler.prepare()
 
@@ -314,7 +314,7 @@ def ideal_events(sensor: SensorModel) -> EventStream:
 def test_the_events_of_a_window_tell_the_true_change_to_within_a_threshold_at_either_end() -> None:
     sensor = SensorModel(0.2, 0.15)
     stream = ideal_events(sensor)
-    events = window_events([stream], window=TimeWindow(0, 1_200_000_000), usable=np.ones((3, 4), bool))
+    events = sort_events([stream], window=TimeWindow(0, 1_200_000_000), usable=np.ones((3, 4), bool))
     eventnerf = EventNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={})
     evnerf = EvNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={})
     rng = np.random.default_rng(0)

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers.small_trainings import train_small_model
 from nerfstudio.utils.eval_utils import eval_setup
-from small_trainings import train_small_model
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.training.checkpoints import checkpoint_to_load

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_pipelines import make_pipeline_config
-from small_trainings import train_small_model
+from helpers.small_pipelines import make_pipeline_config
+from helpers.small_trainings import train_small_model
 
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.method_configs.aenerf import aenerf

@@ -25,8 +25,8 @@ import torch
 import trimesh
 import websockets.sync.client
 import yaml
-from browser import chromium
-from commands import CPU, newest_config, run
+from helpers.browser import chromium
+from helpers.commands import CPU, newest_config, run
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.trainer import writer
 from nerfstudio.scripts import train

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays, make_sampler
 from nerfstudio.cameras.rays import RayBundle, RaySamples
-from small_models import ALL_LOSSES, make_batch, make_model, make_rays, make_sampler
 from torch import Tensor, nn
 
 from aenerf_ns.events.sensor import SensorModel

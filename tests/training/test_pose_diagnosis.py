@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import make_stream
-from small_pipelines import make_pipeline, make_pipeline_config
+from helpers.small_pipelines import make_pipeline, make_pipeline_config
+from helpers.streams import make_stream
 
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.events.pairs import pair_events
+from aenerf_ns.events.pairing import pair_events
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.writer import NativeDatasetWriter
@@ -24,7 +24,7 @@ from aenerf_ns.training import pose_diagnosis
 from aenerf_ns.training.pipeline import AENeRFPipeline
 from aenerf_ns.training.pose_diagnosis import diagnose, summary
 
-CAMERA = EventCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
+CAMERA = CameraIntrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
 SECOND = 10**9
 
 

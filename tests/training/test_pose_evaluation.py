@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.small_models import make_model
+from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
-from small_models import make_model
-from small_pipelines import make_pipeline, make_pipeline_config
 
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
-from aenerf_ns.camera.lens import EventCamera
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
 from aenerf_ns.camera.noise import perturb
-from aenerf_ns.camera.ray_tags import REFERENCE_SECONDS
 from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotation, rotation_from_vector
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
@@ -144,7 +144,7 @@ def make_correction(trajectory: Trajectory, ground_truth: Trajectory | None) -> 
 
 
 def reference_cameras(poses: torch.Tensor, seconds: list[float]):
-    cameras = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5).cameras(poses)
+    cameras = CameraIntrinsics(4, 3, 5.0, 5.0, 2.0, 1.5).cameras(poses)
     cameras.metadata[REFERENCE_SECONDS] = torch.tensor(seconds, dtype=torch.float64)[:, None]
     return cameras
 
@@ -177,7 +177,7 @@ def test_with_ground_truth_views_are_carried_by_the_alignment_to_it(random_poses
     carried = correction.apply_to_camera(reference_cameras(views, [np.nan, 0.5, 1.0]))
     torch.testing.assert_close(carried, some_similarity()(views).float(), rtol=0, atol=1e-5)
     # Other cameras, such as the viewer's, are in the scene's frame and stay.
-    others = EventCamera(4, 3, 5.0, 5.0, 2.0, 1.5).cameras(views)
+    others = CameraIntrinsics(4, 3, 5.0, 5.0, 2.0, 1.5).cameras(views)
     assert correction.apply_to_camera(others) is others.camera_to_worlds
 
 
@@ -240,7 +240,7 @@ def _known_camera() -> tuple[AENeRFModel, Cameras, torch.Tensor]:
     torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.1, -0.2, 2.5])
-    return model, EventCamera(32, 24, 30.0, 30.0, 16.0, 12.0).cameras(pose[None, :3]), pose
+    return model, CameraIntrinsics(32, 24, 30.0, 30.0, 16.0, 12.0).cameras(pose[None, :3]), pose
 
 
 def test_photometric_refinement_finds_the_camera_back() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from small_trainings import train_small_model
+from helpers.small_trainings import train_small_model
 
 from aenerf_ns.training.trainer import AENeRFTrainer
 

@@ -10,9 +10,9 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
-from small_trainings import train_small_model
+from helpers.small_trainings import train_small_model
 
-from aenerf_ns.training import environment
+from aenerf_ns.training import provenance
 from aenerf_ns.training.trainer import AENeRFTrainer
 
 
@@ -20,27 +20,27 @@ def test_a_command_is_recorded_as_it_is_typed(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(sys, "argv", ["benchmarks/paper/__main__.py", "--output", "bench"])
     for name in ("benchmarks.paper.__main__", "benchmarks.paper"):
         monkeypatch.setattr(sys.modules["__main__"], "__spec__", ModuleSpec(name, None))
-        assert environment.environment()["command"] == "python -m benchmarks.paper --output bench"
+        assert provenance.provenance()["command"] == "python -m benchmarks.paper --output bench"
 
 
 def test_a_commit_is_that_of_this_package_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     git = ("git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b")
-    module = tmp_path / "package" / "environment.py"
+    module = tmp_path / "package" / "provenance.py"
     module.parent.mkdir()
     module.write_text("")
-    monkeypatch.setattr(environment, "__file__", str(module))
-    assert environment.environment()["commit"] is None
+    monkeypatch.setattr(provenance, "__file__", str(module))
+    assert provenance.provenance()["commit"] is None
     subprocess.run([*git, "init", "--quiet"], check=True)
     subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "of something else"], check=True)
-    assert environment.environment()["commit"] is None
+    assert provenance.provenance()["commit"] is None
     subprocess.run([*git, "add", "package"], check=True)
     subprocess.run([*git, "commit", "--quiet", "--message", "of this"], check=True)
-    commit = environment.environment()["commit"]
+    commit = provenance.provenance()["commit"]
     assert len(commit) == 7
     module.write_text("changed")
-    assert environment.environment()["commit"] == f"{commit}+changes"
+    assert provenance.provenance()["commit"] == f"{commit}+changes"
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert environment.environment()["commit"] is None
+    assert provenance.provenance()["commit"] is None
 
 
 def test_a_training_records_its_end_and_its_scalars(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from commands import CPU, newest_config, run, simulate
+from helpers.commands import CPU, newest_config, run, simulate
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def train_processes(room: Path, folder: Path, count: int, *options: str) -> list
     """Trains in processes that learn all there is besides the scene, and returns what each of them kept."""
     folder.mkdir()
     run(
-        "python", Path(__file__).with_name("train_on_cpu_processes.py"), "aenerf-small", *CPU,
+        "python", Path(__file__).parents[1] / "helpers" / "train_on_cpu_processes.py", "aenerf-small", *CPU,
         "--machine.num-devices", str(count), "--vis", "tensorboard",
         "--optimizers.camera-opt.scheduler.delay", "0",
         "--pipeline.model.supervision.learn-contrast-threshold-ratio", "True",

@@ -12,9 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nerfstudio.viewer.viewer import Viewer
-from PIL import Image
-from small_viewers import (
+from helpers.small_viewers import (
     DURATION,
     NUM_EVENTS,
     SIZE,
@@ -25,6 +23,8 @@ from small_viewers import (
     sent,
     viewer_of,
 )
+from nerfstudio.viewer.viewer import Viewer
+from PIL import Image
 
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.pipeline import AENeRFPipeline

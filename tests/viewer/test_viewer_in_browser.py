@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from browser import chromium, eventually
-from small_viewers import DURATION, NUM_EVENTS, make_pipeline_of, make_recording, viewer_of
+from helpers.browser import chromium, eventually
+from helpers.small_viewers import DURATION, NUM_EVENTS, make_pipeline_of, make_recording, viewer_of
 
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.boundary import require_at_most
+from aenerf_ns.files.limits import require_at_most
 from aenerf_ns.simulator.arrays import Array
 
 # 16384 x 8192 pixels, uncompressed.

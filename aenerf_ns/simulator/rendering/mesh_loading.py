@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError, reading, reason
-from aenerf_ns.files.boundary import require_at_most
+from aenerf_ns.files.limits import require_at_most
 from aenerf_ns.simulator.arrays import Array, Texture
 from aenerf_ns.simulator.options import MESH_SUFFIXES
 from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh

@@ -1,0 +1,167 @@
+"""The event camera's lens: the direction in which each pixel looks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from numpy.typing import NDArray
+from torch import Tensor
+
+LensModel = Literal["radial_tangential", "fisheye"]
+
+# A pixel whose undistorted direction projects back this far off, in pixels, lies where the lens model folds over.
+_MAX_ROUND_TRIP_ERROR = 1e-3
+
+# A side in pixels; pixels, of a camera for films in 8K; focal lengths and principal points in pixels.
+_MAX_SIDE, _MAX_PIXELS = 1 << 14, 1 << 25
+_FOCAL_LENGTHS = (1e-2, 1e6)
+_MAX_PRINCIPAL_POINT = 1e6
+# Along each side, the pixels that :meth:`CameraIntrinsics.sees` looks at.
+_SAMPLES = 24
+
+
+@dataclass(frozen=True)
+class CameraIntrinsics:
+    """Intrinsics and distortion of a camera.
+
+    Attributes:
+        width: number of pixel columns.
+        height: number of pixel rows.
+        fx: focal length along the rows, in pixels.
+        fy: focal length along the columns, in pixels.
+        cx: principal point from the left edge of the image, in pixels. The centre of the first pixel is at 0.5
+            (Nerfstudio's convention). OpenCV, Kalibr and ESIM count from that centre: add 0.5 to their values.
+        cy: principal point from the top edge of the image, in pixels, with the same convention.
+        lens_model: "radial_tangential" (OpenCV's Brown-Conrady, "plumb_bob") or "fisheye" (OpenCV's fisheye,
+            Kannala-Brandt, "equidistant", "kb4").
+        distortion: in OpenCV's order: k1, k2, p1, p2, k3 ("radial_tangential") or k1, k2, k3, k4 ("fisheye").
+
+    Raises:
+        ValueError: a size is not a whole number of pixels or too large, a focal length or the principal point is not
+            one that a camera can have, a value is not finite, or the number of distortion parameters does not fit the
+            model.
+
+    Example:
+        >>> camera = CameraIntrinsics(width=346, height=260, fx=330.0, fy=330.0, cx=172.5, cy=129.5)
+        >>> directions, is_valid = camera.pixel_directions()
+        >>> directions.shape
+        (260, 346, 3)
+        >>> directions[129, 172]  # the principal point is the centre of this pixel
+        array([ 0., -0., -1.])
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    lens_model: LensModel = "radial_tangential"
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            size = getattr(self, name)
+            if not 0 < size <= _MAX_SIDE or size != int(size):
+                raise ValueError(f"{name} must be a whole number from 1 to {_MAX_SIDE}, not {size:.12g}")
+            # Some formats store it as a decimal number.
+            object.__setattr__(self, name, int(size))
+        if self.width * self.height > _MAX_PIXELS:
+            raise ValueError(f"{self.width} x {self.height} pixels are more than {_MAX_PIXELS:,}")
+        for name in ("fx", "fy"):
+            low, high = _FOCAL_LENGTHS
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} must be from {low:g} to {high:g} pixels, not {getattr(self, name):g}")
+        for name in ("cx", "cy"):
+            if not abs(getattr(self, name)) <= _MAX_PRINCIPAL_POINT:
+                raise ValueError(f"{name} must be within {_MAX_PRINCIPAL_POINT:g} pixels, not {getattr(self, name):g}")
+        if not np.isfinite(self.distortion).all():
+            raise ValueError("the distortion must be finite")
+        expected = {"radial_tangential": 5, "fisheye": 4}
+        if self.lens_model not in expected:
+            raise ValueError(f'lens_model must be one of {sorted(expected)}, not "{self.lens_model}"')
+        if len(self.distortion) != expected[self.lens_model]:
+            raise ValueError(
+                f"{self.lens_model} distortion takes {expected[self.lens_model]} numbers, not {len(self.distortion)}"
+            )
+
+    @property
+    def _opencv_matrix(self) -> NDArray[np.float64]:
+        return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
+
+    def pixel_directions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the directions through the pixel centres, undistorted to the last digit.
+
+        Returns:
+            (height, width, 3) float64 unit vectors in the camera's frame with Nerfstudio's axes (x right, y up,
+            z backward), and (height, width) whether the pixel has a direction. A pixel beyond the range in which the
+            distortion model can be inverted has none.
+        """
+        return self._directions(np.arange(self.width), np.arange(self.height))
+
+    def sees(self) -> bool:
+        """Return whether any of some pixels, evenly spread over the sensor, has a direction."""
+        columns, rows = (
+            np.linspace(0, side - 1, min(side, _SAMPLES)).astype(int) for side in (self.width, self.height)
+        )
+        return bool(self._directions(columns, rows)[1].any())
+
+    def _directions(
+        self, columns: NDArray[np.integer], rows: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the directions through the pixels of (W,) columns and (H,) rows, as :meth:`pixel_directions` does."""
+        shape = len(rows), len(columns)
+        columns, rows = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
+        pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
+        matrix, distortion = self._opencv_matrix, np.array(self.distortion)
+        if self.lens_model == "fisheye":
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
+            plane = cv2.fisheye.undistortPoints(pixels, matrix, distortion, criteria=criteria)
+            projected = cv2.fisheye.distortPoints(plane, matrix, distortion)
+        else:
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+            plane = cv2.undistortPointsIter(pixels, matrix, distortion, np.eye(3), np.eye(3), criteria)
+            points = np.concatenate([plane, np.ones_like(plane[..., :1])], -1)
+            projected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0]
+        plane = plane.reshape(*shape, 2)
+        directions = np.stack([plane[..., 0], -plane[..., 1], np.full(plane.shape[:2], -1.0)], -1)
+        # A distortion that is absurd leaves points that are infinite. Such a pixel has no direction.
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.linalg.norm(projected - pixels, axis=-1).reshape(shape)
+            directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        return directions, error < _MAX_ROUND_TRIP_ERROR
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> CameraIntrinsics:
+        """Return the camera of the part of the sensor that begins at pixel (x, y) and has the given size in pixels."""
+        return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
+
+    def cameras(self, camera_to_worlds: Tensor) -> Cameras:
+        """Return Nerfstudio's cameras with this lens.
+
+        Args:
+            camera_to_worlds: (N, 3, 4) poses, OpenGL camera axes.
+        """
+        if self.lens_model == "fisheye":
+            k1, k2, k3, k4 = self.distortion
+            distortion, camera_type = [k1, k2, k3, k4, 0.0, 0.0], CameraType.FISHEYE
+        else:
+            k1, k2, p1, p2, k3 = self.distortion
+            distortion, camera_type = [k1, k2, k3, 0.0, p1, p2], CameraType.PERSPECTIVE
+        return Cameras(
+            camera_to_worlds=camera_to_worlds.float(),
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx,
+            cy=self.cy,
+            width=self.width,
+            height=self.height,
+            distortion_params=torch.tensor(distortion) if any(distortion) else None,
+            camera_type=camera_type,
+            # Nerfstudio's renderers write into it.
+            metadata={},
+        )

@@ -1,0 +1,452 @@
+"""Pairs of consecutive events of a pixel: the unit of supervision."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import BinaryIO
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.pair_store import (
+    BLOCK,
+    COUNT_MASK,
+    MAX_REACH,
+    NEGATIVE_SHIFT,
+    NUMBER_MASK,
+    PIXEL_SHIFT,
+    REACH_MASK,
+    REACH_SHIFT,
+    EventPairs,
+    map_rows,
+)
+from aenerf_ns.events.stream import EventStream
+
+_MAX_MERGED = 255
+_MAX_PIXELS = 1 << 23
+
+# A pair spans an event only where the intervals on both sides of it are so many refractory periods long. At a steady
+# rate, at most a twentieth of a contrast threshold then goes unseen, which is less than thresholds are known to.
+_INTERVAL_TO_REFRACTORY_PERIOD = 20
+
+EVENTS_IN_MEMORY = 1 << 27
+"""The most events that stay in memory, if there is a file for more: 16 bytes each, twice while they are sorted."""
+_ROWS_AT_A_TIME = 1 << 22
+
+_NEVER = np.iinfo(np.int64).min
+_EVERYTHING = TimeWindow()
+
+
+def pair_events(
+    chunks: Iterable[EventStream],
+    *,
+    refractory_period: int = 0,
+    window: TimeWindow = _EVERYTHING,
+    usable: NDArray[np.bool_] | None = None,
+    expected_events: int | None = None,
+    open_file: Callable[[], tuple[BinaryIO, Path]] | None = None,
+    events_in_memory: int = EVENTS_IN_MEMORY,
+) -> EventPairs:
+    """Pair each event with the previous event of its pixel, in one pass over the stream.
+
+    Memory holds one chunk, 16 bytes for each event, the same again while the events are sorted, and 32 bytes for each
+    pixel. Events beyond ``events_in_memory`` go to a file, and as many are in memory at a time.
+
+    Args:
+        chunks: the stream in pieces, in the order of time, all of one sensor.
+        refractory_period: τ in nanoseconds. An event at most τ after the previous event of its pixel gives no pair. A
+            pair is joined with others only if its interval is at least 20 τ, and theirs are.
+        window: events outside the window are left out, and no pair spans a gap.
+        usable: (height, width) whether the events of a pixel are used. None: all are.
+        expected_events: the number of events, if known. It saves growing the arrays.
+        open_file: called once if the events are too many for memory. Returns a new file, open for reading and writing,
+            and a folder for temporary files. The rows are written to the file's start and mapped. None: all events
+            stay in memory.
+        events_in_memory: the most events that stay in memory, if there is a file.
+
+    Returns:
+        The pairs, with every event of the stream accounted for.
+
+    Raises:
+        DataError: the sensor and ``usable`` differ in size, no event lies in the time window or on a pixel that is
+            used, more than 255 events of one polarity share a pixel and a time, or the sensor or its recording is
+            larger than can be counted.
+    """
+    table: _Table | None = None
+    pieces = window.pieces()
+    piece = total = outside = 0
+    source: str | Path = "events"
+    for full_chunk in chunks:
+        total += len(full_chunk)
+        outside += len(full_chunk)
+        source = full_chunk.source
+        if table is None:
+            shape = (full_chunk.height, full_chunk.width)
+            used = np.ones(shape, bool) if usable is None else usable
+            if used.shape != shape:
+                raise DataError(
+                    source,
+                    f"its sensor has {shape[1]} x {shape[0]} pixels, its lens model {used.shape[1]} x {used.shape[0]}",
+                    "state one size",
+                )
+            table = _Table(used, refractory_period, min(expected_events or 0, events_in_memory), source)
+        for index, chunk in enumerate(full_chunk.between(*times) for times in pieces):
+            if len(chunk) == 0:
+                continue
+            outside -= len(chunk)
+            if index != piece:
+                # After a gap every pixel begins anew.
+                piece = index
+                table.last_time.fill(_NEVER)
+            if open_file is not None and table.size + len(chunk) > events_in_memory:
+                if table.file is None:
+                    table.file, table.folder = open_file()
+                table.flush()
+            table.add(chunk)
+    if table is None or total == outside:
+        raise DataError(
+            source,
+            f"none of its {total} events lies between {window.start} and {window.end} ns, the span of the poses "
+            "and the time window",
+            "check that events and poses share one clock and one unit of time",
+        )
+    return table.pairs(total, outside)
+
+
+class _Table:
+    """Collect the events of a stream, and sort them by pixel.
+
+    Attributes:
+        last_time: (pixels,) int64, time of each pixel's last event.
+        size: events in memory.
+        file: where the rows go; None if they stay in memory.
+        folder: of temporary files.
+    """
+
+    def __init__(
+        self, usable: NDArray[np.bool_], refractory_period: int, expected_events: int, source: str | Path
+    ) -> None:
+        height, width = usable.shape
+        if usable.size > _MAX_PIXELS:
+            raise DataError(source, f"its sensor has {width} x {height} pixels", f"use at most {_MAX_PIXELS} of them")
+        self._usable = usable.ravel()
+        self._shape = (width, height)
+        self._refractory_period = refractory_period
+        self._source = source
+        # numpy.empty only reserves addresses: memory is used as the events are written.
+        self._entries = np.empty((expected_events, 2), np.int64)
+        self._last_entry = np.full(usable.size, -1, np.int64)
+        self._shortest_interval = np.iinfo(np.int64).max
+        # Of unusable, first, merged and refractory events.
+        self._counts = np.zeros(4, np.int64)
+        # Events that went to a file, sorted by pixel, and where the events of each pixel begin there.
+        self._runs: list[tuple[BinaryIO, NDArray[np.int64]]] = []
+        self.last_time = np.full(usable.size, _NEVER, np.int64)
+        self.size = 0
+        self.file: BinaryIO | None = None
+        self.folder = Path()
+
+    def add(self, chunk: EventStream) -> None:
+        """Add the events of a chunk."""
+        if self.size + len(chunk) > len(self._entries):
+            capacity = max(self.size + len(chunk), 3 * len(self._entries) // 2)
+            grown = np.empty((capacity, 2), np.int64)
+            grown[: self.size] = self._entries[: self.size]
+            self._entries = grown
+        failed, self.size, self._shortest_interval = _add_chunk(
+            (chunk.x, chunk.y, chunk.t, chunk.p),
+            chunk.width,
+            self._usable,
+            self._refractory_period,
+            self.last_time,
+            self._last_entry,
+            self._entries,
+            self.size,
+            self._shortest_interval,
+            self._counts,
+        )
+        if failed >= 0:
+            raise DataError(
+                chunk.source,
+                f"more than {_MAX_MERGED} events of one polarity at pixel ({chunk.x[failed]}, {chunk.y[failed]}) share "
+                f"the time {chunk.t[failed]} ns",
+                "check the unit of the times",
+            )
+
+    def flush(self, everything: bool = False) -> None:
+        """Write the events in memory to a temporary file, sorted by pixel.
+
+        Args:
+            everything: also the events of the latest time, which others may still be merged with.
+        """
+        times = self._entries[: self.size, 0]
+        count = self.size if everything or not self.size else int(np.searchsorted(times, times[-1]))
+        if count == 0:
+            return
+        run, begins = self._by_pixel(count)
+        # It has no name, so it is gone when the process ends, however the process ends.
+        file = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115
+        run.tofile(file)
+        self._runs.append((file, begins))
+        left = self._entries[count : self.size].copy()
+        self.size = len(left)
+        self._entries[: self.size] = left
+        self._last_entry[left[:, 1] >> PIXEL_SHIFT] = np.where(
+            (left[:, 1] >> REACH_SHIFT) & REACH_MASK, np.arange(len(left)), -1
+        )
+
+    def pairs(self, num_events: int, num_outside: int) -> EventPairs:
+        """Return the pairs of all events that were added."""
+        unusable, first, merged, refractory = (int(count) for count in self._counts)
+        num_rows = num_events - num_outside - unusable - merged
+        if num_rows == 0:
+            raise DataError(self._source, "no event lies on a pixel with a direction", "check the lens's distortion")
+        num_pairs = num_rows - first - refractory
+        ends = _Ends(num_rows, _INTERVAL_TO_REFRACTORY_PERIOD * self._refractory_period)
+        if self.file is None:
+            rows, _ = self._by_pixel(self.size, ends.num_padded)
+            self._entries = rows[:0]
+            ends.finish(rows[:num_rows])
+        else:
+            self.flush(everything=True)
+            self._entries = self._entries[:0].copy()
+            self._merge(self.file, ends)
+            rows = map_rows(self.file, ends.num_padded)
+        if ends.bounds[-1] < 0:
+            raise DataError(self._source, "its intervals add up to more than 292 years", "choose a shorter time window")
+        tail = np.ones(num_rows - num_pairs, bool)
+        tail[ends.heads[ends.heads >= num_pairs] - num_pairs] = False
+        width, height = self._shape
+        return EventPairs(
+            rows=rows,
+            substitutes=num_pairs + np.flatnonzero(tail),
+            bounds=ends.bounds,
+            width=width,
+            height=height,
+            shortest_interval=self._shortest_interval,
+            num_events=num_events,
+            num_outside=num_outside,
+            num_unusable=unusable,
+            num_first=first,
+            num_merged=merged,
+            num_within_refractory_period=refractory,
+        )
+
+    def _by_pixel(self, count: int, length: int | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the first events in memory sorted by pixel, then by time, and where those of each pixel begin.
+
+        Args:
+            count: number of events.
+            length: of the array that is returned, if it is longer.
+        """
+        begins = np.zeros(len(self._usable) + 1, np.int64)
+        _count_pixels(self._entries[:count], begins[1:])
+        np.cumsum(begins, out=begins)
+        rows = np.empty((count if length is None else length, 2), np.int64)
+        _place(self._entries[:count], 0, begins[:-1].copy(), rows)
+        rows[count:] = 0
+        return rows, begins
+
+    def _merge(self, file: BinaryIO, ends: _Ends) -> None:
+        """Write the events of all runs to a file, sorted by pixel."""
+        begins = np.sum([begins for _, begins in self._runs], axis=0)
+        first = 0
+        while first < len(begins) - 1:
+            # As many pixels as fit, and at least one.
+            last = max(int(np.searchsorted(begins, begins[first] + _ROWS_AT_A_TIME, side="right")) - 1, first + 1)
+            rows = np.empty((begins[last] - begins[first], 2), np.int64)
+            places = begins[first:last] - begins[first]
+            for run, run_begins in self._runs:
+                begin, end = int(run_begins[first]), int(run_begins[last])
+                run.seek(16 * begin)
+                _place(np.fromfile(run, np.int64, 2 * (end - begin)).reshape(-1, 2), first, places, rows)
+            ends.finish(rows)
+            rows.tofile(file)
+            first = last
+        np.zeros((ends.num_padded - ends.num_rows, 2), np.int64).tofile(file)
+        file.flush()
+        for run, _ in self._runs:
+            run.close()
+
+
+class _Ends:
+    """Link rows that come sorted by pixel, and note the heads and the ends of blocks.
+
+    Args:
+        num_rows: of all pixels.
+        shortest_interval: nanoseconds. Pairs whose events are closer are not joined with others.
+
+    Attributes:
+        num_rows: of all pixels.
+        num_padded: number of rows with those that fill the last block.
+        bounds: see :class:`EventPairs`.
+        heads: (H,) int64 rows of the heads so far.
+    """
+
+    def __init__(self, num_rows: int, shortest_interval: int) -> None:
+        num_blocks = -(-num_rows // BLOCK)
+        self.num_rows = num_rows
+        self.num_padded = num_blocks * BLOCK
+        self.bounds = np.zeros(num_blocks + 1, np.int64)
+        self._shortest_interval = shortest_interval
+        self._heads: list[NDArray[np.int64]] = []
+        self._num_heads = 0
+        self._row = 0
+
+    @property
+    def heads(self) -> NDArray[np.int64]:
+        return np.concatenate(self._heads)
+
+    def finish(self, rows: NDArray[np.int64]) -> None:
+        """Put reach and sums into the next rows, all rows of some pixels."""
+        self._heads.append(self._row + _finish(rows, self._row, self._num_heads, self._shortest_interval, self.bounds))
+        self._num_heads += len(self._heads[-1])
+        self._row += len(rows)
+
+
+@numba.njit(cache=True)
+def _add_chunk(columns, width, usable, refractory_period, last_time, last_entry, entries, n, shortest, counts):
+    """Continue with one chunk.
+
+    Returns:
+        −1 or the index of the event that cannot be counted, the new number of entries and the shortest interval.
+    """
+    x, y, t, p = columns
+    for i in range(t.shape[0]):
+        pixel = np.int64(y[i]) * width + x[i]
+        if not usable[pixel]:
+            counts[0] += 1
+            continue
+        previous = last_time[pixel]
+        if t[i] == previous:
+            counts[2] += 1
+            entry = last_entry[pixel]
+            if entry >= 0:
+                shift = 0 if p[i] > 0 else NEGATIVE_SHIFT
+                if (entries[entry, 1] >> shift) & COUNT_MASK == _MAX_MERGED:
+                    return i, n, shortest
+                entries[entry, 1] += 1 << shift
+            continue
+        last_time[pixel] = t[i]
+        last_entry[pixel] = -1
+        entries[n, 0] = t[i]
+        entries[n, 1] = pixel << PIXEL_SHIFT
+        if previous == _NEVER:
+            counts[1] += 1
+        elif t[i] - previous <= refractory_period:
+            counts[3] += 1
+        else:
+            shortest = min(shortest, t[i] - previous)
+            entries[n, 1] |= 1 << REACH_SHIFT | 1 << (0 if p[i] > 0 else NEGATIVE_SHIFT)
+            last_entry[pixel] = n
+        n += 1
+    return -1, n, shortest
+
+
+@numba.njit(cache=True)
+def _count_pixels(entries, counts):
+    """Count the events of each pixel."""
+    for i in range(entries.shape[0]):
+        counts[entries[i, 1] >> PIXEL_SHIFT] += 1
+
+
+@numba.njit(cache=True)
+def _place(entries, first_pixel, places, rows):
+    """Put events into the rows of their pixels, and move the places of the pixels' next events on."""
+    for i in range(entries.shape[0]):
+        pixel = (entries[i, 1] >> PIXEL_SHIFT) - first_pixel
+        place = places[pixel]
+        rows[place, 0] = entries[i, 0]
+        rows[place, 1] = entries[i, 1]
+        places[pixel] = place + 1
+
+
+@numba.njit(cache=True)
+def _finish(rows, row, num_heads, shortest_interval, bounds):
+    """Put reach and sums into rows whose second numbers hold each event's own counts. Returns the heads among them."""
+    heads = np.empty(rows.shape[0], np.int64)
+    begin = num_heads
+    reach = positive = negative = 0
+    was_long = False
+    for i in range(rows.shape[0]):
+        block = (row + i) // BLOCK
+        if (row + i) % BLOCK == 0:
+            bounds[block + 1] = bounds[block]
+        own = rows[i, 1]
+        pixel = own >> PIXEL_SHIFT
+        if (own >> REACH_SHIFT) & REACH_MASK == 0:
+            heads[num_heads - begin] = i
+            rows[i, 1] = pixel << PIXEL_SHIFT | num_heads
+            num_heads += 1
+            positive = negative = 0
+            was_long = False
+            continue
+        interval = rows[i, 0] - rows[i - 1, 0]
+        bounds[block + 1] += interval
+        is_long = interval >= shortest_interval
+        reach = min(reach + 1, MAX_REACH) if is_long and was_long else 1
+        was_long = is_long
+        positive = (positive + own) & COUNT_MASK
+        negative = (negative + (own >> NEGATIVE_SHIFT)) & COUNT_MASK
+        rows[i, 1] = pixel << PIXEL_SHIFT | reach << REACH_SHIFT | negative << NEGATIVE_SHIFT | positive
+    return heads[: num_heads - begin].copy()
+
+
+def near_blocks(bounds: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Return an index into the bounds of :class:`EventPairs`, so that a search in them waits less for memory.
+
+    Returns:
+        (G,) int64, the last block that begins at every G-th step along the intervals or before it, and how many
+        nanoseconds a step takes. A step has 8 blocks on average.
+    """
+    step = int(bounds[-1]) // max(len(bounds) // 8, 1) + 1
+    times = step * np.arange(int(bounds[-1]) // step + 2, dtype=np.int64)
+    return np.searchsorted(bounds, times, side="right") - 1, step
+
+
+@numba.njit(cache=True)
+def find_rows(rows, substitutes, bounds, near, step, places, events, spans, found):
+    """Fill in the rows of pairs; see :func:`aenerf_ns.supervision.event_pairs.find_rows`.
+
+    Args:
+        rows: see there.
+        substitutes: see there.
+        bounds: see there.
+        near: as :func:`near_blocks` returns it.
+        step: as :func:`near_blocks` returns it.
+        places: see there.
+        events: see there.
+        spans: see there.
+        found: (N, 3, 2) int64, the result.
+    """
+    for i in range(spans.shape[0]):
+        if i < places.shape[0]:
+            # The last block that begins at the place or before it.
+            block = near[places[i] // step]
+            count = near[places[i] // step + 1] - block + 1
+            while count > 1:
+                half = count // 2
+                block = block + half if bounds[block + half] <= places[i] else block
+                count -= half
+            row = BLOCK * block
+            left = places[i] - bounds[block]
+            while True:
+                if (rows[row, 1] >> REACH_SHIFT) & REACH_MASK:
+                    left -= rows[row, 0] - rows[row - 1, 0]
+                    if left < 0:
+                        break
+                row += 1
+        else:
+            row = events[i - places.shape[0]]
+            if (rows[row, 1] >> REACH_SHIFT) & REACH_MASK == 0:
+                row = substitutes[rows[row, 1] & NUMBER_MASK]
+        span = min(spans[i], (rows[row, 1] >> REACH_SHIFT) & REACH_MASK)
+        for part in range(2):
+            found[i, 0, part] = rows[row, part]
+            found[i, 1, part] = rows[row - 1, part]
+            found[i, 2, part] = rows[row - span, part]

@@ -1,0 +1,163 @@
+"""Space that moves along with the corrections of the poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from aenerf_ns.method.kernels.loader import is_float_in_memory, kernels_or_none
+from aenerf_ns.method.pose_correction import PoseCorrection
+
+# Cells along an axis of the unit cube of the scene. The times that see a place change little from cell to cell.
+_RESOLUTION = 24
+# The most times at which twists are taken: it bounds memory and time of a step on long recordings.
+_MAX_TIMES = 256
+# Neighbourhoods that the weights are averaged over, and the weight of each against the next smaller one.
+_NUM_BLURS, _BLUR_WEIGHT = 4, 0.05
+
+
+class PoseFollowingWarp(nn.Module):
+    """Carry the field along with the corrections of the poses.
+
+    If a correction moves the cameras of some time, the places that only they see seem to move with them. A field that
+    is fixed in the world must then unlearn the places and learn them again, so it holds the cameras where they are, and
+    corrections creep. Here the field is fixed in a space that moves along instead: place p is looked up at
+
+        D(p) = p − v(p) − ω(p) × p,
+
+    where (v, ω) is the mean of the corrections' twists in the world, over the times that see p. A correction that all
+    these times share moves the place with the cameras, and changes no rendering. Only differences between the
+    corrections of these times are left to be learned, and that is what events tell of. D is smooth, and it is the
+    identity where poses are not corrected.
+
+    Times see a place as often as training rays of these times end there, by their rendering weights. The rays are
+    counted in the cells of a coarse grid, by :meth:`observe`.
+
+    Twists and weights are differentiated, the place at which they are looked up is not: within the span of a gradient,
+    neighbours move alike.
+
+    Args:
+        correction: of the poses, of which something is learned. It stays the model's.
+        unit_positions: maps (N, 3) positions in the scene to the unit cube, as the fields do.
+
+    Attributes:
+        observing: whether rays are being counted. The model switches it.
+    """
+
+    _seconds: Tensor
+    _base_poses: Tensor
+    _seen: Tensor
+    _weights: Tensor
+    _strides: Tensor
+
+    def __init__(self, correction: PoseCorrection, unit_positions: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        # Not as a submodule: the correction's parameters are the model's already.
+        self._correction = (correction,)
+        self._unit_positions = unit_positions
+        self.observing = False
+        duration = correction.trajectory.duration
+        count = min(math.ceil(duration / correction.config.knot_interval) + 1, _MAX_TIMES)
+        self._interval = duration / (count - 1)
+        seconds = torch.linspace(0, duration, count, dtype=torch.float64)
+        self.register_buffer("_seconds", seconds, persistent=False)
+        self.register_buffer("_base_poses", correction.trajectory.pose(seconds), persistent=False)
+        self.register_buffer("_seen", torch.zeros(_RESOLUTION**3, count))
+        self.register_buffer("_weights", torch.full((_RESOLUTION**3, count), 1 / count))
+        self.register_buffer("_strides", torch.tensor([_RESOLUTION**2, _RESOLUTION, 1]), persistent=False)
+        self._twists: Tensor | None = None
+
+    def follow(self) -> None:
+        """Take the corrections as they are now, for all positions until the next call."""
+        twists = self._correction[0].world_twists(self._seconds, self._base_poses).to(self._weights)
+        # Half precision would round the places to a thousandth of the twists' size, and kernels take float32.
+        with torch.autocast(twists.device.type, enabled=False):
+            self._twists = (self._weights @ twists).unflatten(0, [_RESOLUTION] * 3)
+
+    def forward(self, positions: Tensor) -> Tensor:
+        """Return the places (..., 3) in the field's space of positions (..., 3) in the scene."""
+        assert self._twists is not None
+        return self._moved(positions, self._twists)
+
+    def without_gradient(self, positions: Tensor) -> Tensor:
+        """Return the places of :meth:`forward`, through which nothing of the corrections is learned."""
+        assert self._twists is not None
+        return self._moved(positions, self._twists.detach())
+
+    def _moved(self, positions: Tensor, grid: Tensor) -> Tensor:
+        with torch.no_grad():
+            unit = self._unit_positions(forward_ad.unpack_dual(positions).primal.flatten(0, -2)).to(grid.dtype)
+        translation, rotation = self._look_up(grid, unit).unflatten(0, positions.shape[:-1]).split(3, -1)
+        return positions - translation - torch.linalg.cross(rotation, positions)
+
+    def _look_up(self, grid: Tensor, unit: Tensor) -> Tensor:
+        """Return values (N, columns) of a grid (r, r, r, columns) between its cells, at unit places (N, 3)."""
+        fits = unit.device.type == "cpu" and is_float_in_memory(grid) and is_float_in_memory(unit)
+        kernels = kernels_or_none(f"{__package__}.comoving_numba", unit.device) if fits else None
+        if kernels is not None:
+            found: Tensor = _LookUp.apply(grid, unit.contiguous(), kernels)
+            return found
+        # torch counts the coordinates of a place from the last axis.
+        places = (2 * unit - 1).flip(-1)[None, None, None]
+        cells = grid.permute(3, 0, 1, 2)[None]
+        return F.grid_sample(cells, places, padding_mode="border", align_corners=False)[0, :, 0, 0].T
+
+    @torch.no_grad()
+    def observe(self, positions: Tensor, weights: Tensor, seconds: Tensor) -> None:
+        """Count rays.
+
+        Args:
+            positions: (N, samples, 3) of the samples in the scene.
+            weights: (N, samples) rendering weights.
+            seconds: (N,) times of the rays since the trajectory's start.
+        """
+        unit = self._unit_positions(positions.flatten(0, -2)).unflatten(0, positions.shape[:-1])
+        inside = ((unit > 0) & (unit < 1)).all(-1)
+        cell = ((unit * _RESOLUTION).long().clamp(0, _RESOLUTION - 1) * self._strides).sum(-1)
+        place = seconds / self._interval
+        before = place.long().clamp(0, len(self._seconds) - 2)
+        share = (place - before).to(weights)[:, None]
+        index = cell * len(self._seconds) + before[:, None]
+        counts = (weights * inside).to(self._seen)
+        seen = self._seen.view(-1)
+        seen.index_add_(0, index.flatten(), (counts * (1 - share)).flatten())
+        seen.index_add_(0, (index + 1).flatten(), (counts * share).flatten())
+
+    @torch.no_grad()
+    def weigh(self) -> None:
+        """Set the weights of the times in each cell by the rays that have been counted in its neighbourhood.
+
+        Where no ray has ended near a cell, all rays count.
+        """
+        around = self._seen.T.unflatten(1, [_RESOLUTION] * 3)[:, None]
+        total, scale = torch.zeros_like(around), 1.0
+        for _ in range(_NUM_BLURS):
+            around = F.avg_pool3d(F.pad(around, [1] * 6, mode="replicate"), 3, 1)
+            total += scale * around
+            scale *= _BLUR_WEIGHT
+        everywhere = self._seen.mean(0) * 1e-6 + torch.finfo(total.dtype).tiny
+        total = total.flatten(1).T + everywhere
+        self._weights.copy_(total / total.sum(-1, keepdim=True))
+
+
+class _LookUp(torch.autograd.Function):
+    """Look values up; only the grid has gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, grid: Tensor, unit: Tensor, kernels: Any) -> Tensor:
+        ctx.save_for_backward(unit)
+        ctx.resolution, ctx.kernels = len(grid), kernels
+        return kernels.values(grid.contiguous(), unit)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        (unit,) = ctx.saved_tensors
+        return ctx.kernels.gradient(unit, grad.contiguous(), ctx.resolution), None, None

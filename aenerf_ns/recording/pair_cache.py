@@ -1,0 +1,204 @@
+"""The file beside a long recording that keeps its pairs of events from one run to the next."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import sys
+import tempfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.pair_store import EventPairs, map_rows
+from aenerf_ns.events.stream import EventFile
+
+# Counted up when the layout of the file, of the rows or of what is kept with them changes.
+_VERSION = 1
+# The end of the file: length of the description as JSON in front of it, and this word.
+_WORD = b"aenerf-pairs"
+_NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "int")
+
+Shown = TypeVar("Shown")
+
+
+class PairFile:
+    """Keep the pairs of an event file in a file beside it.
+
+    The file holds the rows of :class:`~aenerf_ns.events.pair_store.EventPairs`, then ``substitutes``, ``bounds`` and
+    the pictures, all as they are in memory, then a description as JSON. It is written under another name, and renamed
+    when it is whole.
+
+    Args:
+        events: the event file, or folder of event files.
+        made_from: what the pairs depend on besides the event file, as JSON can hold it.
+    """
+
+    def __init__(self, events: EventFile, made_from: Mapping[str, Any]) -> None:
+        self.path = events.path.with_name(events.path.name + ".pairs")
+        options = {name: repr(value) for name, value in vars(events).items() if name != "path"}
+        stated = {"version": _VERSION, "files": _stamps(events.path), "reader": options, **made_from}
+        # As it will be read again.
+        self._made_from = json.loads(json.dumps(stated))
+        self._new: BinaryIO | None = None
+        self._is_kept = False
+        self._said: set[str] = set()
+
+    def find(self) -> tuple[EventPairs, NDArray[np.int16]] | None:
+        """Return the pairs and the pictures, or None if they are to be made. Says so if there is a file of no use."""
+        if not self.path.is_file():
+            return None
+        try:
+            with self.path.open("rb") as file:
+                found = self._read(file)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            self._say(f"{self.path} is not whole ({error}): it is made again.")
+            return None
+        if found is None:
+            self._say(f"{self.path} is of other events or options: it is made again.")
+        return found
+
+    def _say(self, line: str) -> None:
+        """Print a line, once."""
+        if line not in self._said:
+            CONSOLE.print(f"[yellow]{line}")
+        self._said.add(line)
+
+    def _read(self, file: BinaryIO) -> tuple[EventPairs, NDArray[np.int16]] | None:
+        """Return the pairs and the pictures, or None if they are of other events or options.
+
+        Raises:
+            ValueError, KeyError or TypeError: the file is broken.
+        """
+        size = os.fstat(file.fileno()).st_size
+        file.seek(max(size - 8 - len(_WORD), 0))
+        length = int.from_bytes(file.read(8), "little")
+        if file.read() != _WORD:
+            raise ValueError("its last bytes are missing")
+        end = size - 8 - len(_WORD) - length
+        file.seek(max(end, 0))
+        about = json.loads(file.read(length))
+        if about["made_from"] != self._made_from:
+            return None
+        num_rows = about["num_rows"]
+        file.seek(16 * num_rows)
+        checksum, arrays = 0, []
+        for dtype, shape in about["arrays"]:
+            array = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)
+            checksum = zlib.crc32(array.data, checksum)
+            arrays.append(array)
+        if file.tell() != end or checksum != about["checksum"]:
+            raise ValueError("its parts have other sizes or bytes than it says")
+        substitutes, bounds, pictures = arrays
+        numbers = {name: int(about["numbers"][name]) for name in _NUMBERS}
+        pairs = EventPairs(rows=map_rows(file, num_rows), substitutes=substitutes, bounds=bounds, **numbers)
+        return pairs, pictures
+
+    def open(self) -> tuple[BinaryIO, Path]:
+        """Open a new file to write the rows to. Returns it with a folder for temporary files."""
+        try:
+            folder = self.path.parent
+            if sys.platform == "win32":
+                raise OSError(errno.EACCES, "Windows renames no file that is mapped")
+            self._new = self._part.open("w+b")
+            self._is_kept = True
+        except OSError as error:
+            folder = Path(tempfile.gettempdir())
+            CONSOLE.print(
+                f"[yellow]{self.path.parent} cannot be written to ({error.strerror}): the pairs are in {folder} until "
+                "this process ends, and are made again by the next."
+            )
+            # Without a name: it is gone when the process ends.
+            self._new = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
+        return self._new, folder
+
+    @property
+    def _part(self) -> Path:
+        return self.path.with_name(self.path.name + ".part")
+
+    def keep(self, pairs: EventPairs, pictures: NDArray[np.int16]) -> None:
+        """Keep pairs and pictures if their rows went to a file. Otherwise delete an older file of pairs."""
+        if self._new is None:
+            with suppress(OSError):
+                self.path.unlink(missing_ok=True)
+            return
+        if not self._is_kept:
+            return
+        checksum, arrays = 0, []
+        for array in (pairs.substitutes, pairs.bounds, pictures):
+            array.tofile(self._new)
+            checksum = zlib.crc32(array.data, checksum)
+            arrays.append((array.dtype.str, array.shape))
+        about = {
+            "made_from": self._made_from,
+            "num_rows": len(pairs.rows),
+            "arrays": arrays,
+            "checksum": checksum,
+            "numbers": {name: getattr(pairs, name) for name in _NUMBERS},
+        }
+        text = json.dumps(about).encode()
+        self._new.write(text + len(text).to_bytes(8, "little") + _WORD)
+        self._new.flush()
+        os.fsync(self._new.fileno())
+        self._part.rename(self.path)
+        CONSOLE.print(f"The pairs are in {self.path}, for the next run. It may be deleted.")
+
+    @contextmanager
+    def making(self, alone: bool) -> Iterator[None]:
+        """Delete an unfinished file at the end, and raise one clear error where the disk is full.
+
+        Args:
+            alone: let one process at a time make the file.
+
+        Raises:
+            DataError: the disk is full.
+        """
+        try:
+            with _locked(self.path.parent) if alone else nullcontext():
+                yield
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise DataError(
+                self.path, "the disk is full", "free some of it: the pairs take 16 bytes an event, twice that at first"
+            ) from None
+        finally:
+            if self._new is not None:
+                self._new.close()
+                if self._is_kept:
+                    self._part.unlink(missing_ok=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold a folder's lock, where there are such locks: not on Windows nor in some network folders."""
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    # The folder's, because HDF5 locks its files itself.
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
+
+
+def _stamps(path: Path) -> list[tuple[str, int, int]]:
+    """Return name, size and time of change of a file, or of all files in a folder."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    stats = [(file, file.stat()) for file in files if file.is_file()]
+    return [(str(file.relative_to(path.parent)), stat.st_size, stat.st_mtime_ns) for file, stat in stats]

@@ -1,0 +1,1 @@
+"""Other papers' supervision, on the same field."""

@@ -1,0 +1,40 @@
+"""Predictions and results in the layout of nerfbaselines."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from aenerf_ns.export.nerfbaselines import describe_run, write_predictions, write_results
+
+
+def test_predictions_and_results_are_laid_out_as_nerfbaselines_does(tmp_path: Path) -> None:
+    pictures = [Image.fromarray(np.full((4, 6, 3), value, np.uint8)) for value in (10, 20, 30, 40)]
+    info = describe_run("aenerf", "room", 300)
+    folder = tmp_path / "predictions"
+    write_predictions(folder, [("b", *pictures[:2]), ("a", *pictures[2:])], info)
+    for kind, name, value in (("color", "b", 10), ("gt-color", "b", 20), ("color", "a", 30), ("gt-color", "a", 40)):
+        assert np.array_equal(Image.open(folder / kind / f"{name}.png"), np.full((4, 6, 3), value))
+    written = json.loads((folder / "info.json").read_text())
+    assert written.keys() - info.keys() == {"render_version", "render_datetime", "render_dataset_metadata"}
+    assert written["evaluation_protocol"] == written["dataset_metadata"]["evaluation_protocol"] == "default"
+
+    write_results(tmp_path / "results.json", folder, info, {"psnr": [30.25, 20.1], "ssim": [0.7, 0.5]})
+    results = json.loads((tmp_path / "results.json").read_text())
+    # nerfbaselines 1.2.12 computes these values from these metrics.
+    assert results["metrics"] == {"psnr": 25.175, "ssim": 0.6}
+    assert results["metrics_raw"] == {"psnr": "AADyQc3MoEE=", "ssim": "MzMzPwAAAD8="}
+    assert results["metrics_sha256"] == "457960527a1bb69ba7985afbd9d7f1ac934c4d4cfb2c8df20d33ee96a33be702"
+    assert results.keys() == {
+        "render_datetime", "render_version", "render_dataset_metadata", "nb_info", "evaluate_datetime",
+        "evaluate_version", "metrics", "metrics_raw", "metrics_sha256", "predictions_sha256", "ground_truth_sha256",
+        "evaluation_protocol",
+    }  # fmt: skip
+    # In the order of the names.
+    files = (folder / "color" / f"{name}.png" for name in "ab")
+    expected = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    assert results["predictions_sha256"] == expected != results["ground_truth_sha256"]

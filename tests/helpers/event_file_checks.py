@@ -1,0 +1,103 @@
+"""Read event files and check that malformed ones raise one clear line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.open import open_event_file
+from helpers.event_file_writers import Rows
+
+_VENDOR_FILES = Path(__file__).parents[3] / "shared" / "data" / "vendor_formats"
+
+
+def vendor_file(name: str) -> Path:
+    if not (_VENDOR_FILES / name).is_file():
+        pytest.skip(f"the recording {name} is not at ../shared/data/vendor_formats")
+    return _VENDOR_FILES / name
+
+
+def read(file: EventFile) -> np.ndarray:
+    """(N, 4) int64 x, y, t (nanoseconds) and p of all events, checked as training does."""
+    parts = [np.stack([c.x, c.y, c.t, c.p], -1, dtype=np.int64, casting="unsafe") for c in file.chunks()]
+    return np.concatenate(parts)
+
+
+def table(rows: Rows) -> np.ndarray:
+    return np.array(rows, dtype=np.int64) * [1, 1, 1000, 1]
+
+
+def lapless(rows: Rows, lap: int) -> np.ndarray:
+    """The rows as a reader sees them that does not know how often the time wrapped before the first event."""
+    expected = table(rows)
+    expected[:, 2] -= (rows[0][2] // lap) * lap * 1000
+    return expected
+
+
+def attempt(path: Path) -> None:
+    """Reads all there is to read, as `aenerf convert` would."""
+    file = open_event_file(path)
+    file.count()
+    start, end = file.time_span()
+    chunks = list(file.chunks())
+    assert (start, end) == (chunks[0].t[0], chunks[-1].t[-1])
+
+
+def assert_one_line(error: DataError, path: Path) -> None:
+    assert str(error).startswith(f"{path}: ")
+    assert "\n" not in str(error)
+    assert len(str(error)) < 400
+
+
+def assert_rejected(path: Path, content: bytes, message: str) -> None:
+    """Check that a file of this content is an error of one line that holds the message."""
+    path.write_bytes(content)
+    with pytest.raises(DataError) as caught:
+        attempt(path)
+    assert_one_line(caught.value, path)
+    assert message in str(caught.value)
+
+
+# Ways to damage a file, at places given as fractions of its length.
+EDITS = st.lists(
+    st.tuples(
+        st.sampled_from(["set", "flip", "cut", "insert", "repeat", "number"]),
+        st.floats(0, 1, exclude_max=True),
+        st.one_of(st.integers(0, 255), st.sampled_from([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40])),
+    ),
+    max_size=6,
+)
+
+
+def edited(content: bytes, edits: list[tuple[str, float, int]]) -> bytes:
+    data = bytearray(content)
+    for kind, fraction, value in edits:
+        place = int(fraction * len(data))
+        if kind == "cut":
+            del data[place : place + 1 + value % 64 if value < 2**31 else len(data)]
+        elif kind == "insert":
+            data[place:place] = value.to_bytes(6, "little")
+        elif kind == "repeat":
+            data[place:place] = data[place : place + value % 256]
+        elif kind == "number":
+            data[place : place + 4] = (value & 0xFFFFFFFF).to_bytes(4, "little")
+        elif place < len(data):
+            data[place] = value & 0xFF if kind == "set" else data[place] ^ (1 << value % 8)
+    return bytes(data)
+
+
+def survives(path: Path) -> None:
+    """Reads a file that may hold anything: its events are in order and on the sensor, or there is one clear error."""
+    try:
+        file = open_event_file(path)
+        file.count()
+        file.time_span()
+        for chunk in file.chunks():
+            assert len(chunk)
+    except DataError as error:
+        assert_one_line(error, path)

@@ -1,0 +1,151 @@
+"""Small samplers, models and batches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.rotation import rotation_from_vector
+from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.events.pair_store import EventPairs
+from aenerf_ns.events.pairing import pair_events
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
+from aenerf_ns.method.networks import FieldConfig, ProposalConfig
+from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
+from aenerf_ns.supervision.event_pairs import PairSampler, PairSamplerConfig, PairSupervisionConfig
+from helpers.streams import make_stream
+
+CAMERA = CameraIntrinsics(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
+
+
+ALL_LOSSES = {"reconstruction_loss": 1.0, "temporal_loss": 1e-3, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
+
+
+EPOCH = 1_600_000_000_000_000_000
+
+
+def make_scene(
+    sensor: SensorModel, trajectory: Trajectory, camera: CameraIntrinsics = CAMERA, bounded: bool = False
+) -> SceneRecording:
+    return SceneRecording(
+        trajectory=trajectory,
+        ground_truth=None,
+        event_camera=camera,
+        event_file=NoEvents(Path("none"), camera.width, camera.height),
+        sensor=sensor,
+        window=TimeWindow(),
+        camera_times=torch.tensor([0]),
+        has_image=[False],
+        image_encoding="srgb",
+        bounded=bounded,
+    )
+
+
+class NoEvents(EventFile):
+    """Stands where a scene has an event file, in tests that do not read it."""
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        raise AssertionError("no test reads it")
+
+    def time_span(self) -> tuple[int, int]:
+        raise AssertionError("no test reads it")
+
+
+@dataclass
+class FivePairs:
+    """A training dataset of five events at two pixels."""
+
+    scene: SceneRecording
+    pairs: EventPairs
+
+
+def make_sampler(
+    random_poses: torch.Tensor,
+    sensor: SensorModel,
+    camera: CameraIntrinsics = CAMERA,
+    max_events_per_pair: int = 1,
+    share: float = 0.0,
+    temporal: bool = False,
+    learn_refractory_period: bool = False,
+) -> PairSampler:
+    rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
+    stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
+    _, usable = camera.pixel_directions()
+    pairs = pair_events([stream], refractory_period=sensor.refractory_period, usable=usable)
+    trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
+    return PairSamplerConfig(max_events_per_pair=max_events_per_pair, share_to_moments=share).setup(
+        dataset=FivePairs(make_scene(sensor, trajectory, camera), pairs),
+        supervision=PairSupervisionConfig(learn_refractory_period=learn_refractory_period).setup(
+            sensor=sensor, loss_coefficients={"temporal_loss": float(temporal)}
+        ),
+        device="cpu",
+    )
+
+
+SMALL_FIELD = {
+    "num_samples_per_ray": 12, "num_levels": 4, "max_resolution": 32, "log2_hashmap_size": 10, "hidden_dim": 16
+}  # fmt: skip
+SMALL_PROPOSAL = {"num_samples_per_ray": (16,), "max_resolutions": (16,), "num_levels": 2, "log2_hashmap_size": 8}
+
+
+def make_model(
+    sensor: SensorModel | None = None,
+    bounded: bool = False,
+    trajectory: Trajectory | None = None,
+    field: dict[str, Any] | None = None,
+    proposal: dict[str, Any] | None = None,
+    **options: Any,
+) -> AENeRFModel:
+    torch.manual_seed(0)
+    config = AENeRFModelConfig(
+        field=FieldConfig(**{**SMALL_FIELD, **(field or {})}),
+        proposal=ProposalConfig(**{**SMALL_PROPOSAL, **(proposal or {})}),
+        **options,
+    )
+    ends = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    ends[:, 2, 3] = 3
+    ends[:, 0, 3] = torch.tensor([-0.3, 0.3])
+    ends[1, :3, :3] = rotation_from_vector(torch.tensor([0.03, -0.06, 0.1], dtype=torch.float64))
+    scene = make_scene(sensor or SensorModel(0.2, 0.3), trajectory or Trajectory([0, 10**9], ends), bounded=bounded)
+    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    return config.setup(scene_box=box, num_train_data=1, metadata={SCENE_KEY: scene})
+
+
+def make_rays(count: int = 10, away: bool = False, with_times: bool = False) -> RayBundle:
+    """Rays from z = 3 towards the scene box, or past it."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.tensor([0.0, 0.0, 1.0 if away else -1.0]) + 0.1 * torch.randn(count, 3, generator=generator)
+    directions = F.normalize(directions, dim=-1)
+    return RayBundle(
+        origins=torch.tensor([0.0, 0.0, 3.0]).expand(count, 3),
+        directions=directions,
+        pixel_area=torch.ones(count, 1),
+        camera_indices=torch.zeros(count, 1, dtype=torch.long),
+        times=torch.rand(count, 1, generator=generator, dtype=torch.float64) if with_times else None,
+        metadata={"camera_directions": directions.double()} if with_times else {},
+    )
+
+
+def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
+    positive = (torch.arange(num_pairs) % 2).float()
+    return {
+        "num_positive": positive,
+        "num_negative": 1 - positive,
+        "last_num_positive": positive,
+        "last_num_negative": 1 - positive,
+        "last_interval": torch.full((num_pairs,), 1e-3),
+        "channel": torch.zeros(num_pairs, dtype=torch.long),
+        "ends_between_events": torch.zeros(num_pairs, dtype=torch.bool),
+    }

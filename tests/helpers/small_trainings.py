@@ -1,0 +1,47 @@
+"""Small trainings in the tests' own process."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import writer
+
+from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.training.trainer import AENeRFTrainer, AENeRFTrainerConfig
+from helpers.small_pipelines import make_pipeline_config
+
+
+def train_small_model(folder: Path, name: str, num_steps: int, seed: int = 42, **options: Any) -> AENeRFTrainer:
+    """Train a small model as ns-train does, on the dataset ``data`` of a folder."""
+    config = AENeRFTrainerConfig(
+        method_name="aenerf",
+        experiment_name=name,
+        timestamp="now",
+        output_dir=folder,
+        vis="tensorboard",
+        max_num_iterations=num_steps,
+        pipeline=make_pipeline_config(folder / "data", pose_correction="spline"),
+        optimizers=deepcopy(aenerf.config.optimizers),
+        gradient_accumulation_steps=aenerf.config.gradient_accumulation_steps,
+        logging=aenerf.config.logging,
+        **options,
+    )
+    config.pipeline.datamanager.train_num_rays_per_batch = 64
+    config.machine.device_type = "cpu"
+    for group in config.optimizers.values():
+        group["scheduler"].warm_up = 4
+    config.optimizers["camera_opt"]["scheduler"].delay = 2
+    torch.manual_seed(seed)
+    try:
+        config.save_config()
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.train()
+    finally:
+        # The framework keeps them for good.
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
+    return trainer

@@ -1,0 +1,420 @@
+"""Recordings of one's own with an event file of each vendor's format, or with poses from COLMAP, and bombs in them."""
+
+from __future__ import annotations
+
+import bz2
+import json
+import shutil
+import sqlite3
+import struct
+from collections.abc import Callable
+from contextlib import closing
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
+from aenerf_ns.recording.options import EventDataParserConfig
+from helpers.bag_writers import ARRAY, PACKET, array_message, packet_message, write_bag, write_bag2
+from helpers.event_file_writers import (
+    HEIGHT,
+    WIDTH,
+    Rows,
+    aedat4_file,
+    aedat4_packet,
+    dat,
+    evt2,
+    evt3,
+    evt3_words,
+    flat_table,
+)
+from helpers.malformed_inputs import all_of
+from helpers.published_datasets import write_own
+
+# From 0.1 to 0.7 s, four events a pixel.
+ROWS: Rows = [(x % 30, 5 + x % 3, 100_000 + 5000 * x, 1 - 2 * (x // 30 % 2)) for x in range(120)]
+STAMP = 10**8
+PARTS = [ROWS[begin : begin + 20] for begin in range(0, len(ROWS), 20)]
+NAME = "events"
+
+
+def _around(folder: Path, write_events: Callable[[Path], object], suffix: str) -> Path:
+    """Write calibration and poses, and the events beside them."""
+    folder.mkdir()
+    camera = {"width": WIDTH, "height": HEIGHT, "fl_x": 50.0, "fl_y": 50.0, "cx": 32.0, "cy": 24.0}
+    (folder / "calibration.json").write_text(json.dumps({"event_camera": camera}))
+    lines = [f"{time:.1f} {time} 0 {time * time} 0 0 0 1\n" for time in np.arange(0, 1.05, 0.1)]
+    (folder / "trajectory.txt").write_text("".join(lines))
+    write_events(folder / f"{NAME}{suffix}")
+    return folder
+
+
+def _bytes(content: Callable[[Rows], bytes]) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(content(ROWS))
+
+
+def _messages() -> list[tuple[int, bytes]]:
+    return [(STAMP + part[-1][2] * 1000, array_message(part)) for part in PARTS]
+
+
+def _bag(path: Path, compress: str = "") -> None:
+    write_bag(path, {"/events": (ARRAY, _messages())}, compress)
+
+
+def _packets(path: Path) -> None:
+    stream = evt3_words(ROWS).tobytes()
+    cuts = range(0, len(stream), 200)
+    packets = [
+        (10**8 + 10**7 * i, packet_message(i, 10**8 + 10**7 * i, stream[c : c + 200])) for i, c in enumerate(cuts)
+    ]
+    write_bag(path, {"/events": (PACKET, packets)})
+
+
+def _bag2(path: Path, storage: str) -> None:
+    """The file in the folder of a bag of ROS 2."""
+    folder = path.with_name("bag2")
+    write_bag2(folder, _messages(), ARRAY, storage)
+    shutil.move(next(folder.glob(f"*{path.suffix}")), path)
+    shutil.rmtree(folder)
+
+
+def _lz4(rows: Rows) -> bytes:
+    from lz4.frame import compress
+
+    return aedat4_file(rows, 1, compress, with_table=bool(rows))
+
+
+def write_with_colmap(folder: Path) -> None:
+    """A recording whose poses are COLMAP's, in its binary format."""
+    truth = write_own(folder)
+    (folder / "trajectory.txt").unlink()
+    (folder / "colmap").mkdir()
+    images = []
+    for index in range(3):
+        world_to_camera = np.linalg.inv(truth.poses[5 * index])
+        images.append(colmap_image(index + 1, f"{index:05d}.png", world_to_camera))
+    (folder / "colmap" / "images.bin").write_bytes(struct.pack("<Q", len(images)) + b"".join(images))
+
+
+def colmap_image(number: int, name: str, world_to_camera: np.ndarray) -> bytes:
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(world_to_camera[:3, :3]).as_quat()
+    head = struct.pack("<I7dI", number, w, x, y, z, *world_to_camera[:3, 3], 1)
+    return head + name.encode() + b"\0" + struct.pack("<Q", 2) + struct.pack("<2dQ", 1.0, 2.0, 3) * 2
+
+
+def config_of_recording(folder: Path) -> EventDataParserConfig:
+    """The configuration that reads a recording, whose events may be a folder."""
+    events = folder / NAME
+    return OwnRecordingDataParserConfig(data=folder, events=events if events.is_dir() else None)
+
+
+RECORDINGS: dict[str, Callable[[Path], object]] = {
+    "evt2": partial(_around, write_events=_bytes(evt2), suffix=".raw"),
+    "evt3": partial(_around, write_events=_bytes(evt3), suffix=".raw"),
+    "dat": partial(_around, write_events=_bytes(dat), suffix=".dat"),
+    "aedat4": partial(_around, write_events=_bytes(aedat4_file), suffix=".aedat4"),
+    "aedat4 lz4": partial(_around, write_events=_bytes(_lz4), suffix=".aedat4"),
+    "bag": partial(_around, write_events=_bag, suffix=".bag"),
+    "bag lz4": partial(_around, write_events=partial(_bag, compress="LZ4"), suffix=".bag"),
+    "bag packets": partial(_around, write_events=_packets, suffix=".bag"),
+    "db3": partial(_around, write_events=partial(_bag2, storage="SQLITE3"), suffix=".db3"),
+    "mcap": partial(_around, write_events=partial(_bag2, storage="MCAP"), suffix=".mcap"),
+    "colmap": write_with_colmap,
+    "bag of ROS 2": partial(_around, write_events=lambda path: write_bag2(path, _messages(), ARRAY), suffix=""),
+}
+"""By a name: writes a whole recording to a folder."""
+
+
+# Bombs. Each change makes a whole recording of the kind before the colon one that must be refused.
+
+
+def _edit(suffix: str, change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    def edit(folder: Path) -> None:
+        (path,) = folder.glob(f"**/{suffix}" if "/" in suffix else f"**/*{suffix}")
+        path.write_bytes(change(path.read_bytes()))
+
+    return edit
+
+
+def _sparse(suffix: str, begin: bytes | None = None, end: bytes = b"", gigabytes: int = 8) -> Callable[[Path], object]:
+    """Put zeros without end, which take no room on the disk, behind the file or behind a beginning."""
+
+    def edit(folder: Path) -> None:
+        (path,) = folder.glob(f"**/{suffix}" if "/" in suffix else f"**/*{suffix}")
+        with path.open("r+b") as file:
+            if begin is not None:
+                file.truncate(0)
+                file.write(begin)
+            # Words and records stay whole.
+            file.truncate(file.seek(0, 2) + (gigabytes << 30))
+            file.seek(0, 2)
+            file.write(end)
+
+    return edit
+
+
+def _bag_chunk(compression: bytes, size: int, data: bytes, stated: int | None = None) -> Callable[[Path], object]:
+    """Put other data in the only chunk of a bag of ROS 1, with their compression, and the sizes that they state."""
+
+    def edit(folder: Path) -> None:
+        (path,) = folder.glob("*.bag")
+        content = path.read_bytes()
+        # Behind the magic and the first record.
+        begin = len(b"#ROSBAG V2.0\n") + 4096
+        header_end = begin + 4 + struct.unpack_from("<I", content, begin)[0]
+        end = header_end + 4 + struct.unpack_from("<I", content, header_end)[0]
+        fields = [b"op=\x05", b"compression=" + compression, b"size=" + struct.pack("<I", size)]
+        header = b"".join(struct.pack("<I", len(field)) + field for field in fields)
+        length = len(data) if stated is None else stated
+        chunk = struct.pack("<I", len(header)) + header + struct.pack("<I", length) + data
+        # Where the index begins is in the first record.
+        place = content.index(b"index_pos=") + len(b"index_pos=")
+        (index,) = struct.unpack_from("<Q", content, place)
+        index = struct.pack("<Q", index + len(chunk) - (end - begin))
+        path.write_bytes(content[:place] + index + content[place + 8 : begin] + chunk + content[end:])
+
+    return edit
+
+
+def _sql(*commands: str) -> Callable[[Path], object]:
+    def edit(folder: Path) -> None:
+        (path,) = folder.glob("*.db3")
+        with closing(sqlite3.connect(path)) as database:
+            for command in commands:
+                database.execute(command)
+            database.commit()
+
+    return edit
+
+
+def _in_every_message(content: Callable[[], bytes]) -> Callable[[Path], object]:
+    """Write other bytes to every message of a database."""
+
+    def edit(folder: Path) -> None:
+        (path,) = folder.rglob("*.db3")
+        with closing(sqlite3.connect(path)) as database:
+            database.execute("UPDATE messages SET data = ?", [content()])
+            database.commit()
+
+    return edit
+
+
+def _metadata(old: str, new: str) -> Callable[[Path], object]:
+    return lambda folder: _edit("metadata.yaml", lambda text: text.replace(old.encode(), new.encode()))(folder)
+
+
+def _compressed(mode: str) -> Callable[[Path], object]:
+    return all_of(
+        _metadata("compression_mode: ''", f"compression_mode: {mode}"),
+        _metadata("compression_format: ''", "compression_format: zstd"),
+    )
+
+
+def _huge_chunk(content: bytes) -> bytes:
+    """Put 2^62 bytes in place of the size of the first chunk, wherever an MCAP file states it."""
+    # Behind the magic, the header, kind and size of the chunk, and its two times.
+    place = 8 + 9 + struct.unpack_from("<Q", content, 9)[0] + 9 + 16
+    return content.replace(content[place : place + 8], struct.pack("<Q", 1 << 62))
+
+
+@cache
+def zstd_bomb(gigabytes: int = 4) -> bytes:
+    from backports.zstd import ZstdCompressor
+
+    packer = ZstdCompressor()
+    return b"".join([packer.compress(bytes(1 << 26)) for _ in range(16 * gigabytes)]) + packer.flush()
+
+
+@cache
+def lz4_bomb(beginning: bytes = b"") -> bytes:
+    from lz4.frame import LZ4FrameCompressor
+
+    packer = LZ4FrameCompressor()
+    parts = [packer.begin(), packer.compress(beginning)]
+    return b"".join([*parts, *(packer.compress(bytes(1 << 26)) for _ in range(48)), packer.flush()])
+
+
+@cache
+def bz2_bomb() -> bytes:
+    """4 GB as streams of 64 MB behind one another."""
+    return bz2.compress(bytes(1 << 26)) * 64
+
+
+def _mcap_chunk(data: Callable[[], bytes], compression: bytes, size: int) -> Callable[[Path], object]:
+    """Write an MCAP file of one chunk, without an index."""
+
+    def record(kind: int, content: bytes) -> bytes:
+        return struct.pack("<BQ", kind, len(content)) + content
+
+    def edit(folder: Path) -> None:
+        (path,) = folder.glob("*.mcap")
+        packed = data()
+        head = struct.pack("<I4sI4s", 4, b"ros2", 4, b"none")
+        chunk = struct.pack("<QQQI", STAMP, 2 * STAMP, size, 0) + struct.pack("<I", len(compression)) + compression
+        records = record(1, head) + record(6, chunk + struct.pack("<Q", len(packed)) + packed)
+        footer = record(2, struct.pack("<QQI", 0, 0, 0))
+        path.write_bytes(b"\x89MCAP0\r\n" + records + footer + b"\x89MCAP0\r\n")
+
+    return edit
+
+
+_ENDLESS = (
+    "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS id, 1 AS topic_id, i AS timestamp"
+)
+
+
+def _packet(beginning: bytes, packed: bytes) -> bytes:
+    """An AEDAT4 file with one more packet of the stream of events."""
+    return beginning + struct.pack("<2i", 0, len(packed)) + packed
+
+
+def _zstd(content: bytes) -> bytes:
+    from backports.zstd import compress
+
+    return compress(content)
+
+
+def _many_zeros(_: bytes) -> bytes:
+    """Forty packets of 8 million events at one time."""
+    from lz4.frame import compress
+
+    size = 1 << 23
+    events = flat_table(b"EVTS", [b""], 0, bytes(16 * size), size)
+    packed = compress(struct.pack("<I", len(events)) + events)
+    return aedat4_file([], 1, compress) + (struct.pack("<2i", 0, len(packed)) + packed) * 40
+
+
+def _huge_vector(_: bytes) -> bytes:
+    events = flat_table(b"EVTS", [b""], 0, bytes(16), 2**32 - 1)
+    return _packet(aedat4_file([]), struct.pack("<I", len(events)) + events)
+
+
+def _bag_number(name: bytes, number: bytes) -> Callable[[Path], object]:
+    """Put another number into the first record of a bag of ROS 1."""
+
+    def change(content: bytes) -> bytes:
+        place = content.index(name) + len(name)
+        return content[:place] + number + content[place + len(number) :]
+
+    return _edit(".bag", change)
+
+
+def _as_text(folder: Path) -> None:
+    (folder / "colmap" / "images.bin").rename(folder / "colmap" / "images.txt")
+
+
+_HEADER = struct.pack("<2I", HEIGHT, WIDTH)
+_LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 12)
+)
+_ROS2_HEAD = struct.pack("<BQI4sI", 1, 12, 4, b"ros2", 0)
+
+BOMBS: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "evt2: zeros without end": ("evt2", _sparse(".raw")),
+    "evt2: only zeros": ("evt2", _sparse(".raw", b"% evt 2.0\n% geometry 64x48\n% end\n")),
+    "evt3: zeros without end": ("evt3", _sparse(".raw")),
+    "evt3: only zeros": ("evt3", _sparse(".raw", b"% evt 3.0\n% geometry 64x48\n% end\n")),
+    "evt3: a geometry of 10^9 x 10^9": ("evt3", _edit(".raw", lambda b: b.replace(b"width=64", b"width=999999999"))),
+    "evt2: a header without end": ("evt2", _edit(".raw", lambda b: b"% a b\n" * 10**6 + b)),
+    "dat: zeros without end": ("dat", _sparse(".dat")),
+    "dat: only zeros": ("dat", _sparse(".dat", dat([]))),
+    "dat: records of 255 bytes": ("dat", _edit(".dat", lambda b: b.replace(b"\x0c\x08", b"\x0c\xff"))),
+    "dat: a width of 10^9": ("dat", _edit(".dat", lambda b: b.replace(b"Width 64", b"Width 999999999"))),
+    "aedat4: zeros without end": ("aedat4", _sparse(".aedat4")),
+    "aedat4: zeros in place of packets": ("aedat4", _sparse(".aedat4", aedat4_file([])[:-100])),
+    "aedat4: a packet of 2 GB": (
+        "aedat4",
+        all_of(_edit(".aedat4", lambda b: b + struct.pack("<2i", 0, 2**31 - 1)), _sparse(".aedat4")),
+    ),
+    "aedat4: a header of 4 GB": (
+        "aedat4",
+        all_of(_edit(".aedat4", lambda b: b[:14] + b"\xff" * 4), _sparse(".aedat4")),
+    ),
+    "aedat4: a packet that unpacks to 3 GB": (
+        "aedat4 lz4",
+        lambda folder: _edit(".aedat4", lambda _: _packet(_lz4([]), lz4_bomb(aedat4_packet(ROWS))))(folder),
+    ),
+    "aedat4: zstd that unpacks to 4 GB": (
+        "aedat4",
+        lambda folder: _edit(".aedat4", lambda _: _packet(aedat4_file([], 3, _zstd), zstd_bomb()))(folder),
+    ),
+    "aedat4: packets that unpack to 5 GB": ("aedat4 lz4", lambda folder: _edit(".aedat4", _many_zeros)(folder)),
+    "aedat4: a vector of 4 * 10^9 events": ("aedat4", _edit(".aedat4", _huge_vector)),
+    "bag: a chunk that says to have 4 GB": ("bag", _bag_chunk(b"none", 2**32 - 1, b"", 2**32 - 1)),
+    "bag: lz4 that unpacks to 3 GB": ("bag lz4", lambda f: _bag_chunk(b"lz4", 2**32 - 1, lz4_bomb())(f)),
+    "bag: bz2 that unpacks to 4 GB": ("bag", lambda f: _bag_chunk(b"bz2", 2**32 - 1, bz2_bomb())(f)),
+    "bag: zeros without end": ("bag", all_of(_bag_number(b"index_pos=", struct.pack("<Q", 7 << 30)), _sparse(".bag"))),
+    "bag: 4 * 10^9 topics": ("bag", _bag_number(b"conn_count=", b"\xff" * 4)),
+    "bag: 4 * 10^9 chunks": ("bag", _bag_number(b"chunk_count=", b"\xff" * 4)),
+    "bag: an array of 4 * 10^9 events": ("bag", _edit(".bag", lambda b: b.replace(_HEADER, _HEADER + b"\xff" * 4))),
+    "bag: a sensor of 4 * 10^9 columns": ("bag", _edit(".bag", lambda b: b.replace(_HEADER, b"\xff" * 8))),
+    "db3: a view without end": (
+        "db3",
+        _sql("ALTER TABLE messages RENAME TO others", f"CREATE VIEW messages AS {_ENDLESS}, x'00' AS data FROM n"),
+    ),
+    "db3: a view of 1 GB": (
+        "db3",
+        _sql(
+            "ALTER TABLE messages RENAME TO others",
+            "CREATE VIEW messages AS SELECT id, topic_id, timestamp, zeroblob(999999999) AS data FROM others",
+        ),
+    ),
+    "db3: a computed column": (
+        "db3",
+        _sql(
+            "ALTER TABLE messages RENAME TO others",
+            "CREATE TABLE messages (id INTEGER, topic_id INTEGER, timestamp INTEGER, "
+            "data BLOB GENERATED ALWAYS AS (zeroblob(999999999)) VIRTUAL)",
+            "INSERT INTO messages (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM others",
+        ),
+    ),
+    "db3: messages of zeros": ("db3", _in_every_message(lambda: bytes(1 << 20))),
+    "db3: zeros without end": ("db3", _edit(".db3", lambda b: b[:100] + bytes(len(b) - 100))),
+    "mcap: zeros without end": ("mcap", _sparse(".mcap", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n")),
+    "mcap: zeros with a footer": (
+        "mcap",
+        _sparse(
+            ".mcap",
+            b"\x89MCAP0\r\n" + _ROS2_HEAD,
+            struct.pack("<BQQQI", 2, 20, 0, 0, 0) + b"\x89MCAP0\r\n",
+        ),
+    ),
+    "mcap: a chunk of 2^62 bytes": ("mcap", _edit(".mcap", _huge_chunk)),
+    "mcap: zstd that unpacks to 4 GB": ("mcap", _mcap_chunk(zstd_bomb, b"zstd", 4 << 30)),
+    "mcap: lz4 that unpacks to 3 GB": ("mcap", _mcap_chunk(lz4_bomb, b"lz4", 3 << 30)),
+    "bag of ROS 2: messages of 4 GB": ("bag of ROS 2", all_of(_compressed("message"), _in_every_message(zstd_bomb))),
+    "bag of ROS 2: a file of 4 GB": (
+        "bag of ROS 2",
+        all_of(_compressed("file"), lambda folder: _edit(".db3", lambda _: zstd_bomb())(folder)),
+    ),
+    "bag of ROS 2: metadata of 1 GB": ("bag of ROS 2", _sparse("metadata.yaml", gigabytes=1)),
+    "bag of ROS 2: nested metadata": ("bag of ROS 2", _edit("metadata.yaml", lambda _: b"[" * 100_000)),
+    "bag of ROS 2: metadata that multiply": (
+        "bag of ROS 2",
+        _edit("metadata.yaml", lambda _: f"{_LAUGHS}rosbag2_bagfile_information: *a11\n".encode()),
+    ),
+    "bag of ROS 2: a file 10^5 times": (
+        "bag of ROS 2",
+        _metadata("  - events.db3\n", "  - events.db3\n" * 5_000),
+    ),
+    "colmap: 10^18 images": ("colmap", _edit("images.bin", lambda b: struct.pack("<Q", 10**18) + b[8:])),
+    "colmap: zeros without end": (
+        "colmap",
+        all_of(_edit("images.bin", lambda b: struct.pack("<Q", 10**6) + b[8:]), _sparse("images.bin")),
+    ),
+    "colmap: 10^12 features": (
+        "colmap",
+        _edit(
+            "images.bin", lambda b: b.replace(b".png\0" + struct.pack("<Q", 2), b".png\0" + struct.pack("<Q", 10**12))
+        ),
+    ),
+    "colmap: a name without end": ("colmap", _edit("images.bin", lambda b: b[:80] + b"a" * 10**7)),
+    "colmap: a text without end": ("colmap", all_of(_as_text, _sparse("colmap/images.txt", b"1 1 0 0 0 0 0 0 1 a\n"))),
+    "colmap: a line without end": (
+        "colmap",
+        all_of(_as_text, _sparse("colmap/images.txt", b"1 1 0 0 0 0 0 0 1 a\n", gigabytes=2)),
+    ),
+}

@@ -1,0 +1,269 @@
+"""Poses from frames: what COLMAP makes of a short video, and the arithmetic around it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from aenerf_ns.camera.alignment import Similarity, align
+from aenerf_ns.camera.image_encoding import decode
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.rotation import rotation_from_vector
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.cli import simulate as command
+from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.poses_from_frames.structure_from_motion import (
+    EstimatedPoses,
+    colmap_camera,
+    compare_with_truth,
+    estimate_poses,
+)
+from aenerf_ns.recording.scene import SCENE_KEY
+from aenerf_ns.simulator.open_scene import built_in_scene
+from aenerf_ns.simulator.scene import SimulationScene
+from aenerf_ns.simulator.simulation import Simulation
+
+FRAME = 40_000_000
+
+
+@pytest.fixture(scope="module")
+def room() -> SimulationScene:
+    """The room, on the first seventh of its loop."""
+    whole = built_in_scene("room")
+    return dataclasses.replace(whole, path=lambda s: whole.path(s / 7))
+
+
+@pytest.fixture(scope="module")
+def dataset(room: SimulationScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A dataset whose poses COLMAP estimated from 14 frames, and what the command printed."""
+    folder = tmp_path_factory.mktemp("colmap") / "scene"
+    with pytest.MonkeyPatch.context() as patch, command.CONSOLE.capture() as output:
+        patch.setattr(command, "open_scene", lambda *_: room)
+        Simulate(
+            folder, poses="colmap", width=160, height=120, duration=14 / 25 - 0.03, max_displacement=2.0,
+            train_images=3, validation_views=1, test_views=1,
+        ).main()  # fmt: skip
+    return folder, output.get()
+
+
+def test_colmap_estimates_the_poses_of_a_simulated_camera(dataset: tuple[Path, str]) -> None:
+    folder, output = dataset
+    report = json.loads((folder / "poses_report.json").read_text())
+    assert report["frames"] == 14
+    assert report["registered_frames"] == report["model_sizes"][0] == 14
+    assert report["mean_reprojection_error_pixels"] < 1
+    # Measured: 0.7 degrees and 8 mm at the frames of a path of 1.1 m; about the same between them.
+    for name in ("errors", "errors_between_frames"):
+        assert report[name]["rotation_error_degrees"] < 2
+        assert report[name]["translation_error"] < 0.03
+    errors = report["errors"]
+    assert errors["largest_rotation_error_degrees"] < 4
+    assert errors["misplaced_frames"] == errors["flipped_frames"] == 0
+    assert "14 of 14 frames registered" in output
+    assert "without a pose" not in output
+
+
+def test_the_estimated_poses_are_in_the_dataset_in_metres(dataset: tuple[Path, str]) -> None:
+    folder, _ = dataset
+    estimated, truth = (
+        read_tum_trajectory(folder / f"trajectory_{name}.txt") for name in ("estimated", "ground_truth")
+    )
+    assert np.diff(estimated.times.numpy()).tolist() == [FRAME] * 13
+    assert estimated.start == 1_500_000
+    true = truth.interpolate(estimated.times)
+    # Neither exact, nor in a world or scale of COLMAP's own.
+    error = (estimated.camera_to_worlds - true)[..., 3].norm(dim=-1)
+    assert 1e-5 < error.mean() < 0.05 * estimated.extent
+    # Events before the first estimated pose and after the last one are not trained on.
+    outputs = NativeDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
+    window = outputs.metadata[SCENE_KEY].window
+    assert estimated.start <= window.start < window.end == estimated.end < truth.end
+
+
+def test_colmap_estimates_the_lens_where_none_is_given(room: SimulationScene) -> None:
+    camera = CameraIntrinsics(160, 120, *room.intrinsics(160, 120))
+    simulation = Simulation(room, camera, SensorModel(), "easy", 14 / 25 - 0.03, 2.0, 0)
+    times = simulation.frame_times(25.0, 0.003)
+    frames = [simulation.blurred_frame(int(time), 0.003) for time in times]
+    found = estimate_poses(frames, times, (160, 120), "frames")
+    assert len(found.trajectory) == len(frames)
+    assert found.camera.fx == found.camera.fy == pytest.approx(camera.fx, rel=0.05)
+    assert (found.camera.cx, found.camera.cy) == (80, 60)
+    assert abs(found.camera.distortion[0]) < 0.05
+    assert found.camera.distortion[1:] == (0.0,) * 4
+
+
+def test_frames_without_texture_are_told() -> None:
+    frames = np.full((4, 60, 80), 128, np.uint8)
+    with pytest.raises(DataError, match=r"^flat: COLMAP places none of 4 frames: they have 0 .*; .*textured") as told:
+        estimate_poses(frames, np.arange(4) * FRAME, CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0), "flat")
+    assert "\n" not in str(told.value)
+
+
+def test_unusable_frames_are_told(tmp_path: Path) -> None:
+    camera = CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
+    frames = np.full((2, 60, 80), 128, np.uint8)
+    for times, text in (([0], "1 frames"), ([5, 5], "frame 1 is not after")):
+        with pytest.raises(DataError, match=text):
+            estimate_poses(frames, times, camera, "video")
+    with pytest.raises(DataError, match="video, frame 0: the frame has 60 x 80 pixels"):
+        estimate_poses(frames.transpose(0, 2, 1), [0, 1], camera, "video")
+    Image.fromarray(frames[0].astype(np.uint16)).save(tmp_path / "deep.png")
+    with pytest.raises(DataError, match=r"deep\.png: the image is of PIL's mode I;16"):
+        estimate_poses([tmp_path / "deep.png"] * 2, [0, 1], camera, "video")
+
+
+@pytest.mark.parametrize(
+    ("lens", "distortion"),
+    [
+        ("radial_tangential", (0.0,) * 5),
+        ("radial_tangential", (-0.3, 0.1, 0.002, -0.001, -0.02)),
+        ("fisheye", (0.05, -0.02, 0.01, -0.003)),
+    ],
+)
+def test_colmap_has_the_same_lens(lens: str, distortion: tuple[float, ...]) -> None:
+    import pycolmap
+
+    camera = CameraIntrinsics(80, 60, 70.0, 72.0, 41.0, 29.0, lens, distortion)
+    model, parameters = colmap_camera(camera)
+    colmap = pycolmap.Camera(model=model, width=80, height=60, params=parameters)
+    directions, valid = camera.pixel_directions()
+    assert valid.all()
+    plane = (directions / -directions[..., 2:]).reshape(-1, 3) * [1, -1, -1]
+    columns, rows = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    np.testing.assert_allclose(
+        colmap.img_from_cam(np.ascontiguousarray(plane)), np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("pattern", ["", "RGGB"])
+def test_a_blurred_frame_is_the_mean_of_sharp_ones_in_linear_light(room: SimulationScene, pattern: str) -> None:
+    camera = CameraIntrinsics(64, 48, *room.intrinsics(64, 48))
+    simulation = Simulation(room, camera, SensorModel(bayer_pattern=pattern), "hard", 0.5, 0.5, 0)
+    time, exposure, steps = 100_000_000, 0.04, 64
+    frame = simulation.blurred_frame(time, exposure)
+    assert frame.shape == ((48, 64, 3) if pattern else (48, 64))
+
+    def light(picture: np.ndarray) -> np.ndarray:
+        return decode(torch.from_numpy(picture / 255), "srgb").numpy()
+
+    offsets = ((np.arange(steps) + 0.5) / steps - 0.5) * exposure * 1e9
+    sharp = np.stack([simulation.blurred_frame(time + int(offset), 1e-9) for offset in offsets])
+    # 8 bits of sRGB differ by up to 0.009 in light.
+    error = np.abs(light(frame) - light(sharp).mean(0))
+    assert error.mean() < 0.002
+    assert error.max() < 0.02
+    # It is a blur, and the mean of the sharp ones' sRGB would be another picture.
+    assert np.abs(light(frame) - light(sharp[steps // 2])).mean() > 0.01
+
+
+def test_frames_are_taken_all_along_the_path(room: SimulationScene) -> None:
+    camera = CameraIntrinsics(16, 12, *room.intrinsics(16, 12))
+    simulation = Simulation(room, camera, SensorModel(), "easy", 0.41, 2.0, 0)
+    assert simulation.frame_times(25, 0.01).tolist() == [5_000_000 + FRAME * k for k in range(11)]
+    assert len(simulation.frame_times(25, 0.0101)) == 10
+    for rate, exposure, text in (
+        (0, 0.003, "cannot be taken"),
+        (25, 0.05, "cannot be taken"),
+        (2, 0.003, "fewer than"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            simulation.frame_times(rate, exposure)
+
+
+@pytest.fixture
+def truth() -> torch.Tensor:
+    """(40, 3, 4) poses on a circle of radius 2 that turn with it."""
+    angle = torch.linspace(0, 5, 40, dtype=torch.float64)
+    rotations = rotation_from_vector(torch.stack([torch.zeros(40), torch.zeros(40), angle], -1).double())
+    positions = 2 * torch.stack([angle.cos(), angle.sin(), 0.1 * angle], -1)
+    return torch.cat([rotations, positions[..., None]], -1)
+
+
+def test_the_metric_world_is_found_exactly(truth: torch.Tensor) -> None:
+    rotation = rotation_from_vector(torch.tensor([0.4, -1.1, 2.0], dtype=torch.float64))
+    shift = torch.tensor([3.0, -5, 8], dtype=torch.float64)
+    elsewhere = Similarity(torch.tensor(0.037, dtype=torch.float64), rotation, shift)(truth)
+    aligned, errors = compare_with_truth(Trajectory(FRAME * np.arange(40), elsewhere), truth)
+    torch.testing.assert_close(aligned.camera_to_worlds, truth, rtol=0, atol=1e-10)
+    assert errors.pop("extent") == pytest.approx(Trajectory(FRAME * np.arange(40), truth).extent)
+    assert max(errors.values()) < 1e-8
+
+
+def test_misplaced_and_flipped_frames_are_counted_and_kept(truth: torch.Tensor) -> None:
+    poses = truth.clone()
+    # The last third looks the other way, one frame is turned by 8 degrees, one stands a unit aside.
+    for index, vector in ((slice(28, 40), [0, torch.pi * 0.9, 0]), (20, [np.radians(8), 0, 0])):
+        poses[index, :, :3] = truth[index, :, :3] @ rotation_from_vector(torch.tensor(vector, dtype=torch.float64))
+    poses[10, 2, 3] += 1
+    elsewhere = Similarity(torch.tensor(3.0).double(), truth[7, :, :3], truth[3, :, 3])(poses)
+    aligned, errors = compare_with_truth(Trajectory(FRAME * np.arange(40), elsewhere), truth)
+    assert len(aligned) == 40
+    assert errors["flipped_frames"] == 12
+    assert errors["misplaced_frames"] == 14
+    # Those that are right stay in place.
+    assert errors["median_rotation_error_degrees"] < 2
+    assert errors["median_translation_error"] < 0.1
+    assert errors["largest_rotation_error_degrees"] == pytest.approx(162, abs=2)
+    assert errors["largest_translation_error"] == pytest.approx(1, abs=0.1)
+    # All frames together would be turned away from the truth.
+    assert errors["rotation_error_degrees"] > 45
+
+
+def test_without_a_majority_all_frames_count(truth: torch.Tensor) -> None:
+    # A drift by which no two frames turn the world alike.
+    drift = rotation_from_vector(torch.linspace(0, 2.5, 40).double()[:, None] * torch.tensor([1.0, 0, 0]).double())
+    poses = torch.cat([drift @ truth[..., :3], truth[..., 3:]], -1)
+    aligned, errors = compare_with_truth(Trajectory(FRAME * np.arange(40), poses), truth)
+    expected = align(poses, truth)(poses)
+    torch.testing.assert_close(aligned.camera_to_worlds, expected, rtol=0, atol=1e-12)
+    assert errors["misplaced_frames"] > 30
+
+
+def test_lost_frames_and_fragments_are_told(truth: torch.Tensor) -> None:
+    times = FRAME * np.arange(10)
+    camera = CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
+    found = EstimatedPoses(times, Trajectory(times[[1, 2, 5, 6, 8]], truth[:5]), camera, [5, 3], 100, 0.5, 200.0, 1.0)
+    assert found.gaps() == [(0, 0, 1), (3 * FRAME, 4 * FRAME, 2), (7 * FRAME, 7 * FRAME, 1), (9 * FRAME, 9 * FRAME, 1)]
+    report = found.report()
+    assert json.loads(json.dumps(report)) == report
+    assert (report["frames"], report["registered_frames"], report["registered_fraction"]) == (10, 5, 0.5)
+    assert report["model_sizes"] == [5, 3]
+    assert "5 of 10 frames registered in the largest of 2 models" in found.summary()
+    assert "0.120 to 0.160 s (2)" in found.summary()
+    many = Trajectory(FRAME * np.arange(0, 40, 2), truth[:20])
+    told = dataclasses.replace(found, frame_times=FRAME * np.arange(40), trajectory=many).summary()
+    assert told.count("(1)") == 10
+    assert "and 10 more runs" in told
+    whole = dataclasses.replace(found, frame_times=times[[1, 2, 5, 6, 8]], model_sizes=[5])
+    assert whole.gaps() == []
+    assert "\n" not in whole.summary()
+
+
+def test_a_frame_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    whole = tmp_path / "whole.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (12, 16), np.uint8)).save(whole)
+    cut = tmp_path / "cut.png"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    camera = CameraIntrinsics(16, 12, 10.0, 10.0, 8.0, 6.0)
+    with pytest.raises(DataError, match=r"cut.png: not a PNG or JPEG image that can be read"):
+        estimate_poses([whole, cut], FRAME * np.arange(2), camera, "frames", 0)
+
+
+def test_pose_noise_and_colmap_exclude_each_other(room: SimulationScene, tmp_path: Path) -> None:
+    options = Simulate(tmp_path / "scene", poses="colmap", pose_noise_degrees=1.0, width=16, height=12, duration=0.5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "open_scene", lambda *_: room)
+        with pytest.raises(DataError, match="COLMAP makes errors of its own"):
+            options.main()
+    assert not (tmp_path / "scene").exists()

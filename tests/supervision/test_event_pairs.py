@@ -1,0 +1,172 @@
+"""Pairs of events: the rays and counts of a batch on small exact cases."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+import torch
+from helpers.small_models import CAMERA, EPOCH, make_sampler
+
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+
+
+def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> None:
+    sensor = SensorModel(refractory_period=1_000)
+    sampler = make_sampler(random_poses, sensor)
+    rays, batch = sampler.sample(40)
+    PoseCorrectionConfig(mode="off").setup(
+        num_cameras=0, device="cpu", trajectory=sampler.trajectory, camera_times=torch.zeros(0, dtype=torch.int64)
+    ).apply_to_raybundle(rays)
+    assert rays.origins.shape == (40, 3)
+    assert rays.directions.dtype == torch.float32
+    assert rays.times is not None
+    starts, ends = (torch.round(rays.times[:, 0] * 1e9).long() + EPOCH).chunk(2)
+    pixel_directions, _ = CAMERA.pixel_directions()
+    known = {
+        (EPOCH + 6_000, EPOCH + 250_000_000): ((3, 1), -1),
+        (EPOCH + 101_000, EPOCH + 600_000_000): ((0, 2), -1),
+        (EPOCH + 250_001_000, EPOCH + 10**9): ((3, 1), 1),
+    }
+    seen = set()
+    for i, interval in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+        (x, y), polarity = known[interval]
+        seen.add(interval)
+        assert batch["num_positive"][i] - batch["num_negative"][i] == polarity
+        for ray, time in ((i, interval[0]), (i + 20, interval[1])):
+            pose = sampler.trajectory.interpolate(time)
+            torch.testing.assert_close(rays.origins[ray], pose[:, 3].float())
+            direction = pose[:, :3] @ torch.from_numpy(pixel_directions[y, x])
+            torch.testing.assert_close(rays.directions[ray], direction.float(), rtol=0, atol=1e-6)
+    assert seen == set(known)
+
+
+def test_a_pair_spans_several_events(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel(), max_events_per_pair=3)
+    rays, batch = sampler.sample(8000)
+    assert rays.times is not None
+    starts, ends = torch.round(rays.times[:, 0] * 1e9).long().chunk(2)
+    counts = zip(
+        starts.tolist(),
+        ends.tolist(),
+        batch["num_positive"].tolist(),
+        batch["num_negative"].tolist(),
+        batch["last_num_negative"].tolist(),
+        [round(seconds, 6) for seconds in batch["last_interval"].tolist()],
+        strict=True,
+    )
+    # All that end with an event of their pixel, never beyond its first.
+    found = Counter(counts)
+    one, two = (250_000_000, 10**9, 1, 0, 0, 0.75), (5_000, 10**9, 1, 1, 0, 0.75)
+    assert found.keys() == {
+        (100_000, 600_000_000, 0, 1, 1, 0.5999),
+        (5_000, 250_000_000, 0, 1, 1, 0.249995),
+        one,
+        two,
+    }
+    # One event in half of the cases: log 2 / log 4.
+    assert found[one] / found[two] == pytest.approx(1, abs=0.2)
+
+
+@pytest.mark.parametrize("refractory_period", [12_000_000, 12_500_000])
+def test_pairs_span_events_beside_which_the_refractory_period_is_short(
+    random_poses: torch.Tensor, refractory_period: int
+) -> None:
+    # The middle one of a pixel's three events is 245 ms after the first, 750 ms before the last.
+    sensor = SensorModel(refractory_period=refractory_period)
+    sampler = make_sampler(random_poses, sensor, max_events_per_pair=3)
+    rays, batch = sampler.sample(400)
+    assert rays.times is not None
+    longer = batch["num_positive"] + batch["num_negative"] > 1
+    assert longer.any() == (refractory_period == 12_000_000)
+    starts, ends = torch.round(rays.times[:, 0] * 1e9).long().chunk(2)
+    assert (starts[longer] == 5_000 + refractory_period).all()
+    assert (ends[longer] == 10**9).all()
+
+
+@pytest.mark.parametrize("max_events_per_pair", [1, 3])
+def test_a_third_ray_lies_between_the_last_two_events(random_poses: torch.Tensor, max_events_per_pair: int) -> None:
+    sampler = make_sampler(
+        random_poses, SensorModel(refractory_period=1_000), max_events_per_pair=max_events_per_pair, temporal=True
+    )
+    rays, batch = sampler.sample(6000)
+    assert rays.times is not None
+    start, end, within = rays.times[:, 0].chunk(3)
+    assert ((batch["num_positive"] + batch["num_negative"]).max() > 1) == (max_events_per_pair > 1)
+    single = batch["num_positive"] + batch["num_negative"] == 1
+    torch.testing.assert_close(batch["last_interval"][single], (end - start)[single].float())
+    assert (batch["last_num_positive"] + batch["last_num_negative"] == 1).all()
+    part = 1 - (end - within) / batch["last_interval"]
+    assert part.min() >= 0
+    assert part.max() <= 1
+    # A normal distribution of mean 0.5 and deviation 0.25, cut at two deviations, has the deviation 0.22.
+    assert part.mean().item() == pytest.approx(0.5, abs=0.02)
+    assert part.std().item() == pytest.approx(0.22, abs=0.01)
+    # A batch to log the loss on has none.
+    assert len(sampler.sample(10, training=False)[0]) == 10
+
+
+def test_a_share_of_the_pairs_ends_at_uniform_moments(random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel(refractory_period=1_000), max_events_per_pair=3, share=0.75)
+    rays, batch = sampler.sample(40_000)
+    assert rays.times is not None
+    starts, ends = rays.times[:, 0].chunk(2)
+    between = batch["ends_between_events"]
+    assert between.sum() == 15_000
+    count = batch["num_positive"] + batch["num_negative"]
+    # Nothing has happened since the pair's start, or since an event that is counted: the pixel's middle one.
+    assert set(count[between].tolist()) == {0, 1}
+    assert set(count[~between].tolist()) == {1, 2}
+    # As many as the intervals take up, and at any time within.
+    intervals = [(0.000_101, 0.6), (0.000_006, 0.25), (0.250_001, 1.0)]
+    total = sum(end - start for start, end in intervals)
+    for index, (start, end) in enumerate(intervals):
+        inside = between & (batch["last_interval"] - (end - start)).abs().lt(1e-6)
+        assert inside.sum() / 15_000 == pytest.approx((end - start) / total, abs=0.02)
+        assert ends[inside].min() == pytest.approx(start, abs=0.005)
+        assert ends[inside].max() == pytest.approx(end, abs=0.005)
+        assert ends[inside].mean() == pytest.approx((start + end) / 2, abs=0.02)
+        longer = inside & (count == 1)
+        assert longer.any() == (index == 2)
+        assert torch.allclose(starts[longer], torch.tensor(0.000_006, dtype=torch.float64))
+        assert torch.allclose(starts[inside & ~longer], torch.tensor(start, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_sampling_is_seeded(share: float, random_poses: torch.Tensor) -> None:
+    sampler = make_sampler(random_poses, SensorModel(), share=share)
+    batches = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        batches.append(sampler.sample(40)[0].times)
+    assert torch.equal(batches[0], batches[1])
+    assert not torch.equal(batches[0], batches[2])
+
+
+@pytest.mark.parametrize("number", [0, 256])
+def test_an_impossible_number_of_events_is_refused(number: int, random_poses: torch.Tensor) -> None:
+    with pytest.raises(DataError, match=f"max-events-per-pair is {number}; give a number from 1 to 255"):
+        make_sampler(random_poses, SensorModel(), max_events_per_pair=number)
+
+
+def test_the_colour_filter_is_that_of_the_raw_pixel(random_poses: torch.Tensor) -> None:
+    _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB")).sample(40)
+    # Pixel (3, 1) is blue and pixel (0, 2) red.
+    assert set(batch["channel"].tolist()) == {0, 2}
+
+
+def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) -> None:
+    # This lens model folds over towards the corners, pixel (0, 2) among them.
+    nowhere = CameraIntrinsics(4, 3, 0.1, 0.1, 30.0, 1.5, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
+    for share in (0.0, 1.0):
+        with pytest.raises(DataError, match="no event lies on a pixel with a direction"):
+            make_sampler(random_poses, SensorModel(), nowhere, share=share).prepare()
+    folded = CameraIntrinsics(4, 3, 1.2, 1.2, 3.0, 1.5, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
+    assert not folded.pixel_directions()[1][2, 0]
+    assert folded.pixel_directions()[1][1, 3]
+    for share in (0.0, 1.0):
+        _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB"), folded, share=share).sample(40)
+        assert set(batch["channel"].tolist()) == {2}
