@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from aenerf_ns.errors import errors_as_one_line
-from aenerf_ns.simulator.rendering.embree import load_open3d
+from aenerf_ns.open3d_import import load_open3d
 
 
 def main() -> None:

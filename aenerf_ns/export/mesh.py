@@ -15,8 +15,8 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.export.placing import corrected_poses
 from aenerf_ns.export.rendering import render
 from aenerf_ns.export.times import spread_times
+from aenerf_ns.open3d_import import load_open3d
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.simulator.rendering.embree import load_open3d
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 # Of an unbounded scene, the share of what the views see that lies beyond each end of the box, along each axis.

@@ -44,7 +44,7 @@ from aenerf_ns.cli.report import Report
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.simulator.rendering.embree import load_open3d
+from aenerf_ns.open3d_import import load_open3d
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 # Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.

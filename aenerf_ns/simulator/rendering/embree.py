@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
-from types import ModuleType
-
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.open3d_import import load_open3d
 
 NOTHING = np.uint32(0xFFFFFFFF)
 """Stands for the triangle where a ray hits none."""
@@ -65,27 +61,3 @@ class RayCaster:
         """Return the distance (N,) of points (N, 3) from the nearest triangle."""
         query = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
         return self._scene.compute_distance(self._tensor(query), nthreads=numba.get_num_threads()).numpy()
-
-
-def load_open3d() -> ModuleType:
-    """Import Open3D and the libusb that it needs. Called late, because that takes seconds.
-
-    Raises:
-        DataError: a system library that Open3D needs is missing.
-    """
-    if sys.platform == "linux":
-        # Open3D's wheels link libusb, for depth cameras, but do not contain it.
-        try:
-            ctypes.CDLL("libusb-1.0.so.0")
-        except OSError:
-            import libusb_package
-
-            ctypes.CDLL(str(libusb_package.get_library_path()))
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        remedy = (
-            "install the missing libraries, on Debian and Ubuntu: apt-get install libgl1 libx11-6 libgomp1 libusb-1.0-0"
-        )
-        raise DataError("Open3D", f"cannot be loaded ({error})", remedy) from error
-    return open3d
