@@ -64,7 +64,7 @@ class TumVieDataParser(EventDataParser):
         marker_from_event = torch.linalg.inv(_pose(mocap.block("T_imu_marker"))) @ imu_from_event
         ground_truth_folder = folder / f"{sequence}-vi_gt_data"
         markers = read_tum_trajectory(ground_truth_folder / "mocap_data.txt", "us")
-        reference = markers.mapped(lambda poses: poses @ marker_from_event)
+        reference = markers.transform(lambda poses: poses @ marker_from_event)
         image_folder = ground_truth_folder / f"{side}_images"
         images = read_image_times(image_folder, image_folder / f"image_timestamps_{side}.txt", "us")
         trajectory, ground_truth = self.config.estimated(reference)

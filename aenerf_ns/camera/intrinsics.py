@@ -21,7 +21,7 @@ _MAX_ROUND_TRIP_ERROR = 1e-3
 _MAX_SIDE, _MAX_PIXELS = 1 << 14, 1 << 25
 _FOCAL_LENGTHS = (1e-2, 1e6)
 _MAX_PRINCIPAL_POINT = 1e6
-# Along each side, the pixels that :meth:`CameraIntrinsics.sees` looks at.
+# Along each side, the pixels that :meth:`CameraIntrinsics.has_valid_pixels` looks at.
 _SAMPLES = 24
 
 
@@ -104,7 +104,7 @@ class CameraIntrinsics:
         """
         return self._directions(np.arange(self.width), np.arange(self.height))
 
-    def sees(self) -> bool:
+    def has_valid_pixels(self) -> bool:
         """Return whether any of some pixels, evenly spread over the sensor, has a direction."""
         columns, rows = (
             np.linspace(0, side - 1, min(side, _SAMPLES)).astype(int) for side in (self.width, self.height)
@@ -136,7 +136,7 @@ class CameraIntrinsics:
             directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         return directions, error < _MAX_ROUND_TRIP_ERROR
 
-    def cropped(self, x: int, y: int, width: int, height: int) -> CameraIntrinsics:
+    def crop(self, x: int, y: int, width: int, height: int) -> CameraIntrinsics:
         """Return the camera of the part of the sensor that begins at pixel (x, y) and has the given size in pixels."""
         return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
 

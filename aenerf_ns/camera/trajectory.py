@@ -198,7 +198,7 @@ class Trajectory(nn.Module):
             )
         return self.pose(self.seconds(times))
 
-    def between(self, start: int, end: int) -> Trajectory:
+    def crop(self, start: int, end: int) -> Trajectory:
         """Return the shortest run of knots that covers as much of [start, end] (nanoseconds) as the trajectory does.
 
         The poses within the part are those of the whole trajectory.
@@ -218,7 +218,7 @@ class Trajectory(nn.Module):
         part._polynomials = self._polynomials[first:last]
         return part
 
-    def window(self, longest_gap: int | None = None) -> TimeWindow:
+    def known_time(self, longest_gap: int | None = None) -> TimeWindow:
         """Return the time in which poses are known: the span of the knots, without the gaps.
 
         Args:
@@ -251,11 +251,11 @@ class Trajectory(nn.Module):
             )
         return times
 
-    def mapped(self, function) -> Trajectory:
+    def transform(self, function) -> Trajectory:
         """Return the trajectory with ``function`` applied to its (N, 4, 4) float64 camera-to-world matrices.
 
-        The poses between the knots follow from the mapped knots. They do not depend on knots that :meth:`between` has
-        cut off, so map before you cut.
+        The poses between the knots follow from the transformed knots. They do not depend on knots that :meth:`crop` has
+        cut off, so transform before you crop.
         """
         return Trajectory(self.times, function(homogeneous(self.camera_to_worlds)), self.source)
 

@@ -237,7 +237,7 @@ class WarpedEvents:
         if hypothesis.still:
             poses = torch.eye(4, dtype=torch.float64).expand(_POSES, 4, 4)
         else:
-            trajectory = self._trajectory.mapped(hypothesis.poses)
+            trajectory = self._trajectory.transform(hypothesis.poses)
             poses = homogeneous(trajectory.interpolate(times + hypothesis.clock_offset))
         reference = poses[_POSES // 2]
         relative = np.ascontiguousarray((torch.linalg.inv(reference) @ poses)[:, :3].numpy())

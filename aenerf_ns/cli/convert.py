@@ -60,7 +60,7 @@ class Convert(ConvertArguments):
             check_image(file, recording.frame_camera)
         camera = recording.event_camera
         if self.region is not None:
-            camera = camera.cropped(*self.region)
+            camera = camera.crop(*self.region)
             if recording.sensor.bayer_pattern and (self.region[0] % 2 or self.region[1] % 2):
                 raise DataError(
                     "aenerf convert",
@@ -106,7 +106,7 @@ def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) ->
             f"its events are from {first} to {last} ns, all outside the time window",
             "widen the time window (--start-time-ns, --end-time-ns)",
         )
-    covered = recording.trajectory.between(start, end)
+    covered = recording.trajectory.crop(start, end)
     return recording.trajectory if window == TimeWindow() else covered
 
 

@@ -35,7 +35,7 @@ class ExportTrajectory(ExportTrajectoryArguments):
                 raise DataError(
                     pipeline.datamanager.get_datapath(), "it has no true poses", "export corrected or estimated ones"
                 )
-            trajectory = trajectory.to(pipeline.device).between(estimated.start, estimated.end)
+            trajectory = trajectory.to(pipeline.device).crop(estimated.start, estimated.end)
         times = trajectory.times
         if self.rate is not None:
             times = regular_times(trajectory.start, trajectory.end, self.rate).to(times.device)

@@ -88,7 +88,7 @@ class Reconstruct(ReconstructArguments):
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Write the events, and yield time and image of each batch of them that ends at a time with a pose."""
         events = recording.event_file
-        known = recording.trajectory.window(longest_gap)
+        known = recording.trajectory.known_time(longest_gap)
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
 
         def copied() -> Iterator[EventStream]:

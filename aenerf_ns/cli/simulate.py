@@ -169,7 +169,7 @@ class Simulate(SimulateArguments):
         if self.trajectory is not None:
             assert camera is not None
             given = read_tum_trajectory(self.trajectory)
-            given.between(int(video.times[0]), int(video.times[-1]))
+            given.crop(int(video.times[0]), int(video.times[-1]))
             if not any(noise):
                 return _VideoPoses(camera, given)
             return _VideoPoses(camera, perturb(given, *noise, self.pose_noise_correlation_time, self.seed), given)

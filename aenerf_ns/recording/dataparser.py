@@ -94,7 +94,7 @@ class EventDataParser(DataParser):
 
     def _check_lens(self, camera: CameraIntrinsics, name: str) -> None:
         """Raise a DataError for a lens whose distortion cannot be inverted at any pixel."""
-        if not camera.sees():
+        if not camera.has_valid_pixels():
             raise DataError(
                 str(self.config.data),
                 f"the {name} sees nothing: its distortion {list(camera.distortion)} can be inverted at no pixel",
@@ -111,19 +111,19 @@ class EventDataParser(DataParser):
                 f"the refractory period of {refractory} ns is longer than the recording",
                 "give it in nanoseconds",
             )
-        trajectory = recording.trajectory.mapped(lambda poses: poses @ OPENCV_TO_OPENGL)
+        trajectory = recording.trajectory.transform(lambda poses: poses @ OPENCV_TO_OPENGL)
         transform, scale, scene_box = self._world_transform(
-            trajectory.between(window.start, window.end), recording.scene_box
+            trajectory.crop(window.start, window.end), recording.scene_box
         )
 
         def to_scene(poses: Tensor) -> Tensor:
             moved = transform @ poses
             return torch.cat([moved[..., :3], scale * moved[..., 3:]], -1)
 
-        trajectory = trajectory.mapped(to_scene).between(window.start, window.end)
+        trajectory = trajectory.transform(to_scene).crop(window.start, window.end)
         ground_truth = recording.ground_truth
         if ground_truth is not None:
-            ground_truth = ground_truth.mapped(lambda poses: to_scene(poses @ OPENCV_TO_OPENGL))
+            ground_truth = ground_truth.transform(lambda poses: to_scene(poses @ OPENCV_TO_OPENGL))
             trajectory.knots_covered_by(ground_truth)
         if split == "train":
             times, images = viewer_cameras(trajectory, recording.reference_views["train"])
@@ -183,7 +183,7 @@ class EventDataParser(DataParser):
                 f"nothing is left from {start} to {end} ns",
                 "widen the time window (--start-time-ns, --end-time-ns)",
             )
-        covered = recording.trajectory.between(start, end)
+        covered = recording.trajectory.crop(start, end)
         config.start_time_ns, config.end_time_ns = max(start, covered.start), min(end, covered.end)
         return TimeWindow(
             config.start_time_ns,
@@ -195,7 +195,7 @@ class EventDataParser(DataParser):
         """Return where within the time window the poses are too far apart for interpolation."""
         longest = self.config.max_pose_gap_ns
         longest = recording.max_pose_gap if longest is None else longest
-        gaps = [gap for gap in recording.trajectory.window(longest).gaps if gap[0] < end and gap[1] > start]
+        gaps = [gap for gap in recording.trajectory.known_time(longest).gaps if gap[0] < end and gap[1] > start]
         if longest is not None and gaps and say:
             seconds = sum(last - first for first, last in gaps) * 1e-9
             first, last = max(gaps, key=lambda gap: gap[1] - gap[0])

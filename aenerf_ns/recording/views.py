@@ -111,7 +111,7 @@ def views_on_trajectory(
     Returns:
         All views as train views, and the same alternating between the validation and the test split.
     """
-    known = trajectory.window(max_pose_gap)
+    known = trajectory.known_time(max_pose_gap)
     kept = [(time, file) for time, file in images if known.contains(time)]
     if len(kept) < len(images):
         CONSOLE.print(

@@ -189,11 +189,11 @@ def test_large_turns_between_knots_do_not_flip(turn: float) -> None:
 
 def test_a_part_has_the_poses_of_the_whole(random_poses: torch.Tensor) -> None:
     trajectory = Trajectory(EPOCH + 10**9 * np.arange(8), random_poses)
-    part = trajectory.between(EPOCH + 3 * 10**9 + 5, EPOCH + 5 * 10**9)
+    part = trajectory.crop(EPOCH + 3 * 10**9 + 5, EPOCH + 5 * 10**9)
     assert len(part) == 3
     times = EPOCH + np.linspace(3 * 10**9, 5 * 10**9 - 1, 31).astype(np.int64)
     torch.testing.assert_close(part.interpolate(times), trajectory.interpolate(times), rtol=0, atol=1e-12)
-    again = part.between(EPOCH + 4 * 10**9, EPOCH + 5 * 10**9).interpolate(times[16:])
+    again = part.crop(EPOCH + 4 * 10**9, EPOCH + 5 * 10**9).interpolate(times[16:])
     torch.testing.assert_close(again, trajectory.interpolate(times[16:]), rtol=0, atol=1e-12)
 
 
@@ -201,7 +201,7 @@ def test_the_world_and_the_axes_of_the_camera_do_not_matter(random_poses: torch.
     trajectory = Trajectory(10**9 * np.arange(8), random_poses)
     world, axes = homogeneous(random_poses[3]), OPENCV_TO_OPENGL
     times = np.linspace(0, 7 * 10**9, 50).astype(np.int64)
-    mapped = trajectory.mapped(lambda poses: world @ poses @ axes).interpolate(times)
+    mapped = trajectory.transform(lambda poses: world @ poses @ axes).interpolate(times)
     expected = (world @ homogeneous(trajectory.interpolate(times)) @ axes)[:, :3]
     torch.testing.assert_close(mapped, expected, rtol=0, atol=1e-12)
 
@@ -237,13 +237,13 @@ def test_outside_the_span_is_an_error(random_poses: torch.Tensor) -> None:
 
 def test_a_part_of_a_trajectory_covers_what_was_asked_for(random_poses: torch.Tensor) -> None:
     trajectory = Trajectory(100 + 10 * np.arange(8), random_poses, "poses.txt")
-    assert trajectory.between(115, 131).times.tolist() == [110, 120, 130, 140]
-    assert trajectory.between(110, 130).times.tolist() == [110, 120, 130]
-    assert trajectory.between(0, 105).times.tolist() == [100, 110]
-    assert len(trajectory.between(0, 10**9)) == 8
+    assert trajectory.crop(115, 131).times.tolist() == [110, 120, 130, 140]
+    assert trajectory.crop(110, 130).times.tolist() == [110, 120, 130]
+    assert trajectory.crop(0, 105).times.tolist() == [100, 110]
+    assert len(trajectory.crop(0, 10**9)) == 8
     for start, end in ((0, 99), (171, 200)):
         with pytest.raises(DataError, match=f"poses.txt: .*do not overlap the events from {start} to {end} ns"):
-            trajectory.between(start, end)
+            trajectory.crop(start, end)
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ Change = Callable[[EventStream, Trajectory], tuple[EventStream, Trajectory]]
 
 
 def with_poses(function: Callable[[torch.Tensor], torch.Tensor]) -> Change:
-    return lambda events, trajectory: (events, trajectory.mapped(function))
+    return lambda events, trajectory: (events, trajectory.transform(function))
 
 
 def axes(*signs: float) -> torch.Tensor:
@@ -331,7 +331,7 @@ def test_the_command_finds_nothing_wrong_and_draws_a_picture(shorter: Path, tmp_
 
 def test_the_command_names_mistakes_and_remedies(shorter: Path) -> None:
     path = shorter / "trajectory_estimated.txt"
-    write_tum_trajectory(path, read_tum_trajectory(path).mapped(torch.linalg.inv))
+    write_tum_trajectory(path, read_tum_trajectory(path).transform(torch.linalg.inv))
     events = all_events(NativeDataParserConfig(data=shorter).setup().read_recording())
     rng = np.random.default_rng(0)
     t = np.concatenate([events.t, np.sort(rng.integers(0, PART, 6000))])

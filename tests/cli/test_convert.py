@@ -172,7 +172,7 @@ def test_filters_cut_events_camera_poses_and_images(tmp_path: Path) -> None:
     assert found < expected
     pixels = {row[:2] for row in found}
     assert found == {row for row in expected if row[:2] in pixels}
-    assert after.event_camera == before.event_camera.cropped(2, 0, 3, 2)
+    assert after.event_camera == before.event_camera.crop(2, 0, 3, 2)
     assert after.frame_camera == before.frame_camera
     assert (after.trajectory.start, after.trajectory.end) == (start, START + 1_500_000_000)
     # One of three train images is within the window. Images without a time are kept.

@@ -104,7 +104,7 @@ def test_the_poses_keep_their_scale(is_scaled: bool, tmp_path: Path, capsys: pyt
 
 def test_images_without_a_pose_are_left_out(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     poses = read_tum_trajectory(data / "trajectory_estimated.txt")
-    write_tum_trajectory(data / "trajectory_estimated.txt", poses.between(START, START + 500_000_000))
+    write_tum_trajectory(data / "trajectory_estimated.txt", poses.crop(START, START + 500_000_000))
     Reconstruct(data, tmp_path / "out").main()
     views = opened(tmp_path / "out").reference_views["train"]
     assert 0 < len(views) < 25

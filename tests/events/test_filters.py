@@ -152,7 +152,7 @@ def test_hot_pixels_are_left_out_and_told() -> None:
 
 def test_a_cropped_camera_sees_the_same_directions() -> None:
     camera = CameraIntrinsics(12, 10, 8.0, 8.5, 6.2, 4.9, "radial_tangential", (-0.1, 0.02, 0.001, 0.0, 0.0))
-    cropped = camera.cropped(3, 2, 7, 5)
+    cropped = camera.crop(3, 2, 7, 5)
     assert (cropped.width, cropped.height) == (7, 5)
     np.testing.assert_allclose(
         cropped.pixel_directions()[0], camera.pixel_directions()[0][2:7, 3:10], rtol=0, atol=1e-12

@@ -40,7 +40,7 @@ def make_pipeline_config(
         with NativeDatasetWriter(folder, camera, SensorModel(bayer_pattern="RGGB"), "srgb") as writer:
             writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 10**9, -1)], 6, 4))
             trajectory = Trajectory([0, 5 * 10**8, 10**9], poses)
-            writer.add_trajectories(trajectory, None if true_world is None else trajectory.mapped(true_world))
+            writer.add_trajectories(trajectory, None if true_world is None else trajectory.transform(true_world))
             if true_world is not None:
                 poses = homogeneous(true_world(poses))
             for _ in range(num_views):

@@ -125,7 +125,7 @@ def _log_radiance(correction: PoseCorrection, seconds: Tensor, directions: Tenso
 def test_both_offsets_are_found_in_a_known_scene() -> None:
     truth = _correction()
     # The given trajectory is 20 ms ahead, and of a body that the camera is fastened to at an angle.
-    given = truth.trajectory.mapped(lambda poses: poses @ torch.linalg.inv(motion_from_twist(_RIGID)))
+    given = truth.trajectory.transform(lambda poses: poses @ torch.linalg.inv(motion_from_twist(_RIGID)))
     given = Trajectory(given.times + 20_000_000, given.camera_to_worlds)
     correction = _correction(given, rigid_offset=True, clock_offset=0.0)
     groups: dict[str, list[torch.nn.Parameter]] = {}

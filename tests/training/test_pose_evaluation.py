@@ -228,7 +228,7 @@ def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tenso
     with pytest.raises(DataError, match=r"^truth.txt: .*do not cover two of the estimated ones"):
         make_correction(truth, late)
     # Where it covers a part, that part is compared.
-    half = truth.between(0, 3 * SECOND)
+    half = truth.crop(0, 3 * SECOND)
     estimated, corrected, reference = make_correction(truth, half).compared_poses()
     assert len(estimated) == len(corrected) == len(reference) == len(half)
     torch.testing.assert_close(estimated, reference, rtol=0, atol=1e-12)
@@ -334,7 +334,7 @@ def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor)
     truth = make_truth(random_poses)
     noisy = perturb(truth, rotation_degrees=3.0, translation=0.2, correlation_time=0.3, seed=1)
     errors = pose_errors(noisy.camera_to_worlds, truth.camera_to_worlds)
-    flipped = [t.mapped(lambda poses: poses @ OPENCV_TO_OPENGL).camera_to_worlds for t in (noisy, truth)]
+    flipped = [t.transform(lambda poses: poses @ OPENCV_TO_OPENGL).camera_to_worlds for t in (noisy, truth)]
     assert pose_errors(*flipped) == pytest.approx(errors, rel=1e-9)
 
 
