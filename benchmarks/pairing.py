@@ -24,7 +24,7 @@ import tyro
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.events.pair_store import PIXEL_SHIFT, EventPairs
+from aenerf_ns.events.pair_store import EventPairs, pixel_index
 from aenerf_ns.events.pairing import EVENTS_IN_MEMORY, pair_events
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
@@ -102,7 +102,7 @@ def sample(pairs: EventPairs) -> dict[str, float]:
     # Where uniform pairs end: the share of them in each tenth of the recording and of the pixels.
     rows = torch.cat([source._table.draw(0, _PAIRS, 1)[:, 0] for _ in range(_BATCHES)])
     times = rows[:, 0].double() / rows[:, 0].max()
-    places = (rows[:, 1] >> PIXEL_SHIFT).double() / (_WIDTH * _HEIGHT)
+    places = pixel_index(rows[:, 1]).double() / (_WIDTH * _HEIGHT)
     shares = torch.stack([torch.histc(parts, 10, 0, 1) for parts in (times, places)]) / len(rows)
     return {
         "batch_ms": 1e3 * float(np.median(wall)),

@@ -14,6 +14,7 @@ import pytest
         "aenerf_ns.camera.alignment",
         "aenerf_ns.camera.intrinsics",
         "aenerf_ns.camera.trajectory",
+        "aenerf_ns.events.stream",
         "aenerf_ns.files.open",
         "aenerf_ns.simulator.esim",
     ],

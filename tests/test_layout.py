@@ -31,7 +31,6 @@ MAY_USE = {
     "training": {
         "errors",
         "progress",
-        "events",
         "camera",
         "recording",
         "supervision",

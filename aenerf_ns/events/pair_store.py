@@ -1,44 +1,52 @@
-"""The table of all pairs of events: each event with the previous event of its pixel."""
+"""The table of all pairs of events: each event with the previous event of its pixel.
+
+A row of the table is two int64: a time, and a packed number. Only this module and the kernels in
+:mod:`aenerf_ns.events.pairing` know which bits of that number mean what.
+"""
 
 from __future__ import annotations
 
 import mmap
 import sys
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-# Numba compiles these numbers into events/pairs.py and keeps the result until that file changes: change it too.
-# The parts of a row's second number, from the highest bits: pixel, reach, sum of negative and of positive events.
-PIXEL_SHIFT, REACH_SHIFT, NEGATIVE_SHIFT = 40, 32, 16
-COUNT_MASK, REACH_MASK, NUMBER_MASK = 0xFFFF, 0xFF, 0xFFFFFFFF
-# With this reach, and at most 255 events merged into one, a pair's counts fit in 16 bits.
-MAX_REACH = 255
+from aenerf_ns.events.stream import EventStream
+
+# Numba compiles these numbers into events/pairing.py and keeps the result until that file changes: change it too.
+# The parts of a packed number, from the highest bits: pixel, span, sum of negative and of positive events.
+PIXEL_SHIFT, SPAN_SHIFT, NEGATIVE_SHIFT = 40, 32, 16
+COUNT_MASK, SPAN_MASK, INDEX_MASK = 0xFFFF, 0xFF, 0xFFFFFFFF
+MAX_SPAN = 255
+"""The most consecutive pairs that are joined. With at most 255 events merged into one, counts then fit in 16 bits."""
 BLOCK = 16
-"""EventPairs keeps one number for this many rows, to find moments."""
+"""Rows for which :class:`EventPairs` keeps one end, to find moments."""
 
 
 @dataclass(frozen=True)
 class EventPairs:
     """Every event with the previous event of its pixel (paper, eq. 4), in the order of pixels, then of time.
 
-    Events of one pixel with one time are one event here, with their polarities counted. Each event has a row. An event
-    that gives no pair, such as the first of its pixel, is a *head*: its row only tells where the next pair begins. The
-    row before a pair's row is that of the pair's earlier event.
+    Events of one pixel with one time are one event here, with their polarities counted. Each event has a row. The row
+    before a pair's row is that of the pair's earlier event. An event that gives no pair, such as the first of its
+    pixel, is a *chain start*: its row only tells where the next pair begins.
 
     Attributes:
-        rows: (R, 2) int64, in memory or mapped from a file. The first number is the event's time in nanoseconds. The
-            second number holds, from the highest bits, the ``pixel`` (row * width + column, 24 bits), the ``reach``
-            (8 bits) and two counts (16 bits each). The reach is how many consecutive pairs may be joined that end with
-            this pair's, at most 255; 0 for a head. The counts are negative and positive events from the last head up to
-            this row, modulo 65536. A head has its number among all heads in place of the counts. Rows behind the last
-            event's fill the last block, and are not drawn.
-        substitutes: (S,) int64, for each head among the first ``len(pairs)`` rows, a pair among the rows behind them.
-            So a uniform row of the first ``len(pairs)``, or its substitute if it is a head, is a uniform pair.
-        bounds: (B + 1,) int64, nanoseconds from the first interval's start to the end of each block of 16 rows, when
-            the intervals of all pairs are laid end to end. Block b is the rows from 16 b to 16 b + 15.
+        rows: (R, 2) int64, in memory or mapped from a file: the event's time in nanoseconds, and a packed number. The
+            packed number holds, from the highest bits, the pixel (row * width + column, 24 bits), the maximum span
+            (8 bits) and two counts (16 bits each). The maximum span is how many consecutive pairs may be joined that
+            end with this pair, at most 255; 0 for a chain start. The counts are negative and positive events from the
+            last chain start up to this row, modulo 65536. A chain start has its index among all chain starts in place
+            of the counts. Rows behind the last event's fill the last block, and are not drawn.
+        replacement_rows: (S,) int64, for each chain start among the first ``len(pairs)`` rows, a pair among the rows
+            behind them. So a uniform row of the first ``len(pairs)``, or its replacement if it is a chain start, is a
+            uniform pair.
+        block_ends: (B + 1,) int64, nanoseconds from the first interval's start to the end of each block of 16 rows,
+            when the intervals of all pairs are laid end to end. Block b is the rows from 16 b to 16 b + 15, and ends at
+            ``block_ends[b + 1]``.
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
         shortest_interval: nanoseconds between the two events of the closest pair.
@@ -52,8 +60,8 @@ class EventPairs:
     """
 
     rows: NDArray[np.int64]
-    substitutes: NDArray[np.int64]
-    bounds: NDArray[np.int64]
+    replacement_rows: NDArray[np.int64]
+    block_ends: NDArray[np.int64]
     width: int
     height: int
     shortest_interval: int
@@ -68,6 +76,35 @@ class EventPairs:
         used = self.num_events - self.num_outside - self.num_unusable - self.num_merged
         return used - self.num_first - self.num_within_refractory_period
 
+    def events(self, rows: slice = slice(None)) -> EventStream:
+        """Return the later events of pairs, in the order of time.
+
+        Args:
+            rows: of the table. They are in the order of pixels, so consecutive rows are events of neighboring pixels,
+                and every n-th row is an even sample of all pixels and times.
+
+        Returns:
+            One event for each pixel and time, with the polarity that prevails there. Events whose polarities cancel are
+            left out.
+        """
+        start, stop, step = rows.indices(len(self.rows))
+        # Row 0 is no pair, and every other row has one before it.
+        later = self.rows[max(start, 1) : stop : step]
+        earlier = self.rows[max(start, 1) - 1 : stop - 1 : step, 1]
+        times, packed = later.T
+        positive, negative = event_counts(packed, earlier)
+        kept = is_pair(packed) & (positive != negative)
+        order = np.flatnonzero(kept)[np.argsort(times[kept], kind="stable")]
+        y, x = np.divmod(pixel_index(packed[order]), self.width)
+        return EventStream(
+            x=x.astype(np.uint16),
+            y=y.astype(np.uint16),
+            t=times[order],
+            p=np.where(positive > negative, 1, -1).astype(np.int8)[order],
+            width=self.width,
+            height=self.height,
+        )
+
     def summary(self) -> str:
         """Return one line that accounts for every event of the stream."""
         return (
@@ -76,6 +113,46 @@ class EventPairs:
             f"their pixel, {self.num_within_refractory_period:,} within the refractory period; {self.num_merged:,} "
             "merged with one of the same pixel and time"
         )
+
+
+# The parts of packed numbers, which may be an array or a tensor on any device.
+
+
+def is_pair(packed: Any) -> Any:
+    """Return whether rows are pairs, and no chain starts."""
+    return max_span(packed) > 0
+
+
+def max_span(packed: Any) -> Any:
+    """Return how many consecutive pairs may be joined that end with each row's pair, 0 for a chain start."""
+    return packed >> SPAN_SHIFT & SPAN_MASK
+
+
+def pixel_index(packed: Any) -> Any:
+    """Return the pixels of rows, counted row by row over the sensor."""
+    return packed >> PIXEL_SHIFT
+
+
+def chain_index(packed: Any) -> Any:
+    """Return the indices of chain starts among all chain starts."""
+    return packed & INDEX_MASK
+
+
+def event_counts(later: Any, earlier: Any) -> tuple[Any, Any]:
+    """Count the events of a pixel after an earlier row, up to and including a later one.
+
+    Args:
+        later: packed numbers of pairs.
+        earlier: packed numbers of rows of the same pixels, at most the later rows' maximum span before these.
+
+    Returns:
+        Numbers of positive and of negative events.
+    """
+    # A chain start has an index in place of its counts, which are 0.
+    earlier = earlier * is_pair(earlier)
+    positive = (later - earlier) & COUNT_MASK
+    negative = ((later >> NEGATIVE_SHIFT) - (earlier >> NEGATIVE_SHIFT)) & COUNT_MASK
+    return positive, negative
 
 
 def map_rows(file: BinaryIO, num_rows: int) -> NDArray[np.int64]:

@@ -16,14 +16,16 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import (
     BLOCK,
     COUNT_MASK,
-    MAX_REACH,
+    INDEX_MASK,
+    MAX_SPAN,
     NEGATIVE_SHIFT,
-    NUMBER_MASK,
     PIXEL_SHIFT,
-    REACH_MASK,
-    REACH_SHIFT,
+    SPAN_MASK,
+    SPAN_SHIFT,
     EventPairs,
+    is_pair,
     map_rows,
+    pixel_index,
 )
 from aenerf_ns.events.stream import EventStream
 
@@ -196,9 +198,7 @@ class _Table:
         left = self._entries[count : self.size].copy()
         self.size = len(left)
         self._entries[: self.size] = left
-        self._last_entry[left[:, 1] >> PIXEL_SHIFT] = np.where(
-            (left[:, 1] >> REACH_SHIFT) & REACH_MASK, np.arange(len(left)), -1
-        )
+        self._last_entry[pixel_index(left[:, 1])] = np.where(is_pair(left[:, 1]), np.arange(len(left)), -1)
 
     def pairs(self, num_events: int, num_outside: int) -> EventPairs:
         """Return the pairs of all events that were added."""
@@ -217,15 +217,16 @@ class _Table:
             self._entries = self._entries[:0].copy()
             self._merge(self.file, ends)
             rows = map_rows(self.file, ends.num_padded)
-        if ends.bounds[-1] < 0:
+        if ends.block_ends[-1] < 0:
             raise DataError(self._source, "its intervals add up to more than 292 years", "choose a shorter time window")
         tail = np.ones(num_rows - num_pairs, bool)
-        tail[ends.heads[ends.heads >= num_pairs] - num_pairs] = False
+        chain_starts = ends.chain_starts()
+        tail[chain_starts[chain_starts >= num_pairs] - num_pairs] = False
         width, height = self._shape
         return EventPairs(
             rows=rows,
-            substitutes=num_pairs + np.flatnonzero(tail),
-            bounds=ends.bounds,
+            replacement_rows=num_pairs + np.flatnonzero(tail),
+            block_ends=ends.block_ends,
             width=width,
             height=height,
             shortest_interval=self._shortest_interval,
@@ -275,7 +276,7 @@ class _Table:
 
 
 class _Ends:
-    """Link rows that come sorted by pixel, and note the heads and the ends of blocks.
+    """Link rows that come sorted by pixel, and note the chain starts and the ends of blocks.
 
     Args:
         num_rows: of all pixels.
@@ -284,28 +285,28 @@ class _Ends:
     Attributes:
         num_rows: of all pixels.
         num_padded: number of rows with those that fill the last block.
-        bounds: see :class:`EventPairs`.
-        heads: (H,) int64 rows of the heads so far.
+        block_ends: see :class:`EventPairs`.
     """
 
     def __init__(self, num_rows: int, shortest_interval: int) -> None:
         num_blocks = -(-num_rows // BLOCK)
         self.num_rows = num_rows
         self.num_padded = num_blocks * BLOCK
-        self.bounds = np.zeros(num_blocks + 1, np.int64)
+        self.block_ends = np.zeros(num_blocks + 1, np.int64)
         self._shortest_interval = shortest_interval
-        self._heads: list[NDArray[np.int64]] = []
-        self._num_heads = 0
+        self._chain_starts: list[NDArray[np.int64]] = []
+        self._num_chains = 0
         self._row = 0
 
-    @property
-    def heads(self) -> NDArray[np.int64]:
-        return np.concatenate(self._heads)
+    def chain_starts(self) -> NDArray[np.int64]:
+        """Return the (H,) int64 rows of the chain starts so far."""
+        return np.concatenate(self._chain_starts)
 
     def finish(self, rows: NDArray[np.int64]) -> None:
-        """Put reach and sums into the next rows, all rows of some pixels."""
-        self._heads.append(self._row + _finish(rows, self._row, self._num_heads, self._shortest_interval, self.bounds))
-        self._num_heads += len(self._heads[-1])
+        """Put maximum span and sums into the next rows, all rows of some pixels."""
+        starts = _finish(rows, self._row, self._num_chains, self._shortest_interval, self.block_ends)
+        self._chain_starts.append(self._row + starts)
+        self._num_chains += len(starts)
         self._row += len(rows)
 
 
@@ -342,7 +343,7 @@ def _add_chunk(columns, width, usable, refractory_period, last_time, last_entry,
             counts[3] += 1
         else:
             shortest = min(shortest, t[i] - previous)
-            entries[n, 1] |= 1 << REACH_SHIFT | 1 << (0 if p[i] > 0 else NEGATIVE_SHIFT)
+            entries[n, 1] |= 1 << SPAN_SHIFT | 1 << (0 if p[i] > 0 else NEGATIVE_SHIFT)
             last_entry[pixel] = n
         n += 1
     return -1, n, shortest
@@ -367,85 +368,85 @@ def _place(entries, first_pixel, places, rows):
 
 
 @numba.njit(cache=True)
-def _finish(rows, row, num_heads, shortest_interval, bounds):
-    """Put reach and sums into rows whose second numbers hold each event's own counts. Returns the heads among them."""
-    heads = np.empty(rows.shape[0], np.int64)
-    begin = num_heads
-    reach = positive = negative = 0
+def _finish(rows, row, num_chains, shortest_interval, block_ends):
+    """Put maximum span and sums into rows that hold each event's own counts. Returns the chain starts among them."""
+    chain_starts = np.empty(rows.shape[0], np.int64)
+    begin = num_chains
+    span = positive = negative = 0
     was_long = False
     for i in range(rows.shape[0]):
         block = (row + i) // BLOCK
         if (row + i) % BLOCK == 0:
-            bounds[block + 1] = bounds[block]
+            block_ends[block + 1] = block_ends[block]
         own = rows[i, 1]
         pixel = own >> PIXEL_SHIFT
-        if (own >> REACH_SHIFT) & REACH_MASK == 0:
-            heads[num_heads - begin] = i
-            rows[i, 1] = pixel << PIXEL_SHIFT | num_heads
-            num_heads += 1
+        if (own >> SPAN_SHIFT) & SPAN_MASK == 0:
+            chain_starts[num_chains - begin] = i
+            rows[i, 1] = pixel << PIXEL_SHIFT | num_chains
+            num_chains += 1
             positive = negative = 0
             was_long = False
             continue
         interval = rows[i, 0] - rows[i - 1, 0]
-        bounds[block + 1] += interval
+        block_ends[block + 1] += interval
         is_long = interval >= shortest_interval
-        reach = min(reach + 1, MAX_REACH) if is_long and was_long else 1
+        span = min(span + 1, MAX_SPAN) if is_long and was_long else 1
         was_long = is_long
         positive = (positive + own) & COUNT_MASK
         negative = (negative + (own >> NEGATIVE_SHIFT)) & COUNT_MASK
-        rows[i, 1] = pixel << PIXEL_SHIFT | reach << REACH_SHIFT | negative << NEGATIVE_SHIFT | positive
-    return heads[: num_heads - begin].copy()
+        rows[i, 1] = pixel << PIXEL_SHIFT | span << SPAN_SHIFT | negative << NEGATIVE_SHIFT | positive
+    return chain_starts[: num_chains - begin].copy()
 
 
-def near_blocks(bounds: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return an index into the bounds of :class:`EventPairs`, so that a search in them waits less for memory.
+def near_blocks(block_ends: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Return an index into the ``block_ends`` of :class:`EventPairs`, so that a search there waits less for memory.
 
     Returns:
         (G,) int64, the last block that begins at every G-th step along the intervals or before it, and how many
         nanoseconds a step takes. A step has 8 blocks on average.
     """
-    step = int(bounds[-1]) // max(len(bounds) // 8, 1) + 1
-    times = step * np.arange(int(bounds[-1]) // step + 2, dtype=np.int64)
-    return np.searchsorted(bounds, times, side="right") - 1, step
+    step = int(block_ends[-1]) // max(len(block_ends) // 8, 1) + 1
+    times = step * np.arange(int(block_ends[-1]) // step + 2, dtype=np.int64)
+    return np.searchsorted(block_ends, times, side="right") - 1, step
 
 
 @numba.njit(cache=True)
-def find_rows(rows, substitutes, bounds, near, step, places, events, spans, found):
+def find_rows(rows, replacement_rows, block_ends, near, step, moments, events, spans, found):
     """Fill in the rows of pairs; see :func:`aenerf_ns.supervision.event_pairs.find_rows`.
 
     Args:
         rows: see there.
-        substitutes: see there.
-        bounds: see there.
+        replacement_rows: see there.
+        block_ends: see there.
         near: as :func:`near_blocks` returns it.
         step: as :func:`near_blocks` returns it.
-        places: see there.
+        moments: see there.
         events: see there.
         spans: see there.
         found: (N, 3, 2) int64, the result.
     """
     for i in range(spans.shape[0]):
-        if i < places.shape[0]:
-            # The last block that begins at the place or before it.
-            block = near[places[i] // step]
-            count = near[places[i] // step + 1] - block + 1
+        if i < moments.shape[0]:
+            # The last block that begins at the moment or before it.
+            block = near[moments[i] // step]
+            count = near[moments[i] // step + 1] - block + 1
             while count > 1:
                 half = count // 2
-                block = block + half if bounds[block + half] <= places[i] else block
+                block = block + half if block_ends[block + half] <= moments[i] else block
                 count -= half
             row = BLOCK * block
-            left = places[i] - bounds[block]
+            left = moments[i] - block_ends[block]
             while True:
-                if (rows[row, 1] >> REACH_SHIFT) & REACH_MASK:
+                if (rows[row, 1] >> SPAN_SHIFT) & SPAN_MASK:
                     left -= rows[row, 0] - rows[row - 1, 0]
                     if left < 0:
                         break
                 row += 1
         else:
-            row = events[i - places.shape[0]]
-            if (rows[row, 1] >> REACH_SHIFT) & REACH_MASK == 0:
-                row = substitutes[rows[row, 1] & NUMBER_MASK]
-        span = min(spans[i], (rows[row, 1] >> REACH_SHIFT) & REACH_MASK)
+            row = events[i - moments.shape[0]]
+            if (rows[row, 1] >> SPAN_SHIFT) & SPAN_MASK == 0:
+                row = replacement_rows[rows[row, 1] & INDEX_MASK]
+        span = min(spans[i], (rows[row, 1] >> SPAN_SHIFT) & SPAN_MASK)
         for part in range(2):
             found[i, 0, part] = rows[row, part]
             found[i, 1, part] = rows[row - 1, part]

@@ -24,7 +24,8 @@ class SortedEvents:
     Attributes:
         times: (N,) int64 nanoseconds, never decreasing.
         codes: (N,) uint32, twice the number of the event's pixel, counted row by row, plus one for a negative event.
-        num_pixels: pixels of the sensor.
+        width: number of pixel columns of the sensor.
+        height: number of pixel rows of the sensor.
         pieces: first and last time of each stretch in which the poses are known, in nanoseconds.
         num_outside: events left out, outside the time window or in a gap.
         num_unusable: events left out, at pixels that are not used.
@@ -32,7 +33,8 @@ class SortedEvents:
 
     times: NDArray[np.int64]
     codes: NDArray[np.uint32]
-    num_pixels: int
+    width: int
+    height: int
     pieces: tuple[tuple[int, int], ...]
     num_outside: int
     num_unusable: int
@@ -47,7 +49,7 @@ class SortedEvents:
             end: nanoseconds.
 
         Returns:
-            (2, num_pixels) numbers of positive and of negative events.
+            (2, pixels) numbers of positive and of negative events.
 
         Raises:
             ValueError: the window ends before it starts, leaves the time window or crosses a gap.
@@ -55,19 +57,19 @@ class SortedEvents:
         if not any(first <= start <= end <= last for first, last in self.pieces):
             raise ValueError(f"({start}, {end}] ns is not inside one of {self.pieces}")
         begin, stop = np.searchsorted(self.times, [start, end], side="right")
-        return np.bincount(self.codes[begin:stop], minlength=2 * self.num_pixels).reshape(-1, 2).T
+        return np.bincount(self.codes[begin:stop], minlength=2 * self.width * self.height).reshape(-1, 2).T
 
-    def stream(self, part: slice, width: int) -> EventStream:
-        """Return some of the events in the order of time, given the width of the sensor."""
+    def events(self, part: slice = slice(None)) -> EventStream:
+        """Return the events of a slice, in the order of time."""
         codes = self.codes[part]
-        rows, columns = np.divmod(codes >> 1, np.uint32(width))
+        rows, columns = np.divmod(codes >> 1, np.uint32(self.width))
         return EventStream(
             x=columns.astype(np.uint16),
             y=rows.astype(np.uint16),
             t=self.times[part],
             p=np.where(codes & 1, -1, 1).astype(np.int8),
-            width=width,
-            height=self.num_pixels // width,
+            width=self.width,
+            height=self.height,
         )
 
     def summary(self) -> str:
@@ -113,7 +115,8 @@ def sort_events(chunks: Iterable[EventStream], *, window: TimeWindow, usable: ND
     found = SortedEvents(
         times=np.concatenate(times),
         codes=np.concatenate(codes),
-        num_pixels=usable.size,
+        width=width,
+        height=height,
         pieces=tuple(window.pieces()),
         num_outside=total - inside,
         num_unusable=inside - sum(map(len, times)),

@@ -92,6 +92,26 @@ class EventStream:
         first, last = np.searchsorted(self.t, [start, end + 1])
         return self[first:last]
 
+    def nearest(self, time: int, count: int) -> EventStream:
+        """Return about ``count`` events around a time in nanoseconds, half of them before it.
+
+        Example:
+            >>> pixels = np.zeros(10, np.uint16)
+            >>> stream = EventStream(pixels, pixels, np.arange(0, 100, 10), np.ones(10, np.int8), width=1, height=1)
+            >>> stream.nearest(45, 4).t.tolist()
+            [30, 40, 50, 60]
+            >>> stream.nearest(0, 4).t.tolist()
+            [0, 10]
+        """
+        middle = int(np.searchsorted(self.t, time))
+        return self[max(middle - count // 2, 0) : middle + count // 2]
+
+    def subsample(self, count: int) -> EventStream:
+        """Return at most ``count`` of the events, evenly spread over them."""
+        if len(self) <= count:
+            return self
+        return self[np.linspace(0, len(self) - 1, count).astype(np.int64)]
+
 
 def _unsorted(source: str | Path, index: int, time: int, previous: int) -> DataError:
     return DataError(

@@ -18,7 +18,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import interlevel_loss
-from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
@@ -35,11 +34,11 @@ from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 from aenerf_ns.method.field import to_unit_cube
 from aenerf_ns.method.image_metrics import ImageMetrics
-from aenerf_ns.method.initial_samplers import EvenSampler, EvenThenDisparitySampler
 from aenerf_ns.method.networks import Backbone, FieldConfig, ProposalConfig, make_networks
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 from aenerf_ns.method.ray_losses import distortion_loss
+from aenerf_ns.method.ray_samplers import EvenSampler, EvenThenDisparitySampler, ProposalSampler
 from aenerf_ns.method.temporal import log_radiance_rate
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.supervision.base import Supervision, SupervisionConfig
@@ -159,7 +158,7 @@ class AENeRFModel(Model):
         self.density_fns = [network.density_fn for network in proposal_networks]
         if config.backbone == "mlp":
             self.density_fns *= len(config.proposal.num_samples_per_ray)
-        self.proposal_sampler = ProposalNetworkSampler(
+        self.proposal_sampler = ProposalSampler(
             num_nerf_samples_per_ray=config.field.num_samples_per_ray,
             num_proposal_samples_per_ray=config.proposal.num_samples_per_ray,
             num_proposal_network_iterations=len(self.density_fns),
@@ -253,11 +252,7 @@ class AENeRFModel(Model):
         """
         if self.space is not None:
             self.space.follow()
-        steps_since_update = self.proposal_sampler._steps_since_update
         samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
-        if not self.training:
-            # A picture must not move the steps that train the proposal networks.
-            self.proposal_sampler._steps_since_update = steps_since_update
         outputs: dict[str, Any] = {}
         is_trained_on = self.training and _is_of_batch(ray_bundle)
         num_rates = self.supervision.num_rate_rays(len(ray_bundle)) if is_trained_on else 0

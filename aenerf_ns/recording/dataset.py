@@ -18,7 +18,6 @@ from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.picture import PolaritySums, polarity_picture
 from aenerf_ns.events.sorted_events import SortedEvents, sort_events
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.events.timeline import EventTimeline, timeline_of_pairs, timeline_of_windows
 from aenerf_ns.progress import tracked
 from aenerf_ns.recording.pair_cache import PairFile
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
@@ -163,14 +162,20 @@ class EventDataset(InputDataset):
         return "_windows_and_pictures" in vars(self)
 
     @cached_property
-    def timeline(self) -> EventTimeline:
+    def timeline(self) -> EventStream:
         """Events to look at around a time, at most 8 million. The first access may read the whole event file.
 
         Raises:
             DataError: see :attr:`pairs`.
         """
         if self._has_windows:
-            return timeline_of_windows(self.windows, _TIMELINE_ROWS)
+            return self.windows.events(_every(len(self.windows.times), _TIMELINE_ROWS))
         # Rows that are mapped from a file are read-only.
         in_memory = self.pairs.rows.flags.writeable
-        return timeline_of_pairs(self.pairs, _TIMELINE_ROWS if in_memory else _TIMELINE_ROWS_IN_FILE)
+        most = _TIMELINE_ROWS if in_memory else _TIMELINE_ROWS_IN_FILE
+        return self.pairs.events(_every(len(self.pairs.rows), most))
+
+
+def _every(num_rows: int, max_rows: int) -> slice:
+    """Return a slice of at most ``max_rows`` of the rows, evenly spread."""
+    return slice(None, None, max(-(-num_rows // max_rows), 1))

@@ -35,9 +35,9 @@ Shown = TypeVar("Shown")
 class PairFile:
     """Keep the pairs of an event file in a file beside it.
 
-    The file holds the rows of :class:`~aenerf_ns.events.pair_store.EventPairs`, then ``substitutes``, ``bounds`` and
-    the pictures, all as they are in memory, then a description as JSON. It is written under another name, and renamed
-    when it is whole.
+    The file holds the rows of :class:`~aenerf_ns.events.pair_store.EventPairs`, then ``replacement_rows``,
+    ``block_ends`` and the pictures, all as they are in memory, then a description as JSON. It is written under another
+    name, and renamed when it is whole.
 
     Args:
         events: the event file, or folder of event files.
@@ -99,9 +99,11 @@ class PairFile:
             arrays.append(array)
         if file.tell() != end or checksum != about["checksum"]:
             raise ValueError("its parts have other sizes or bytes than it says")
-        substitutes, bounds, pictures = arrays
+        replacement_rows, block_ends, pictures = arrays
         numbers = {name: int(about["numbers"][name]) for name in _NUMBERS}
-        pairs = EventPairs(rows=map_rows(file, num_rows), substitutes=substitutes, bounds=bounds, **numbers)
+        pairs = EventPairs(
+            rows=map_rows(file, num_rows), replacement_rows=replacement_rows, block_ends=block_ends, **numbers
+        )
         return pairs, pictures
 
     def open(self) -> tuple[BinaryIO, Path]:
@@ -135,7 +137,7 @@ class PairFile:
         if not self._is_kept:
             return
         checksum, arrays = 0, []
-        for array in (pairs.substitutes, pairs.bounds, pictures):
+        for array in (pairs.replacement_rows, pairs.block_ends, pictures):
             array.tofile(self._new)
             checksum = zlib.crc32(array.data, checksum)
             arrays.append((array.dtype.str, array.shape))

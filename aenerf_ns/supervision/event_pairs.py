@@ -20,14 +20,13 @@ from torch import Tensor
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import (
     BLOCK,
-    COUNT_MASK,
-    MAX_REACH,
-    NEGATIVE_SHIFT,
-    NUMBER_MASK,
-    PIXEL_SHIFT,
-    REACH_MASK,
-    REACH_SHIFT,
+    MAX_SPAN,
     EventPairs,
+    chain_index,
+    event_counts,
+    is_pair,
+    max_span,
+    pixel_index,
 )
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
@@ -219,11 +218,11 @@ class PairSampler(Sampler):
         device: torch.device | str,
     ) -> None:
         super().__init__(config, dataset, supervision, device)
-        if not 1 <= config.max_events_per_pair <= MAX_REACH:
+        if not 1 <= config.max_events_per_pair <= MAX_SPAN:
             raise DataError(
                 "the sampler",
                 f"max-events-per-pair is {config.max_events_per_pair}",
-                f"give a number from 1 to {MAX_REACH}",
+                f"give a number from 1 to {MAX_SPAN}",
             )
         if not 0 <= config.share_to_moments <= 1:
             raise DataError(
@@ -284,14 +283,11 @@ class PairSampler(Sampler):
             within = torch.rand(num_pairs, dtype=torch.float64, device=device).mul_(2).sub_(1).mul_(_WITHIN_MASS)
             within.erfinv_().mul_(_WITHIN_DEVIATION * math.sqrt(2)).add_(_WITHIN_MEAN)
             seconds.append(last_start + within * last_interval)
-        # A head has its number in place of the sums, which are 0.
-        sums = torch.where(numbers >> REACH_SHIFT & REACH_MASK > 0, numbers, 0)
-        sums = torch.stack([sums, sums >> NEGATIVE_SHIFT])
-        # By polarity: from the pair's last event but one, and from its first event.
-        last_count, count = ((sums[:, :1] - sums[:, 1:]) & COUNT_MASK).float().unbind(1)
+        # From the pair's last event but one, and from its first event.
+        last_count, count = torch.stack(event_counts(numbers[:1], numbers[1:])).float().unbind(1)
         # A pair that ends at a moment has not seen its last event.
         count[:, :num_to_moments] -= last_count[:, :num_to_moments]
-        pixel = numbers[0] >> PIXEL_SHIFT
+        pixel = pixel_index(numbers[0])
         rays = self._pixel_rays.rays(pixel, seconds)
         batch = {
             "num_positive": count[0],
@@ -316,7 +312,7 @@ class _PairTable:
 
     def __init__(self, pairs: EventPairs, device: torch.device | str) -> None:
         self._batch_device = torch.device(device)
-        arrays = (pairs.rows, pairs.substitutes, pairs.bounds)
+        arrays = (pairs.rows, pairs.replacement_rows, pairs.block_ends)
         size = sum(array.nbytes for array in arrays)
         self._device = self._batch_device if _fits(size, self._batch_device) else torch.device("cpu")
         if self._device != self._batch_device:
@@ -325,7 +321,7 @@ class _PairTable:
             )
         self._num_pairs = len(pairs)
         # Known here, because reading it from a GPU in a step would wait for the GPU.
-        self._duration = int(pairs.bounds[-1])
+        self._duration = int(pairs.block_ends[-1])
         self._find_rows: Callable[[Tensor, Tensor, Tensor], Tensor]
         if self._device.type == "cpu":
             self._find_rows = _CpuTable(*arrays).find_rows
@@ -348,14 +344,14 @@ class _PairTable:
             event of its pixel before, and of the event that the pair begins with.
         """
         device = self._device
-        places = torch.randint(self._duration, (num_moments,), device=device)
+        moments = torch.randint(self._duration, (num_moments,), device=device)
         events = torch.randint(self._num_pairs, (num_events,), device=device)
         if max_events == 1:
             spans = torch.ones(num_moments + num_events, dtype=torch.int64, device=device)
         else:
             spans = (max_events + 1) ** torch.rand(num_moments + num_events, dtype=torch.float64, device=device)
             spans = spans.long().clamp_(max=max_events)
-        rows = self._find_rows(places, events, spans)
+        rows = self._find_rows(moments, events, spans)
         if device != self._batch_device:
             rows = rows.pin_memory().to(self._batch_device, non_blocking=True)
         return rows
@@ -375,22 +371,22 @@ class _CpuTable:
         self._find = pairing.find_rows
         self._table = (*arrays, *pairing.near_blocks(arrays[2]))
 
-    def find_rows(self, places: Tensor, events: Tensor, spans: Tensor) -> Tensor:
+    def find_rows(self, moments: Tensor, events: Tensor, spans: Tensor) -> Tensor:
         found = torch.empty((len(spans), 3, 2), dtype=torch.int64)
-        self._find(*self._table, *(array.numpy() for array in (places, events, spans, found)))
+        self._find(*self._table, *(array.numpy() for array in (moments, events, spans, found)))
         return found
 
 
 def find_rows(
-    rows: Tensor, substitutes: Tensor, bounds: Tensor, places: Tensor, events: Tensor, spans: Tensor
+    rows: Tensor, replacement_rows: Tensor, block_ends: Tensor, moments: Tensor, events: Tensor, spans: Tensor
 ) -> Tensor:
     """Find the rows of pairs in a table of pairs, without waiting for a GPU.
 
     Args:
         rows: see :class:`~aenerf_ns.events.pair_store.EventPairs`.
-        substitutes: see there.
-        bounds: see there.
-        places: (M,) int64 nanoseconds along the intervals of all pairs, laid end to end. Each finds the pair around it.
+        replacement_rows: see there.
+        block_ends: see there.
+        moments: (M,) int64 nanoseconds along the intervals of all pairs, laid end to end. Each finds its pair.
         events: (N - M,) int64 numbers below the number of pairs. Each finds a pair of its own.
         spans: (N,) int64, how many consecutive pairs to join that end with the found one, if so many may be joined.
 
@@ -399,16 +395,15 @@ def find_rows(
         that the pair begins with.
     """
     number = rows[:, 1][events]
-    is_head = number >> REACH_SHIFT & REACH_MASK == 0
-    by_event = torch.where(is_head, substitutes[torch.where(is_head, number & NUMBER_MASK, 0)], events)
-    block = torch.searchsorted(bounds, places, right=True) - 1
+    starts_chain = ~is_pair(number)
+    by_event = torch.where(starts_chain, replacement_rows[torch.where(starts_chain, chain_index(number), 0)], events)
+    block = torch.searchsorted(block_ends, moments, right=True) - 1
     time, number = rows.view(-1, BLOCK, 2)[block].unbind(-1)
     # From the block's end backwards, because the row before its first belongs to another block.
-    is_head = number[:, 1:] >> REACH_SHIFT & REACH_MASK == 0
-    passed = F.pad(time.diff().masked_fill_(is_head, 0).cumsum(1), (1, 0))
-    ends = bounds[block + 1][:, None] - passed[:, -1:] + passed
-    row = torch.cat([BLOCK * block + (ends <= places[:, None]).sum(1), by_event])
-    spans = spans.minimum(rows[:, 1][row] >> REACH_SHIFT & REACH_MASK)
+    elapsed = F.pad(time.diff().masked_fill_(~is_pair(number[:, 1:]), 0).cumsum(1), (1, 0))
+    ends = block_ends[block + 1][:, None] - elapsed[:, -1:] + elapsed
+    row = torch.cat([BLOCK * block + (ends <= moments[:, None]).sum(1), by_event])
+    spans = spans.minimum(max_span(rows[:, 1][row]))
     return rows[torch.stack([row, row - 1, row - spans], 1)]
 
 

@@ -13,8 +13,6 @@ from torch import Tensor
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
-from aenerf_ns.events.pair_store import COUNT_MASK, NEGATIVE_SHIFT, PIXEL_SHIFT, REACH_MASK, REACH_SHIFT, EventPairs
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.method.pose_correction import PoseCorrection
 from aenerf_ns.supervision.event_pairs import PairSampler
 
@@ -227,7 +225,8 @@ def _contrast(pipeline: AENeRFPipeline) -> dict[str, Any]:
 
     dataset = pipeline.datamanager.train_dataset
     camera = dataset.scene.event_camera
-    events = _events(dataset.pairs)
+    surplus = max(len(dataset.pairs.rows) - _MAX_ROWS, 0)
+    events = dataset.pairs.events(slice(surplus // 2 + 1, len(dataset.pairs.rows) - (surplus + 1) // 2))
     figures: dict[str, Any] = dict.fromkeys(
         (
             "contrast_estimated",
@@ -290,21 +289,3 @@ def _dense_poses(correction: PoseCorrection) -> tuple[Trajectory, Trajectory]:
             for source in (base, correction)
         )
     return estimated, corrected
-
-
-def _events(pairs: EventPairs) -> EventStream:
-    """Return the events that pairs end with, in the order of time: of all pixels, or of some rows of a busy sensor."""
-    surplus = max(len(pairs.rows) - _MAX_ROWS, 0)
-    rows = pairs.rows[surplus // 2 : len(pairs.rows) - (surplus + 1) // 2]
-    time, number = rows.T
-    is_pair = number >> REACH_SHIFT & REACH_MASK > 0
-    # A head has its number in place of the sums, which are 0.
-    sums = np.where(is_pair, number, 0)
-    positive, negative = (np.diff(sums >> shift & COUNT_MASK) & COUNT_MASK for shift in (0, NEGATIVE_SHIFT))
-    chosen = (is_pair[1:] & (positive != negative)).nonzero()[0]
-    chosen = chosen[np.argsort(time[1:][chosen], kind="stable")]
-    y, x = np.divmod(number[1:][chosen] >> PIXEL_SHIFT, pairs.width)
-    polarity = np.where(positive[chosen] > negative[chosen], 1, -1)
-    return EventStream(
-        x.astype(np.uint16), y.astype(np.uint16), time[1:][chosen], polarity.astype(np.int8), pairs.width, pairs.height
-    )

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import torch
-from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.utils import comms
 from torch import nn
+
+from aenerf_ns.method.ray_samplers import ProposalSampler
 
 if TYPE_CHECKING:
     from aenerf_ns.training.trainer import AENeRFTrainer
@@ -23,7 +24,7 @@ class TrainingState(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self._training: tuple[AENeRFTrainer, ProposalNetworkSampler] | None = None
+        self._training: tuple[AENeRFTrainer, ProposalSampler] | None = None
         self._loaded: dict[str, Any] | None = None
 
     def get_extra_state(self) -> dict[str, Any] | None:
@@ -41,7 +42,7 @@ class TrainingState(nn.Module):
             "random_generator": torch.get_rng_state(),
             "cuda_random_generator": torch.cuda.get_rng_state(trainer.device) if _is_on_gpu(trainer) else None,
             "gradients": accumulating,
-            "proposal_sampler": {"step": sampler._step, "steps_since_update": sampler._steps_since_update},
+            "proposal_sampler": sampler.schedule_state(),
             "schedule_length": trainer.config.schedule_length,
         }
 
@@ -49,7 +50,7 @@ class TrainingState(nn.Module):
         """Take a checkpoint's state. It has an effect when :meth:`go_on` is called, because evaluations load it too."""
         self._loaded = state
 
-    def go_on(self, trainer: AENeRFTrainer, sampler: ProposalNetworkSampler) -> None:
+    def go_on(self, trainer: AENeRFTrainer, sampler: ProposalSampler) -> None:
         """Follow a training from now on, which goes on from the loaded state if there is one.
 
         Args:
@@ -63,8 +64,7 @@ class TrainingState(nn.Module):
         for group, gradients in state["gradients"].items():
             for parameter, gradient in zip(trainer.optimizers.parameters[group], gradients, strict=True):
                 parameter.grad = None if gradient is None else gradient.to(parameter)
-        sampler._step = state["proposal_sampler"]["step"]
-        sampler._steps_since_update = state["proposal_sampler"]["steps_since_update"]
+        sampler.load_schedule_state(state["proposal_sampler"])
         if trainer.config.load_scheduler:
             trainer.config.schedule_length = state["schedule_length"]
         torch.set_rng_state(state["random_generator"])

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.picture import polarity_picture
-from aenerf_ns.events.timeline import EventTimeline
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import world_rays
@@ -99,29 +99,30 @@ class RecordingView:
         if self._dataset.has_events:
             _ = self._dataset.timeline
 
-    def events(self, seconds: float, count: int) -> EventTimeline:
+    def events(self, seconds: float, count: int) -> EventStream:
         """Return about ``count`` events around a time since the trajectory's start; none where there is no file."""
         if not self._dataset.has_events:
-            return EventTimeline(np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0, np.int8))
+            nothing = np.zeros(0, np.uint16)
+            size = self.camera.width, self.camera.height
+            return EventStream(nothing, nothing, np.zeros(0, np.int64), np.zeros(0, np.int8), *size)
         return self._dataset.timeline.nearest(self._dataset.scene.trajectory.start + round(seconds * 1e9), count)
 
-    def picture(self, events: EventTimeline) -> NDArray[np.uint8]:
+    def picture(self, events: EventStream) -> NDArray[np.uint8]:
         """Return a picture (height, width, 3) of events, as wide as the viewer's panel: red positive, blue negative."""
         width, height = self.camera.width, self.camera.height
-        rows, columns = np.divmod(events.pixels, width)
-        picture = polarity_picture(columns, rows, events.polarities, width, height)
+        picture = polarity_picture(events.x, events.y, events.p, width, height)
         scale = _PICTURE_WIDTH / width
         interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
         size = (_PICTURE_WIDTH, max(round(scale * height), 1))
         return cv2.resize(picture, size, interpolation=interpolation).astype(np.uint8, copy=False)
 
-    def described_picture(self, events: EventTimeline, seconds: float) -> str:
+    def described_picture(self, events: EventStream, seconds: float) -> str:
         """Return the picture of events around a time with their span, in Markdown."""
         if len(events) == 0:
             path = self._dataset.scene.event_file.path
             return f"There are no events at {path}." if not self._dataset.has_events else "No events around this time."
         middle = self._dataset.scene.trajectory.start + round(seconds * 1e9)
-        begin, end = ((int(time) - middle) / 1e6 for time in events.times[[0, -1]])
+        begin, end = ((int(time) - middle) / 1e6 for time in events.t[[0, -1]])
         data = base64.b64encode(png(self.picture(events))).decode()
         return (
             f"![events](data:image/png;base64,{data})\n\n"
@@ -135,15 +136,15 @@ class RecordingView:
         return torch.from_numpy(directions).reshape(-1, 3).to(self._model.device)
 
     @torch.no_grad()
-    def points(self, events: EventTimeline) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def points(self, events: EventStream) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Return places (N, 3) in the scene of at most 2000 of the events, and their colours (N, 3).
 
         An event lies on the surface that its pixel sees from the corrected pose of its time, 1 % nearer to the camera.
         """
-        shown = events.thinned(_MOST_POINTS)
+        shown = events.subsample(_MOST_POINTS)
         device = self._model.device
-        seconds = self._model.camera_optimizer.trajectory.seconds(torch.from_numpy(shown.times).to(device))
-        pixels = torch.from_numpy(shown.pixels.astype(np.int64)).to(device)
+        seconds = self._model.camera_optimizer.trajectory.seconds(torch.from_numpy(shown.t).to(device))
+        pixels = torch.from_numpy(shown.y.astype(np.int64) * self.camera.width + shown.x).to(device)
         origins, directions = world_rays(self._model.camera_optimizer.pose(seconds), self._directions[pixels])
         count = len(pixels)
         if count == 0:
@@ -157,7 +158,7 @@ class RecordingView:
         depth, accumulation = self._model.render_rays(rays, "depth", "accumulation")
         seen = (accumulation[:, 0] > _LEAST_ACCUMULATION).cpu().numpy()
         places = (rays.origins + _IN_FRONT * depth * rays.directions).cpu().numpy()
-        colors = np.where(shown.polarities[:, None] > 0, _POSITIVE_COLOR, _NEGATIVE_COLOR).astype(np.uint8)
+        colors = np.where(shown.p[:, None] > 0, _POSITIVE_COLOR, _NEGATIVE_COLOR).astype(np.uint8)
         return places[seen], colors[seen]
 
     def figures(self) -> str:

@@ -126,9 +126,9 @@ def test_pairs_are_found_by_place_and_by_number(
     # Every pair once, from as many numbers.
     events = np.arange(len(pairs))
     spans = generator.integers(1, 12, len(places) + len(events))
-    arguments = (pairs.rows, pairs.substitutes, pairs.bounds, places, events, spans)
+    arguments = (pairs.rows, pairs.replacement_rows, pairs.block_ends, places, events, spans)
     found = np.empty((len(spans), 3, 2), np.int64)
-    find_rows_on_cpu(*arguments[:3], *near_blocks(pairs.bounds), *arguments[3:], found)
+    find_rows_on_cpu(*arguments[:3], *near_blocks(pairs.block_ends), *arguments[3:], found)
     # A GPU's way.
     assert np.array_equal(find_rows(*map(torch.from_numpy, arguments)).numpy(), found)
     ends = {(y * WIDTH + x, time): index for index, (x, y, _, time, *_) in enumerate(known)}

@@ -11,16 +11,13 @@ import numpy as np
 import pytest
 import torch
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
-from helpers.streams import make_stream
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.events.pairing import pair_events
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.training import pose_diagnosis
 from aenerf_ns.training.pipeline import AENeRFPipeline
 from aenerf_ns.training.pose_diagnosis import diagnose, summary
 
@@ -125,20 +122,6 @@ def test_a_still_camera_and_few_events_can_be_diagnosed(tmp_path: Path, mode: st
     assert few["contrast_corrected"] is None
     for figures in (still, few):
         json.dumps(figures, allow_nan=False)
-
-
-def test_the_events_of_pairs_are_those_of_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = [
-        (0, 0, 1, 1), (1, 0, 2, -1), (0, 0, 3, -1), (3, 2, 4, 1), (1, 0, 5, 1), (1, 0, 5, 1), (0, 0, 6, 1), (3, 2, 7, 1)
-    ]  # fmt: skip
-    pairs = pair_events([make_stream(rows)])
-    events = pose_diagnosis._events(pairs)
-    # Without the first of each pixel, and events of one pixel and time once.
-    expected = [(0, 0, 3, -1), (1, 0, 5, 1), (0, 0, 6, 1), (3, 2, 7, 1)]
-    assert list(zip(events.x, events.y, events.t, events.p, strict=True)) == expected
-    # Only the rows in the middle of the table: 16, with 8 behind the last event's.
-    monkeypatch.setattr(pose_diagnosis, "_MAX_ROWS", len(pairs.rows) - 2)
-    assert 0 < len(pose_diagnosis._events(pairs)) <= 4
 
 
 def test_the_last_step_is_diagnosed_and_the_checkpoint_keeps_it(

@@ -130,9 +130,8 @@ def test_the_picture_holds_the_events_around_the_time(viewer: Viewer, pipeline: 
     picture = np.asarray(Image.open(io.BytesIO(b64decode(data))))
     assert picture.shape == (round(280 * SIZE[1] / SIZE[0]), 280, 3)
     events = pipeline.datamanager.train_dataset.timeline.nearest(1_500_000_000, 100)
-    x, y = events.pixels % SIZE[0], events.pixels // SIZE[0]
     net = np.zeros(SIZE[::-1], int)
-    np.add.at(net, (y, x), events.polarities)
+    np.add.at(net, (events.y, events.x), events.p)
     row, column = np.argwhere(net > 0)[0]
     red, green, blue = picture[int((row + 0.5) * 280 / SIZE[0]), int((column + 0.5) * 280 / SIZE[0])]
     assert red > green
@@ -163,26 +162,26 @@ def test_events_are_points_at_the_rendered_depth(viewer: Viewer, pipeline: AENeR
     assert len(points) == len(events)
     correction = pipeline.model.camera_optimizer
     with torch.no_grad():
-        poses = correction.pose(torch.from_numpy(events.times * 1e-9))
+        poses = correction.pose(torch.from_numpy(events.t * 1e-9))
     in_camera = (poses[:, :, :3].mT @ (torch.from_numpy(points).double() - poses[:, :, 3])[..., None])[..., 0].numpy()
     x = 12.0 - 20.0 * in_camera[:, 0] / in_camera[:, 2]
     y = 8.0 + 20.0 * in_camera[:, 1] / in_camera[:, 2]
-    np.testing.assert_allclose(x, events.pixels % SIZE[0] + 0.5, atol=1e-3)
-    np.testing.assert_allclose(y, events.pixels // SIZE[0] + 0.5, atol=1e-3)
+    np.testing.assert_allclose(x, events.x + 0.5, atol=1e-3)
+    np.testing.assert_allclose(y, events.y + 0.5, atol=1e-3)
     camera = view.camera.cameras(poses[:1])
     with viewer.train_lock:
         depth = pipeline.model.eval().get_outputs_for_camera(camera)["depth"].reshape(-1)
     distance = np.linalg.norm(in_camera[0])
-    assert distance == pytest.approx(0.99 * float(depth[events.pixels[0]]), rel=1e-3)
+    assert distance == pytest.approx(0.99 * float(depth[int(events.y[0]) * SIZE[0] + int(events.x[0])]), rel=1e-3)
     positive = colors[:, 0] > colors[:, 2]
-    np.testing.assert_array_equal(positive, events.polarities > 0)
+    np.testing.assert_array_equal(positive, events.p > 0)
     panel.events_in_scene.value = False
     wait_until(lambda: len(sent(viewer, "PointCloudMessage", "/recording/events")[-1].points) == 0)
 
 
 def test_points_are_limited_for_slow_links(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     timeline = pipeline.datamanager.train_dataset.timeline
-    many = timeline._part(np.sort(np.random.default_rng(0).integers(len(timeline), size=9000)))
+    many = timeline[np.sort(np.random.default_rng(0).integers(len(timeline), size=9000))]
     with viewer.train_lock:
         points, _ = pipeline.recording._view.points(many)
     assert len(points) <= 2000

@@ -190,5 +190,5 @@ class FlowPatchSampler(PatchSampler):
         size = int(_FLOW_DENSITY * height * width)
         begin = int(max(min(at - (at - first) % size, last - size), first))
         if begin not in self._flows:
-            self._flows[begin] = optical_flow(windows.stream(slice(begin, min(begin + size, last)), width))
+            self._flows[begin] = optical_flow(windows.events(slice(begin, min(begin + size, last))))
         return self._flows[begin]
