@@ -4,7 +4,7 @@
 
 Takes poses from the built-in paths at hard speed, adds independent noise, leaves frames out, and compares three ways to
 interpolate with the path. Linear: positions linearly, rotations spherically. Cubic: the trajectory of this project.
-Smoothing: SciPy's cubic smoothing spline, which chooses its strength by generalised cross-validation.
+Smoothing: SciPy's cubic smoothing spline, which chooses its strength by generalized cross-validation.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class BasePoses:
     rates: tuple[float, ...] = (25.0, 50.0, 125.0)
     """Poses a second."""
     noises: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.15, 0.005), (0.5, 0.02))
-    """Root mean squares of the noise of the given poses, in degrees and metres."""
+    """Root mean squares of the noise of the given poses, in degrees and meters."""
     lost: tuple[int, ...] = (1, 2, 4, 8)
     """Frames in a row that are left out, in the rows on lost frames."""
     seeds: int = 5
@@ -51,18 +51,18 @@ class BasePoses:
     def main(self) -> None:
         """Measure and write the mean errors."""
         rows = [
-            {"path": name, "rate": rate, "noise_degrees": degrees, "noise_metres": metres}
-            | _whole_path(name, rate, degrees, metres, self.seeds)
+            {"path": name, "rate": rate, "noise_degrees": degrees, "noise_meters": meters}
+            | _whole_path(name, rate, degrees, meters, self.seeds)
             for name in _PATHS
             for rate in self.rates
-            for degrees, metres in self.noises
+            for degrees, meters in self.noises
         ]
         gaps = [
-            {"path": name, "rate": rate, "noise_degrees": degrees, "noise_metres": metres, "lost": lost}
-            | _lost_frames(name, rate, degrees, metres, lost)
+            {"path": name, "rate": rate, "noise_degrees": degrees, "noise_meters": meters, "lost": lost}
+            | _lost_frames(name, rate, degrees, meters, lost)
             for name in _PATHS
             for rate in self.rates[-1:]
-            for degrees, metres in self.noises
+            for degrees, meters in self.noises
             for lost in self.lost
         ]
         write_result(self.output, {"duration_easy": _DURATION, "seeds": self.seeds, "rows": rows, "lost_frames": gaps})
@@ -97,20 +97,20 @@ _WAYS: dict[str, Callable[[NDArray[np.int64], Tensor, NDArray[np.int64]], Tensor
 }
 
 
-def _whole_path(name: str, rate: float, degrees: float, metres: float, seeds: int) -> dict:
+def _whole_path(name: str, rate: float, degrees: float, meters: float, seeds: int) -> dict:
     profile = SpeedProfile("hard", _DURATION)
     times = np.rint(np.arange(0, profile.duration, 1 / rate) * 1e9).astype(np.int64)
     fine = np.arange(0, times[-1], round(_FINE_STEP * 1e9))
     knots, truth = _true_poses(name, profile, times), _true_poses(name, profile, fine)
     errors: dict[str, list[tuple[float, float]]] = {way: [] for way in _WAYS}
-    for seed in range(seeds if degrees or metres else 1):
-        given = _with_noise(knots, degrees, metres, seed)
+    for seed in range(seeds if degrees or meters else 1):
+        given = _with_noise(knots, degrees, meters, seed)
         for way, interpolate in _WAYS.items():
             errors[way].append(_mean_errors(interpolate(times, given, fine), truth))
     return _means(errors)
 
 
-def _lost_frames(name: str, rate: float, degrees: float, metres: float, lost: int) -> dict:
+def _lost_frames(name: str, rate: float, degrees: float, meters: float, lost: int) -> dict:
     """Measure the errors while frames are lost, at ten places of the path."""
     profile = SpeedProfile("hard", _DURATION)
     times = np.rint(np.arange(0, profile.duration, 1 / rate) * 1e9).astype(np.int64)
@@ -119,7 +119,7 @@ def _lost_frames(name: str, rate: float, degrees: float, metres: float, lost: in
     for seed, first in enumerate(np.linspace(5, len(times) - lost - 5, 10).astype(int)):
         kept = np.delete(np.arange(len(times)), np.s_[first : first + lost])
         fine = np.linspace(times[first - 1], times[first + lost], 50).astype(np.int64)
-        given, truth = _with_noise(knots, degrees, metres, seed)[kept], _true_poses(name, profile, fine)
+        given, truth = _with_noise(knots, degrees, meters, seed)[kept], _true_poses(name, profile, fine)
         for way in errors:
             errors[way].append(_mean_errors(_WAYS[way](times[kept], given, fine), truth))
     return _means(errors)
@@ -130,11 +130,11 @@ def _true_poses(name: str, profile: SpeedProfile, times: NDArray[np.int64]) -> T
     return torch.from_numpy(np.stack([_PATHS[name](float(s))[:3] for s in parameters]))
 
 
-def _with_noise(poses: Tensor, degrees: float, metres: float, seed: int) -> Tensor:
+def _with_noise(poses: Tensor, degrees: float, meters: float, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     turn, shift = torch.randn(2, len(poses), 3, generator=generator, dtype=torch.float64) / math.sqrt(3)
     rotations = poses[..., :3] @ rotation_from_vector(math.radians(degrees) * turn)
-    return torch.cat([rotations, poses[..., 3:] + metres * shift[..., None]], -1)
+    return torch.cat([rotations, poses[..., 3:] + meters * shift[..., None]], -1)
 
 
 def _mean_errors(poses: Tensor, truth: Tensor) -> tuple[float, float]:
@@ -144,7 +144,7 @@ def _mean_errors(poses: Tensor, truth: Tensor) -> tuple[float, float]:
 
 def _means(errors: dict[str, list[tuple[float, float]]]) -> dict:
     means = {way: np.mean(values, 0) for way, values in errors.items()}
-    return {way: {"degrees": float(mean[0]), "metres": float(mean[1])} for way, mean in means.items()}
+    return {way: {"degrees": float(mean[0]), "meters": float(mean[1])} for way, mean in means.items()}
 
 
 if __name__ == "__main__":

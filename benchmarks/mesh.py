@@ -4,7 +4,7 @@
         --output benchmarks/results/mesh_room_small_cpu.json
 
 Exports the mesh of a trained run with ``aenerf export-mesh``, and carries it over to the world of the true poses by the
-Sim(3) that best maps the corrected trajectory to the true one. Then measures, in metres:
+Sim(3) that best maps the corrected trajectory to the true one. Then measures, in meters:
 
 - accuracy: the distance of points on the mesh, evenly spread over its area, from the nearest true surface;
 - completeness: the distance of true points that the camera saw on its way from the mesh;
@@ -116,7 +116,7 @@ class Mesh:
 
 
 def _summary(distances: np.ndarray) -> dict[str, Any]:
-    """Return the mean and the median of distances in metres, and the shares below some."""
+    """Return the mean and the median of distances in meters, and the shares below some."""
     return {
         "mean": float(distances.mean()),
         "median": float(np.median(distances)),

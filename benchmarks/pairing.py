@@ -52,7 +52,7 @@ def stream(num_events: int) -> Iterator[EventStream]:
 
 
 def with_numpy(num_events: int) -> int:
-    """Pair events as one would with NumPy: sort by pixel, then by time, and take neighbours."""
+    """Pair events as one would with NumPy: sort by pixel, then by time, and take neighbors."""
     chunks = list(stream(num_events))
     x, y, t, p = (np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in "xytp")
     del chunks

@@ -37,7 +37,7 @@ class Quality:
     simulate: str = "--scene room --speed easy --width 160 --height 120"
     """Options of aenerf simulate."""
     protocols: tuple[str, ...] = ()
-    """More colour corrections to evaluate the run with, as in aenerf evaluate --color-correction."""
+    """More color corrections to evaluate the run with, as in aenerf evaluate --color-correction."""
     train: str = ""
     """More options of ns-train, as in --train="--machine.seed 1"."""
 
@@ -55,7 +55,7 @@ class Quality:
 
 
 def _evaluate_under(folder: Path, protocol: str) -> dict[str, Any]:
-    """Evaluate the run under another colour correction than its own."""
+    """Evaluate the run under another color correction than its own."""
     options = ("--load-config", config_of(folder, "run"), "--color-correction", protocol, "--output", "other.json")
     run_script(folder, "aenerf", "evaluate", *options)
     return json.loads((folder / "other.json").read_text("utf8"))["results"]

@@ -304,7 +304,7 @@ class EventSimulator:
 
         Args:
             image: linear radiance, (H, W) for a monochrome sensor, or (H, W, 3) linear RGB. A monochrome sensor takes
-                the Rec. 709 luminance of RGB. A colour sensor needs RGB.
+                the Rec. 709 luminance of RGB. A color sensor needs RGB.
             time_ns: time of the frame in nanoseconds, later than the previous frame's.
 
         Returns:
@@ -316,7 +316,7 @@ class EventSimulator:
         """
         intensity = self._to_intensity(np.asarray(image))
         time_ns = int(time_ns)
-        # NumPy's logarithm is vectorised, numba's is not.
+        # NumPy's logarithm is vectorized, numba's is not.
         log_intensity = np.log(intensity + self.log_epsilon)
         if self._log_intensity is None:
             self._start_ns = time_ns

@@ -31,7 +31,7 @@ def frame_displacement(
     Args:
         depth: (H, W) of the first view along its optical axis, inf where there is no surface.
         first_camera_to_world, second_camera_to_world: (4, 4), OpenCV axes.
-        intrinsics: (fx, fy, cx, cy) of the depth map, pixel centres at +0.5.
+        intrinsics: (fx, fy, cx, cy) of the depth map, pixel centers at +0.5.
         sees_infinity: whether pixels of depth inf show something, which then moves as the camera turns.
 
     Returns:
@@ -78,7 +78,7 @@ def frame_parameters(
     rows = int(np.ceil(height * shrink))
     probe = tuple(shrink * np.asarray(intrinsics, np.float64))
     target = _MARGIN * maximum_displacement
-    # A probe is too small to share among threads: synchronising them takes longer than rendering.
+    # A probe is too small to share among threads: synchronizing them takes longer than rendering.
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:

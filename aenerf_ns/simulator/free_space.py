@@ -13,7 +13,7 @@ _STEPS = 2000
 
 
 class FreeSpace:
-    """The space at a clearance, in metres, from every face."""
+    """The space at a clearance, in meters, from every face."""
 
     def __init__(self, caster: RayCaster, clearance: float) -> None:
         self._caster = caster

@@ -17,7 +17,7 @@ from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, Shape, box, lit, pillar
 TEXTURE_SIZE = 256
 BACKGROUND = (0.5, 0.5, 0.5)
 RAIL = 0.3
-"""Distance of the rails from the middle, in metres."""
+"""Distance of the rails from the middle, in meters."""
 HALF = (0.5, 0.5)
 
 
@@ -30,7 +30,7 @@ _COATS = {
 
 
 def locomotive_scene(seed: int = 0, *, shiny: bool = False) -> Renderer:
-    """Build and light the locomotive, in front of grey.
+    """Build and light the locomotive, in front of gray.
 
     Args:
         seed: moves the patterns of the textures.
@@ -78,7 +78,7 @@ def _spokes(size: int, rng: np.random.Generator) -> Texture:
     radius, angle = np.hypot(axis[None, :], axis[:, None]), np.arctan2(axis[:, None], axis[None, :])
     light = np.clip((np.abs(np.sin(4 * angle)) * radius - 0.10) * -40 + 0.5, 0, 1)
     light = np.maximum(light, np.clip((radius - 0.36) * 60 + 0.5, 0, 1))
-    dark, bright = tx.linear_colour("4a2a28"), tx.linear_colour("c8503c")
+    dark, bright = tx.linear_color("4a2a28"), tx.linear_color("c8503c")
     grain = 0.08 * tx.spectral_noise(size, rng)
     return np.clip((dark + light[..., None] * (bright - dark)) * np.exp(grain)[..., None], *tx.ALBEDO_RANGE).astype(
         np.float32

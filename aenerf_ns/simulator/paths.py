@@ -1,7 +1,7 @@
 """Camera paths, and the two speeds at which a camera travels them.
 
 A path maps a parameter s in [0, 1] to a camera-to-world matrix (4, 4) with OpenCV axes (x right, y down, z forward).
-The world's z axis points up. Lengths are in metres.
+The world's z axis points up. Lengths are in meters.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def _stack(poses: Sequence[Array]) -> Array:
 
 
 def _room_pose(angle: float, outwards: float, upwards: float, gaze: float) -> Array:
-    """Return the pose at an angle of the room's loop, displaced in metres, its gaze turned by ``gaze`` radians."""
+    """Return the pose at an angle of the room's loop, displaced in meters, its gaze turned by ``gaze`` radians."""
     radius = 1.15 + 0.10 * np.sin(2 * angle) + outwards
     height = 1.40 + 0.15 * np.sin(3 * angle + 0.7) + upwards
     opposite = angle + np.pi + 0.35 * np.sin(2 * angle + 0.4) + gaze
@@ -95,19 +95,19 @@ def _anywhere(eye: Array) -> bool:
     return True
 
 
-def object_path(s: float, turns: float = 4.0, radius: float = 4.0, centre: ArrayLike = ORIGIN) -> Array:
+def object_path(s: float, turns: float = 4.0, radius: float = 4.0, center: ArrayLike = ORIGIN) -> Array:
     """Return the pose (4, 4) on a spiral from the equator to the pole of a hemisphere, as in Robust e-NeRF's scenes."""
-    return _hemisphere_pose(2 * np.pi * turns * s, 0.5 * np.pi * s, radius, ORIGIN, centre)
+    return _hemisphere_pose(2 * np.pi * turns * s, 0.5 * np.pi * s, radius, ORIGIN, center)
 
 
 def object_validation_views(
-    count: int, radius: float = 4.0, centre: ArrayLike = ORIGIN, is_free: Callable[[Array], bool] = _anywhere
+    count: int, radius: float = 4.0, center: ArrayLike = ORIGIN, is_free: Callable[[Array], bool] = _anywhere
 ) -> Array:
     """Return views (count, 4, 4) all over the hemisphere, on a golden-angle spiral.
 
     Args:
         count: number of views.
-        radius, centre: radius and centre (3,) of the hemisphere, in metres.
+        radius, center: radius and center (3,) of the hemisphere, in meters.
         is_free: tells whether a camera may be at a place (3,). A view is turned about the vertical until it may.
 
     Raises:
@@ -116,7 +116,7 @@ def object_validation_views(
 
     def candidates(k: int, z: float) -> Iterator[Array]:
         for i in range(_TRIES):
-            yield _hemisphere_pose(2.399963 * k + 0.1 * i, np.arcsin(z), radius, ORIGIN, centre)
+            yield _hemisphere_pose(2.399963 * k + 0.1 * i, np.arcsin(z), radius, ORIGIN, center)
 
     heights = (np.arange(count) + 0.5) / count
     return _stack([_first_free(candidates(k, z), is_free) for k, z in enumerate(heights)])
@@ -126,10 +126,10 @@ def object_test_views(
     count: int,
     seed: int,
     radius: float = 4.0,
-    centre: ArrayLike = ORIGIN,
+    center: ArrayLike = ORIGIN,
     is_free: Callable[[Array], bool] = _anywhere,
 ) -> Array:
-    """Return random views (count, 4, 4) over the hemisphere, at other distances and off-centre, where `is_free`.
+    """Return random views (count, 4, 4) over the hemisphere, at other distances and off-center, where `is_free`.
 
     Raises:
         DataError: a view cannot be placed.
@@ -143,7 +143,7 @@ def object_test_views(
                 np.arcsin(rng.uniform(0, 1)),
                 radius / 4.0 * rng.uniform(3.6, 4.4),
                 radius / 4.0 * rng.uniform(-0.15, 0.15, 3),
-                centre,
+                center,
             )
 
     return _stack([_first_free(candidates(), is_free) for _ in range(count)])
@@ -159,7 +159,7 @@ def _first_free(candidates: Iterator[Array], is_free: Callable[[Array], bool]) -
 class WalkPath:
     """A closed smooth walk through given positions, looking at given targets.
 
-    Positions and targets are periodic cubic splines. Their parameter is the distance between neighbouring positions, so
+    Positions and targets are periodic cubic splines. Their parameter is the distance between neighboring positions, so
     that the speed hardly varies.
 
     Args:
@@ -167,7 +167,7 @@ class WalkPath:
         targets: (N, 3) that the camera looks at from the positions.
 
     Raises:
-        ValueError: too few points, neighbours in one place, or a gaze that is vertical or has no direction.
+        ValueError: too few points, neighbors in one place, or a gaze that is vertical or has no direction.
     """
 
     def __init__(self, positions: ArrayLike, targets: ArrayLike) -> None:
@@ -182,7 +182,7 @@ class WalkPath:
         self._eye = CubicSpline(knots, closed, bc_type="periodic")
         self._target = CubicSpline(knots, np.concatenate([looked_at, looked_at[:1]]), bc_type="periodic")
         self.size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
-        """Root mean square distance of the positions from their mean, in metres."""
+        """Root mean square distance of the positions from their mean, in meters."""
         gaze = self._target(_FINE) - self._eye(_FINE)
         if (np.linalg.norm(gaze[:, :2], axis=1) < 0.02 * np.linalg.norm(gaze, axis=1) + 1e-9).any():
             raise ValueError("the camera looks straight up or down, or at the place it is in; move the targets")
@@ -192,7 +192,7 @@ class WalkPath:
         return self._pose(s, np.zeros(3), 0.0)
 
     def _pose(self, s: float, shift: ArrayLike, gaze: float) -> Array:
-        """Return the pose displaced by ``shift`` metres (right, up, level forward), turned by ``gaze`` radians."""
+        """Return the pose displaced by ``shift`` meters (right, up, level forward), turned by ``gaze`` radians."""
         eye, target = self._eye(s % 1.0), self._target(s % 1.0)
         forward = (target - eye) * [1.0, 1.0, 0.0]
         forward /= np.linalg.norm(forward)
@@ -247,14 +247,14 @@ class WalkPath:
 
 
 def _hemisphere_pose(
-    azimuth: float, elevation: float, radius: float, target: ArrayLike, centre: ArrayLike = ORIGIN
+    azimuth: float, elevation: float, radius: float, target: ArrayLike, center: ArrayLike = ORIGIN
 ) -> Array:
-    """Return a pose on the hemisphere that looks at ``target``, which is relative to the centre."""
+    """Return a pose on the hemisphere that looks at ``target``, which is relative to the center."""
     outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     eye = radius * (np.cos(elevation) * outward + np.sin(elevation) * np.array([0.0, 0.0, 1.0]))
     # The direction of growing elevation is a vertical that stays defined at the pole.
     up = np.cos(elevation) * np.array([0.0, 0.0, 1.0]) - np.sin(elevation) * outward
-    return look_at(eye + np.asarray(centre), np.add(target, centre), up)
+    return look_at(eye + np.asarray(center), np.add(target, center), up)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ TEXTURE_SIZE = 256
 HALF_SIZE = 2.0
 HEIGHT = 2.5
 
-BOOK_COLOURS = ("b5523b", "d9a441", "4f7a5b", "3f6d8e", "8c4a6b", "e0d3b0", "6b7f3a", "c9772e", "5a5fa0", "a8463f")
+BOOK_COLORS = ("b5523b", "d9a441", "4f7a5b", "3f6d8e", "8c4a6b", "e0d3b0", "6b7f3a", "c9772e", "5a5fa0", "a8463f")
 
 
 def room_scene(seed: int = 0) -> Renderer:
@@ -163,9 +163,9 @@ def _table() -> list[Shape]:
         pillar((0.38, -0.2, top), 0.045, 0.1, "stripes", 0.15, tint=(1.0, 0.8, 0.7)),
     ]
     stack = ((0.0, 0.30, 0.21, "3f6d8e", 12), (0.035, 0.27, 0.19, "b5523b", -9), (0.075, 0.24, 0.18, "d9a441", 27))
-    for lift, long, wide, colour, degrees in stack:
-        centre, tint = (0.33, 0.1, top + lift + 0.0175), tx.linear_colour(colour) * 1.1
-        parts.append(turned_box(centre, (long, wide, 0.0344), degrees, "book", 0.3, tint=tint))
+    for lift, long, wide, color, degrees in stack:
+        center, tint = (0.33, 0.1, top + lift + 0.0175), tx.linear_color(color) * 1.1
+        parts.append(turned_box(center, (long, wide, 0.0344), degrees, "book", 0.3, tint=tint))
     return parts
 
 
@@ -193,14 +193,14 @@ def _bookshelf(rng: np.random.Generator) -> list[Shape]:
                 continue
             width = rng.uniform(0.045, 0.085)
             height, depth = clear * rng.uniform(0.66, 0.93), rng.uniform(0.16, 0.22)
-            colour = 0.08 + 0.8 * tx.linear_colour(BOOK_COLOURS[rng.integers(len(BOOK_COLOURS))])
+            color = 0.08 + 0.8 * tx.linear_color(BOOK_COLORS[rng.integers(len(BOOK_COLORS))])
             parts.append(
                 box(
                     (x, back - 0.03 - depth, z + board),
                     (x + width, back - 0.03, z + board + height),
                     "book",
                     0.36,
-                    tint=colour * 1.1,
+                    tint=color * 1.1,
                     texture_offset=(float(rng.random()), 0.5),
                 )
             )

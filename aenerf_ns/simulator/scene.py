@@ -11,7 +11,7 @@ from aenerf_ns.simulator.rendering.renderer import Renderer
 
 @dataclass(frozen=True)
 class SimulationScene:
-    """A scene and the cameras in it. Poses are camera-to-world, OpenCV axes, z up, metres.
+    """A scene and the cameras in it. Poses are camera-to-world, OpenCV axes, z up, meters.
 
     Attributes:
         name: name of a built-in scene or of a file.
@@ -38,6 +38,6 @@ class SimulationScene:
     notes: tuple[str, ...] = ()
 
     def intrinsics(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """Return (fx, fy, cx, cy) in pixels, pixel centres at +0.5."""
+        """Return (fx, fy, cx, cy) in pixels, pixel centers at +0.5."""
         focal = self.focal_ratio * width
         return focal, focal, width / 2, height / 2

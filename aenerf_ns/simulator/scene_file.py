@@ -25,13 +25,13 @@ from aenerf_ns.simulator.rendering.renderer import Renderer
 from aenerf_ns.simulator.scene import SimulationScene
 
 CLEARANCE = 0.15
-"""Distance in metres that cameras keep from a mesh; less along a path of less than about a metre."""
+"""Distance in meters that cameras keep from a mesh; less along a path of less than about a meter."""
 _FOCAL_RATIO = {"around": 1.2, "walk": 0.62}
 _SKY = [[0.25, 0.25, 0.25], [1.0, 1.0, 1.0]]
 _BACKGROUND = [0.5, 0.5, 0.5]
 _RADIUS = 4.0
 _RADII = 3.6
-"""Default distance of the camera from an object: in metres, and in half diagonals of the object's bounds."""
+"""Default distance of the camera from an object: in meters, and in half diagonals of the object's bounds."""
 _DURATION = 4.0
 _ROUGHEST = 0.5
 """Highest roughness. The narrow lobe that reflections assume does not describe rougher surfaces."""
@@ -44,7 +44,7 @@ _LARGEST, _MOST_LAMPS, _MOST_KNOTS = 1e6, 100, 10_000
 
 _KEYS = {"mesh", "up", "scale", "materials", "light", "background", "path", "focal_ratio", "box", "credits"}
 _PATH_KEYS = {
-    "around": {"kind", "centre", "radius", "turns", "duration"},
+    "around": {"kind", "center", "radius", "turns", "duration"},
     "walk": {"kind", "positions", "targets", "duration"},
 }
 _REMEDY = "see docs/simulator.md"
@@ -177,11 +177,11 @@ def _number_up_to(values: JsonObject, name: str, highest: float) -> float:
 
 
 def _lamp(lamp: JsonObject) -> AreaLight:
-    lamp.refuse_keys_except({"centre", "half_u", "half_v", "radiance"})
-    centre, half_u, half_v = (_array(lamp, key, (3,)) for key in ("centre", "half_u", "half_v"))
+    lamp.refuse_keys_except({"center", "half_u", "half_v", "radiance"})
+    center, half_u, half_v = (_array(lamp, key, (3,)) for key in ("center", "half_u", "half_v"))
     if not np.cross(half_u, half_v).any():
         raise lamp.error("half_u", "spans no rectangle with half_v", "give two directions")
-    return AreaLight(centre, half_u, half_v, _radiance(lamp, "radiance", (3,)))
+    return AreaLight(center, half_u, half_v, _radiance(lamp, "radiance", (3,)))
 
 
 def _background(values: JsonObject, light: tuple[Environment, list[AreaLight]] | None) -> Array | None:
@@ -189,7 +189,7 @@ def _background(values: JsonObject, light: tuple[Environment, list[AreaLight]] |
     if values.holds("background", str):
         values.choice("background", ("environment",))
         if light is None:
-            raise values.error("background", 'is "environment", but the light is baked', "give a colour")
+            raise values.error("background", 'is "environment", but the light is baked', "give a color")
         return None
     if "background" not in values:
         return np.array(_BACKGROUND)
@@ -214,14 +214,14 @@ def _views(values: JsonObject, kind: str, bounds: Array, caster: RayCaster) -> _
     """Return the camera's path and the views beside it. The path is checked to keep clear of the mesh."""
     route: Callable[[float], Array]
     if kind == "around":
-        centre = _array(values, "centre", (3,)) if "centre" in values else bounds.mean(axis=0)
+        center = _array(values, "center", (3,)) if "center" in values else bounds.mean(axis=0)
         radius = values.number("radius", *_SCALES, 0.5 * _RADII * float(np.linalg.norm(bounds[1] - bounds[0])))
-        route = partial(paths.object_path, turns=values.number("turns", *_TURNS, 4.0), radius=radius, centre=centre)
+        route = partial(paths.object_path, turns=values.number("turns", *_TURNS, 4.0), radius=radius, center=center)
         space = FreeSpace(caster, min(CLEARANCE, 0.13 * radius))
         views = _Views(
             route,
-            lambda count: paths.object_validation_views(count, radius, centre, space.is_free),
-            lambda count, seed: paths.object_test_views(count, seed, radius, centre, space.is_free),
+            lambda count: paths.object_validation_views(count, radius, center, space.is_free),
+            lambda count, seed: paths.object_test_views(count, seed, radius, center, space.is_free),
         )
     else:
         try:

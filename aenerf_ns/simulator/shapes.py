@@ -20,12 +20,12 @@ from aenerf_ns.simulator.rendering.mesh_repair import prepared
 from aenerf_ns.simulator.rendering.renderer import Renderer
 
 _SAGITTA = 5e-4
-"""Largest distance of a triangle from the round surface that it approximates, in metres."""
+"""Largest distance of a triangle from the round surface that it approximates, in meters."""
 _FEWEST_SIDES = 12
 """The faces of a prism with fewer than 10 sides would meet at creases."""
 
 Surface = tuple[Array, NDArray[np.int64], Array]
-"""Vertices (V, 3) in metres, faces (F, 3), anticlockwise seen from outside, and texture coordinates (V, 2) in tiles."""
+"""Vertices (V, 3) in meters, faces (F, 3) counterclockwise from outside, and texture coordinates (V, 2) in tiles."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +33,19 @@ class Shape:
     """A textured surface.
 
     Attributes:
-        surface: returns the surface in local coordinates, given the longest side of its cells in metres. A cell is two
+        surface: returns the surface in local coordinates, given the longest side of its cells in meters. A cell is two
             triangles.
-        centre: (3,) in metres.
+        center: (3,) in meters.
         rotation: (3, 3) world-from-local.
         texture: name of the texture.
         texture_offset: (u, v) in tiles.
         tint: (3,) factor of the texture's albedo.
         emission: radiance with which the surface glows at an albedo of 1. It lights nothing: an `AreaLight` does.
-        spacing: longest side of the cells in metres, where that is less than the scene's: the size of its shadows.
+        spacing: longest side of the cells in meters, where that is less than the scene's: the size of its shadows.
     """
 
     surface: Callable[[float], Surface]
-    centre: ArrayLike
+    center: ArrayLike
     rotation: Array
     texture: str
     texture_offset: tuple[float, float] = (0.0, 0.0)
@@ -57,7 +57,7 @@ class Shape:
 def mesh_of(
     shapes: Sequence[Shape], textures: Mapping[str, Texture], spacing: float, gloss: Mapping[str, Gloss] | None = None
 ) -> Mesh:
-    """Join shapes to one mesh of cells with sides of at most ``spacing`` metres.
+    """Join shapes to one mesh of cells with sides of at most ``spacing`` meters.
 
     ``gloss`` has coats by the names of the textures that they cover. Other shapes are diffuse.
 
@@ -65,21 +65,21 @@ def mesh_of(
         KeyError: the texture of a shape is missing.
     """
     index = {name: i for i, name in enumerate(textures)}
-    vertices, faces, uv, colour, count = [], [], [], [], 0
+    vertices, faces, uv, color, count = [], [], [], [], 0
     for shape in shapes:
         local, corners, tiles = shape.surface(min(spacing, shape.spacing))
         # Not a matrix product, which may round equal rows differently: the two sides of a seam must stay in one place.
-        vertices.append((local[:, None, :] * shape.rotation).sum(axis=-1) + np.asarray(shape.centre))
+        vertices.append((local[:, None, :] * shape.rotation).sum(axis=-1) + np.asarray(shape.center))
         faces.append(corners + count)
         uv.append(tiles + shape.texture_offset)
-        colour.append(np.tile(np.asarray(shape.tint, np.float64), (len(local), 1)))
+        color.append(np.tile(np.asarray(shape.tint, np.float64), (len(local), 1)))
         count += len(local)
     sizes, coats = [len(part) for part in faces], gloss or {}
     mesh = Mesh(
         np.concatenate(vertices),
         np.concatenate(faces),
         np.concatenate(uv),
-        np.concatenate(colour),
+        np.concatenate(color),
         np.repeat([index[shape.texture] for shape in shapes], sizes),
         np.repeat([shape.emission for shape in shapes], sizes).astype(np.float64),
         np.repeat([coats.get(shape.texture, DIFFUSE) for shape in shapes], sizes, axis=0),
@@ -104,7 +104,7 @@ def lit(
 
     Args:
         shapes, textures: the scene.
-        spacing: largest distance in metres of the points at which light is computed.
+        spacing: largest distance in meters of the points at which light is computed.
         environment, lamps, background, ambient, seed: see `light_mesh`.
         gloss: coats by the names of textures, see `mesh_of`.
     """
@@ -136,26 +136,26 @@ def box(low: ArrayLike, high: ArrayLike, texture: str, scale: float, **rest: Any
     return turned_box((low_corner + high_corner) / 2, high_corner - low_corner, 0.0, texture, scale, **rest)
 
 
-def turned_box(centre: ArrayLike, size: ArrayLike, degrees: float, texture: str, scale: float, **rest: Any) -> Shape:
+def turned_box(center: ArrayLike, size: ArrayLike, degrees: float, texture: str, scale: float, **rest: Any) -> Shape:
     """Make a box turned about the vertical.
 
     Args:
-        centre: (3,) in metres.
-        size: (3,) sides in metres.
-        degrees: angle of the turn, anticlockwise seen from above.
+        center: (3,) in meters.
+        size: (3,) sides in meters.
+        degrees: angle of the turn, counterclockwise seen from above.
         texture: name of the texture. Its origin lies in the middle of each side.
-        scale: side of one tile of the texture, in metres.
+        scale: side of one tile of the texture, in meters.
         rest: ``texture_offset``, ``tint``, ``emission`` and ``spacing`` of the `Shape`.
     """
-    return Shape(partial(_box, np.asarray(size, float), scale), centre, turned(degrees), texture, **rest)
+    return Shape(partial(_box, np.asarray(size, float), scale), center, turned(degrees), texture, **rest)
 
 
-def sphere(centre: ArrayLike, radius: float, texture: str, scale: float, **rest: Any) -> Shape:
+def sphere(center: ArrayLike, radius: float, texture: str, scale: float, **rest: Any) -> Shape:
     """Make a sphere. A tilted axis keeps the poles of the texture at the sides, away from views from above.
 
     For the other arguments see `turned_box`.
     """
-    return Shape(partial(_sphere, radius, scale), centre, axes((0, 0.6, 0.8), (1, 0, 0)), texture, **rest)
+    return Shape(partial(_sphere, radius, scale), center, axes((0, 0.6, 0.8), (1, 0, 0)), texture, **rest)
 
 
 def pillar(foot: ArrayLike, radius: float, height: float, texture: str, scale: float, **rest: Any) -> Shape:
@@ -164,14 +164,14 @@ def pillar(foot: ArrayLike, radius: float, height: float, texture: str, scale: f
 
 
 def rod(
-    centre: ArrayLike, radius: float, length: float, along: Array, texture: str, scale: float, **rest: Any
+    center: ArrayLike, radius: float, length: float, along: Array, texture: str, scale: float, **rest: Any
 ) -> Shape:
     """Make a lying cylinder; ``along`` is ALONG_X or ALONG_Y. For the other arguments see `turned_box`."""
-    return Shape(partial(_cylinder, radius, length, scale), centre, along, texture, **rest)
+    return Shape(partial(_cylinder, radius, length, scale), center, along, texture, **rest)
 
 
 def panel(
-    centre: ArrayLike,
+    center: ArrayLike,
     size: tuple[float, float],
     right: ArrayLike,
     up: ArrayLike,
@@ -183,7 +183,7 @@ def panel(
 
     For the other arguments see `turned_box`.
     """
-    return Shape(partial(_rectangle, size, scale), centre, axes(right, up), texture, **rest)
+    return Shape(partial(_rectangle, size, scale), center, axes(right, up), texture, **rest)
 
 
 def _rectangle(size: tuple[float, float], scale: float, spacing: float) -> Surface:
@@ -247,7 +247,7 @@ def _joined(parts: Sequence[Surface]) -> Surface:
 
 
 def _triangles(grid: Array) -> NDArray[np.int64]:
-    """Return two triangles for each cell of a grid (rows, columns, ...), anticlockwise where rows go up."""
+    """Return two triangles for each cell of a grid (rows, columns, ...), counterclockwise where rows go up."""
     vertex = np.arange(grid.shape[0] * grid.shape[1]).reshape(grid.shape[:2])
     a, b, c, d = (part.reshape(-1) for part in (vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, 1:], vertex[1:, :-1]))
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])

@@ -31,12 +31,12 @@ _RAYS_OF_EXPOSURES = 4
 
 
 class ReferencePicture(NamedTuple):
-    """The picture from a pose, grey for a monochrome sensor.
+    """The picture from a pose, gray for a monochrome sensor.
 
     Attributes:
         display: (height, width, 3) uint8, sRGB.
         linear: (height, width, 3) uint16, linear radiance; 65535 stands for 1, which is display white.
-        depth: (height, width) float32 along the optical axis at the pixels' centres, inf where nothing is hit.
+        depth: (height, width) float32 along the optical axis at the pixels' centers, inf where nothing is hit.
     """
 
     display: NDArray[np.uint8]
@@ -88,7 +88,7 @@ class Simulation:
         return self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy
 
     def trajectory(self, pose_rate: float) -> Trajectory:
-        """Return the true trajectory from the start to the end, camera-to-world, OpenCV axes, in metres.
+        """Return the true trajectory from the start to the end, camera-to-world, OpenCV axes, in meters.
 
         Args:
             pose_rate: poses a second.
@@ -149,7 +149,7 @@ class Simulation:
             exposure: duration of the exposure in seconds.
 
         Returns:
-            (height, width) for a monochrome sensor, (height, width, 3) for a colour sensor.
+            (height, width) for a monochrome sensor, (height, width, 3) for a color sensor.
         """
         middle = time * 1e-9
         ends = np.interp(

@@ -1,7 +1,7 @@
 """Make procedural textures: seeded, tileable, linear albedo within [0.03, 0.92].
 
 A texture is a float32 array (N, N, 3). Columns run along the surface coordinate u. Rows run along v, which points up in
-pictures. Colours are sRGB hexadecimal strings "rrggbb".
+pictures. Colors are sRGB hexadecimal strings "rrggbb".
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from aenerf_ns.simulator.arrays import Array, Texture
 ALBEDO_RANGE = (0.03, 0.92)
 
 
-def linear_colour(colour: str) -> Array:
-    """Return linear RGB (3,) of an sRGB colour "rrggbb"."""
-    return decode(np.array([int(colour[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0, "srgb")
+def linear_color(color: str) -> Array:
+    """Return linear RGB (3,) of an sRGB color "rrggbb"."""
+    return decode(np.array([int(color[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0, "srgb")
 
 
 def spectral_noise(
@@ -38,44 +38,44 @@ def spectral_noise(
     return noise / noise.std()
 
 
-def mottled(size: int, rng: np.random.Generator, colours: Sequence[str], contrast: float = 0.08) -> Texture:
-    """Make clouds that pass through all the colours, under a finer grain: plaster, stone, marble."""
-    blend = _blend(colours, 0.5 + 0.24 * spectral_noise(size, rng, 1.5))
+def mottled(size: int, rng: np.random.Generator, colors: Sequence[str], contrast: float = 0.08) -> Texture:
+    """Make clouds that pass through all the colors, under a finer grain: plaster, stone, marble."""
+    blend = _blend(colors, 0.5 + 0.24 * spectral_noise(size, rng, 1.5))
     return _albedo(blend, contrast * spectral_noise(size, rng, 0.9))
 
 
-def wood(size: int, rng: np.random.Generator, colours: Sequence[str]) -> Texture:
+def wood(size: int, rng: np.random.Generator, colors: Sequence[str]) -> Texture:
     """Make wood with its grain along u: warped year rings and stretched fibres."""
     warp = spectral_noise(size, rng, 1.8, (4.0, 1.0))
     rings = np.sin(2 * np.pi * (5 * _coordinate(size)[:, None] + 0.55 * warp))
     fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
-    return _albedo(_blend(colours, 0.5 + 0.22 * rings + 0.10 * fibres), 0.06 * fibres)
+    return _albedo(_blend(colors, 0.5 + 0.22 * rings + 0.10 * fibres), 0.06 * fibres)
 
 
-def planks(size: int, rng: np.random.Generator, colours: Sequence[str], rows: int = 8, columns: int = 2) -> Texture:
+def planks(size: int, rng: np.random.Generator, colors: Sequence[str], rows: int = 8, columns: int = 2) -> Texture:
     """Make floorboards along u, each of its own tone, with staggered joints."""
     row, column, edge = _bond(size, rows, columns, rng.random(rows))
     tone = rng.random((rows, columns))[row, column]
     fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
-    board = _blend(colours, tone + 0.14 * fibres)
+    board = _blend(colors, tone + 0.14 * fibres)
     return _albedo(board * (0.6 + 0.4 * _smooth_step(edge, 0.002, 0.009))[..., None], 0.06 * fibres)
 
 
 def bricks(
-    size: int, rng: np.random.Generator, colours: Sequence[str], mortar: str, rows: int = 12, columns: int = 4
+    size: int, rng: np.random.Generator, colors: Sequence[str], mortar: str, rows: int = 12, columns: int = 4
 ) -> Texture:
     """Make a running bond of bricks, each of its own tone, with soft mortar joints."""
     row, column, edge = _bond(size, rows, columns, 0.5 * (np.arange(rows) % 2) / columns)
     grain = spectral_noise(size, rng, 0.8)
-    brick = _blend(colours, rng.random((rows, columns))[row, column] + 0.12 * grain)
+    brick = _blend(colors, rng.random((rows, columns))[row, column] + 0.12 * grain)
     mix = _smooth_step(edge + 0.0012 * grain, 0.006, 0.014)[..., None]
-    return _albedo(mix * brick + (1 - mix) * linear_colour(mortar), 0.06 * grain)
+    return _albedo(mix * brick + (1 - mix) * linear_color(mortar), 0.06 * grain)
 
 
-def striped_wallpaper(size: int, rng: np.random.Generator, colours: Sequence[str], stripes: int = 6) -> Texture:
-    """Make upright stripes that cycle through the colours, with diamonds on every other stripe."""
+def striped_wallpaper(size: int, rng: np.random.Generator, colors: Sequence[str], stripes: int = 6) -> Texture:
+    """Make upright stripes that cycle through the colors, with diamonds on every other stripe."""
     u, v = _coordinate(size)[None, :] * stripes, _coordinate(size)[:, None] * stripes
-    palette = np.array([linear_colour(colour) for colour in colours])
+    palette = np.array([linear_color(color) for color in colors])
     index = np.floor(u).astype(int) % stripes
     inside = _smooth_step(0.5 - np.abs(u % 1 - 0.5), 0.02, 0.06)
     paper = inside[..., None] * palette[index % len(palette)] + (1 - inside[..., None]) * palette[-1]
@@ -86,9 +86,9 @@ def striped_wallpaper(size: int, rng: np.random.Generator, colours: Sequence[str
 
 
 def leafy_wallpaper(
-    size: int, rng: np.random.Generator, ground: str, colours: Sequence[str], sprigs: int = 110
+    size: int, rng: np.random.Generator, ground: str, colors: Sequence[str], sprigs: int = 110
 ) -> Texture:
-    """Strew leaves of several colours over a mottled ground."""
+    """Strew leaves of several colors over a mottled ground."""
     paper = _blend([ground, ground], np.zeros((size, size)))
     u, v = _coordinate(size)[None, :], _coordinate(size)[:, None]
     for _ in range(sprigs):
@@ -98,39 +98,39 @@ def leafy_wallpaper(
         width = 0.36 * length * (1 - (along / length) ** 2)
         leaf = _smooth_step(width - np.abs(across), 0.0, 0.006)
         vein = 1 - 0.35 * _smooth_step(0.005 - np.abs(across), 0.0, 0.004)
-        colour = linear_colour(colours[rng.integers(len(colours))]) * rng.uniform(0.8, 1.15)
-        paper = paper * (1 - leaf[..., None]) + leaf[..., None] * vein[..., None] * colour
+        color = linear_color(colors[rng.integers(len(colors))]) * rng.uniform(0.8, 1.15)
+        paper = paper * (1 - leaf[..., None]) + leaf[..., None] * vein[..., None] * color
     return _albedo(paper, 0.06 * spectral_noise(size, rng, 1.1))
 
 
-def checker(size: int, rng: np.random.Generator, colours: Sequence[str], cells: int = 4) -> Texture:
-    """Make soft-edged squares of two colours."""
+def checker(size: int, rng: np.random.Generator, colors: Sequence[str], cells: int = 4) -> Texture:
+    """Make soft-edged squares of two colors."""
     wave = np.sin(np.pi * cells * _coordinate(size))
     squares = np.clip(6 * wave[None, :] * wave[:, None], -0.5, 0.5)
-    return _albedo(_blend(colours, 0.5 + squares), 0.06 * spectral_noise(size, rng, 1.0))
+    return _albedo(_blend(colors, 0.5 + squares), 0.06 * spectral_noise(size, rng, 1.0))
 
 
-def fabric(size: int, rng: np.random.Generator, colours: Sequence[str], threads: int = 24) -> Texture:
+def fabric(size: int, rng: np.random.Generator, colors: Sequence[str], threads: int = 24) -> Texture:
     """Make a plain weave with uneven threads and a wide check."""
     coordinate = _coordinate(size)
     wave = np.sin(2 * np.pi * threads * coordinate)
     check = np.sin(2 * np.pi * 2 * coordinate)
     tone = 0.5 + 0.10 * wave[None, :] * wave[:, None] + 0.16 * (check[None, :] + check[:, None])
     uneven = spectral_noise(size, rng, 0.9, (6.0, 1.0)) + spectral_noise(size, rng, 0.9, (1.0, 6.0))
-    return _albedo(_blend(colours, tone + 0.08 * uneven), 0.05 * uneven)
+    return _albedo(_blend(colors, tone + 0.08 * uneven), 0.05 * uneven)
 
 
-def rug(size: int, rng: np.random.Generator, colours: Sequence[str]) -> Texture:
-    """Make a rug: borders around a field of nested diamonds. The colours are ground, field, accent and light."""
-    ground, field, accent, light = (linear_colour(colour) for colour in colours)
+def rug(size: int, rng: np.random.Generator, colors: Sequence[str]) -> Texture:
+    """Make a rug: borders around a field of nested diamonds. The colors are ground, field, accent and light."""
+    ground, field, accent, light = (linear_color(color) for color in colors)
     u, v = np.abs(_coordinate(size) - 0.5)[None, :], np.abs(_coordinate(size) - 0.5)[:, None]
     reach = np.maximum(u, v)
     diamonds = np.sin(2 * np.pi * 6.5 * (u + v)) * np.cos(2 * np.pi * 4 * (u - v))
     picture = field + (accent - field) * _smooth_step(diamonds, 0.1, 0.3)[..., None]
     picture = picture + (light - picture) * _smooth_step(-diamonds, 0.62, 0.8)[..., None]
     teeth = 0.012 * np.abs(((u - v) * 24) % 2 - 1)
-    for inner, colour in ((0.36, ground), (0.385, light), (0.40, accent), (0.445, light), (0.46, ground)):
-        picture = picture + (colour - picture) * _smooth_step(reach - inner + teeth, 0.0, 0.006)[..., None]
+    for inner, color in ((0.36, ground), (0.385, light), (0.40, accent), (0.445, light), (0.46, ground)):
+        picture = picture + (color - picture) * _smooth_step(reach - inner + teeth, 0.0, 0.006)[..., None]
     pile = spectral_noise(size, rng, 0.5, (3.0, 1.0))
     return _albedo(picture, 0.06 * pile)
 
@@ -151,27 +151,27 @@ def landscape(size: int, rng: np.random.Generator, sky: Sequence[str], hills: Se
     """Paint ridges, one before the other, under a clouded sky."""
     v = _coordinate(size)[:, None]
     picture = _blend(sky, 1.5 * v - 0.45 + 0.10 * spectral_noise(size, rng, 1.5, (2.5, 1.0)))
-    for depth, colour in enumerate(hills):
+    for depth, color in enumerate(hills):
         profile = spectral_noise(size, rng, 1.9)[0] * 0.05 / (1 + 0.3 * depth)
         ridge = 0.60 - 0.50 * (depth + 0.4) / len(hills) + profile[None, :]
         shade = (0.85 + 0.3 * np.clip((ridge - v) * 3, 0, 1) + 0.12 * spectral_noise(size, rng, 1.0))[..., None]
         mix = _smooth_step(ridge - v, 0.0, 0.006)[..., None]
-        picture = (1 - mix) * picture + mix * linear_colour(colour) * shade
+        picture = (1 - mix) * picture + mix * linear_color(color) * shade
     return _albedo(picture, 0.05 * spectral_noise(size, rng, 0.8))
 
 
-def abstract(size: int, rng: np.random.Generator, ground: str, colours: Sequence[str], shapes: int = 16) -> Texture:
+def abstract(size: int, rng: np.random.Generator, ground: str, colors: Sequence[str], shapes: int = 16) -> Texture:
     """Paint overlapping discs and bars."""
     u, v = _coordinate(size)[None, :], _coordinate(size)[:, None]
     picture = _blend([ground, ground], np.zeros((size, size)))
     for shape in range(shapes):
-        centre, radius, angle = rng.uniform(0.15, 0.85, 2), rng.uniform(0.05, 0.2), rng.uniform(0, np.pi)
-        du, dv = u - centre[0], v - centre[1]
+        center, radius, angle = rng.uniform(0.15, 0.85, 2), rng.uniform(0.05, 0.2), rng.uniform(0, np.pi)
+        du, dv = u - center[0], v - center[1]
         along, across = du * np.cos(angle) + dv * np.sin(angle), dv * np.cos(angle) - du * np.sin(angle)
         bar = np.maximum(np.abs(along) - 1.5 * radius, np.abs(across) - 0.25 * radius)
         distance = np.hypot(du, dv) - radius if shape % 2 else bar
-        colour = linear_colour(colours[shape % len(colours)])
-        picture += 0.85 * _smooth_step(-distance, -0.003, 0.005)[..., None] * (colour - picture)
+        color = linear_color(colors[shape % len(colors)])
+        picture += 0.85 * _smooth_step(-distance, -0.003, 0.005)[..., None] * (color - picture)
     return _albedo(picture, 0.08 * spectral_noise(size, rng, 0.9))
 
 
@@ -184,9 +184,9 @@ def _smooth_step(value: Array, low: float, high: float) -> Array:
     return fraction * fraction * (3 - 2 * fraction)
 
 
-def _blend(colours: Sequence[str], position: Array) -> Array:
-    """Interpolate the sequence of colours at positions from 0 to 1."""
-    palette = np.array([linear_colour(colour) for colour in colours])
+def _blend(colors: Sequence[str], position: Array) -> Array:
+    """Interpolate the sequence of colors at positions from 0 to 1."""
+    palette = np.array([linear_color(color) for color in colors])
     knots = np.linspace(0, 1, len(palette))
     return np.stack([np.interp(position, knots, channel) for channel in palette.T], axis=-1)
 
@@ -202,5 +202,5 @@ def _bond(size: int, rows: int, columns: int, shift: Array) -> tuple[NDArray[np.
     return row, column, np.minimum(edge_u, edge_v)
 
 
-def _albedo(colour: Array, relative_noise: Array) -> Texture:
-    return np.clip(colour * np.exp(relative_noise)[..., None], *ALBEDO_RANGE).astype(np.float32)
+def _albedo(color: Array, relative_noise: Array) -> Texture:
+    return np.clip(color * np.exp(relative_noise)[..., None], *ALBEDO_RANGE).astype(np.float32)

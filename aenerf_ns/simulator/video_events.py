@@ -20,7 +20,7 @@ from aenerf_ns.simulator.esim import NOISELESS, EventSimulator
 from aenerf_ns.simulator.frames import DISPLACEMENT_PERCENTILE
 from aenerf_ns.simulator.options import Interpolation, SensorNoise
 
-_GREY_LEVELS = decode(np.arange(256) / 255, "srgb")
+_GRAY_LEVELS = decode(np.arange(256) / 255, "srgb")
 
 
 class VideoInterval(NamedTuple):
@@ -37,16 +37,16 @@ class VideoInterval(NamedTuple):
     events: EventStream
 
 
-def quantisation_epsilon(sensor: SensorModel) -> float:
+def quantization_epsilon(sensor: SensorModel) -> float:
     """Return the radiance that is added before the logarithm, because 8 bits of sRGB are coarse near black.
 
-    Without it, the step from black to the first grey level would be infinite in log-radiance. With it, the step from
-    grey level 0 to 2 of 255 is exactly the smaller contrast threshold C: log((L(2) + ε) / ε) = C, where L is linear
+    Without it, the step from black to the first gray level would be infinite in log-radiance. With it, the step from
+    gray level 0 to 2 of 255 is exactly the smaller contrast threshold C: log((L(2) + ε) / ε) = C, where L is linear
     radiance. For C of 0.1 or more, any other two levels that are 2 apart differ by less. So a pixel that flickers by
-    one grey level does not keep firing.
+    one gray level does not keep firing.
     """
     threshold = min(sensor.positive_contrast_threshold, sensor.negative_contrast_threshold)
-    return float(_GREY_LEVELS[2]) / math.expm1(threshold)
+    return float(_GRAY_LEVELS[2]) / math.expm1(threshold)
 
 
 def video_events(
@@ -59,7 +59,7 @@ def video_events(
 ) -> Iterator[VideoInterval]:
     """Simulate an event sensor that sees a video. One frame after the other is read, so memory does not grow.
 
-    sRGB values are decoded to linear radiance, and :func:`quantisation_epsilon` is added before the logarithm. The
+    sRGB values are decoded to linear radiance, and :func:`quantization_epsilon` is added before the logarithm. The
     sensor is that of :class:`~aenerf_ns.simulator.esim.EventSimulator`.
 
     Args:
@@ -76,14 +76,14 @@ def video_events(
         ValueError: the displacement is not positive, a value of the noise is out of range, or the frames are too small
             for optical flow.
     """
-    epsilon = quantisation_epsilon(sensor)
+    epsilon = quantization_epsilon(sensor)
     simulator = EventSimulator(video.width, video.height, sensor, noise, log_epsilon=epsilon, seed=seed)
     flow = FlowInterpolation(video.width, video.height, max_displacement) if interpolation == "flow" else None
     before: tuple[NDArray[np.uint8], NDArray[np.float64], int] | None = None
     with progress_bar() as progress:
         frames = zip(video, video.times.tolist(), strict=True)
         for frame, time in progress.track(frames, total=len(video.times), description="Simulating events"):
-            seen = to_channels(torch.from_numpy(_GREY_LEVELS[frame]), sensor.num_channels).squeeze(-1).numpy()
+            seen = to_channels(torch.from_numpy(_GRAY_LEVELS[frame]), sensor.num_channels).squeeze(-1).numpy()
             pieces = []
             if flow is not None and before is not None:
                 first_frame, first_seen, start = before
@@ -137,10 +137,10 @@ class FlowInterpolation:
             first_frame, second_frame: (height, width, 3) RGB, from which the flow is found.
             first_log, second_log: (height, width) or (height, width, 3) log-radiance, which moves along the flow.
         """
-        first_grey, second_grey = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (first_frame, second_frame))
+        first_gray, second_gray = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (first_frame, second_frame))
         # Without a guess of the flow to start from.
-        forward = self._flow.calc(first_grey, second_grey, np.empty(0))
-        backward = self._flow.calc(second_grey, first_grey, np.empty(0))
+        forward = self._flow.calc(first_gray, second_gray, np.empty(0))
+        backward = self._flow.calc(second_gray, first_gray, np.empty(0))
         displacement = max(
             np.percentile(np.linalg.norm(flow, axis=-1), DISPLACEMENT_PERCENTILE) for flow in (forward, backward)
         )

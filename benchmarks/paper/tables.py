@@ -250,7 +250,7 @@ def _conditions(figures: Sequence[Figures]) -> str:
         device = f"{machine['gpu'] if one['device'] == 'cuda' else machine['cpu']}, {machine['cores']} cores"
         lines.append(f"- {device}; {versions}; commit {one['commit']}")
     used = {one["results"].get("color_correction", "none (nerfacto)") for one in figures}
-    lines.append(f"- colour correction: {'; '.join(sorted(used))}")
+    lines.append(f"- color correction: {'; '.join(sorted(used))}")
     return "\n".join(lines)
 
 

@@ -51,7 +51,7 @@ SCENES = {
         "choose",
         "forklift",
         ("--speed", "hard", *_SMALL, *_NOISE, "--bayer-pattern", "RGGB", "--seed", "7"),
-        "colour, on a floor",
+        "color, on a floor",
     ),
     "games": PoseScene(
         "report", "games", ("--speed", "hard", *_SMALL, *_NOISE, "--seed", "11"), "large in the picture"
@@ -60,7 +60,7 @@ SCENES = {
         "report",
         "plants",
         ("--speed", "easy", *_SMALL, *_NOISE, "--bayer-pattern", "RGGB", "--seed", "12"),
-        "colour, fine structures",
+        "color, fine structures",
     ),
     "workshop": PoseScene("report", "workshop", ("--speed", "hard", *_SMALL, *_NOISE, "--seed", "13"), "a large place"),
     "gallery": PoseScene(

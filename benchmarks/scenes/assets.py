@@ -32,7 +32,7 @@ import cv2
 
 _PICTURE_SIZE = 512
 _DETAILS = {"plain": textures.mottled, "wood": textures.wood, "cloth": textures.fabric}
-_LICENCE = "CC0 1.0"
+_LICENSE = "CC0 1.0"
 
 
 @dataclass(frozen=True)
@@ -156,33 +156,33 @@ class Library:
             dress: replacements of materials, by the replaced name. None leaves the faces out.
 
         Raises:
-            DataError: if the package lacks the model, or if the model's own licence is not CC0: a few models of the
+            DataError: if the package lacks the model, or if the model's own license is not CC0: a few models of the
                 package's CC0 file are CC BY.
         """
         entry = self._catalogue().get(name)
         if entry is None:
             raise DataError(name, f"no such model in {FURNITURE.file}", "name one of its folders")
         path = self._furniture() / entry["model"].lstrip("/")
-        for licence in path.parent.glob("*[Ll][Ii][Cc][Ee][Nn]*"):
-            if "Creative Commons Zero" not in licence.read_text(errors="replace"):
-                raise DataError(licence, f"{name} is not under {_LICENCE}", "use another model")
+        for license_file in path.parent.glob("*[Ll][Ii][Cc][Ee][Nn]*"):
+            if "Creative Commons Zero" not in license_file.read_text(errors="replace"):
+                raise DataError(license_file, f"{name} is not under {_LICENSE}", "use another model")
         dress = dress or {}
 
-        def surface(material: str, colour: tuple[float, float, float], picture: Path | None) -> Material | None:
+        def surface(material: str, color: tuple[float, float, float], picture: Path | None) -> Material | None:
             if material in dress:
                 return dress[material]
             if picture is not None:
                 return _photograph(f"{name}/{picture.name}", picture)
             pattern = detail if isinstance(detail, str) else detail.get(material, "plain")
-            return coloured(f"{name}/{material}", colour, pattern)
+            return colored(f"{name}/{material}", color, pattern)
 
-        centimetres = [float(entry[key]) for key in ("width", "depth", "height")]
-        model = read_obj(path, surface, np.array(centimetres) / 100)
+        centimeters = [float(entry[key]) for key in ("width", "depth", "height")]
+        model = read_obj(path, surface, np.array(centimeters) / 100)
         self.credits[name] = {
             "asset": name,
             "source": f"{FURNITURE.file}: BlendSwap-CC-0.sh3f",
             "author": entry.get("creator", "unknown"),
-            "licence": _LICENCE,
+            "license": _LICENSE,
         }
         return model.standing()
 
@@ -206,7 +206,7 @@ class Library:
             "asset": f"{name} (environment)",
             "source": f"{package.name}: hdri/{name}.exr.js",
             "author": "Poly Haven",
-            "licence": _LICENCE,
+            "license": _LICENSE,
         }
         return with_whole_sun(np.ascontiguousarray(picture[..., 2::-1], np.float32))
 
@@ -227,10 +227,10 @@ def _unpack(package: Path, empty: Path) -> Path:
 
 
 def with_whole_sun(panorama: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a panorama (H, W, 3) whose sun has all its colours.
+    """Return a panorama (H, W, 3) whose sun has all its colors.
 
     The package's compression lost the red and the green of some suns, and left ringing in their blue. Such suns get the
-    colour of the sky around them.
+    color of the sky around them.
     """
     lost = (panorama[..., 0] < 1e-3) & (np.abs(panorama[..., 2]) > 1)
     if not lost.any():
@@ -242,9 +242,9 @@ def with_whole_sun(panorama: NDArray[np.float32]) -> NDArray[np.float32]:
     return whole
 
 
-def coloured(name: str, colour: tuple[float, float, float], pattern: str = "plain") -> Material:
-    """Make a material with a faint pattern around an sRGB colour (0 to 1), neither black nor glaring."""
-    tones = [np.clip(np.array(colour) * factor, 0.2, 0.95) for factor in (0.85, 1.0, 1.15)]
+def colored(name: str, color: tuple[float, float, float], pattern: str = "plain") -> Material:
+    """Make a material with a faint pattern around an sRGB color (0 to 1), neither black nor glaring."""
+    tones = [np.clip(np.array(color) * factor, 0.2, 0.95) for factor in (0.85, 1.0, 1.15)]
     hexadecimal = ["".join(f"{round(255 * value):02x}" for value in tone) for tone in tones]
     return paint(name, _DETAILS[pattern], hexadecimal, size=128)
 

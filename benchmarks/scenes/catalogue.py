@@ -13,8 +13,8 @@ from benchmarks.scenes.cleaning import without_coincident_faces
 from benchmarks.scenes.meshes import Model
 
 _HALF_EXTENT, _RADIUS, _DISTANCE = 1.2, 1.35, 4.0
-"""Half of an object's longest side, radius of the ball that holds it, and the camera's distance, in metres."""
-_GREY = (0.5, 0.5, 0.5)
+"""Half of an object's longest side, radius of the ball that holds it, and the camera's distance, in meters."""
+_GRAY = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class BenchmarkScene:
         lamps: further lights, as in a scene file.
         walk: positions and targets of a walk. None if the camera goes around the scene.
         duration: seconds that the path takes at constant speed.
-        show_environment: whether the environment is the background. Otherwise the background is grey.
+        show_environment: whether the environment is the background. Otherwise the background is gray.
     """
 
     compose: Callable[[Library], Model]
@@ -50,7 +50,7 @@ class BenchmarkScene:
 
     def description(self, mesh: str, environment: str, credits: Sequence[dict[str, str]]) -> dict[str, object]:
         """Return the content of the scene file, given the file names of its mesh and its environment."""
-        path: dict[str, object] = {"kind": "around", "centre": [0, 0, 0], "radius": _DISTANCE, "turns": 4}
+        path: dict[str, object] = {"kind": "around", "center": [0, 0, 0], "radius": _DISTANCE, "turns": 4}
         if self.walk is not None:
             path = {"kind": "walk", "positions": self.walk[0], "targets": self.walk[1]}
         path["duration"] = self.duration
@@ -64,7 +64,7 @@ class BenchmarkScene:
         return {
             "mesh": mesh,
             "light": light,
-            "background": "environment" if self.show_environment else list(_GREY),
+            "background": "environment" if self.show_environment else list(_GRAY),
             "path": path,
             "credits": list(credits),
         }
@@ -76,11 +76,11 @@ def loop(
     """Return positions and targets of an oval walk around the origin. The camera bobs and looks across the middle.
 
     Args:
-        half_length: half axis of the oval along x, in metres.
-        half_width: half axis of the oval along y, in metres.
-        height: mean height of the camera, in metres.
+        half_length: half axis of the oval along x, in meters.
+        half_width: half axis of the oval along y, in meters.
+        height: mean height of the camera, in meters.
         reach: distance of the targets beyond the middle, as a fraction of the oval's half axes.
-        look_height: mean height of the targets, in metres.
+        look_height: mean height of the targets, in meters.
         count: number of positions.
     """
     turn = 2 * np.pi * np.arange(count) / count

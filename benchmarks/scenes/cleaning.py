@@ -13,7 +13,7 @@ from aenerf_ns.simulator.rendering.embree import RayCaster
 from benchmarks.scenes.meshes import Array, Model, areas, longest_sides, unit_normals
 
 _LARGE = 0.02
-"""Length in metres. Triangles with a longer side are also checked near their corners, others only in the middle."""
+"""Length in meters. Triangles with a longer side are also checked near their corners, others only in the middle."""
 
 
 def without_coincident_faces(model: Model, gap: float) -> Model:
@@ -24,7 +24,7 @@ def without_coincident_faces(model: Model, gap: float) -> Model:
 
     Args:
         model: meshes that may touch.
-        gap: in metres.
+        gap: in meters.
     """
     owner = np.repeat(np.arange(len(model.parts)), [len(part.points) for part in model.parts])
     _, first = np.unique(np.sort(_corner_numbers(model.triangles), axis=1), axis=0, return_index=True)
@@ -45,7 +45,7 @@ def without_coincident_faces(model: Model, gap: float) -> Model:
 
 
 def _corner_numbers(triangles: Array) -> NDArray[np.int64]:
-    """Number the corners (F, 3) of triangles (F, 3, 3): the same number for points equal to a micrometre."""
+    """Number the corners (F, 3) of triangles (F, 3, 3): the same number for points equal to a micrometer."""
     return np.unique(triangles.reshape(-1, 3).round(6), axis=0, return_inverse=True)[1].reshape(-1, 3)
 
 

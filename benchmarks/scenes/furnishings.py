@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from aenerf_ns.simulator import textures as tx
-from benchmarks.scenes.meshes import Material, Model, coloured_copy, join, paint
+from benchmarks.scenes.meshes import Material, Model, colored_copy, join, paint
 from benchmarks.scenes.shapes import box, disc, rectangle, revolved
 
-_BOOK_COLOURS = ("8c3b32", "35608c", "4a7a4f", "b98a3a", "6f4a7a", "a8a090", "396b73", "a35f3a")
+_BOOK_COLORS = ("8c3b32", "35608c", "4a7a4f", "b98a3a", "6f4a7a", "a8a090", "396b73", "a35f3a")
 
 
 def oak() -> Material:
@@ -49,10 +49,10 @@ def books(width: float, depth: float, height: float, seed: int, fill: float = 1.
         deep, set_back = depth * rng.uniform(0.7, 0.9), rng.uniform(0, 0.02)
         if x + thick > width * fill:
             return join(row)
-        colour = tx.linear_colour(_BOOK_COLOURS[rng.integers(len(_BOOK_COLOURS))]) / tx.linear_colour("b0aca2")
+        color = tx.linear_color(_BOOK_COLORS[rng.integers(len(_BOOK_COLORS))]) / tx.linear_color("b0aca2")
         low, high = np.array([x, set_back, 0]), np.array([x + thick, set_back + deep, tall])
-        row.append(box(low, high, coloured_copy(cover, colour), without="yzZ"))
-        row.append(rectangle((x, set_back, 0), (thick, 0, 0), (0, 0, tall), coloured_copy(spine, colour)))
+        row.append(box(low, high, colored_copy(cover, color), without="yzZ"))
+        row.append(rectangle((x, set_back, 0), (thick, 0, 0), (0, 0, tall), colored_copy(spine, color)))
         row.append(rectangle((x, set_back, tall), (thick, 0, 0), (0, deep, 0), pages, 0.2))
         x += thick + 0.0015
 
@@ -179,7 +179,7 @@ def skirting(low: tuple[float, float], high: tuple[float, float], material: Mate
 def lamp(x: float, y: float, z: float, half_size: float, radiance: Sequence[float]) -> dict[str, list[float]]:
     """Describe a square lamp that shines downwards, for a scene file."""
     return {
-        "centre": [x, y, z],
+        "center": [x, y, z],
         "half_u": [half_size, 0, 0],
         "half_v": [0, -half_size, 0],
         "radiance": list(radiance),

@@ -1,6 +1,6 @@
-"""Textured triangle meshes: how they are held, put together and coloured.
+"""Textured triangle meshes: how they are held, put together and colored.
 
-Lengths are in metres and the z axis points up. Corners run counter-clockwise, seen from the front of a face.
+Lengths are in meters and the z axis points up. Corners run counter-clockwise, seen from the front of a face.
 """
 
 from __future__ import annotations
@@ -78,17 +78,17 @@ class Model:
         return self.moved((-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]))
 
     def fitted(self, half_extent: float, radius: float) -> Model:
-        """Centre the bounds at the origin and scale the model to the largest size within two limits.
+        """Center the bounds at the origin and scale the model to the largest size within two limits.
 
         Args:
-            half_extent: half of the longest side of the bounds, at most; in metres.
-            radius: radius of a ball around the origin that must hold the model; in metres.
+            half_extent: half of the longest side of the bounds, at most; in meters.
+            radius: radius of a ball around the origin that must hold the model; in meters.
         """
         low, high = self.bounds
-        centre = (low + high) / 2
-        reach = np.linalg.norm(self.triangles.reshape(-1, 3) - centre, axis=1).max()
+        center = (low + high) / 2
+        reach = np.linalg.norm(self.triangles.reshape(-1, 3) - center, axis=1).max()
         scale = min(2 * half_extent / (high - low).max(), radius / reach)
-        return self.moved(-scale * centre, scale=scale)
+        return self.moved(-scale * center, scale=scale)
 
     def with_texture_shifted(self, shift: tuple[float, float]) -> Model:
         """Shift all texture coordinates by (u, v)."""
@@ -133,9 +133,9 @@ def paint(
     return Material(name, srgb_picture(texture)[::-1])
 
 
-def coloured_copy(material: Material, colour: ArrayLike) -> Material:
+def colored_copy(material: Material, color: ArrayLike) -> Material:
     """Multiply a material's linear albedo by an RGB factor."""
-    factor = np.asarray(colour, np.float64)
+    factor = np.asarray(color, np.float64)
     name = f"{material.name} * {factor.round(4).tolist()}"
     return Material(name, srgb_picture(np.clip(decode(material.picture / 255, "srgb") * factor, *ALBEDO_RANGE)))
 

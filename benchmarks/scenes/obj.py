@@ -20,7 +20,7 @@ from benchmarks.scenes.meshes import Array, Material, Model, Part, cross_2d, not
 
 @dataclass(frozen=True)
 class _ObjMaterial:
-    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    color: tuple[float, float, float] = (0.6, 0.6, 0.6)
     opacity: float = 1.0
     picture: Path | None = None
 
@@ -39,12 +39,12 @@ def read_obj(
 
     Args:
         path: OBJ file. Its material libraries lie beside it.
-        surface: maps the name, sRGB colour and picture file (or None) of a material to the material to use, or to
+        surface: maps the name, sRGB color and picture file (or None) of a material to the material to use, or to
             None to leave its faces out.
-        size: extent (3,) of the content along x, y and z, in metres. Proportions are kept: the scale is the median
-            of the three ratios. None if the file's unit is the metre.
+        size: extent (3,) of the content along x, y and z, in meters. Proportions are kept: the scale is the median
+            of the three ratios. None if the file's unit is the meter.
         minimum_opacity: faces of more transparent materials are left out, because rays stop at every surface.
-        tile: side of a texture tile in those planes, in metres.
+        tile: side of a texture tile in those planes, in meters.
 
     Raises:
         DataError: if the file cannot be read or has no faces.
@@ -85,7 +85,7 @@ def read_obj(
     parts = []
     for name, faces in polygons.items():
         entry = materials.get(name, _ObjMaterial())
-        material = surface(name, entry.colour, entry.picture) if entry.opacity >= minimum_opacity else None
+        material = surface(name, entry.color, entry.picture) if entry.opacity >= minimum_opacity else None
         if material is None:
             continue
         corners = np.concatenate([face[:, triangulate(points[face[0]])] for face in faces], axis=1)
@@ -155,7 +155,7 @@ def _index(text: str, count: int) -> int:
 
 
 def _read_mtl(path: Path) -> dict[str, _ObjMaterial]:
-    """Read the colours, opacities and pictures of a material library, by material name."""
+    """Read the colors, opacities and pictures of a material library, by material name."""
     materials: dict[str, _ObjMaterial] = {}
     name = ""
     for line in path.read_text(errors="replace").splitlines():
@@ -166,7 +166,7 @@ def _read_mtl(path: Path) -> dict[str, _ObjMaterial]:
             materials[name] = _ObjMaterial()
         elif key == "Kd":
             red, green, blue = (float(number) for number in value.split()[:3])
-            materials[name] = replace(materials[name], colour=(red, green, blue))
+            materials[name] = replace(materials[name], color=(red, green, blue))
         elif key == "d":
             materials[name] = replace(materials[name], opacity=float(value.split()[-1]))
         elif key == "map_Kd" and (path.parent / value).is_file():

@@ -1,4 +1,4 @@
-"""Scenes that the camera walks through. Lengths are in metres, z points up."""
+"""Scenes that the camera walks through. Lengths are in meters, z points up."""
 
 from __future__ import annotations
 

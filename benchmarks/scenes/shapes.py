@@ -1,4 +1,4 @@
-"""Simple shapes as textured meshes. A texture repeats every ``tile`` metres."""
+"""Simple shapes as textured meshes. A texture repeats every ``tile`` meters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def box(low: ArrayLike, high: ArrayLike, material: Material, tile: float = 0.5, 
     Args:
         low, high: (3,) corners.
         material: of all sides.
-        tile: side of a texture tile, in metres.
+        tile: side of a texture tile, in meters.
         without: sides to leave out, as letters: "x" is the side at low x, "X" the side at high x, and so on.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)

@@ -64,7 +64,7 @@ class _Worker:
         return self._seconds(lambda: self._model.get_outputs_for_camera(self._camera))
 
     def psnr(self) -> float:
-        """Return the PSNR over the validation views, with the colour correction fitted on them."""
+        """Return the PSNR over the validation views, with the color correction fitted on them."""
         pipeline = self._trainer.pipeline
         # Commits that refine the poses of the views would do it each time.
         pipeline.config.refine_test_poses = False

@@ -117,8 +117,8 @@ def test_obj_files_are_read_with_their_materials(tmp_path):
     (tmp_path / "a.mtl").write_text("newmtl wood\nKd 0.5 0.25 0\nnewmtl glass\nd 0.3\nnewmtl paper\nKd 1 1 1\n")
     asked = {}
 
-    def surface(name, colour, picture):
-        asked[name] = (colour, picture)
+    def surface(name, color, picture):
+        asked[name] = (color, picture)
         return None if name == "paper" else PLAIN
 
     model = read_obj(tmp_path / "a.obj", surface, size=(2.0, 0.4, 1.0))
@@ -223,7 +223,7 @@ def test_two_builds_at_once_unpack_the_furniture_once(tmp_path, monkeypatch):
     assert [path.name for path in other.iterdir() if not path.name.startswith(".")] == [package.name]
 
 
-def test_a_sun_that_lost_its_colours_gets_those_of_the_sky_around_it() -> None:
+def test_a_sun_that_lost_its_colors_gets_those_of_the_sky_around_it() -> None:
     sky = np.array([2.0, 1.5, 1.0], np.float32)
     panorama = np.tile(sky, (16, 32, 1))
     whole = assets.with_whole_sun(panorama)

@@ -36,7 +36,7 @@ def test_an_error_that_all_poses_share_is_none() -> None:
 def test_a_turn_between_nearby_times_is_seen_in_pixels() -> None:
     poses = _poses()
     wrong = poses.clone()
-    # Every second pose, 0.1 seconds from its neighbours, is turned by 0.01 radians.
+    # Every second pose, 0.1 seconds from its neighbors, is turned by 0.01 radians.
     turn = motion_from_twist(torch.tensor([0.0, 0, 0, 0, 0.01, 0], dtype=torch.float64))
     wrong[1::2, :, :3] = wrong[1::2, :, :3] @ turn[:3, :3]
     seconds = torch.linspace(0, 4, len(poses), dtype=torch.float64)

@@ -34,11 +34,11 @@ def light_mesh(mesh: Mesh, *rest: object, **options: float) -> Renderer:
     return lighting.light_mesh(mesh, RayCaster(mesh.vertices, mesh.faces), *rest, **options)
 
 
-def mesh_of(shape: trimesh.Trimesh, colour: object = (0.5, 0.5, 0.5)) -> Mesh:
-    colours = np.tile(np.asarray(colour, np.float64), (len(shape.vertices), 1))
+def mesh_of(shape: trimesh.Trimesh, color: object = (0.5, 0.5, 0.5)) -> Mesh:
+    colors = np.tile(np.asarray(color, np.float64), (len(shape.vertices), 1))
     uv, texture = np.zeros((len(shape.vertices), 2)), np.full(len(shape.faces), -1)
     glow, coat = np.zeros(len(shape.faces)), np.zeros((len(shape.faces), 2))
-    return scaled(Mesh(np.array(shape.vertices), np.array(shape.faces), uv, colours, texture, glow, coat, ()), 1.0)
+    return scaled(Mesh(np.array(shape.vertices), np.array(shape.faces), uv, colors, texture, glow, coat, ()), 1.0)
 
 
 def plate(half: float, picture: np.ndarray | None = None, tiles: float = 1.0) -> Mesh:
@@ -46,10 +46,10 @@ def plate(half: float, picture: np.ndarray | None = None, tiles: float = 1.0) ->
     corners = half * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     uv = tiles * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     textures = () if picture is None else (np.asarray(picture, np.float32),)
-    colour = np.full((4, 3), 0.5 if picture is None else 1.0)
+    color = np.full((4, 3), 0.5 if picture is None else 1.0)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     texture = np.full(2, len(textures) - 1)
-    return scaled(Mesh(corners, faces, uv, colour, texture, np.zeros(2), np.zeros((2, 2)), textures), 1.0)
+    return scaled(Mesh(corners, faces, uv, color, texture, np.zeros(2), np.zeros((2, 2)), textures), 1.0)
 
 
 def joined(*meshes: Mesh) -> Mesh:
@@ -58,7 +58,7 @@ def joined(*meshes: Mesh) -> Mesh:
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)]),
         np.concatenate([mesh.uv for mesh in meshes]),
-        np.concatenate([mesh.colour for mesh in meshes]),
+        np.concatenate([mesh.color for mesh in meshes]),
         np.concatenate([mesh.texture for mesh in meshes]),
         np.concatenate([mesh.emission for mesh in meshes]),
         np.concatenate([mesh.gloss for mesh in meshes]),

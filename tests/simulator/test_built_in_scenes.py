@@ -36,7 +36,7 @@ def test_no_ray_leaves_the_room(room: SimulationScene) -> None:
     eyes = np.stack([room.path(s)[:3, 3] for s in rng.uniform(size=100_000)])
     rays = np.concatenate([eyes, rng.normal(size=eyes.shape)], axis=1).astype(np.float32)
     assert np.isfinite(room.renderer.caster.cast(rays)["t_hit"]).all()
-    # Into the edges, where two sides meet, and around the corners, 10 micrometres beside the point itself.
+    # Into the edges, where two sides meet, and around the corners, 10 micrometers beside the point itself.
     edges = rng.uniform((-2, -2, 0), (2, 2, 2.5), eyes.shape)
     free = rng.integers(0, 4, len(edges))
     for axis, (low, high) in enumerate(((-2, 2), (-2, 2), (0, 2.5))):

@@ -172,7 +172,7 @@ def test_stream_order_and_range() -> None:
     np.testing.assert_array_equal(np.lexsort((pixel, t)), np.arange(len(t)))
 
 
-def test_colour_filters_and_luminance() -> None:
+def test_color_filters_and_luminance() -> None:
     thresholds = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.2}
     before, after = np.ones((4, 6, 3)), np.ones((4, 6, 3))
     for channel, pixels in enumerate(
@@ -180,9 +180,9 @@ def test_colour_filters_and_luminance() -> None:
     ):
         after[:] = before
         after[..., channel] = 1.3
-        colour = make_simulator(6, 4, bayer_pattern="RGGB", **thresholds)
-        colour(before, 0)
-        x, y, _, _ = colour(after, 1000)
+        color = make_simulator(6, 4, bayer_pattern="RGGB", **thresholds)
+        color(before, 0)
+        x, y, _, _ = color(after, 1000)
         assert sorted(set(zip((y % 2).tolist(), (x % 2).tolist(), strict=True))) == pixels
         assert len(x) == 6 * len(pixels)
     gray, luminance = make_simulator(6, 4, **thresholds), make_simulator(6, 4, **thresholds)

@@ -66,7 +66,7 @@ def test_frame_parameters_bound_the_motion(toy: SimulationScene) -> None:
 
 
 def test_frames_follow_what_moves_behind_a_mesh(box_file: Path) -> None:
-    """Around a box, what is far behind it moves most: an environment there must not, a plain colour may."""
+    """Around a box, what is far behind it moves most: an environment there must not, a plain color may."""
     intrinsics = 1.2 * 24, 1.2 * 24, 12.0, 9.0
     lens = np.array([[intrinsics[0], 0, 12.0], [0, intrinsics[1], 9.0], [0, 0, 1]])
     corner = np.mgrid[:24, :18].reshape(2, -1).T + 0.5

@@ -67,19 +67,19 @@ def test_the_same_picture_from_glb_and_obj(tmp_path: Path) -> None:
     np.testing.assert_allclose(overhead, value * [0.8, 1.0, 0.6], atol=1e-3)
 
 
-def test_colours_of_a_ply_are_srgb(tmp_path: Path) -> None:
+def test_colors_of_a_ply_are_srgb(tmp_path: Path) -> None:
     body = trimesh.creation.box()
     for kind in ("vertex_colors", "face_colors"):
-        coloured = trimesh.Trimesh(
+        colored = trimesh.Trimesh(
             body.vertices,
             body.faces,
             process=False,
             **{kind: np.array([[200, 100, 50, 255]] * (8 if kind[0] == "v" else 12), np.uint8)},
         )
-        coloured.export(tmp_path / "box.ply")
+        colored.export(tmp_path / "box.ply")
         mesh = load_mesh(tmp_path / "box.ply", False)
         np.testing.assert_allclose(
-            mesh.colour[mesh.faces], np.broadcast_to(decode(np.array([200, 100, 50]) / 255, "srgb"), (12, 3, 3))
+            mesh.color[mesh.faces], np.broadcast_to(decode(np.array([200, 100, 50]) / 255, "srgb"), (12, 3, 3))
         )
 
 
@@ -92,8 +92,8 @@ def test_an_obj_with_a_concave_polygon_and_two_materials(tmp_path: Path) -> None
     mesh = scaled(load_mesh(tmp_path / "a.obj", False), 2.0)
     # The notch is not filled; the scale is applied; the first material comes first.
     np.testing.assert_allclose(normals_and_areas(mesh)[1].sum(), 4 * (0.6 + 0.5), rtol=1e-6)
-    np.testing.assert_allclose(mesh.colour[mesh.faces[0]], [[0.7, 0.1, 0.1]] * 3)
-    np.testing.assert_allclose(mesh.colour[mesh.faces[-1]], [[0.1, 0.6, 0.1]] * 3)
+    np.testing.assert_allclose(mesh.color[mesh.faces[0]], [[0.7, 0.1, 0.1]] * 3)
+    np.testing.assert_allclose(mesh.color[mesh.faces[-1]], [[0.1, 0.6, 0.1]] * 3)
 
 
 @pytest.mark.parametrize(

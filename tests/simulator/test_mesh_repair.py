@@ -35,7 +35,7 @@ def test_subdivision_leaves_no_gaps() -> None:
 
 
 def test_coincident_faces_show_the_first_from_everywhere() -> None:
-    red, green = (mesh_of(trimesh.creation.box((1, 1, 0.2)), colour) for colour in ((0.8, 0, 0), (0, 0.8, 0)))
+    red, green = (mesh_of(trimesh.creation.box((1, 1, 0.2)), color) for color in ((0.8, 0, 0), (0, 0.8, 0)))
     smaller = mesh_of(trimesh.creation.box((0.6, 0.6, 0.2)), (0, 0, 0.8))
     for second, count in ((green, 12), (smaller, 4)):
         both, coincident = prepared(joined(red, second))

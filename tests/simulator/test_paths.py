@@ -30,7 +30,7 @@ def test_paths_are_smooth(path: object) -> None:
         poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (8001, 1, 1)), atol=1e-12
     )
     np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1, atol=1e-12)
-    # Continuous second derivatives: those of neighbours differ by a small part of their size.
+    # Continuous second derivatives: those of neighbors differ by a small part of their size.
     second = np.diff(poses[:, :3], n=2, axis=0) * 8000**2
     assert np.abs(np.diff(second, axis=0)).max() < 0.02 * np.abs(second).max()
 

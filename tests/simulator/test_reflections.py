@@ -27,7 +27,7 @@ LENS, SIZE = (60.0, 60.0, 40.0, 30.0), (80, 60)
 
 def coated(mesh: Mesh, specular: float, roughness: float, albedo: float = 0.5) -> Mesh:
     gloss = np.tile([specular, roughness], (len(mesh.faces), 1))
-    return dataclasses.replace(mesh, gloss=gloss, colour=np.full_like(mesh.colour, albedo))
+    return dataclasses.replace(mesh, gloss=gloss, color=np.full_like(mesh.color, albedo))
 
 
 def red(scene: Renderer, pose: np.ndarray = OVERHEAD) -> np.ndarray:

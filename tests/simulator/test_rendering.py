@@ -54,7 +54,7 @@ def test_depth_and_alpha_of_a_tilted_plate() -> None:
 
 
 def test_texture_coordinates_and_wrapping() -> None:
-    """A picture with two different ramps, repeated: bilinear between the centres of its texels, and round its edges."""
+    """A picture with two different ramps, repeated: bilinear between the centers of its texels, and round its edges."""
     rng = np.random.default_rng(0)
     picture = rng.uniform(0.1, 0.9, (6, 10, 3)).astype(np.float32)
     scene = baked_mesh(plate(1.0, picture, tiles=1.5), BLACK)

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("small_work")
 
 TIN = {"specular": 0.5, "roughness": 0.2}
 DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [
-    {"centre": [0, 0, 3], "half_u": [1, 0, 0], "half_v": [0, -1, 0], "radiance": [9, 9, 9]}]}  # fmt: skip
+    {"center": [0, 0, 3], "half_u": [1, 0, 0], "half_v": [0, -1, 0], "radiance": [9, 9, 9]}]}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -46,19 +46,19 @@ DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [
         ({"path": {"kind": "around", "radius": 1e30}}, "radius is 1e+30; give a number from"),
         ({"path": {"kind": "around", "turns": 1e9}}, "turns is 1e+09; give a number from 0.001 to 1000"),
         ({"path": {"kind": "around", "duration": 1e300}}, "duration is 1e+300; give a number from 0.001 to 100000"),
-        ({"path": {"kind": "around", "centre": [0, 0, 1e30]}}, "centre has 1e+30; give numbers up to 1e+06"),
+        ({"path": {"kind": "around", "center": [0, 0, 1e30]}}, "center has 1e+30; give numbers up to 1e+06"),
         ({"path": {**WALK, "positions": [[0, 0, 0]] * 20_000}}, "positions has 20000 rows; give at most 10000"),
         ({"light": {"sky": [[1] * 3, [1e300] * 3]}}, "light.sky has 1e+300; give numbers up to 1e+06"),
         ({"light": {**DAY, "lamps": DAY["lamps"] * 101}}, "light.lamps has 101 entries; give at most 100"),
         ({"light": {**DAY, "lamps": [{**DAY["lamps"][0], "half_v": [0, 0, 0]}]}}, "half_u spans no rectangle with"),
-        ({"colour": 1}, "unknown key 'colour'"),
+        ({"color": 1}, "unknown key 'color'"),
         ({"light": "bright"}, 'light is "bright"; give "baked"'),
         ({"light": {}}, 'light has none or both of "sky" and "environment"'),
         ({"light": {"sky": [[1, 1, 1]]}}, "light.sky must be 2 x 3 finite numbers, not [[1, 1, 1]]"),
         ({"light": {"sky": [[1, 1, 1], [1, 1, -1]]}}, "must not be negative"),
         ({"light": {"environment": "gone.hdr"}}, "gone.hdr: the environment does not exist"),
         ({"light": {"environment": "box.glb"}}, "box.glb: not a Radiance picture"),
-        ({"light": {"sky": [[0] * 3, [1] * 3], "lamps": [{"centre": [0, 0, 1]}]}}, "light.lamps[0].half_u is missing"),
+        ({"light": {"sky": [[0] * 3, [1] * 3], "lamps": [{"center": [0, 0, 1]}]}}, "light.lamps[0].half_u is missing"),
         ({"light": {"sky": [[0] * 3, [1] * 3], "lamps": [3]}}, "light.lamps[0] is 3, not an object"),
         ({"light": DAY, "materials": {"tin": TIN}}, "no surface has the material 'tin'; the file has paint"),
         ({"light": DAY, "materials": {"paint": {"specular": 0.5}}}, "materials.paint.roughness is missing"),
@@ -73,7 +73,7 @@ DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [
         ({"path": {"kind": "fly"}}, 'path.kind is "fly"; give "around" or "walk"'),
         ({"path": {"kind": "around", "radius": 0.5}}, "runs into the mesh at ("),
         ({"path": {"kind": "around", "radius": 0.8}}, "comes within 0.0"),
-        ({"path": {"kind": "around", "speed": 1}}, "unknown key 'path.speed'; known keys are centre, duration"),
+        ({"path": {"kind": "around", "speed": 1}}, "unknown key 'path.speed'; known keys are center, duration"),
         ({"path": {"kind": "walk", "positions": [[0, 0, 0]], "targets": [[0, 0, 0]]}}, "at least 4"),
         ({"path": {**WALK, "positions": WALK["targets"]}}, "straight up or down"),
         ({"path": {**WALK, "positions": WALK["positions"][:3] + WALK["positions"][:1]}}, "are the same"),
@@ -137,7 +137,7 @@ def test_views_are_off_the_path_seeded_and_free(box_file: Path, path: dict) -> N
     scene_mesh.add_geometry(obstacle, transform=trimesh.transformations.translation_matrix(place))
     scene_mesh.export(box_file)
     if path is not WALK:
-        path = {**path, "turns": 0.5, "centre": [0, 0, 0]}
+        path = {**path, "turns": 0.5, "center": [0, 0, 0]}
     scene = open_scene(scene_file(box_file, path=path))
     validation, test = scene.validation_views(10), scene.test_views(60, 5)
     assert validation.shape == (10, 4, 4)

@@ -32,15 +32,15 @@ def test_depth_and_silhouette_match_the_solid(kind: str) -> None:
     rng = np.random.default_rng(len(kind))
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0] if kind != "panel" else np.eye(3)
     rotation *= np.sign(np.linalg.det(rotation))
-    centre = np.array([0.1, -0.2, 0.3])
-    shape = dataclasses.replace(SOLIDS[kind], centre=centre, rotation=rotation)
+    center = np.array([0.1, -0.2, 0.3])
+    shape = dataclasses.replace(SOLIDS[kind], center=center, rotation=rotation)
     scene = baked_mesh(shapes.mesh_of([shape], WHITE, 0.1), BLACK)
     width, height, intrinsics = 24, 20, (20.0, 22.0, 12.3, 9.1)
     _, depth, alpha = scene.render(OVERHEAD, intrinsics, width, height, 1)
     directions = ray_directions(intrinsics, width, height) @ OVERHEAD[:3, :3].T
 
     def inside(points: np.ndarray, slack: float) -> np.ndarray:
-        p = (points - centre) @ rotation
+        p = (points - center) @ rotation
         if kind == "sphere":
             return np.linalg.norm(p, axis=-1) <= 0.7 + slack
         if kind == "cylinder":
@@ -79,7 +79,7 @@ def test_solids_are_closed_and_face_outwards(kind: str, volume: float, area: flo
 
 
 def test_texture_coordinates() -> None:
-    """A linear ramp along u, seen head-on: the value at each pixel's centre, half texels and all."""
+    """A linear ramp along u, seen head-on: the value at each pixel's center, half texels and all."""
     ramp = np.repeat(np.repeat(np.linspace(0.1, 0.8, 64)[None, :, None], 64, axis=0), 3, axis=2).astype(np.float32)
     plate = shapes.panel(ORIGIN, (2, 2), (1, 0, 0), (0, 1, 0), "ramp", 2.0, texture_offset=(0.5, 0.5), tint=(1, 0.5, 0))
     scene = baked_mesh(shapes.mesh_of([plate], {"ramp": ramp}, 0.3), BLACK)

@@ -22,5 +22,5 @@ def test_spectral_noise_has_its_spectrum(exponent: float) -> None:
     assert abs(slope + 2 * exponent) < 0.25
 
 
-def test_linear_colour_is_srgb() -> None:
-    np.testing.assert_allclose(tx.linear_colour("00bcff"), [0, 0.502886, 1], atol=1e-6)
+def test_linear_color_is_srgb() -> None:
+    np.testing.assert_allclose(tx.linear_color("00bcff"), [0, 0.502886, 1], atol=1e-6)

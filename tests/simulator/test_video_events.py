@@ -22,7 +22,7 @@ from aenerf_ns.poses_from_frames.video import Video, open_video
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.options import Interpolation, SensorNoise
 from aenerf_ns.simulator.textures import spectral_noise
-from aenerf_ns.simulator.video_events import quantisation_epsilon, video_events
+from aenerf_ns.simulator.video_events import quantization_epsilon, video_events
 
 FRAME = 33_333_333
 LEVELS = decode(np.arange(256) / 255, "srgb")
@@ -58,13 +58,13 @@ def joined(pieces: list[EventStream]) -> EventStream:
     return EventStream(*columns, pieces[0].width, pieces[0].height)
 
 
-def grey(levels: NDArray[np.integer]) -> NDArray[np.uint8]:
+def gray(levels: NDArray[np.integer]) -> NDArray[np.uint8]:
     return np.repeat(levels.astype(np.uint8)[..., None], 3, axis=-1)
 
 
 @pytest.mark.parametrize("rising", [True, False])
 def test_events_come_when_the_closed_form_crosses_the_thresholds(rising: bool, tmp_path: Path) -> None:
-    # Grey levels that rise or fall from frame to frame: every crossing is at a known place of a polyline.
+    # Gray levels that rise or fall from frame to frame: every crossing is at a known place of a polyline.
     rng = np.random.default_rng(0)
     levels = np.sort(rng.integers(0, 256, (6, 5, 4)), axis=0)
     levels = levels if rising else levels[::-1]
@@ -78,7 +78,7 @@ def test_events_come_when_the_closed_form_crosses_the_thresholds(rising: bool, t
     events = joined(
         [interval.events for interval in video_events(open_video(tmp_path), sensor, interpolation="linear")]
     )
-    # As stated in the docs: the step from grey level 0 to 2 is the smaller threshold.
+    # As stated in the docs: the step from gray level 0 to 2 is the smaller threshold.
     epsilon = 2 / 255 / 12.92 / (math.exp(0.17) - 1)
     log_radiance = np.log(LEVELS[levels] + epsilon)
     threshold = 0.21 if rising else 0.17
@@ -97,26 +97,26 @@ def test_events_come_when_the_closed_form_crosses_the_thresholds(rising: bool, t
 
 
 @pytest.mark.parametrize("threshold", [0.1, 0.25, 0.5])
-def test_two_grey_levels_never_differ_by_more_than_a_threshold(threshold: float) -> None:
-    epsilon = quantisation_epsilon(SensorModel(2 * threshold, threshold))
+def test_two_gray_levels_never_differ_by_more_than_a_threshold(threshold: float) -> None:
+    epsilon = quantization_epsilon(SensorModel(2 * threshold, threshold))
     steps = np.log((LEVELS[2:] + epsilon) / (LEVELS[:-2] + epsilon))
     assert steps[0] == pytest.approx(threshold)
     assert steps.argmax() == 0
 
 
-def test_a_dark_pixel_that_flickers_by_a_grey_level_does_not_keep_firing() -> None:
+def test_a_dark_pixel_that_flickers_by_a_gray_level_does_not_keep_firing() -> None:
     rng = np.random.default_rng(0)
-    flicker = [grey(rng.integers(0, 2, (16, 16))) for _ in range(100)]
+    flicker = [gray(rng.integers(0, 2, (16, 16))) for _ in range(100)]
     assert len(events_of(flicker, SensorModel(0.25, 0.25))) == 0
 
 
-def test_a_colour_sensor_sees_each_colour_through_its_filter() -> None:
+def test_a_color_sensor_sees_each_color_through_its_filter() -> None:
     frames = [np.full((4, 6, 3), 100, np.uint8) for _ in range(2)]
     frames[1][..., 0] = 200
     for interpolation in ("linear", "flow"):
         pictures = [np.tile(frame, (4, 4, 1)) for frame in frames]
         events = events_of(pictures, SensorModel(0.25, 0.25, bayer_pattern="RGGB"), interpolation)
-        epsilon = quantisation_epsilon(SensorModel(0.25, 0.25))
+        epsilon = quantization_epsilon(SensorModel(0.25, 0.25))
         rise = math.log((LEVELS[200] + epsilon) / (LEVELS[100] + epsilon))
         assert len(events) == int(rise / 0.25) * (16 * 24) // 4
         assert not (events.x % 2).any()
@@ -125,7 +125,7 @@ def test_a_colour_sensor_sees_each_colour_through_its_filter() -> None:
 
 def test_a_seed_gives_the_same_events_again() -> None:
     rng = np.random.default_rng(0)
-    frames = [grey(rng.integers(50, 80, (24, 32))) for _ in range(4)]
+    frames = [gray(rng.integers(50, 80, (24, 32))) for _ in range(4)]
     sensor, noise = SensorModel(0.2, 0.25, 1_000_000), SensorNoise(0.02, 1.0, 5.0)
     for interpolation in ("linear", "flow"):
         first, again, other = (events_of(frames, sensor, interpolation, noise, seed) for seed in (1, 1, 2))
@@ -156,7 +156,7 @@ def net_polarity(events: EventStream, times: NDArray[np.float64]) -> NDArray[np.
 
 def test_optical_flow_places_events_nearer_to_the_truth() -> None:
     moving, sensor = texture(1), SensorModel(0.2, 0.2)
-    exact = EventSimulator(96, 72, sensor, log_epsilon=quantisation_epsilon(sensor))
+    exact = EventSimulator(96, 72, sensor, log_epsilon=quantization_epsilon(sensor))
     steps, intervals = 40, 4
 
     def seen(frame: float) -> NDArray[np.float64]:
@@ -169,7 +169,7 @@ def test_optical_flow_places_events_nearer_to_the_truth() -> None:
         ]
     )
     frames = [
-        grey((encode(torch.from_numpy(seen(index)), "srgb") * 255).round().numpy()) for index in range(intervals + 1)
+        gray((encode(torch.from_numpy(seen(index)), "srgb") * 255).round().numpy()) for index in range(intervals + 1)
     ]
     times = np.linspace(0, intervals * FRAME, 200)[1:]
     expected = net_polarity(truth, times)
@@ -197,7 +197,7 @@ def test_memory_does_not_grow_with_the_length_of_the_video(interpolation: Interp
     class LongVideo(StoredVideo):
         def __iter__(self) -> Iterator[NDArray[np.uint8]]:
             for index in range(len(self.times)):
-                frame = grey(np.full((16, 16), 20 * (index % 2)))
+                frame = gray(np.full((16, 16), 20 * (index % 2)))
                 alive.append(weakref.ref(frame))
                 yield frame
                 del frame

@@ -71,7 +71,7 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
 
     Args:
         path: the file.
-        turn_degrees: rotation about the vertical, anticlockwise seen from above.
+        turn_degrees: rotation about the vertical, counterclockwise seen from above.
         gain: factor of the radiance.
 
     Raises:
@@ -102,7 +102,7 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
     if not np.isfinite(picture).all() or picture.min() < 0 or not 0 < picture.max() * gain < 1e12:
         raise DataError(path, "radiance that is negative, infinite, or nowhere positive", "give another picture")
     radiance = gain * picture[..., 2::-1]
-    # An anticlockwise turn moves the content at +x towards +y, which is to the left.
+    # An counterclockwise turn moves the content at +x towards +y, which is to the left.
     shift = turn_degrees / 360.0 * columns
     whole, part = int(np.floor(shift)), shift - np.floor(shift)
     radiance = (1 - part) * np.roll(radiance, -whole, axis=1) + part * np.roll(radiance, -whole - 1, axis=1)

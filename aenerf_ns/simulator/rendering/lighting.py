@@ -41,12 +41,12 @@ class AreaLight:
     """An invisible rectangle that shines to one side, that of half_u x half_v.
 
     Attributes:
-        centre: (3,) in metres.
-        half_u, half_v: (3,) from the centre to the middle of a side, in metres.
+        center: (3,) in meters.
+        half_u, half_v: (3,) from the center to the middle of a side, in meters.
         radiance: (3,) linear RGB, uniform.
     """
 
-    centre: ArrayLike
+    center: ArrayLike
     half_u: ArrayLike
     half_v: ArrayLike
     radiance: ArrayLike
@@ -58,7 +58,7 @@ class LightPoints(NamedTuple):
     corner: NDArray[np.int64]  # (F, 3) light point of each corner of the faces
     position: Array  # (G, 3)
     normal: Array  # (G, 3) unit
-    size: Array  # (G,) mean length of the edges at the point, in metres
+    size: Array  # (G,) mean length of the edges at the point, in meters
 
 
 def light_points(mesh: Mesh) -> LightPoints:
@@ -88,8 +88,8 @@ def light_points(mesh: Mesh) -> LightPoints:
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     # An edge that belongs to one face only marks the boundary of a surface. A point on the boundary moves onto the face
     # that leads furthest inside. Other points stay, because a step along a face of a curved surface leaves the surface.
-    neighbours = np.concatenate([np.roll(place.reshape(-1, 3), turn, axis=1).reshape(-1) for turn in (1, 2)])
-    edges = np.concatenate([corner, corner]) * (place.max() + 1) + neighbours
+    neighbors = np.concatenate([np.roll(place.reshape(-1, 3), turn, axis=1).reshape(-1) for turn in (1, 2)])
+    edges = np.concatenate([corner, corner]) * (place.max() + 1) + neighbors
     edge, uses = np.unique(edges, return_counts=True)
     is_open = np.zeros(count, bool)
     is_open[edge[uses == 1] // (place.max() + 1)] = True
@@ -161,7 +161,7 @@ def light_mesh(
     points = light_points(mesh)
     arrays = mesh_arrays(mesh, points.corner)
     textures = mip_maps(mesh.textures, bits16=True)
-    emitters = np.array([[a.centre, a.half_u, a.half_v, a.radiance] for a in lamps], np.float64).reshape(-1, 4, 3)
+    emitters = np.array([[a.center, a.half_u, a.half_v, a.radiance] for a in lamps], np.float64).reshape(-1, 4, 3)
     light = _light(arrays, textures, caster, points, environment, emitters, ambient, seed)
     glow = np.zeros(len(points.position), np.float32)
     np.maximum.at(glow, points.corner, mesh.emission[:, None].astype(np.float32))
@@ -174,7 +174,7 @@ def light_mesh(
 
 
 def baked_mesh(mesh: Mesh, caster: RayCaster, background: Array) -> Renderer:
-    """Return a renderer of a mesh whose colours are radiance, in front of a uniform background (3,)."""
+    """Return a renderer of a mesh whose colors are radiance, in front of a uniform background (3,)."""
     arrays = mesh_arrays(mesh, np.zeros_like(mesh.faces))
     light, textures = np.ones((2, 1, 3), np.float32), mip_maps(mesh.textures, bits16=True)
     return Renderer(arrays, textures, caster, light, background, surroundings(None), math.inf, None)
@@ -218,9 +218,9 @@ def _light(
                 received = weights.reshape(len(p), -1).mean(axis=1)
                 sharp[part] += received[:, None] * emitter[3].astype(np.float32)
             if sun is not None:
-                rays, weights, colours = sun.rays(p, n, j, 8.0 * extent)
+                rays, weights, colors = sun.rays(p, n, j, 8.0 * extent)
                 _clear_blocked(caster, rays, weights)
-                sharp[part] += (weights[:, None] * colours).reshape(len(p), -1, 3).mean(axis=1)
+                sharp[part] += (weights[:, None] * colors).reshape(len(p), -1, 3).mean(axis=1)
             rays = np.empty((len(p) * _DIRECTIONS, 6), np.float32)
             _gathering_rays(p, n, j, directions, rays)
             hits = caster.cast(rays)
@@ -245,21 +245,21 @@ def _light(
         _follow_links(links, albedo, light, reflected)
         light = direct + reflected
     del links
-    neighbours = np.unique(
+    neighbors = np.unique(
         np.concatenate([np.stack([points.corner[:, i], points.corner[:, i - 1]], axis=1) for i in range(3)]), axis=0
     )
-    neighbours = np.concatenate([neighbours, neighbours[:, ::-1]])
-    neighbours = np.concatenate([neighbours, neighbours + count])
+    neighbors = np.concatenate([neighbors, neighbors[:, ::-1]])
+    neighbors = np.concatenate([neighbors, neighbors + count])
     soft = light - sharp
     for _ in range(_SMOOTHING):
-        soft = _means(neighbours, soft, ~buried)
+        soft = _means(neighbors, soft, ~buried)
     light = sharp + soft
     for _ in range(2):
-        # A point inside or beneath another object has no light of its own. It takes the mean of its neighbours' light.
+        # A point inside or beneath another object has no light of its own. It takes the mean of its neighbors' light.
         known = ~buried
-        filled = _means(neighbours[buried[neighbours[:, 0]]], light, known)
+        filled = _means(neighbors[buried[neighbors[:, 0]]], light, known)
         found = np.zeros(2 * count, np.bool_)
-        found[neighbours[buried[neighbours[:, 0]] & known[neighbours[:, 1]], 0]] = True
+        found[neighbors[buried[neighbors[:, 0]] & known[neighbors[:, 1]], 0]] = True
         light[found] = filled[found]
         buried &= ~found
     return np.ascontiguousarray(light.reshape(2, count, 3), np.float32)
@@ -271,12 +271,12 @@ def _plane_sequence(count: int) -> Array:
     return (np.arange(1, count + 1)[:, None] * np.array([1 / plastic, 1 / plastic**2])) % 1.0
 
 
-def _means(neighbours: NDArray[np.int64], values: NDArray, known: NDArray[np.bool_]) -> NDArray:
-    """Return the mean (N, C) over each point and its neighbours, of those that are known; the point's value if none is.
+def _means(neighbors: NDArray[np.int64], values: NDArray, known: NDArray[np.bool_]) -> NDArray:
+    """Return the mean (N, C) over each point and its neighbors, of those that are known; the point's value if none is.
 
-    ``neighbours`` (M, 2) are pairs of points.
+    ``neighbors`` (M, 2) are pairs of points.
     """
-    to, of = neighbours[known[neighbours[:, 1]]].T
+    to, of = neighbors[known[neighbors[:, 1]]].T
     weight = known + np.bincount(to, minlength=len(values))
     total = values * known[:, None]
     total += np.stack([np.bincount(to, column[of], len(values)) for column in values.T], axis=1)
@@ -284,22 +284,22 @@ def _means(neighbours: NDArray[np.int64], values: NDArray, known: NDArray[np.boo
 
 
 def _albedo(arrays: MeshArrays, textures: MipMaps, count: int) -> NDArray[np.float32]:
-    """Return the mean colour (G, 3) of the faces at each light point."""
-    colour = np.empty((len(arrays.faces), 3), np.float32)
-    _face_colours(arrays, textures, colour)
+    """Return the mean color (G, 3) of the faces at each light point."""
+    color = np.empty((len(arrays.faces), 3), np.float32)
+    _face_colors(arrays, textures, color)
     corner = arrays.light_point.reshape(-1)
-    colours = np.repeat(colour, 3, axis=0)
-    total = np.stack([np.bincount(corner, column, count) for column in colours.T], axis=1)
+    colors = np.repeat(color, 3, axis=0)
+    total = np.stack([np.bincount(corner, column, count) for column in colors.T], axis=1)
     return (total / np.bincount(corner, minlength=count)[:, None]).astype(np.float32)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _face_colours(arrays, textures, colours):
-    """Fill the mean colour of each face, from the mip level that has about two texels on the face."""
+def _face_colors(arrays, textures, colors):
+    """Fill the mean color of each face, from the mip level that has about two texels on the face."""
     for face in numba.prange(len(arrays.faces)):
         i, j, k = arrays.faces[face]
         for c in range(3):
-            colours[face, c] = (arrays.colour[i, c] + arrays.colour[j, c] + arrays.colour[k, c]) / 3.0
+            colors[face, c] = (arrays.color[i, c] + arrays.color[j, c] + arrays.color[k, c]) / 3.0
         if arrays.texture[face] >= 0:
             uv = arrays.uv
             nx, ny, nz = face_normal(arrays, face)
@@ -312,15 +312,15 @@ def _face_colours(arrays, textures, colours):
                 side * arrays.density[face],
                 True,
             )
-            colours[face, 0] *= r / 65535.0
-            colours[face, 1] *= g / 65535.0
-            colours[face, 2] *= b / 65535.0
+            colors[face, 0] *= r / 65535.0
+            colors[face, 1] *= g / 65535.0
+            colors[face, 2] *= b / 65535.0
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _lamp_rays(points, normals, jitter, lamp, offset, rays, weights):
     """Fill segments to a lamp (4, 3), and the irradiance / pi that each alone would bring from unit radiance."""
-    centre, half_u, half_v = lamp[0], lamp[1], lamp[2]
+    center, half_u, half_v = lamp[0], lamp[1], lamp[2]
     nx = half_u[1] * half_v[2] - half_u[2] * half_v[1]
     ny = half_u[2] * half_v[0] - half_u[0] * half_v[2]
     nz = half_u[0] * half_v[1] - half_u[1] * half_v[0]
@@ -328,9 +328,9 @@ def _lamp_rays(points, normals, jitter, lamp, offset, rays, weights):
         for sample in range(_STRATA * _STRATA):
             a = 2.0 * (sample % _STRATA + jitter[n, 0]) / _STRATA - 1.0
             b = 2.0 * (sample // _STRATA + jitter[n, 1]) / _STRATA - 1.0
-            dx = centre[0] + a * half_u[0] + b * half_v[0] - points[n, 0]
-            dy = centre[1] + a * half_u[1] + b * half_v[1] - points[n, 1]
-            dz = centre[2] + a * half_u[2] + b * half_v[2] - points[n, 2]
+            dx = center[0] + a * half_u[0] + b * half_v[0] - points[n, 0]
+            dy = center[1] + a * half_u[1] + b * half_v[1] - points[n, 1]
+            dz = center[2] + a * half_u[2] + b * half_v[2] - points[n, 2]
             square = dx * dx + dy * dy + dz * dz
             distance = math.sqrt(square)
             cosine = (normals[n, 0] * dx + normals[n, 1] * dy + normals[n, 2] * dz) / distance
@@ -363,12 +363,12 @@ class _Sun:
         self._cumulative = np.cumsum(power[texel]) / power[texel].sum()
         per_power = radiance.reshape(-1, 3)[texel] / radiance.reshape(-1, 3)[texel].mean(axis=-1, keepdims=True)
         # Radiance divided by the probability density of the direction.
-        self._colour = (per_power * power.sum()).astype(np.float32)
+        self._color = (per_power * power.sum()).astype(np.float32)
 
     def rays(
         self, points: Array, normals: Array, jitter: Array, reach: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return segments (N * samples, 6), weights and colours. The mean of weight times colour is irradiance / pi."""
+        """Return segments (N * samples, 6), weights and colors. The mean of weight times color is irradiance / pi."""
         rows, columns = self._shape
         rank = np.arange(_SUN_SAMPLES)
         index = np.searchsorted(self._cumulative, ((rank + jitter[:, :1]) / _SUN_SAMPLES).reshape(-1))
@@ -386,7 +386,7 @@ class _Sun:
         cosine = (direction.reshape(len(points), -1, 3) * normals[:, None]).sum(axis=-1).reshape(-1)
         rays = np.concatenate([np.repeat(points, _SUN_SAMPLES, axis=0), reach * direction], axis=1)
         weights = np.maximum(cosine, 0) / np.pi
-        return rays.astype(np.float32), weights.astype(np.float32), self._colour[index]
+        return rays.astype(np.float32), weights.astype(np.float32), self._color[index]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

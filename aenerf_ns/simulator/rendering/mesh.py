@@ -1,4 +1,4 @@
-"""Triangle meshes with colours and textures."""
+"""Triangle meshes with colors and textures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Gloss(NamedTuple):
     """The glossy coat of a material."""
 
     specular: float = 0.0
-    """Share of light that the coat reflects at normal incidence (F0), in all colours; 0 for a diffuse surface."""
+    """Share of light that the coat reflects at normal incidence (F0), in all colors; 0 for a diffuse surface."""
     roughness: float = 0.0
     """Square root of the slopes' root mean square in the microfacet model (alpha = roughness^2); 0 for a mirror."""
 
@@ -25,15 +25,15 @@ DIFFUSE = Gloss()
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles in the world, z up, in metres once the mesh is `scaled`.
+    """Triangles in the world, z up, in meters once the mesh is `scaled`.
 
-    The albedo of a surface point is its texture's value times the colour interpolated between the vertices.
+    The albedo of a surface point is its texture's value times the color interpolated between the vertices.
 
     Attributes:
         vertices: (V, 3). Surfaces of different materials share no vertices, nor do the two sides of a texture's seam.
-        faces: (F, 3) vertices, anticlockwise seen from the front.
+        faces: (F, 3) vertices, counterclockwise seen from the front.
         uv: (V, 2) texture coordinates in widths and heights of the texture, from its lower left corner.
-        colour: (V, 3) linear RGB.
+        color: (V, 3) linear RGB.
         texture: (F,) index into ``textures``, -1 for none.
         emission: (F,) irradiance / pi that a face seems to receive in addition. It makes the face glow and lights
             nothing else.
@@ -44,7 +44,7 @@ class Mesh:
     vertices: Array
     faces: NDArray[np.int64]
     uv: Array
-    colour: Array
+    color: Array
     texture: NDArray[np.int64]
     emission: Array
     gloss: Array
@@ -62,7 +62,7 @@ class Mesh:
 
 
 def scaled(mesh: Mesh, scale: float) -> Mesh:
-    """Scale a mesh by ``scale`` metres per unit. Round its vertices to float32, as the ray caster does."""
+    """Scale a mesh by ``scale`` meters per unit. Round its vertices to float32, as the ray caster does."""
     return replace(mesh, vertices=(scale * mesh.vertices).astype(np.float32).astype(np.float64))
 
 

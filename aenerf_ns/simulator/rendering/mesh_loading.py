@@ -1,4 +1,4 @@
-"""Read meshes with colours and textures from .glb, .obj and .ply files."""
+"""Read meshes with colors and textures from .glb, .obj and .ply files."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from aenerf_ns.simulator.rendering.polygons import triangulated_obj
 # Of meshes that a ray caster takes.
 _MAX_BYTES = 1 << 30
 
-UNCOLOURED = 0.5
-"""Albedo of a surface that has no colour in its file."""
+UNCOLORED = 0.5
+"""Albedo of a surface that has no color in its file."""
 
 
 def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) -> Mesh:
     """Read a mesh with all the parts and transforms of its scene.
 
-    Of a material, only the base colour is read: a factor, a texture, and colours of vertices or faces. Vertex colours
-    of .ply and .obj files are sRGB. Factors and the vertex colours of .glb files are linear.
+    Of a material, only the base color is read: a factor, a texture, and colors of vertices or faces. Vertex colors
+    of .ply and .obj files are sRGB. Factors and the vertex colors of .glb files are linear.
 
     Args:
         path: a .glb, .obj (with its .mtl) or .ply file.
@@ -95,7 +95,7 @@ def _mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Gloss]) ->
             known = ", ".join(sorted({known for known in names if known})) or "no names of materials"
             raise DataError(path, f"no surface has the material {name!r}", f"the file has {known}")
     parts = [_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in meshes]
-    vertices, faces, uv, colour, texture = zip(*parts, strict=True)
+    vertices, faces, uv, color, texture = zip(*parts, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
     world = np.concatenate(vertices)
     if y_up:
@@ -107,7 +107,7 @@ def _mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Gloss]) ->
         world,
         joined,
         np.concatenate(uv),
-        np.concatenate(colour),
+        np.concatenate(color),
         np.concatenate(texture),
         np.zeros(len(joined)),
         np.repeat([gloss.get(name, DIFFUSE) for name in names], [len(part) for part in faces], axis=0),
@@ -118,26 +118,26 @@ def _mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Gloss]) ->
 def _part(
     path: Path, mesh: Any, transform: Array, is_gltf: bool, textures: dict[int, tuple[int, Texture]]
 ) -> tuple[Array, NDArray[np.int64], Array, Array, NDArray[np.int64]]:
-    """Return vertices, faces, texture coordinates, colours, and the texture of each face. Add new textures."""
+    """Return vertices, faces, texture coordinates, colors, and the texture of each face. Add new textures."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if faces.max() >= len(vertices) or faces.min() < 0:
         raise DataError(path, "a face has a vertex that does not exist", "export the mesh again")
     visual = mesh.visual
     uv, index = np.zeros((len(vertices), 2)), -1
     if visual.kind == "face":
-        # Face colours need separate vertices for each face.
+        # Face colors need separate vertices for each face.
         vertices, uv = vertices[faces].reshape(-1, 3), np.zeros((3 * len(faces), 2))
-        colour = np.repeat(_colours(visual.face_colors, is_gltf), 3, axis=0)
+        color = np.repeat(_colors(visual.face_colors, is_gltf), 3, axis=0)
         faces = np.arange(3 * len(faces)).reshape(-1, 3)
     elif visual.kind == "vertex":
-        colour = _colours(visual.vertex_colors, is_gltf)
+        color = _colors(visual.vertex_colors, is_gltf)
     elif visual.kind == "texture":
         material = visual.material
         factor, image = _material(material)
-        colour = np.tile(factor, (len(vertices), 1))
+        color = np.tile(factor, (len(vertices), 1))
         painted = visual.vertex_attributes.get("color")
         if painted is not None and len(painted) == len(vertices):
-            colour = colour * _colours(painted, is_gltf)
+            color = color * _colors(painted, is_gltf)
         if image is not None and visual.uv is not None and len(visual.uv) == len(vertices):
             uv = np.asarray(visual.uv, np.float64)[:, :2]
             if not np.isfinite(uv).all():
@@ -151,13 +151,13 @@ def _part(
                 textures[id(image)] = (len(textures), table[pixels])
             index = textures[id(image)][0]
     else:
-        colour = np.full((len(vertices), 3), UNCOLOURED)
+        color = np.full((len(vertices), 3), UNCOLORED)
     # Infinite vertices are refused later, where the whole mesh is known.
     with np.errstate(invalid="ignore", over="ignore"):
         turned = vertices @ transform[:3, :3].T + transform[:3, 3]
     if np.linalg.det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    return turned, faces, uv, colour, np.full(len(faces), index)
+    return turned, faces, uv, color, np.full(len(faces), index)
 
 
 def _material_name(visual: Any) -> str:
@@ -166,7 +166,7 @@ def _material_name(visual: Any) -> str:
 
 
 def _material(material: Any) -> tuple[Array, Any]:
-    """Return the linear colour factor (3,) and the picture, or None, of a material."""
+    """Return the linear color factor (3,) and the picture, or None, of a material."""
     if hasattr(material, "baseColorTexture"):
         factor = material.baseColorFactor
         return (np.ones(3) if factor is None else np.asarray(factor)[:3] / 255.0), material.baseColorTexture
@@ -174,16 +174,16 @@ def _material(material: Any) -> tuple[Array, Any]:
     image, factor = material.image, (material.kwargs or {}).get("kd")
     if factor is not None and np.size(factor) == 3:
         return np.asarray(factor, np.float64), image
-    return np.full(3, UNCOLOURED if image is None else 1.0), image
+    return np.full(3, UNCOLORED if image is None else 1.0), image
 
 
-def _colours(values: Any, is_linear: bool) -> Array:
-    """Return linear RGB (N, 3) of colours that are integers of any width, or decimals."""
-    colours = np.asarray(values)[:, :3]
-    if colours.dtype.kind in "iu":
-        colours = colours / float(np.iinfo(colours.dtype).max)
-    colours = np.asarray(colours, np.float64).clip(0, None)
-    return decode(colours, "linear" if is_linear else "srgb")
+def _colors(values: Any, is_linear: bool) -> Array:
+    """Return linear RGB (N, 3) of colors that are integers of any width, or decimals."""
+    colors = np.asarray(values)[:, :3]
+    if colors.dtype.kind in "iu":
+        colors = colors / float(np.iinfo(colors.dtype).max)
+    colors = np.asarray(colors, np.float64).clip(0, None)
+    return decode(colors, "linear" if is_linear else "srgb")
 
 
 def _check_glb(path: Path, content: bytes) -> None:
@@ -208,7 +208,7 @@ def _check_glb(path: Path, content: bytes) -> None:
 
 
 def _check_obj(path: Path, text: str) -> None:
-    """Refuse an .obj that refers to a missing file, because trimesh would leave its surfaces grey."""
+    """Refuse an .obj that refers to a missing file, because trimesh would leave its surfaces gray."""
     from PIL import Image
 
     libraries = [line.split(None, 1)[1].strip() for line in text.splitlines() if line.startswith("mtllib ")]

@@ -24,7 +24,7 @@ def prepared(mesh: Mesh, spacing: float | None = None) -> tuple[Mesh, int]:
 
     Args:
         mesh: a mesh as it was read.
-        spacing: longest edge in metres. The default subdivides large faces into some ten thousand corners.
+        spacing: longest edge in meters. The default subdivides large faces into some ten thousand corners.
 
     Returns:
         the mesh, and the number of its faces that coincided with others.
@@ -67,7 +67,7 @@ def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
     Returns:
         the mesh, and the index (F,) of the original face that each face is part of.
     """
-    vertices, uv, colour, faces = mesh.vertices, mesh.uv, mesh.colour, mesh.faces
+    vertices, uv, color, faces = mesh.vertices, mesh.uv, mesh.color, mesh.faces
     source = np.arange(len(faces))
     while True:
         corners = vertices[faces]
@@ -79,7 +79,7 @@ def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
                 mesh,
                 vertices=vertices,
                 uv=uv,
-                colour=colour,
+                color=color,
                 faces=faces,
                 texture=mesh.texture[source],
                 emission=mesh.emission[source],
@@ -96,7 +96,7 @@ def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
         midpoints = (0.5 * (vertices[i] + vertices[j])).astype(np.float32).astype(np.float64)
         vertices = np.concatenate([vertices, midpoints])
         uv = np.concatenate([uv, 0.5 * (uv[i] + uv[j])])
-        colour = np.concatenate([colour, 0.5 * (colour[i] + colour[j])])
+        color = np.concatenate([color, 0.5 * (color[i] + color[j])])
         faces = faces.copy()
         faces[split] = np.stack([a, middle, c], axis=1)
         faces = np.concatenate([faces, np.stack([middle, b, c], axis=1)])
@@ -148,6 +148,6 @@ def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[M
         mesh,
         vertices=np.concatenate([mesh.vertices, apart]),
         uv=np.concatenate([mesh.uv, mesh.uv[copied]]),
-        colour=np.concatenate([mesh.colour, mesh.colour[copied]]),
+        color=np.concatenate([mesh.color, mesh.color[copied]]),
         faces=faces,
     ), moved

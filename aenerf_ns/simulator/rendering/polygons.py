@@ -15,7 +15,7 @@ def ear_clipping(corners: Array) -> NDArray[np.int64]:
     """Cut a simple polygon with corners (N, 3) into triangles that keep its orientation.
 
     Returns:
-        Corner numbers (T, 3). T is at most N - 2: earcut may leave out corners that repeat a neighbour or lie on a line
+        Corner numbers (T, 3). T is at most N - 2: earcut may leave out corners that repeat a neighbor or lie on a line
         with both, and parts of polygons that cross themselves.
     """
     normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)  # Newell's

@@ -35,7 +35,7 @@ class Coats(NamedTuple):
 
     specular: NDArray[np.float32]  # (F,) reflectance at normal incidence, 0 where a face is diffuse
     lobe: NDArray[np.float32]  # (F,) standard deviation of reflected directions, in radians
-    curvature: NDArray[np.float32]  # (F,) turn of the normal along the face, in radians per metre
+    curvature: NDArray[np.float32]  # (F,) turn of the normal along the face, in radians per meter
     normal: Array  # (G, 3) unit
 
 
@@ -45,7 +45,7 @@ class Reflections:
 
     Attributes:
         coats: the coats.
-        lamps: (L, 4, 3) centre, half sides and radiance.
+        lamps: (L, 4, 3) center, half sides and radiance.
         environment: light from far away.
         ambient: radiance that arrives from everywhere.
     """
@@ -74,7 +74,7 @@ def reflections(
         mesh: the mesh.
         light_point: (F, 3) light point of each corner.
         normal: (G, 3) unit normals of the light points. They are interpolated over the faces.
-        lamps: (L, 4, 3) centre, half sides and radiance.
+        lamps: (L, 4, 3) center, half sides and radiance.
         environment: light from far away.
         ambient: radiance that reaches every surface from all sides.
     """
@@ -104,7 +104,7 @@ def add_reflections(
 
     Args:
         reflected, arrays, textures, light, caster: see `Renderer`.
-        rays: (rows * columns * samples, 6) rays through the picture, one metre long along the optical axis.
+        rays: (rows * columns * samples, 6) rays through the picture, one meter long along the optical axis.
         hits: what the rays hit, from the ray caster.
         focal_length: in pixels.
         samples: rays per pixel.
@@ -150,7 +150,7 @@ def _mirror(
     """Fill the mirrored rays (N, 6) of rays that hit glossy faces, with unit directions, and the diffuse light there.
 
     ``optics`` (N, 3) are the Fresnel reflectance, the standard deviation of the reflected directions over the sample's
-    region, in radians, and the side of that region in metres.
+    region, in radians, and the side of that region in meters.
     """
     for n in numba.prange(len(rays)):
         face = faces[n]
@@ -266,7 +266,7 @@ def _covered(lamp, ray, reach, lobe):
         (ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux),
     ):
         place = (sx * px + sy * py + sz * pz) / square
-        # The lobe's direction moves the place on the lamp's plane by this vector per metre of distance and radian.
+        # The lobe's direction moves the place on the lamp's plane by this vector per meter of distance and radian.
         along = (sx * dx + sy * dy + sz * dz) / facing
         mx, my, mz = sx - along * nx, sy - along * ny, sz - along * nz
         width = math.sqrt(2.0 * (mx * mx + my * my + mz * mz)) * lobe * distance / square

@@ -2,7 +2,7 @@
 
 The light that a surface receives does not depend on the view. `lighting` computes that light once, and diffuse surfaces
 need primary rays only. Glossy surfaces take a second ray each (`reflections`). Radiance is linear RGB, lengths are
-metres, and the world's z axis points up. A camera has OpenCV axes (x right, y down, z forward). The centre of pixel
+meters, and the world's z axis points up. A camera has OpenCV axes (x right, y down, z forward). The center of pixel
 (x, y) lies at (x + 0.5, y + 0.5), as in Nerfstudio.
 """
 
@@ -31,8 +31,8 @@ POINT_SPREAD = 0.5
 
 # Not parallel: starting threads for this little work takes longer than the work, above all on a busy machine.
 @numba.njit(cache=True, error_model="numpy")
-def _camera_rays(rotation, centre, intrinsics, offsets, window, rays):
-    """Fill the rays (N, 6) of a window of the picture. Directions reach one metre along the optical axis."""
+def _camera_rays(rotation, center, intrinsics, offsets, window, rays):
+    """Fill the rays (N, 6) of a window of the picture. Directions reach one meter along the optical axis."""
     fx, fy, cx, cy = intrinsics
     samples = len(offsets)
     left, right, top, bottom = window
@@ -43,7 +43,7 @@ def _camera_rays(rotation, centre, intrinsics, offsets, window, rays):
                 v = (y + 0.5 + offsets[s, 1] - cy) / fy
                 ray = rays[((y - top) * (right - left) + x - left) * samples + s]
                 for axis in range(3):
-                    ray[axis] = centre[axis]
+                    ray[axis] = center[axis]
                     ray[3 + axis] = rotation[axis, 0] * u + rotation[axis, 1] * v + rotation[axis, 2]
 
 
@@ -81,7 +81,7 @@ def _shade(
     hits,
     window,
     rotation,
-    centre,
+    center,
     intrinsics,
     offsets,
     background,
@@ -99,7 +99,7 @@ def _shade(
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics
     samples = len(offsets)
-    ox, oy, oz = centre[0], centre[1], centre[2]
+    ox, oy, oz = center[0], center[1], center[2]
     has_sky = len(sky.level) > 0
     left, right, top, bottom = window
     for y in numba.prange(height):
@@ -191,10 +191,10 @@ class Renderer:
 
         Args:
             camera_to_world: (4, 4) or (3, 4), OpenCV axes.
-            intrinsics: (fx, fy, cx, cy) in pixels, pixel centres at +0.5.
+            intrinsics: (fx, fy, cx, cy) in pixels, pixel centers at +0.5.
             width, height: size of the picture in pixels.
             samples: rays per pixel, 1 or at least 3. Every pixel of every frame has the same pattern of rays, which
-                samples a Gaussian point-spread function. A single ray goes through the pixel's centre.
+                samples a Gaussian point-spread function. A single ray goes through the pixel's center.
 
         Returns:
             radiance (H, W, 3), linear RGB; depth (H, W) along the optical axis, the mean over the rays that hit, inf
@@ -204,12 +204,12 @@ class Renderer:
             ValueError: `sample_offsets` has no pattern with this number of samples.
         """
         pose = np.asarray(camera_to_world, np.float64)
-        rotation, centre = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
+        rotation, center = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
         lens, offsets = np.asarray(intrinsics, np.float64), sample_offsets(samples)
-        window = self._window(rotation, centre, lens, offsets, width, height)
+        window = self._window(rotation, center, lens, offsets, width, height)
         left, right, top, bottom = window
         rays = np.empty(((bottom - top) * (right - left) * len(offsets), 6), np.float32)
-        _camera_rays(rotation, centre, lens, offsets, window, rays)
+        _camera_rays(rotation, center, lens, offsets, window, rays)
         hits = self.caster.cast(rays)
         radiance = np.empty((height, width, 3), np.float32)
         depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
@@ -220,7 +220,7 @@ class Renderer:
             hits["primitive_ids"],
             window,
             rotation,
-            centre,
+            center,
             lens,
             offsets,
             self.background,
@@ -253,10 +253,10 @@ class Renderer:
         return np.array(list(itertools.product(*np.stack([used.min(axis=0), used.max(axis=0)], axis=1))))
 
     def _window(
-        self, rotation: Array, centre: Array, lens: Array, offsets: Array, width: int, height: int
+        self, rotation: Array, center: Array, lens: Array, offsets: Array, width: int, height: int
     ) -> tuple[int, int, int, int]:
         """Return left, right, top and bottom of the part of the picture outside which no ray hits the mesh."""
-        corners = (self._corners - centre) @ rotation
+        corners = (self._corners - center) @ rotation
         if corners[:, 2].min() <= 0:
             return 0, width, 0, height
         pixels = lens[:2] * corners[:, :2] / corners[:, 2:] + lens[2:]
@@ -276,7 +276,7 @@ def sample_offsets(samples: int) -> NDArray[np.float64]:
     """Return offsets (N, 2) in pixels of equally weighted rays that sample the point-spread function.
 
     The offsets lie on a spiral of golden angles, with radii at the quantiles of the Gaussian. A linear map then gives
-    them exactly the Gaussian's mean and covariance. A single ray goes through the centre.
+    them exactly the Gaussian's mean and covariance. A single ray goes through the center.
 
     Raises:
         ValueError: fewer than one ray, or two, because two rays cannot spread in both directions.

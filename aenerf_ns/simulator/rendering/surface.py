@@ -22,9 +22,9 @@ class MeshArrays(NamedTuple):
     vertices: Array  # (V, 3)
     faces: NDArray[np.int32]  # (F, 3)
     uv: Array  # (V, 2)
-    colour: NDArray[np.float32]  # (V, 3)
+    color: NDArray[np.float32]  # (V, 3)
     texture: NDArray[np.int32]  # (F,) -1 for none
-    density: NDArray[np.float32]  # (F,) texels per metre
+    density: NDArray[np.float32]  # (F,) texels per meter
     light_point: NDArray[np.int32]  # (F, 3) light point of each corner
 
 
@@ -39,7 +39,7 @@ def mesh_arrays(mesh: Mesh, light_point: NDArray[np.integer]) -> MeshArrays:
         mesh.vertices,
         mesh.faces.astype(np.int32),
         mesh.uv,
-        mesh.colour.astype(np.float32),
+        mesh.color.astype(np.float32),
         mesh.texture.astype(np.int32),
         np.sqrt(in_texture * texels[mesh.texture] / np.maximum(area, 1e-300)).astype(np.float32),
         light_point.astype(np.int32),
@@ -47,7 +47,7 @@ def mesh_arrays(mesh: Mesh, light_point: NDArray[np.integer]) -> MeshArrays:
 
 
 def ray_offset(arrays: MeshArrays) -> float:
-    """Return how far before a surface, in metres, a ray must start that leaves the surface."""
+    """Return how far before a surface, in meters, a ray must start that leaves the surface."""
     return max(1e-4, 2e-5 * float(np.abs(arrays.vertices).max()))
 
 
@@ -66,17 +66,17 @@ def diffuse_radiance(arrays, textures, light, face, side, wi, wj, wk, footprint)
     """Return the light that a point of a face reflects evenly: its albedo times the light that it receives.
 
     ``side`` is 0 for the front and 1 for the back. ``wi``, ``wj`` and ``wk`` are the point's barycentric coordinates.
-    ``footprint`` is the side of the texture region to average, in metres.
+    ``footprint`` is the side of the texture region to average, in meters.
     """
     i, j, k = arrays.faces[face, 0], arrays.faces[face, 1], arrays.faces[face, 2]
     li, lj, lk = arrays.light_point[face, 0], arrays.light_point[face, 1], arrays.light_point[face, 2]
-    colour, uv = arrays.colour, arrays.uv
+    color, uv = arrays.color, arrays.uv
     r = wi * light[side, li, 0] + wj * light[side, lj, 0] + wk * light[side, lk, 0]
     g = wi * light[side, li, 1] + wj * light[side, lj, 1] + wk * light[side, lk, 1]
     b = wi * light[side, li, 2] + wj * light[side, lj, 2] + wk * light[side, lk, 2]
-    r *= wi * colour[i, 0] + wj * colour[j, 0] + wk * colour[k, 0]
-    g *= wi * colour[i, 1] + wj * colour[j, 1] + wk * colour[k, 1]
-    b *= wi * colour[i, 2] + wj * colour[j, 2] + wk * colour[k, 2]
+    r *= wi * color[i, 0] + wj * color[j, 0] + wk * color[k, 0]
+    g *= wi * color[i, 1] + wj * color[j, 1] + wk * color[k, 1]
+    b *= wi * color[i, 2] + wj * color[j, 2] + wk * color[k, 2]
     if arrays.texture[face] >= 0:
         tr, tg, tb = lookup(
             textures,
