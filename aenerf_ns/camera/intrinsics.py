@@ -1,9 +1,10 @@
-"""The event camera's lens: the direction in which each pixel looks."""
+"""A camera's lens: the direction in which each pixel looks, and the same lens in the terms of other programs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -14,14 +15,32 @@ from torch import Tensor
 
 LensModel = Literal["radial_tangential", "fisheye"]
 
+# The parameters of each lens model, in OpenCV's order.
+_PARAMETERS: dict[LensModel, tuple[str, ...]] = {
+    "radial_tangential": ("k1", "k2", "p1", "p2", "k3"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+# What other programs call the two models.
+_LENS_MODELS: dict[str, LensModel] = {
+    # Nerfstudio and COLMAP.
+    "OPENCV": "radial_tangential",
+    "OPENCV_FISHEYE": "fisheye",
+    # ROS and Kalibr.
+    "plumb_bob": "radial_tangential",
+    "radtan": "radial_tangential",
+    "none": "radial_tangential",
+    "equidistant": "fisheye",
+    # Basalt.
+    "kb4": "fisheye",
+}
+
 # A pixel whose undistorted direction projects back this far off, in pixels, lies where the lens model folds over.
 _MAX_ROUND_TRIP_ERROR = 1e-3
 
-# A side in pixels; pixels, of a camera for films in 8K; focal lengths and principal points in pixels.
+# 8K film cameras have 33 million pixels.
 _MAX_SIDE, _MAX_PIXELS = 1 << 14, 1 << 25
-_FOCAL_LENGTHS = (1e-2, 1e6)
-_MAX_PRINCIPAL_POINT = 1e6
-# Along each side, the pixels that :meth:`CameraIntrinsics.has_valid_pixels` looks at.
+_LIMITS = {"fx": (1e-2, 1e6), "fy": (1e-2, 1e6), "cx": (-1e6, 1e6), "cy": (-1e6, 1e6)}
+# Pixels along each side that :meth:`CameraIntrinsics.has_valid_pixels` looks at.
 _SAMPLES = 24
 
 
@@ -34,8 +53,8 @@ class CameraIntrinsics:
         height: number of pixel rows.
         fx: focal length along the rows, in pixels.
         fy: focal length along the columns, in pixels.
-        cx: principal point from the left edge of the image, in pixels. The centre of the first pixel is at 0.5
-            (Nerfstudio's convention). OpenCV, Kalibr and ESIM count from that centre: add 0.5 to their values.
+        cx: principal point from the left edge of the image, in pixels. The center of the first pixel is at 0.5
+            (Nerfstudio's convention). OpenCV, Kalibr and ESIM count from that center: add 0.5 to their values.
         cy: principal point from the top edge of the image, in pixels, with the same convention.
         lens_model: "radial_tangential" (OpenCV's Brown-Conrady, "plumb_bob") or "fisheye" (OpenCV's fisheye,
             Kannala-Brandt, "equidistant", "kb4").
@@ -51,7 +70,7 @@ class CameraIntrinsics:
         >>> directions, is_valid = camera.pixel_directions()
         >>> directions.shape
         (260, 346, 3)
-        >>> directions[129, 172]  # the principal point is the centre of this pixel
+        >>> directions[129, 172]  # the principal point is the center of this pixel
         array([ 0., -0., -1.])
     """
 
@@ -73,29 +92,84 @@ class CameraIntrinsics:
             object.__setattr__(self, name, int(size))
         if self.width * self.height > _MAX_PIXELS:
             raise ValueError(f"{self.width} x {self.height} pixels are more than {_MAX_PIXELS:,}")
-        for name in ("fx", "fy"):
-            low, high = _FOCAL_LENGTHS
+        for name, (low, high) in _LIMITS.items():
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name} must be from {low:g} to {high:g} pixels, not {getattr(self, name):g}")
-        for name in ("cx", "cy"):
-            if not abs(getattr(self, name)) <= _MAX_PRINCIPAL_POINT:
-                raise ValueError(f"{name} must be within {_MAX_PRINCIPAL_POINT:g} pixels, not {getattr(self, name):g}")
         if not np.isfinite(self.distortion).all():
             raise ValueError("the distortion must be finite")
-        expected = {"radial_tangential": 5, "fisheye": 4}
-        if self.lens_model not in expected:
-            raise ValueError(f'lens_model must be one of {sorted(expected)}, not "{self.lens_model}"')
-        if len(self.distortion) != expected[self.lens_model]:
-            raise ValueError(
-                f"{self.lens_model} distortion takes {expected[self.lens_model]} numbers, not {len(self.distortion)}"
-            )
+        if self.lens_model not in _PARAMETERS:
+            raise ValueError(f'lens_model must be one of {sorted(_PARAMETERS)}, not "{self.lens_model}"')
+        expected = len(_PARAMETERS[self.lens_model])
+        if len(self.distortion) != expected:
+            raise ValueError(f"{self.lens_model} distortion takes {expected} numbers, not {len(self.distortion)}")
+
+    @classmethod
+    def from_opencv(
+        cls,
+        size: tuple[float, float],
+        pinhole: tuple[float, float, float, float],
+        distortion: Sequence[float] = (),
+        lens_model: str = "plumb_bob",
+    ) -> CameraIntrinsics:
+        """Make a camera whose principal point is counted from the center of the first pixel.
+
+        OpenCV, ROS, Kalibr, Basalt and ESIM count in this way.
+
+        Args:
+            size: width and height in pixels.
+            pinhole: fx, fy, cx and cy in pixels.
+            distortion: in OpenCV's order. What is missing at the end is zero.
+            lens_model: the name that ROS, Kalibr or Basalt gives the model.
+
+        Raises:
+            ValueError: the lens model is unknown, or a value is none that a camera can have.
+        """
+        fx, fy, cx, cy = pinhole
+        lens = _require_lens_model(lens_model)
+        missing = len(_PARAMETERS[lens]) - len(distortion)
+        return cls(*size, fx, fy, cx + 0.5, cy + 0.5, lens, (*distortion, *[0.0] * missing))  # type: ignore[arg-type]
+
+    @classmethod
+    def from_transforms(cls, width: int, height: int, values: Mapping[str, Any]) -> CameraIntrinsics:
+        """Make a camera of Nerfstudio's names: fl_x, fl_y, cx, cy, camera_model, and the distortion parameters.
+
+        Raises:
+            ValueError: the camera model is unknown, or a value is none that a camera can have.
+        """
+        lens = _require_lens_model(values["camera_model"])
+        distortion = tuple(values[name] for name in _PARAMETERS[lens])
+        return cls(width, height, values["fl_x"], values["fl_y"], values["cx"], values["cy"], lens, distortion)
+
+    def to_transforms(self) -> dict[str, Any]:
+        """Return the lens by Nerfstudio's names, the inverse of :meth:`from_transforms` without the size."""
+        return {
+            "camera_model": "OPENCV_FISHEYE" if self.lens_model == "fisheye" else "OPENCV",
+            "fl_x": self.fx,
+            "fl_y": self.fy,
+            "cx": self.cx,
+            "cy": self.cy,
+            **dict(zip(_PARAMETERS[self.lens_model], self.distortion, strict=True)),
+        }
+
+    def to_colmap(self) -> tuple[str, list[float]]:
+        """Return COLMAP's simplest model of the lens, and its parameters. Its pixels count from the edge, too."""
+        pinhole = [float(value) for value in (self.fx, self.fy, self.cx, self.cy)]
+        distortion = [float(value) for value in self.distortion]
+        if self.lens_model == "fisheye":
+            return "OPENCV_FISHEYE", pinhole + distortion
+        if not any(distortion):
+            return "PINHOLE", pinhole
+        if distortion[4] == 0:
+            return "OPENCV", pinhole + distortion[:4]
+        # The last three are those of a denominator.
+        return "FULL_OPENCV", [*pinhole, *distortion, 0.0, 0.0, 0.0]
 
     @property
     def _opencv_matrix(self) -> NDArray[np.float64]:
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
 
     def pixel_directions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the directions through the pixel centres, undistorted to the last digit.
+        """Return the directions through the pixel centers, undistorted to the last digit.
 
         Returns:
             (height, width, 3) float64 unit vectors in the camera's frame with Nerfstudio's axes (x right, y up,
@@ -105,7 +179,7 @@ class CameraIntrinsics:
         return self._directions(np.arange(self.width), np.arange(self.height))
 
     def has_valid_pixels(self) -> bool:
-        """Return whether any of some pixels, evenly spread over the sensor, has a direction."""
+        """Return whether the distortion can be inverted at any of 24 x 24 sample pixels."""
         columns, rows = (
             np.linspace(0, side - 1, min(side, _SAMPLES)).astype(int) for side in (self.width, self.height)
         )
@@ -165,3 +239,9 @@ class CameraIntrinsics:
             # Nerfstudio's renderers write into it.
             metadata={},
         )
+
+
+def _require_lens_model(name: str) -> LensModel:
+    if name not in _LENS_MODELS:
+        raise ValueError(f"the lens model is {name!r}, not one of {', '.join(_LENS_MODELS)}")
+    return _LENS_MODELS[name]

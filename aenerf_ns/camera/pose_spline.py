@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 import torch
-from scipy.linalg import solve_banded
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation
 
 # Four lost frames in a row make a segment five times as long as its neighbours. The errors of the poses at its ends
 # grow with its length, but the spline is still closer to the path than a straight line (docs/experiments.md).
-_LONGEST_SEGMENT = 5.5
+_MAX_SEGMENT_RATIO = 5.5
 # Closer to half a turn, the shorter way round is hardly known.
-_LARGEST_TURN = math.radians(150)
+_MAX_TURN = math.radians(150)
 
 
 def pose_polynomials(seconds: Tensor, poses: Tensor) -> Tensor:
@@ -39,7 +39,7 @@ def pose_polynomials(seconds: Tensor, poses: Tensor) -> Tensor:
         The columns are x, y, z of the position, and x, y, z, w of the quaternion.
     """
     quaternions = quaternion_from_rotation(poses[:, :, :3])
-    # A quaternion and its negative are one rotation: of both, the spline takes the one closer to the quaternion ahead.
+    # A quaternion and its negative are one rotation. The spline takes the one closer to the quaternion before it.
     flips = torch.where((quaternions[1:] * quaternions[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(poses.dtype)
     quaternions = torch.cat([quaternions[:1], quaternions[1:] * flips.cumprod(0)])
     # A rotation turns by twice the angle between its quaternions.
@@ -49,7 +49,7 @@ def pose_polynomials(seconds: Tensor, poses: Tensor) -> Tensor:
     steps = seconds.diff()[:, None]
     chords = values.diff(dim=0) / steps
     in_spline = _in_spline(steps[:, 0], 2 * angles[:, 0])
-    slopes = _slopes(steps, chords, in_spline)
+    slopes = _spline_slopes(seconds, values, in_spline)
     # The slopes of steady motions, in which quaternions move along great circles.
     scale = 1 / (torch.sinc(angles / math.pi) * steps)
     leaving = torch.cat([chords[:, :3], scale * (end - torch.cos(angles) * start)], -1)
@@ -88,56 +88,28 @@ def _quadratic_rotation(quaternion: Tensor) -> Tensor:
 def _in_spline(steps: Tensor, turns: Tensor) -> Tensor:
     """Return which of the (N,) segments, of given lengths and angles, belong to a spline of at least two segments."""
     longest = torch.full_like(steps, math.inf)
-    longest[1:] = _LONGEST_SEGMENT * steps[:-1]
-    longest[:-1] = torch.minimum(longest[:-1], _LONGEST_SEGMENT * steps[1:])
-    known = (steps <= longest) & (turns <= _LARGEST_TURN)
+    longest[1:] = _MAX_SEGMENT_RATIO * steps[:-1]
+    longest[:-1] = torch.minimum(longest[:-1], _MAX_SEGMENT_RATIO * steps[1:])
+    known = (steps <= longest) & (turns <= _MAX_TURN)
     beside = torch.zeros_like(known)
     beside[1:] |= known[:-1]
     beside[:-1] |= known[1:]
     return known & beside
 
 
-def _slopes(steps: Tensor, chords: Tensor, in_spline: Tensor) -> Tensor:
+def _spline_slopes(seconds: Tensor, values: Tensor, in_spline: Tensor) -> Tensor:
     """Return the (N, columns) derivatives at the knots of the splines, and zeros at the other knots.
 
-    The equations of all splines are one tridiagonal system, because no knot belongs to two splines.
-
     Args:
-        steps: (N - 1, 1) lengths of the segments in seconds.
-        chords: (N - 1, columns) differences between the knots, per second.
+        seconds: (N,) times of the knots.
+        values: (N, columns) at the knots.
         in_spline: (N - 1,) which segments belong to a spline.
     """
-    h, m = steps.cpu().numpy(), chords.cpu().numpy()
-    # Whether the segment ahead of a knot and the segment after it belong to a spline.
-    ahead, after = np.zeros((2, len(h) + 1), bool)
-    ahead[1:] = after[:-1] = in_spline.cpu().numpy()
-    # The row of a knot has the factors of the slopes at the knot ahead, at the knot itself and at the next knot.
-    lower, upper = np.zeros((2, len(h) + 1, 1))
-    diagonal, right = np.ones((len(h) + 1, 1)), np.zeros((len(h) + 1, m.shape[1]))
-    # The second derivative is continuous.
-    i = np.nonzero(ahead & after)[0]
-    lower[i], diagonal[i], upper[i] = h[i], 2 * (h[i - 1] + h[i]), h[i - 1]
-    right[i] = 3 * (h[i] * m[i - 1] + h[i - 1] * m[i])
-    # The third derivative is continuous at the second knot and at the last but one.
-    i = np.nonzero(after & ~ahead)[0]
-    diagonal[i], upper[i], right[i] = _not_a_knot(h[i], h[i + 1], m[i], m[i + 1])
-    i = np.nonzero(ahead & ~after)[0]
-    diagonal[i], lower[i], right[i] = _not_a_knot(h[i - 1], h[i - 2], m[i - 1], m[i - 2])
-    # With three knots both of these say the same. A parabola has no third derivative.
-    i = i[~ahead[i - 2]]
-    diagonal[i], lower[i], right[i] = 1, 1, 2 * m[i - 1]
-    bands = np.stack([np.roll(upper[:, 0], 1), diagonal[:, 0], np.roll(lower[:, 0], -1)])
-    return torch.from_numpy(solve_banded((1, 1), bands, right)).to(chords)
-
-
-def _not_a_knot(end: np.ndarray, inner: np.ndarray, end_chord: np.ndarray, inner_chord: np.ndarray) -> tuple:
-    """Return the factors of the slopes at the end of a spline and at the knot beside it, and the right-hand side.
-
-    Args:
-        end: (K, 1) lengths of the segments at the ends of K splines.
-        inner: (K, 1) lengths of the segments beside them.
-        end_chord: (K, columns) differences over the segments at the ends, per second.
-        inner_chord: (K, columns) differences over the segments beside them, per second.
-    """
-    both = end + inner
-    return inner, both, ((end + 2 * both) * inner * end_chord + end**2 * inner_chord) / both
+    x, y = seconds.cpu().numpy(), values.cpu().numpy()
+    slopes = np.zeros_like(y)
+    # A spline begins and ends where a segment that belongs to one meets a segment, or an end, that does not.
+    edges = np.flatnonzero(np.diff(in_spline.cpu().numpy(), prepend=False, append=False))
+    for first, last in edges.reshape(-1, 2):
+        knots = slice(first, last + 1)
+        slopes[knots] = CubicSpline(x[knots], y[knots], bc_type="not-a-knot")(x[knots], 1)
+    return torch.from_numpy(slopes).to(values)

@@ -148,22 +148,6 @@ def cross_matrix(vector: Tensor) -> Tensor:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
-def vector_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Return the logarithm of unit quaternions.
-
-    Args:
-        quaternion: (..., 4) unit quaternions x, y, z, w of either sign.
-
-    Returns:
-        (..., 3) axis times angle in radians, of the shorter way round (angle at most π).
-    """
-    quaternion = torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
-    xyz, w = quaternion[..., :3], quaternion[..., 3:]
-    sine = xyz.norm(dim=-1, keepdim=True)
-    angle = 2 * torch.atan2(sine, w)
-    return xyz * torch.where(sine > 1e-12, angle / sine.clamp_min(1e-12), torch.full_like(sine, 2.0))
-
-
 def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
     """Return the (..., 3, 3) rotation matrices of unit quaternions (..., 4) in the order x, y, z, w."""
     x, y, z, w = quaternion.unbind(-1)

@@ -66,7 +66,9 @@ class Trajectory(nn.Module):
         poses = camera_to_worlds.detach().to(torch.float64)[:, :3, :4]
         if len(times) != len(poses) or len(times) < 2:
             raise DataError(source, f"{len(times)} times and {len(poses)} poses", "give at least two timed poses")
-        backward = times[1:] <= times[:-1]
+        seconds = _to_seconds(times - times[0])
+        # Nanoseconds apart a century from the start, times are equal in seconds, too.
+        backward = seconds.diff() <= 0
         if backward.any():
             index = int(backward.nonzero()[0]) + 1
             raise DataError(
@@ -82,7 +84,6 @@ class Trajectory(nn.Module):
         if distance > _MAX_POSITION:
             raise DataError(source, f"a pose is {float(distance):g} away from the origin", "check the columns")
         require_rigid(poses, source)
-        seconds = (times - times[0]).to(torch.float64) * 1e-9
         for name, value in (
             ("times", times),
             ("camera_to_worlds", poses),
@@ -118,7 +119,7 @@ class Trajectory(nn.Module):
 
     def seconds(self, times: Tensor) -> Tensor:
         """Return the float64 seconds since ``start`` of integer times in nanoseconds."""
-        return (times - self.times[0]).to(torch.float64) * 1e-9
+        return _to_seconds(times - self.times[0])
 
     def pose(self, seconds: Tensor) -> Tensor:
         """Return the poses at times inside the span, differentiable with respect to time.
@@ -265,6 +266,10 @@ def _as_times(times: ArrayLike | Tensor) -> Tensor:
     return torch.as_tensor(times if isinstance(times, Tensor) else np.asarray(times), dtype=torch.int64)
 
 
+def _to_seconds(nanoseconds: Tensor) -> Tensor:
+    return nanoseconds.to(torch.float64) * 1e-9
+
+
 def require_rigid(poses: Tensor, source: str | Path) -> None:
     """Raise a DataError unless the (N, 3 or 4, 4) poses are rotations and translations."""
     rotations = poses[:, :3, :3]
@@ -272,7 +277,8 @@ def require_rigid(poses: Tensor, source: str | Path) -> None:
     error = torch.maximum(error, (torch.linalg.det(rotations) - 1).abs())
     if poses.shape[1] == 4:
         error = torch.maximum(error, (poses[:, 3] - poses.new_tensor([0, 0, 0, 1])).abs().amax(1))
-    if error.max() > _MAX_RIGIDITY_ERROR:
+    # Also if it is not a number.
+    if not error.max() <= _MAX_RIGIDITY_ERROR:
         raise DataError(
             source,
             f"pose {int(error.argmax())} is not a rigid motion (it is off by {float(error.max()):.2g})",

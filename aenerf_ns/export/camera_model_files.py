@@ -40,7 +40,7 @@ class PlacedImage:
 
 
 @dataclass(frozen=True)
-class SeenPoints:
+class ObservedPoints:
     """Points of a scene, each seen in one image.
 
     Attributes:
@@ -56,11 +56,11 @@ class SeenPoints:
     pixels: NDArray[np.float64]
 
 
-def write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: SeenPoints) -> None:
+def write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
     """Write a COLMAP model in binary form, and the lists of images that Nerfstudio's ``colmap`` dataparser splits by.
 
     Args:
-        folder: that the model's folder ``sparse/0`` and the lists are written to.
+        folder: gets the model's folder ``sparse/0`` and the lists.
         images: in the order of their numbers in the model, which begin with 1.
         points: of the model; each has a track of one image.
     """
@@ -71,8 +71,14 @@ def write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: Seen
     numbers: dict[CameraIntrinsics, int] = {}
     for image in images:
         if image.camera not in numbers:
-            numbers[image.camera] = len(numbers) + 1
-            model.add_camera_with_trivial_rig(_colmap_camera(image.camera, numbers[image.camera]))
+            camera = image.camera
+            numbers[camera] = len(numbers) + 1
+            name, parameters = camera.to_colmap()
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(
+                    camera_id=numbers[camera], model=name, width=camera.width, height=camera.height, params=parameters
+                )
+            )
     for index, image in enumerate(images):
         world_to_camera = np.linalg.inv(image.camera_to_world)
         model.add_image_with_trivial_frame(
@@ -84,11 +90,10 @@ def write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: Seen
             ),
             pycolmap.Rigid3d(world_to_camera[:3]),
         )
-    # Of how many points before it in the same image.
-    place = np.zeros(len(images), np.int64)
-    for position, color, image_index in zip(points.positions, points.colors, points.images, strict=True):
-        element = pycolmap.TrackElement(int(image_index) + 1, int(place[image_index]))
-        place[image_index] += 1
+    num_earlier = np.zeros(len(images), np.int64)
+    for position, color, index in zip(points.positions, points.colors, points.images, strict=True):
+        element = pycolmap.TrackElement(int(index) + 1, int(num_earlier[index]))
+        num_earlier[index] += 1
         model.add_point3D(position, pycolmap.Track([element]), color)
     sparse = folder / SPARSE_FOLDER
     sparse.mkdir(parents=True)
@@ -97,16 +102,21 @@ def write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: Seen
         (folder / f"{split}_list.txt").write_text("".join(f"{name}\n" for name in names), "utf8")
 
 
-def write_transforms(folder: Path, images: Sequence[PlacedImage], points: SeenPoints) -> None:
+def write_transforms(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
     """Write ``transforms.json`` and ``points.ply``, as Nerfstudio's ``nerfstudio`` dataparser reads them.
 
     Poses are camera-to-world with OpenGL camera axes, in the same world as ``points.ply``.
     """
+    # Imported lazily, because few commands need it.
+    import trimesh
+
     frames = []
     for image in images:
         frame = {
             "file_path": f"{IMAGE_FOLDER}/{image.name}",
-            **_transforms_camera(image.camera),
+            "w": image.camera.width,
+            "h": image.camera.height,
+            **image.camera.to_transforms(),
             "transform_matrix": (image.camera_to_world @ OPENCV_TO_OPENGL.numpy()).tolist(),
         }
         if image.depth is not None:
@@ -114,7 +124,7 @@ def write_transforms(folder: Path, images: Sequence[PlacedImage], points: SeenPo
         frames.append(frame)
     splits = _names_by_split(images, f"{IMAGE_FOLDER}/")
     meta: dict[str, Any] = {
-        "camera_model": "OPENCV_FISHEYE" if images[0].camera.lens_model == "fisheye" else "OPENCV",
+        "camera_model": images[0].camera.to_transforms()["camera_model"],
         # The world of the poses is the original one. Without this line the framework would guess another.
         "applied_transform": np.eye(4)[:3].tolist(),
         "ply_file_path": POINTS_FILE,
@@ -122,11 +132,11 @@ def write_transforms(folder: Path, images: Sequence[PlacedImage], points: SeenPo
         "frames": frames,
     }
     (folder / TRANSFORMS_FILE).write_text(json.dumps(meta, indent=1) + "\n", "utf8")
-    _write_ply(folder / POINTS_FILE, points)
+    trimesh.PointCloud(points.positions, colors=points.colors).export(folder / POINTS_FILE)
 
 
 def _names_by_split(images: Sequence[PlacedImage], prefix: str) -> dict[str, list[str]]:
-    """Return the images' names by split, none where images are not split.
+    """List the images' names by split; an empty dictionary where images are not split.
 
     A split without images gets those of the other held-out split, because the framework asks for all three.
     """
@@ -134,38 +144,3 @@ def _names_by_split(images: Sequence[PlacedImage], prefix: str) -> dict[str, lis
     if not names["train"] or not (names["val"] or names["test"]):
         return {}
     return {**names, "val": names["val"] or names["test"], "test": names["test"] or names["val"]}
-
-
-def _colmap_camera(camera: CameraIntrinsics, number: int) -> Any:
-    import pycolmap
-
-    basic = [camera.fx, camera.fy, camera.cx, camera.cy]
-    if camera.lens_model == "fisheye":
-        model, parameters = "OPENCV_FISHEYE", [*basic, *camera.distortion]
-    elif not any(camera.distortion):
-        model, parameters = "PINHOLE", basic
-    elif camera.distortion[4] == 0:
-        model, parameters = "OPENCV", [*basic, *camera.distortion[:4]]
-    else:
-        # k4, k5 and k6 are those of the denominator.
-        model, parameters = "FULL_OPENCV", [*basic, *camera.distortion, 0.0, 0.0, 0.0]
-    return pycolmap.Camera(camera_id=number, model=model, width=camera.width, height=camera.height, params=parameters)
-
-
-def _transforms_camera(camera: CameraIntrinsics) -> dict[str, float]:
-    names = ("k1", "k2", "k3", "k4") if camera.lens_model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
-    return {
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "w": camera.width,
-        "h": camera.height,
-        **dict(zip(names, camera.distortion, strict=True)),
-    }
-
-
-def _write_ply(path: Path, points: SeenPoints) -> None:
-    import trimesh
-
-    trimesh.PointCloud(points.positions, colors=points.colors).export(path)

@@ -13,8 +13,8 @@ from torch import Tensor
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.export.camera_model_files import (
     IMAGE_FOLDER,
+    ObservedPoints,
     PlacedImage,
-    SeenPoints,
     write_colmap_model,
     write_transforms,
 )
@@ -69,7 +69,7 @@ def export_frames(pipeline: AENeRFPipeline, folder: Path, times: Tensor, num_poi
     write_cameras(folder, images, points_seen(pipeline, images, num_points))
 
 
-def write_cameras(folder: Path, images: Sequence[PlacedImage], points: SeenPoints) -> None:
+def write_cameras(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
     """Write images' cameras as a COLMAP model and as a transforms.json, with points of the scene."""
     write_colmap_model(folder, images, points)
     write_transforms(folder, images, points)

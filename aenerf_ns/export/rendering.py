@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.export.camera_model_files import PlacedImage, SeenPoints
+from aenerf_ns.export.camera_model_files import ObservedPoints, PlacedImage
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
@@ -45,7 +45,7 @@ def render(pipeline: AENeRFPipeline, lens: CameraIntrinsics, pose: Tensor) -> di
 
 
 @torch.no_grad()
-def points_seen(pipeline: AENeRFPipeline, images: Sequence[PlacedImage], most: int) -> SeenPoints:
+def points_seen(pipeline: AENeRFPipeline, images: Sequence[PlacedImage], most: int) -> ObservedPoints:
     """Return points on the surfaces that images see, in the recording's world, at pixels spread over the images.
 
     Args:
@@ -85,7 +85,7 @@ def points_seen(pipeline: AENeRFPipeline, images: Sequence[PlacedImage], most: i
                 )
             progress.advance(task)
     columns = (np.concatenate(column)[:most] for column in zip(*parts, strict=True))
-    return SeenPoints(*columns)
+    return ObservedPoints(*columns)
 
 
 def in_recording(pipeline: AENeRFPipeline, points: Tensor) -> Tensor:

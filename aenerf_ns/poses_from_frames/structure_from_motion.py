@@ -6,7 +6,7 @@ import contextlib
 import sqlite3
 import statistics
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -265,7 +265,7 @@ class _Workspace:
         if camera is None:
             reader.camera_model = "SIMPLE_RADIAL"
         else:
-            reader.camera_model, parameters = colmap_camera(camera)
+            reader.camera_model, parameters = camera.to_colmap()
             reader.camera_params = ", ".join(map(repr, parameters))
         extraction.use_gpu, extraction.num_threads = False, 1
         extraction.sift.peak_threshold = _PEAK_THRESHOLD
@@ -348,14 +348,3 @@ def _pairs(num_frames: int) -> list[tuple[int, int]]:
     keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _KEY_FRAMES))})
     pairs |= {(i, j) for i in keys for j in keys if i < j}
     return sorted(pairs)
-
-
-def colmap_camera(camera: CameraIntrinsics) -> tuple[str, Sequence[float]]:
-    """Return COLMAP's name of a lens, and its parameters. COLMAP's pixels count from the edge of the image, as ours."""
-    pinhole = [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
-    distortion = [float(value) for value in camera.distortion]
-    if camera.lens_model == "fisheye":
-        return "OPENCV_FISHEYE", pinhole + distortion
-    if not any(distortion):
-        return "PINHOLE", pinhole
-    return "FULL_OPENCV", [*pinhole, *distortion, 0.0, 0.0, 0.0]

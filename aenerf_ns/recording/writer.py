@@ -21,7 +21,6 @@ from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.errors import DataError, reason
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
-from aenerf_ns.files.json_object import LENS_MODELS
 from aenerf_ns.files.output_paths import cannot_be_created
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
@@ -133,7 +132,7 @@ class NativeDatasetWriter(_FolderWriter):
         self._meta: dict[str, Any] = {
             "w": frame_camera.width,
             "h": frame_camera.height,
-            **_lens(frame_camera),
+            **frame_camera.to_transforms(),
             "image_encoding": image_encoding,
             "event_camera": {"file": "events.h5", **_event_camera(event_camera, sensor)},
             "frames": [],
@@ -303,21 +302,9 @@ def _event_camera(camera: CameraIntrinsics, sensor: SensorModel) -> dict[str, An
     return {
         "width": camera.width,
         "height": camera.height,
-        **_lens(camera),
+        **camera.to_transforms(),
         "positive_contrast_threshold": sensor.positive_contrast_threshold,
         "negative_contrast_threshold": sensor.negative_contrast_threshold,
         "refractory_period_ns": sensor.refractory_period,
         "bayer_pattern": sensor.bayer_pattern,
-    }
-
-
-def _lens(camera: CameraIntrinsics) -> dict[str, Any]:
-    model, names = next((model, names) for model, (lens, names) in LENS_MODELS.items() if lens == camera.lens_model)
-    return {
-        "camera_model": model,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        **dict(zip(names, camera.distortion, strict=True)),
     }

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from aenerf_ns.camera.alignment import align, rotation_angle
-from aenerf_ns.camera.rotation import quaternion_from_rotation, vector_from_quaternion
 from aenerf_ns.camera.trajectory import homogeneous
 
 
@@ -66,7 +66,7 @@ def correction_components(estimated: Tensor, corrected: Tensor) -> dict[str, lis
         By name: translations in the units of the poses, and the rotation's vector in degrees.
     """
     motion = torch.linalg.solve(homogeneous(estimated.double()), homogeneous(corrected.double()))
-    vectors = torch.rad2deg(vector_from_quaternion(quaternion_from_rotation(motion[:, :3, :3])))
+    vectors = Rotation.from_matrix(motion[:, :3, :3].cpu().numpy()).as_rotvec(degrees=True)
     named = {f"translation {axis}": motion[:, i, 3] for i, axis in enumerate("xyz")}
     named |= {f"rotation {axis}": vectors[:, i] for i, axis in enumerate("xyz")}
     return {name: values.tolist() for name, values in named.items()}

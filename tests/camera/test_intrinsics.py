@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
@@ -18,12 +19,12 @@ PINHOLE = CameraIntrinsics(5, 4, 6.0, 7.0, 2.5, 2.0)
 
 
 def opencv_matrix(camera: CameraIntrinsics) -> np.ndarray:
-    # OpenCV counts from the centre of the first pixel.
+    # OpenCV counts from the center of the first pixel.
     return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
 
 
 @pytest.mark.parametrize("camera", [DAVIS, FISHEYE], ids=["radial_tangential", "fisheye"])
-def test_opencv_projects_each_direction_onto_its_pixel(camera: CameraIntrinsics) -> None:
+def test_opencv_projects_directions_onto_pixels(camera: CameraIntrinsics) -> None:
     directions, has_direction = camera.pixel_directions()
     assert has_direction.all()
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-15)
@@ -35,7 +36,7 @@ def test_opencv_projects_each_direction_onto_its_pixel(camera: CameraIntrinsics)
     np.testing.assert_allclose(pixels, np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-8)
 
 
-def test_a_pinhole_looks_through_pixel_centres() -> None:
+def test_pinhole_looks_through_pixel_centers() -> None:
     directions, _ = PINHOLE.pixel_directions()
     x, y = 3, 0
     expected = np.array([(x + 0.5 - 2.5) / 6, -(y + 0.5 - 2.0) / 7, -1])
@@ -43,7 +44,7 @@ def test_a_pinhole_looks_through_pixel_centres() -> None:
 
 
 @pytest.mark.parametrize("camera", [DAVIS, FISHEYE, PINHOLE], ids=["radial_tangential", "fisheye", "pinhole"])
-def test_the_framework_renders_along_the_same_rays(camera: CameraIntrinsics) -> None:
+def test_nerfstudio_has_the_same_rays(camera: CameraIntrinsics) -> None:
     pose = (torch.eye(4, dtype=torch.float64) @ OPENCV_TO_OPENGL)[None, :3]
     pose[0, :, 3] = torch.tensor([1.0, 2.0, 3.0])
     rays = camera.cameras(pose).generate_rays(camera_indices=0)
@@ -54,7 +55,41 @@ def test_the_framework_renders_along_the_same_rays(camera: CameraIntrinsics) -> 
     assert rays.directions.dtype == torch.float32
 
 
-def test_pixels_beyond_the_lens_model_have_no_direction() -> None:
+@pytest.mark.parametrize("camera", [DAVIS, FISHEYE, PINHOLE], ids=["radial_tangential", "fisheye", "pinhole"])
+def test_lens_in_other_terms_and_back(camera: CameraIntrinsics) -> None:
+    assert CameraIntrinsics.from_transforms(camera.width, camera.height, camera.to_transforms()) == camera
+    matrix, name = opencv_matrix(camera), "equidistant" if camera.lens_model == "fisheye" else "plumb_bob"
+    pinhole = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    again = CameraIntrinsics.from_opencv((camera.width, camera.height), pinhole, camera.distortion, name)
+    assert (again.cx, again.cy, again.distortion) == (camera.cx, camera.cy, camera.distortion)
+    with pytest.raises(ValueError, match="the lens model is 'fov', not one of OPENCV"):
+        CameraIntrinsics.from_opencv((8, 6), pinhole, (), "fov")
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("PINHOLE", (0.0,) * 5),
+        ("OPENCV", (-0.3, 0.1, 0.002, -0.001, 0.0)),
+        ("FULL_OPENCV", (-0.3, 0.1, 0.002, -0.001, -0.02)),
+        ("OPENCV_FISHEYE", (0.05, -0.02, 0.01, -0.003)),
+    ],
+)
+def test_colmap_has_the_same_lens(model: str, distortion: tuple[float, ...]) -> None:
+    lens = "fisheye" if model == "OPENCV_FISHEYE" else "radial_tangential"
+    camera = CameraIntrinsics(80, 60, 70.0, 72.0, 41.0, 29.0, lens, distortion)
+    name, parameters = camera.to_colmap()
+    assert name == model
+    colmap = pycolmap.Camera(model=name, width=80, height=60, params=parameters)
+    directions, valid = camera.pixel_directions()
+    assert valid.all()
+    plane = (directions / -directions[..., 2:]).reshape(-1, 3) * [1, -1, -1]
+    columns, rows = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    pixels = colmap.img_from_cam(np.ascontiguousarray(plane))
+    np.testing.assert_allclose(pixels, np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-6)
+
+
+def test_pixels_beyond_the_lens_have_no_direction() -> None:
     # Radial distortion this strong folds over before the corners.
     camera = CameraIntrinsics(200, 200, 80.0, 80.0, 100.0, 100.0, "radial_tangential", (-0.4, 0.0, 0.0, 0.0, 0.0))
     _, has_direction = camera.pixel_directions()
@@ -67,7 +102,7 @@ def test_pixels_beyond_the_lens_model_have_no_direction() -> None:
     [
         ({"fx": 0.0}, "fx must be from 0.01 to 1e[+]06 pixels, not 0"),
         ({"width": -1}, "width must be a whole number from 1 to 16384, not -1"),
-        ({"cx": float("nan")}, "cx must be within"),
+        ({"cx": float("nan")}, "cx must be from"),
         ({"distortion": (0.1, 0.2)}, "takes 5 numbers, not 2"),
         ({"lens_model": "kb4"}, "lens_model must be one of"),
     ],

@@ -14,7 +14,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.export.camera_model_files import PlacedImage, SeenPoints, write_colmap_model, write_transforms
+from aenerf_ns.export.camera_model_files import ObservedPoints, PlacedImage, write_colmap_model, write_transforms
 
 LENSES = {
     "pinhole": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5),
@@ -25,7 +25,7 @@ LENSES = {
 SPLITS = ("train", "train", "train", "val", "test", "test", "train", "train")
 
 
-def write(folder: Path, lens: CameraIntrinsics, random_poses: torch.Tensor) -> tuple[list[PlacedImage], SeenPoints]:
+def write(folder: Path, lens: CameraIntrinsics, random_poses: torch.Tensor) -> tuple[list[PlacedImage], ObservedPoints]:
     """Writes images of one lens at random poses, each with the points at two distances along five of its pixels."""
     images = [
         PlacedImage(f"some/{index:03d}.png", lens, np.vstack([pose, [0, 0, 0, 1]]), split)
@@ -42,7 +42,7 @@ def write(folder: Path, lens: CameraIntrinsics, random_poses: torch.Tensor) -> t
         pixels.append(np.stack([columns + 0.5, rows + 0.5], -1))
         indices.append(np.full(5, index))
     colors = generator.integers(0, 256, (40, 3)).astype(np.uint8)
-    points = SeenPoints(np.concatenate(positions), colors, np.concatenate(indices), np.concatenate(pixels))
+    points = ObservedPoints(np.concatenate(positions), colors, np.concatenate(indices), np.concatenate(pixels))
     write_colmap_model(folder, images, points)
     write_transforms(folder, images, points)
     return images, points
@@ -68,7 +68,7 @@ def test_the_model_is_read_by_pycolmap(name: str, tmp_path: Path, random_poses: 
         np.testing.assert_allclose(image.project_point(point.xyz), shown, atol=1e-3)
 
 
-def assert_read(outputs: DataparserOutputs, images: list[PlacedImage], points: SeenPoints, folder: Path) -> None:
+def assert_read(outputs: DataparserOutputs, images: list[PlacedImage], points: ObservedPoints, folder: Path) -> None:
     """Asserts that a dataparser of the framework gives images, in the world that they were written in."""
     assert [Path(file).relative_to(folder / "images").as_posix() for file in outputs.image_filenames] == [
         image.name for image in images

@@ -24,7 +24,6 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.poses_from_frames.structure_from_motion import (
     EstimatedPoses,
-    colmap_camera,
     compare_with_truth,
     estimate_poses,
 )
@@ -121,29 +120,6 @@ def test_unusable_frames_are_told(tmp_path: Path) -> None:
     Image.fromarray(frames[0].astype(np.uint16)).save(tmp_path / "deep.png")
     with pytest.raises(DataError, match=r"deep\.png: the image is of PIL's mode I;16"):
         estimate_poses([tmp_path / "deep.png"] * 2, [0, 1], camera, "video")
-
-
-@pytest.mark.parametrize(
-    ("lens", "distortion"),
-    [
-        ("radial_tangential", (0.0,) * 5),
-        ("radial_tangential", (-0.3, 0.1, 0.002, -0.001, -0.02)),
-        ("fisheye", (0.05, -0.02, 0.01, -0.003)),
-    ],
-)
-def test_colmap_has_the_same_lens(lens: str, distortion: tuple[float, ...]) -> None:
-    import pycolmap
-
-    camera = CameraIntrinsics(80, 60, 70.0, 72.0, 41.0, 29.0, lens, distortion)
-    model, parameters = colmap_camera(camera)
-    colmap = pycolmap.Camera(model=model, width=80, height=60, params=parameters)
-    directions, valid = camera.pixel_directions()
-    assert valid.all()
-    plane = (directions / -directions[..., 2:]).reshape(-1, 3) * [1, -1, -1]
-    columns, rows = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
-    np.testing.assert_allclose(
-        colmap.img_from_cam(np.ascontiguousarray(plane)), np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-6
-    )
 
 
 @pytest.mark.parametrize("pattern", ["", "RGGB"])
