@@ -33,6 +33,7 @@ _GUESSED = "the size 240 x 180 was guessed, because there are no images: give ec
 class EcdDataParserConfig(PublishedDataParserConfig):
     """Event Camera Dataset (text files)."""
 
+    markers = ("events.txt", "groundtruth.txt", "calib.txt")
     _target: type = field(default_factory=lambda: EcdDataParser)
     width: int | None = None
     """Pixel columns of the sensor. By default those of the images, or 240 (DAVIS240C) where there are none."""

@@ -55,6 +55,7 @@ _EVENT_FROM_FRAME = (
 class EdsDataParserConfig(PublishedDataParserConfig):
     """EDS (raw download)."""
 
+    markers = ("events.h5", "stamped_groundtruth.txt")
     _target: type = field(default_factory=lambda: EdsDataParser)
     calibration: Path | None = None
     """Kalibr's camchain, in place of the authors' calibration. cam0 is the frame camera, cam1 the event camera."""

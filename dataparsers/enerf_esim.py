@@ -55,7 +55,14 @@ class EsimEventFolder(EventFile):
 class ENeRFEsimDataParserConfig(PublishedDataParserConfig):
     """E-NeRF's ESIM scenes."""
 
+    markers = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
     _target: type = field(default_factory=lambda: ENeRFEsimDataParser)
+
+    @classmethod
+    def recognizes(cls, data: Path) -> bool:
+        return (
+            (data / "events").is_dir() and any(data.glob("*poses_all*.txt")) and (data / "poses_bounds.npy").is_file()
+        )
 
 
 class ENeRFEsimDataParser(EventDataParser):

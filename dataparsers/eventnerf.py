@@ -19,7 +19,6 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
-from aenerf_ns.files.layouts import eventnerf_splits
 from aenerf_ns.files.limits import read_text
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.recording.dataparser import EventDataParser
@@ -74,9 +73,14 @@ class EvenPosesDataParserConfig(ObjectDataParserConfig):
 class EventNeRFDataParserConfig(EvenPosesDataParserConfig):
     """EventNeRF."""
 
+    markers = ("train/events/*.npz", "train/pose", "train/intrinsics")
     _target: type = field(default_factory=lambda: EventNeRFDataParser)
     color: bool = True
-    """Whether the sensor has the colour filter RGGB."""
+    """Whether the sensor has the color filter RGGB."""
+
+    @classmethod
+    def recognizes(cls, data: Path) -> bool:
+        return any((split / "pose").is_dir() and (split / "intrinsics").is_dir() for split in _training_splits(data))
 
 
 class EventNeRFDataParser(EventDataParser):
@@ -89,7 +93,7 @@ class EventNeRFDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         data = Path(self.config.data)
-        splits = [split for split in eventnerf_splits(data) if (split / "pose").is_dir()]
+        splits = [split for split in _training_splits(data) if (split / "pose").is_dir()]
         if not splits:
             raise DataError(data, "there is no train/pose", "give the folder of a scene or of one of its splits")
         if len(splits) > 1:
@@ -126,6 +130,10 @@ class EventNeRFDataParser(EventDataParser):
             image_encoding="srgb",
             scene_box=self.config.scene_box(UNIT_SPHERE),
         )
+
+
+def _training_splits(data: Path) -> list[Path]:
+    return [data] if (data / "pose").is_dir() else sorted(path for path in data.glob("train*") if path.is_dir())
 
 
 def _held_out_views(scene: Path) -> dict[Split, list[ReferenceView]]:

@@ -1,4 +1,4 @@
-"""All dataset formats, and the one that a folder is recognised to have."""
+"""All dataset formats, and how the format of a folder is recognized."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from aenerf_ns.dataparsers.own_recording import own_recording_dataparser
 from aenerf_ns.dataparsers.paev3d import paev3d_dataparser
 from aenerf_ns.dataparsers.robust_enerf import robust_enerf_dataparser
 from aenerf_ns.dataparsers.tum_vie import tum_vie_dataparser
-from aenerf_ns.files.layouts import recognise
+from aenerf_ns.errors import DataError, reading
+from aenerf_ns.files.output_paths import require_dataset
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
 
-# By the names they are registered with.
+# By the names they are registered with. Where a folder has several formats, the first one here is taken.
 FORMATS: dict[str, EventDataParserConfig] = {
     "aenerf-data": native_dataparser.config,
     "ecd-data": ecd_dataparser.config,
@@ -38,6 +39,21 @@ FORMATS: dict[str, EventDataParserConfig] = {
 }
 
 
+def recognize(data: Path) -> str:
+    """Name the format of a dataset, judged by the names of its files.
+
+    Raises:
+        DataError: the folder does not exist, or has none of the formats.
+    """
+    with reading(data):
+        for name, config in FORMATS.items():
+            if config.recognizes(data):
+                return name
+    require_dataset(data)
+    known = "; ".join(f"{name}: {' with '.join(config.markers)}" for name, config in FORMATS.items())
+    raise DataError(data, "no known format of recordings", f"looked for {known}")
+
+
 @dataclass
 class AutomaticDataParserConfig(DataParserConfig):
     """A recording in any known format. To set a format's options, name the format."""
@@ -45,12 +61,12 @@ class AutomaticDataParserConfig(DataParserConfig):
     _target: type = field(default_factory=lambda: EventDataParser)
 
     def setup(self, **kwargs: Any) -> Any:
-        """Return the dataparser of the format that ``data`` has, with that format's default configuration.
+        """Make the dataparser of the format of ``data``, with that format's default configuration.
 
         Raises:
             DataError: ``data`` does not exist, or has none of the formats.
         """
-        name = recognise(Path(self.data))
+        name = recognize(Path(self.data))
         config = deepcopy(FORMATS[name])
         config.data = self.data
         CONSOLE.print(f"{self.data} is in the format {name}.")

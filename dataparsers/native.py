@@ -26,6 +26,7 @@ from aenerf_ns.recording.recording import SPLITS, Recording, ReferenceView, Spli
 class NativeDataParserConfig(SensorOptions, EventDataParserConfig):
     """aenerf-ns dataset folder."""
 
+    markers = ("transforms.json", "trajectory_estimated.txt")
     _target: type = field(default_factory=lambda: NativeDataParser)
     auto_scale_poses: bool | None = None
     """Scale the estimated poses to fit in a box of +/- 1. By default as the dataset states: aenerf convert and aenerf

@@ -16,7 +16,6 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.files.colmap import read_colmap_poses
-from aenerf_ns.files.layouts import CALIBRATIONS
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
@@ -25,11 +24,18 @@ from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, MAX_VIEWS, read_image_list, views_on_trajectory
 
+_CALIBRATIONS = ("calibration.json", "camchain.yaml")
+
 
 @dataclass
 class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     """A recording of your own."""
 
+    markers = (
+        f"events{{{','.join(SUFFIXES)}}}",
+        " or ".join(_CALIBRATIONS),
+        "trajectory.txt or a COLMAP model in colmap",
+    )
     _target: type = field(default_factory=lambda: OwnRecordingDataParser)
     events: Path | None = None
     """The file of events. By default the file in the folder that is named "events", with the suffix of any format."""
@@ -54,6 +60,11 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     images: Path | None = None
     """List of the images: on each line the time in seconds and the file. By default images.txt in the folder, if it is
     there."""
+
+    @classmethod
+    def recognizes(cls, data: Path) -> bool:
+        has_calibration = any((data / name).is_file() for name in _CALIBRATIONS)
+        return has_calibration and ((data / "trajectory.txt").is_file() or (data / "colmap").is_dir())
 
 
 class OwnRecordingDataParser(EventDataParser):
@@ -110,11 +121,11 @@ class OwnRecordingDataParser(EventDataParser):
     def _calibration_file(self, folder: Path) -> Path:
         if self.config.calibration is not None:
             return self.config.calibration
-        found = [folder / name for name in CALIBRATIONS if (folder / name).is_file()]
+        found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
         if len(found) != 1:
             raise DataError(
                 folder,
-                f"it holds {len(found)} of {' and '.join(CALIBRATIONS)}",
+                f"it holds {len(found)} of {' and '.join(_CALIBRATIONS)}",
                 "give the calibration as --calibration",
             )
         return found[0]

@@ -19,7 +19,6 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import open_npz_member, read_npy_header
 from aenerf_ns.files.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
-from aenerf_ns.files.layouts import paev3d_scenes
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, image_files_of_poses, views_on_trajectory
@@ -35,7 +34,12 @@ _MAX_BYTES = 1 << 20
 class PAEv3DDataParserConfig(EvenPosesDataParserConfig):
     """PAEv3D."""
 
+    markers = ("H5_Files/SCENE/event.h5", "Render_info/SCENE", "Intrinsics")
     _target: type = field(default_factory=lambda: PAEv3DDataParser)
+
+    @classmethod
+    def recognizes(cls, data: Path) -> bool:
+        return bool(_scenes(data))
 
 
 class PAEv3DDataParser(EventDataParser):
@@ -45,7 +49,7 @@ class PAEv3DDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         data = Path(self.config.data)
-        scenes = paev3d_scenes(data)
+        scenes = _scenes(data)
         if not scenes:
             raise DataError(data, "there is no H5_Files/SCENE", "give the dataset's folder, or H5_Files/SCENE in it")
         if len(scenes) > 1:
@@ -75,6 +79,13 @@ class PAEv3DDataParser(EventDataParser):
             max_views=MAX_VIEWS,
             scene_box=self.config.scene_box(UNIT_SPHERE),
         )
+
+
+def _scenes(data: Path) -> list[Path]:
+    """List the folders of events. The event files may be missing, as where a trained run is opened."""
+    if data.parent.name == "H5_Files":
+        return [data]
+    return sorted(path for path in data.glob("H5_Files/*") if path.is_dir())
 
 
 class _Call:

@@ -32,6 +32,7 @@ _LENS_MODELS: dict[str, LensModel] = {"plumb_bob": "radial_tangential", "equidis
 class RobustENeRFDataParserConfig(ObjectDataParserConfig):
     """Robust e-NeRF (raw_events.npz)."""
 
+    markers = ("raw_events.npz", "camera_poses.npz", "camera_calibration.npz")
     _target: type = field(default_factory=lambda: RobustENeRFDataParser)
     auto_scale_poses: bool | None = True
     """Scale the estimated poses to fit in a box of +/- 1, where the scene has no box. The cameras of an object of 1.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,13 +16,13 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
 from aenerf_ns.files.json_object import JsonObject
-from aenerf_ns.files.layouts import TUM_VIE_EVENTS, tum_vie_event_files
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
 
+_EVENT_FILE = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
 # Sequences recorded with calibration A. All others were recorded with calibration B.
 _SET_A = {"loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"}
 # Indices into the lists of the calibration.
@@ -35,10 +36,15 @@ _SENSOR = SensorModel(1.458 * 0.25, 0.25, 1375)
 class TumVieDataParserConfig(PublishedDataParserConfig):
     """TUM-VIE (raw download)."""
 
+    markers = ("SEQUENCE-events_left.h5", "SEQUENCE-vi_gt_data")
     _target: type = field(default_factory=lambda: TumVieDataParser)
     max_pose_gap_ns: int | None = 50_000_000
     """Leave out everything between consecutive poses that are further apart than this, in nanoseconds. The motion
     capture at 120 Hz covers only the start and the end of long sequences."""
+
+    @classmethod
+    def recognizes(cls, data: Path) -> bool:
+        return bool(_event_files(data))
 
 
 class TumVieDataParser(EventDataParser):
@@ -87,16 +93,26 @@ class TumVieDataParser(EventDataParser):
         )
 
 
+def _event_files(data: Path) -> list[Path]:
+    """List the event files of the left cameras of all sequences. The files may be missing, as where a trained run is
+    opened: any other part of a sequence suffices."""
+    if _EVENT_FILE.fullmatch(data.name):
+        return [data]
+    parts = ("-events_left.h5", "-vi_gt_data")
+    names = {path.name.removesuffix(part) for part in parts for path in data.glob(f"?*{part}")}
+    return [data / f"{name}-events_left.h5" for name in sorted(names)]
+
+
 def _choose(data: Path) -> tuple[Path, str, str]:
     """Return the event file, its sequence and its side."""
-    files = tum_vie_event_files(data)
+    files = _event_files(data)
     if not files:
         raise DataError(data, "there is no SEQUENCE-events_left.h5", "download a sequence to this folder")
     if len(files) > 1:
         raise DataError(
             data, f"it holds {len(files)} sequences", f"give the event file of one as --data, such as {files[0]}"
         )
-    match = TUM_VIE_EVENTS.fullmatch(files[0].name)
+    match = _EVENT_FILE.fullmatch(files[0].name)
     assert match is not None
     return files[0], match["sequence"], match["side"]
 

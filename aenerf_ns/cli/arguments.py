@@ -6,6 +6,7 @@ Nothing here imports torch or the framework, which take seconds. The classes of 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,7 +15,6 @@ import tyro
 from aenerf_ns.cli.operands import Dataset, RunConfig
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.events.sensor import BayerPattern, SensorModel, require_event_sensor_size
-from aenerf_ns.files.layouts import LAYOUTS
 from aenerf_ns.files.limits import require_file
 from aenerf_ns.files.output_paths import require_new, require_writable
 from aenerf_ns.files.text import MAX_ROWS
@@ -93,17 +93,20 @@ class Named:
     """A format that is named, without its options."""
 
 
+FORMAT_NAMES = tuple(
+    point.name
+    for point in entry_points(group="nerfstudio.dataparser_configs")
+    if point.value.startswith("aenerf_ns.") and point.name != "event-data"
+)
+
 if TYPE_CHECKING:
     FormatName = Any
 else:
     # With the names of the formats only, because their options come with the framework.
     FormatName = tyro.conf.OmitArgPrefixes[
         tyro.extras.subcommand_type_from_defaults(
-            {"auto": Automatic(), **{name: Named() for name in LAYOUTS}},
-            descriptions={
-                "auto": "recognise the format from the files of the dataset",
-                **{name: layout.summary for name, layout in LAYOUTS.items()},
-            },
+            {"auto": Automatic(), **{name: Named() for name in FORMAT_NAMES}},
+            descriptions={"auto": "recognize the format from the files of the dataset"},
             prefix_names=False,
         )
     ]

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, cast, get_type_hints
 import tyro
 
 from aenerf_ns.cli.arguments import Automatic
-from aenerf_ns.dataparsers.formats import FORMATS
-from aenerf_ns.files.layouts import LAYOUTS, recognise
+from aenerf_ns.dataparsers.formats import FORMATS, recognize
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
 
@@ -41,10 +40,7 @@ else:
     DatasetFormat = tyro.conf.OmitArgPrefixes[
         tyro.extras.subcommand_type_from_defaults(
             {"auto": Automatic(), **{name: _format_options(config) for name, config in FORMATS.items()}},
-            descriptions={
-                "auto": "recognise the format from the files of the dataset",
-                **{name: LAYOUTS[name].summary for name in FORMATS},
-            },
+            descriptions={"auto": "recognize the format from the files of the dataset"},
             prefix_names=False,
         )
     ]
@@ -85,7 +81,7 @@ def open_dataset(data: Path, dataset_format: DatasetFormat) -> EventDataParser:
     """
     guessed = None
     if isinstance(dataset_format, Automatic):
-        guessed = recognise(data)
+        guessed = recognize(data)
         dataset_format = FORMATS[guessed]
     config = copy(dataset_format)
     config.data = data

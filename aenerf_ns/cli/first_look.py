@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from aenerf_ns.cli.arguments import (
-    Automatic,
+    FORMAT_NAMES,
     CheckArguments,
     ConvertArguments,
     EvaluateArguments,
@@ -25,7 +25,6 @@ from aenerf_ns.cli.export_arguments import (
 )
 from aenerf_ns.cli.run_file import require_plausible
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.layouts import LAYOUTS, look_over
 from aenerf_ns.files.output_paths import require_dataset
 
 OfDataset = CheckArguments | ConvertArguments | ReconstructArguments
@@ -53,7 +52,7 @@ _COMMANDS: dict[str, Callable[..., Arguments]] = {
     "export-mesh": ExportMeshArguments,
     "export-video": ExportVideoArguments,
 }
-_FORMATS = {"auto", *LAYOUTS}
+_FORMATS = {"auto", *FORMAT_NAMES}
 
 
 def parsed(words: Sequence[str]) -> Arguments | None:
@@ -88,7 +87,7 @@ def judge(arguments: Arguments) -> None:
     """
     arguments.judge()
     if isinstance(arguments, OfDataset):
-        (look_over if isinstance(arguments.format, Automatic) else require_dataset)(arguments.data)
+        require_dataset(arguments.data)
     elif isinstance(arguments, OfRun):
         require_plausible(arguments.load_config)
     elif isinstance(arguments, ReportArguments):

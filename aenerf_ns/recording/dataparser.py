@@ -18,7 +18,6 @@ from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.layouts import of_guessed_format
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import FrameSequence, Recording, Split
@@ -38,13 +37,13 @@ class EventDataParser(DataParser):
     """Hand a recording to Nerfstudio.
 
     Training cameras are places on the estimated trajectory; evaluation cameras are the reference views of a split. A
-    format implements :meth:`read_recording`. A format that is found without being named also states its files in
-    ``files/layouts.py``.
+    format implements :meth:`read_recording`. A format that is found without being named also states its files in its
+    configuration (``markers``).
     """
 
     config: EventDataParserConfig
     guessed_format: str | None = None
-    """The name of this format, where it was recognised and not named: an error may mean that it is another."""
+    """The name of this format, where it was recognized and not named: an error may mean that it is another."""
 
     @abstractmethod
     def read_recording(self) -> Recording:
@@ -82,7 +81,8 @@ class EventDataParser(DataParser):
         except DataError as error:
             if self.guessed_format is None:
                 raise
-            raise of_guessed_format(error, self.guessed_format) from None
+            hint = f"the format {self.guessed_format} was guessed: where it is another, name it before --data"
+            raise DataError(error.source, error.problem, f"{error.remedy} ({hint})") from None
         self._check_lens(recording.event_camera, "event camera")
         if any(recording.reference_views.values()):
             self._check_lens(recording.frame_camera, "camera of the images")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
@@ -21,6 +21,8 @@ from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 class EventDataParserConfig(DataParserConfig):
     """The options of every event dataparser."""
 
+    markers: ClassVar[tuple[str, ...]] = ()
+    """Names of the files that tell this format from the others."""
     scale_factor: float = 1.0
     """Factor on the camera positions, after the automatic scale."""
     auto_scale_poses: bool | None = True
@@ -38,6 +40,11 @@ class EventDataParserConfig(DataParserConfig):
     max_pose_gap_ns: int | None = None
     """Leave out everything between consecutive poses that are further apart than this, in nanoseconds. By default the
     value that the dataset states; where it states none, poses are interpolated however far apart they are."""
+
+    @classmethod
+    def recognizes(cls, data: Path) -> bool:
+        """Tell from names of files alone whether a folder has this format."""
+        return all((data / name).exists() for name in cls.markers)
 
     def setup(self, **kwargs: Any) -> Any:
         """Return the dataparser.

@@ -25,8 +25,6 @@ from aenerf_ns.cli.reconstruct import Reconstruct
 from aenerf_ns.cli.report import Report
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.formats import FORMATS
-from aenerf_ns.files.layouts import LAYOUTS
-from aenerf_ns.files.training_words import judge_training
 
 # Of which a message shows all, and no file system has a name.
 LONG = "a" * 290
@@ -299,9 +297,6 @@ def test_the_real_command_takes_a_word(tmp_path: Path) -> None:
         ("report C nothing --output O", 1, "nothing: there is no such file"),
         (f"simulate --output {LONG}", 1, f"{LONG}: it cannot be created (File name too long); choose another --output"),
         (f"evaluate {LONG} --output O", 1, f"{LONG}: it cannot be read (File name too long); check its name"),
-        ("check empty", 2, "empty: no known format of recordings; looked for aenerf-data: transforms.json"),
-        ("reconstruct empty --output O", 1, "empty: no known format of recordings"),
-        ("check broken", 2, "broken/groundtruth.txt: line 1 has 3 fields; each line must hold the 8"),
         ("check F --picture F", 2, "F: its name is not that of a picture; end the --picture with .png"),
         ("check F --picture C/a.png", 2, "C/a.png: it cannot be created (Not a directory); choose another --picture"),
         ("convert F --output O --pixel-share 2", 1, "aenerf convert: the share of pixels must be above 0"),
@@ -384,34 +379,3 @@ def test_help_and_complaints_take_no_slow_imports(
     with pytest.raises(SystemExit):
         parsed(line, monkeypatch)
     assert capsys.readouterr()
-
-
-def test_formats_are_described_alike_before_and_after_slow_imports() -> None:
-    assert list(LAYOUTS) == list(FORMATS)
-    for name, config in FORMATS.items():
-        assert LAYOUTS[name].summary == (type(config).__doc__ or "").splitlines()[0]
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        ("aenerf --data nothing", "nothing: there is no such folder"),
-        ("aenerf-small --vis viewer --data=nothing", "nothing: there is no such folder"),
-        ("aenerf ecd-data --data nothing", "nothing: there is no such folder"),
-        ("aenerf --data C", "C: no known format of recordings"),
-        ("aenerf --data F", None),
-        ("aenerf ecd-data --data C", None),
-        ("aenerf --data nothing --help", None),
-        ("aenerf --data nothing --load-config C", None),
-        ("nerfacto --data nothing", None),
-        ("", None),
-    ],
-)
-def test_the_dataset_of_a_training_is_judged_early(words: str, complaint: str | None) -> None:
-    line = ["/somewhere/ns-train", *words.split()]
-    judge_training(["/somewhere/pytest", *line[1:]])
-    if complaint is None:
-        judge_training(line)
-    else:
-        with pytest.raises(SystemExit, match=f"^Error: {complaint}"):
-            judge_training(line)

@@ -16,7 +16,7 @@ from helpers.published_datasets import (
     write_eventnerf,
 )
 
-from aenerf_ns.dataparsers.formats import recognise
+from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.errors import DataError
 
 
@@ -33,7 +33,7 @@ def test_eventnerf_splits_and_images(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.reference_views["test"][1].camera_to_world.numpy(), truth.poses[1], atol=1e-12)
     assert recording.scene_box is not None
     # A split by itself, and a scene with several.
-    assert recognise(truth.data / "train") == "eventnerf-data"
+    assert recognize(truth.data / "train") == "eventnerf-data"
     (truth.data / "train").rename(truth.data / "train1")
     shutil.copytree(truth.data / "train1", truth.data / "train2")
     with pytest.raises(DataError, match=r"2 training splits; give one as --data, such as .*train1"):

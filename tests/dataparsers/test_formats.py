@@ -1,4 +1,4 @@
-"""Every published format is recognised and read exactly, and converts to the native format unchanged."""
+"""Every published format is recognized and read exactly, and converts to the native format unchanged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from helpers.published_datasets import (
 )
 from helpers.small_datasets import AS_RECORDED, parse
 
-from aenerf_ns.dataparsers.formats import FORMATS, AutomaticDataParserConfig, recognise
+from aenerf_ns.dataparsers.formats import FORMATS, AutomaticDataParserConfig, recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
@@ -72,9 +72,9 @@ def test_rays_are_those_of_opencv(written: tuple[str, Truth]) -> None:
         np.testing.assert_allclose(pixels[..., 1], np.arange(v, v + 7)[:, None].repeat(9, 1), rtol=0, atol=1e-6)
 
 
-def test_every_format_is_recognised(written: tuple[str, Truth]) -> None:
+def test_every_format_is_recognized(written: tuple[str, Truth]) -> None:
     name, truth = written
-    assert recognise(truth.data) == name
+    assert recognize(truth.data) == name
     parser = AutomaticDataParserConfig(data=truth.data).setup()
     assert type(parser.config) is type(FORMATS[name])
     pairs = EventDataset(parser.get_dataparser_outputs("train")).pairs
@@ -85,12 +85,12 @@ def test_every_format_is_recognised(written: tuple[str, Truth]) -> None:
     assert FORMATS[name].data == type(FORMATS[name])().data
 
 
-def test_native_datasets_and_ecd_are_recognised(tmp_path: Path, slider_depth: Path) -> None:
+def test_native_datasets_and_ecd_are_recognized(tmp_path: Path, slider_depth: Path) -> None:
     convert_to_native(
         recording_of(config_of("robust-enerf-data", write_robust_enerf(tmp_path / "made").data)), tmp_path / "n"
     )
-    assert recognise(tmp_path / "n") == "aenerf-data"
-    assert recognise(slider_depth) == "ecd-data"
+    assert recognize(tmp_path / "n") == "aenerf-data"
+    assert recognize(slider_depth) == "ecd-data"
 
 
 def test_converted_to_the_native_format_nothing_changes(written: tuple[str, Truth], tmp_path: Path) -> None:
@@ -148,12 +148,12 @@ def test_a_folder_of_no_known_format_says_what_was_looked_for(tmp_path: Path) ->
     with pytest.raises(
         DataError, match=r"no known format of recordings; looked for .*raw_events.npz.*H5_Files"
     ) as error:
-        recognise(tmp_path)
+        recognize(tmp_path)
     assert "\n" not in str(error.value)
     for name in FORMATS:
         assert name in str(error.value)
     with pytest.raises(DataError, match="nowhere: there is no such folder"):
-        recognise(tmp_path / "nowhere")
+        recognize(tmp_path / "nowhere")
     with pytest.raises(SystemExit, match=r"^Error: .*no known format"):
         EventDataManagerConfig(dataparser=AutomaticDataParserConfig(data=tmp_path)).setup(device="cpu")
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.dataparsers.formats import recognise
+from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
@@ -131,7 +131,7 @@ def test_a_colmap_model_gives_poses_at_the_times_of_its_images(
     (truth.data / "calibration.json").write_text(json.dumps(calibration))
     # Images 2, 0 and 1 in this order; of image 3 COLMAP made nothing.
     write_colmap(truth.data / place, truth.poses[[10, 0, 5]], ["00002.png", "00000.png", "00001.png"])
-    assert recognise(truth.data) == "event-recording-data"
+    assert recognize(truth.data) == "event-recording-data"
     recording = recording_of(OwnRecordingDataParserConfig(data=truth.data))
     assert (recording.trajectory.times - EPOCH * 1_000).tolist() == [0, 5 * 10**8, 10**9]
     assert_same_poses(recording.trajectory.camera_to_worlds, truth.poses[[0, 5, 10]] @ shift, 1e-7)

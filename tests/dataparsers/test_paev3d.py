@@ -16,7 +16,7 @@ from helpers.published_datasets import (
     write_paev3d,
 )
 
-from aenerf_ns.dataparsers.formats import recognise
+from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.paev3d import PAEv3DDataParserConfig
 from aenerf_ns.errors import DataError
 
@@ -42,7 +42,7 @@ def test_scenes_of_paev3d_are_told_apart(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"it holds 2 scenes; give one as --data, such as .*H5_Files/Bunny"):
         recording_of(PAEv3DDataParserConfig(data=truth.data))
     one = truth.data / "H5_Files" / "Car"
-    assert recognise(one) == "paev3d-data"
+    assert recognize(one) == "paev3d-data"
     assert recording_of(PAEv3DDataParserConfig(data=one)).event_file.path.parent == one
 
 

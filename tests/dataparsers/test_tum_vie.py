@@ -23,7 +23,7 @@ from helpers.unpacked_pairs import unpacked
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from aenerf_ns.dataparsers.formats import recognise
+from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
@@ -109,7 +109,7 @@ def test_several_sequences_in_a_folder_are_told_apart(tmp_path: Path, tum_vie_ca
     ):
         recording_of(config_of("tum-vie-data", tmp_path / "made"))
     one = tmp_path / "made" / "office-maze-events_left.h5"
-    assert recognise(one) == "tum-vie-data"
+    assert recognize(one) == "tum-vie-data"
     assert recording_of(config_of("tum-vie-data", one)).event_file.path == one
 
 
