@@ -21,6 +21,7 @@ import numpy as np
 import torch
 import tyro
 
+from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
@@ -70,6 +71,7 @@ def sampler(pairs: EventPairs) -> PairSampler:
     sensor = SensorModel()
     end = 200 * pairs.num_events
     scene = SceneRecording(
+        frame=Similarity(torch.ones(()), torch.eye(3), torch.zeros(3)),
         trajectory=Trajectory([0, end], torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)),
         ground_truth=None,
         event_camera=CameraIntrinsics(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2),

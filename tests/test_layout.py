@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,24 +27,17 @@ MAY_USE = {
     "checking": {"progress", "events", "camera", "recording"},
     "supervision": {"errors", "events", "camera", "recording"},
     "method": {"errors", "camera", "recording", "supervision"},
+    # What is done with a trained run, without the trainer.
+    "evaluation": {"errors", "progress", "camera", "recording", "supervision", "method", "checking"},
     # What the viewer shows of a run. It only looks: the pipeline hands it what it needs.
-    "viewer": {"errors", "events", "camera", "files", "recording", "method"},
-    "training": {
-        "errors",
-        "progress",
-        "camera",
-        "recording",
-        "supervision",
-        "method",
-        "checking",
-        "viewer",
-    },
+    "viewer": {"errors", "events", "camera", "files", "recording", "method", "evaluation"},
+    "training": {"errors", "recording", "supervision", "method", "evaluation", "viewer"},
     # What training and checking left behind, measured and shown.
-    "report": {"errors", "progress", "camera", "files", "supervision", "training", "checking"},
+    "report": {"errors", "progress", "camera", "files", "supervision", "evaluation", "training", "checking"},
     # Stands beside the method: only commands and benchmarks use it.
     "simulator": {"errors", "progress", "open3d_import", "events", "camera", "files", "poses_from_frames"},
     # What other tools take from a trained run.
-    "export": {"errors", "progress", "open3d_import", "events", "camera", "files", "recording", "training"},
+    "export": {"errors", "progress", "open3d_import", "events", "camera", "files", "recording", "evaluation"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},
     "cli": {
@@ -57,6 +51,7 @@ MAY_USE = {
         "recording",
         "poses_from_frames",
         "method",
+        "evaluation",
         "training",
         "checking",
         "export",
@@ -106,6 +101,24 @@ def test_the_floors_are_in_order_and_none_is_forgotten() -> None:
     for place, used in MAY_USE.items():
         needed = set().union(*(_imported(path) for own, path in _modules() if own == place))
         assert used <= needed, f"{place} no longer uses {used - needed}"
+
+
+def test_modules_form_no_circle() -> None:
+    """Imports within functions and under TYPE_CHECKING count: what types refer to, a reader must know too."""
+    paths = {}
+    for _, path in _modules():
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        paths[".".join(parts[parts[0] == "aenerf_ns" :]).removesuffix(".__init__")] = path
+    imported: dict[str, set[str]] = {}
+    for name, path in paths.items():
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        named = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+        for node in nodes:
+            if isinstance(node, ast.ImportFrom):
+                named |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
+        imported[name] = {module.removeprefix("aenerf_ns.") for module in named} & paths.keys() - {name}
+    # Raises a CycleError that names the modules of the circle.
+    graphlib.TopologicalSorter(imported).prepare()
 
 
 def test_nothing_that_is_installed_imports_the_benchmarks() -> None:

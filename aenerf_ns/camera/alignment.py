@@ -14,7 +14,7 @@ class Similarity:
 
     Attributes:
         scale: factor on lengths.
-        rotation: (3, 3).
+        rotation: (3, 3). It may be a rotation in single precision only: :meth:`inverse` is exact nevertheless.
         translation: (3,), in the units of the target.
     """
 
@@ -25,12 +25,15 @@ class Similarity:
     def __call__(self, poses: Tensor) -> Tensor:
         """Map (..., 3, 4) camera-to-world poses to the target's world."""
         rotations = self.rotation @ poses[..., :3]
-        positions = self.scale * poses[..., 3] @ self.rotation.mT + self.translation
-        return torch.cat([rotations, positions[..., None]], -1)
+        return torch.cat([rotations, self.map_points(poses[..., 3])[..., None]], -1)
+
+    def map_points(self, points: Tensor) -> Tensor:
+        """Map points (..., 3) to the target's world."""
+        return self.scale * points @ self.rotation.mT + self.translation
 
     def inverse(self) -> Similarity:
         """Return the inverse map."""
-        rotation, scale = self.rotation.mT, 1 / self.scale
+        rotation, scale = torch.linalg.inv(self.rotation), 1 / self.scale
         return Similarity(scale, rotation, -scale * (rotation @ self.translation))
 
 

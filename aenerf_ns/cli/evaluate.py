@@ -19,15 +19,19 @@ class Evaluate(EvaluateArguments):
     def main(self) -> None:
         """Load the run, evaluate it and write the metrics."""
         self.judge()
-        config, pipeline, checkpoint = open_run(self.load_config)
-        of_run = pipeline.model.color_correction.protocol
+        # Imported lazily, because these imports take seconds.
+        from aenerf_ns.evaluation.color_fit import replace_color_correction
+        from aenerf_ns.evaluation.evaluate import evaluate
+
+        config, run, checkpoint = open_run(self.load_config)
+        of_run = run.model.color_correction.protocol
         used = self.color_correction or of_run
         if self.color_correction is not None:
-            pipeline.replace_color_correction(used)
+            replace_color_correction(run, used)
         if self.render_output is not None:
             with created(self.render_output, "--render-output"):
                 self.render_output.mkdir(exist_ok=True)
-        results = pipeline.get_average_eval_image_metrics(output_path=self.render_output, get_std=True)
+        results = evaluate(run, self.render_output)
         evaluation = {
             "experiment_name": config.experiment_name,
             "method_name": config.method_name,
@@ -48,7 +52,7 @@ class Evaluate(EvaluateArguments):
             from aenerf_ns.export.predictions import export_predictions
 
             with created(self.nerfbaselines, "--nerfbaselines"):
-                export_predictions(pipeline, self.nerfbaselines, config, results["views"])
+                export_predictions(run, self.nerfbaselines, config, results["views"])
         refined = results.get("refined_test_poses")
         figures = {"placed": results} | ({"refined": refined} if refined else {})
         shown = "; ".join(

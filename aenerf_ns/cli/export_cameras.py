@@ -25,10 +25,10 @@ class ExportCameras(ExportCamerasArguments):
         from aenerf_ns.export.placing import placed_views
         from aenerf_ns.export.rendering import points_seen
 
-        _, pipeline, _ = open_run(self.load_config, test_mode="inference")
-        placed = placed_views(pipeline)
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        placed = placed_views(run)
         images = [image for image, _ in placed]
-        points = points_seen(pipeline, images, self.num_points)
+        points = points_seen(run, images, self.num_points)
         try:
             for image, file in placed:
                 target = self.output / IMAGE_FOLDER / image.name

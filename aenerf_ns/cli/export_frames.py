@@ -22,13 +22,13 @@ class ExportFrames(ExportFramesArguments):
         from aenerf_ns.export.frames import export_frames
         from aenerf_ns.export.times import times_at_rate, times_of_seconds
 
-        _, pipeline, _ = open_run(self.load_config, test_mode="inference")
+        _, run, _ = open_run(self.load_config, test_mode="inference")
         if self.times:
-            times = times_of_seconds(pipeline, self.times)
+            times = times_of_seconds(run.scene.window, self.times)
         else:
-            times = times_at_rate(pipeline, 10.0 if self.rate is None else self.rate)
+            times = times_at_rate(run.scene.window, 10.0 if self.rate is None else self.rate)
         try:
-            export_frames(pipeline, self.output, times, self.num_points)
+            export_frames(run, self.output, times, self.num_points)
         except OSError as error:
             raise cannot_be_created(self.output, error) from None
         CONSOLE.print(f"{self.output}: {len(times)} frames with depths, times and cameras.", soft_wrap=True)

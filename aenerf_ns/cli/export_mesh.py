@@ -23,8 +23,8 @@ class ExportMesh(ExportMeshArguments):
 
         from aenerf_ns.export.mesh import extract_mesh
 
-        _, pipeline, _ = open_run(self.load_config, test_mode="inference")
-        mesh = extract_mesh(pipeline, self.num_views, self.resolution)
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        mesh = extract_mesh(run, self.num_views, self.resolution)
         written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
         with created(self.output, "--output"):
             written.export(self.output)

@@ -25,24 +25,22 @@ class ExportTrajectory(ExportTrajectoryArguments):
         # Imported lazily, because this import takes seconds.
         from aenerf_ns.export.times import regular_times
 
-        _, pipeline, _ = open_run(self.load_config, test_mode="inference")
-        correction = pipeline.model.camera_optimizer
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        correction = run.model.camera_optimizer
         estimated = correction.trajectory
         trajectory = estimated
         if self.poses == "ground-truth":
-            trajectory = pipeline.datamanager.train_dataset.scene.ground_truth
+            trajectory = run.scene.ground_truth
             if trajectory is None:
-                raise DataError(
-                    pipeline.datamanager.get_datapath(), "it has no true poses", "export corrected or estimated ones"
-                )
-            trajectory = trajectory.to(pipeline.device).crop(estimated.start, estimated.end)
+                raise DataError(run.data, "it has no true poses", "export corrected or estimated ones")
+            trajectory = trajectory.to(run.device).crop(estimated.start, estimated.end)
         times = trajectory.times
         if self.rate is not None:
             times = regular_times(trajectory.start, trajectory.end, self.rate).to(times.device)
         source = correction if self.poses == "corrected" else trajectory
         with torch.no_grad():
             poses = source.pose(trajectory.seconds(times))
-        written = Trajectory(times.cpu(), pipeline.in_recording(poses))
+        written = Trajectory(times.cpu(), run.scene.to_recording(poses))
         with created(self.output, "--output"):
             write_tum_trajectory(self.output, written)
         CONSOLE.print(f"{self.output}: {len(written)} {self.poses} poses.")

@@ -25,12 +25,12 @@ class ExportVideo(ExportVideoArguments):
         from aenerf_ns.export.times import times_at_rate
         from aenerf_ns.export.video import side_by_side
 
-        _, pipeline, _ = open_run(self.load_config, test_mode="inference")
-        pipeline.datamanager.train_dataset.scene.event_file.require()
-        times = times_at_rate(pipeline, self.rate)
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        run.scene.event_file.require()
+        times = times_at_rate(run.scene.window, self.rate)
         if len(times) < 2:
             raise DataError("aenerf export-video", f"a rate of {self.rate} gives no two frames", "give a higher --rate")
-        pictures = side_by_side(pipeline, times)
+        pictures = side_by_side(run, times)
         first = next(pictures)
         try:
             self.output.parent.mkdir(parents=True, exist_ok=True)

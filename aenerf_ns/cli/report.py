@@ -39,9 +39,9 @@ class Report(ReportArguments):
         # Measuring takes long, and only one run at a time is sure to fit in the memory. So the runs are opened twice.
         opened: list[tuple[TrainerConfig, Protocol]] = []
         for run in self.runs:
-            config, pipeline, _ = open_run(run)
-            opened.append((config, read_protocol(pipeline)))
-            del pipeline
+            config, opened_run, _ = open_run(run)
+            opened.append((config, read_protocol(opened_run)))
+            del opened_run
             gc.collect()
         names = _names([config for config, _ in opened])
         protocols = [protocol for _, protocol in opened]
@@ -55,11 +55,11 @@ class Report(ReportArguments):
         shared = shared_views(protocols)
         reports: list[RunReport] = []
         for run, name in zip(self.runs, names, strict=True):
-            config, pipeline, _ = open_run(run)
+            config, opened_run, _ = open_run(run)
             # The views of the first run, so that the same ones are beside each other.
             shown = reports[0].chosen if reports and shared else None
-            reports.append(measure_run(name, config, pipeline, shared, shown))
-            del pipeline
+            reports.append(measure_run(name, config, opened_run, shared, shown))
+            del opened_run
             gc.collect()
         paired = paired_differences(reports, shared)
         left_out = views_left_out(reports, shared)

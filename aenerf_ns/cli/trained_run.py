@@ -12,10 +12,10 @@ from aenerf_ns.files.output_paths import require_run
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-    from aenerf_ns.training.pipeline import AENeRFPipeline
+    from aenerf_ns.evaluation.run import TrainedRun
 
 
-def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tuple[TrainerConfig, AENeRFPipeline, Path]:
+def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tuple[TrainerConfig, TrainedRun, Path]:
     """Open a trained run.
 
     Args:
@@ -23,7 +23,7 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
         test_mode: see :class:`~aenerf_ns.training.pipeline.AENeRFPipeline`.
 
     Returns:
-        The run's configuration, its pipeline, and the checkpoint that was loaded.
+        The run's configuration, the run, and the checkpoint that was loaded.
 
     Raises:
         DataError: there is no such file, opening it could run foreign code, the run is of another method, it has no
@@ -54,7 +54,7 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
             raise DataError(
                 checkpoint, f"its {name} is not finite", "remove it if there is an earlier one, or train again"
             )
-    return opened, pipeline, checkpoint
+    return opened, pipeline.trained_run(), checkpoint
 
 
 def _require_checkpoints(config: TrainerConfig) -> TrainerConfig:

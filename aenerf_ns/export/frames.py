@@ -11,6 +11,8 @@ from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import homogeneous
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.export.camera_model_files import (
     IMAGE_FOLDER,
     ObservedPoints,
@@ -23,8 +25,6 @@ from aenerf_ns.export.rendering import points_seen, render
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.views import IMAGE_LIST
-from aenerf_ns.training.pipeline import AENeRFPipeline
-from aenerf_ns.training.view_metrics import to_image
 
 DEPTH_FOLDER = "depth"
 DEPTH_UNIT = 1e-3
@@ -33,30 +33,30 @@ _DEEPEST = 2**16 - 1
 
 
 @torch.no_grad()
-def export_frames(pipeline: AENeRFPipeline, folder: Path, times: Tensor, num_points: int) -> None:
+def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int) -> None:
     """Render frames and depths at times along the trajectory, and write them with their cameras.
 
     Depth pictures have 16 bits and hold the distance along the optical axis, in thousandths of the recording's unit,
     0 where no surface is seen or where it is too far.
 
     Args:
-        pipeline: of the run, in evaluation mode.
+        run: in evaluation mode.
         folder: to create.
         times: (N,) in nanoseconds.
         num_points: points of the scene at most.
     """
-    lens = pipeline.datamanager.dataparser.recording.event_camera
+    lens = run.recording.event_camera
     directions, _ = lens.pixel_directions()
     # Distances along the optical axis are distances along the ray times these. The axis looks along -z.
     along_axis = torch.from_numpy(-directions[..., 2:])
-    poses = homogeneous(corrected_poses(pipeline, times))
+    poses = homogeneous(corrected_poses(run, times))
     for name in (IMAGE_FOLDER, DEPTH_FOLDER):
         (folder / name).mkdir(parents=True)
     images, lines = [], []
     with progress_bar() as progress:
         task = progress.add_task("Rendering frames", total=len(times))
         for index, (time, pose) in enumerate(zip(times.tolist(), poses, strict=True)):
-            outputs = render(pipeline, lens, pose)
+            outputs = render(run, lens, pose)
             name = f"{index:06d}.png"
             to_image(outputs["rgb"]).save(folder / IMAGE_FOLDER / name)
             depth = (outputs["depth"].cpu() * along_axis / DEPTH_UNIT).round()[..., 0].numpy()
@@ -66,7 +66,7 @@ def export_frames(pipeline: AENeRFPipeline, folder: Path, times: Tensor, num_poi
             lines.append(f"{format_seconds(time)} {IMAGE_FOLDER}/{name}\n")
             progress.advance(task)
     (folder / IMAGE_LIST).write_text("".join(lines), "utf8")
-    write_cameras(folder, images, points_seen(pipeline, images, num_points))
+    write_cameras(folder, images, points_seen(run, images, num_points))
 
 
 def write_cameras(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:

@@ -12,12 +12,12 @@ from torch import Tensor
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
+from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.export.placing import corrected_poses
 from aenerf_ns.export.rendering import render
 from aenerf_ns.export.times import spread_times
 from aenerf_ns.open3d_import import load_open3d
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 # Of an unbounded scene, the share of what the views see that lies beyond each end of the box, along each axis.
 _LEFT_OUT = 0.01
@@ -44,14 +44,14 @@ class ColoredMesh:
     colors: NDArray[np.uint8]
 
 
-def extract_mesh(pipeline: AENeRFPipeline, num_views: int, resolution: int) -> ColoredMesh:
+def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> ColoredMesh:
     """Fuse the depths of views along the corrected trajectory in a truncated signed distance field, and mesh it.
 
     The framework's own exporter takes the cameras as the dataset gives them, while its renderings are from the
     corrected poses. Its field also forgets: a voxel holds the mean of its last two views or so, and the mesh is rough.
 
     Args:
-        pipeline: of the run, in evaluation mode.
+        run: in evaluation mode.
         num_views: evenly spread over the time of the run.
         resolution: voxels along the longest side of the box that is meshed: the scene's own box where the dataset
             states one, else a box that holds nearly all that the views see.
@@ -60,17 +60,17 @@ def extract_mesh(pipeline: AENeRFPipeline, num_views: int, resolution: int) -> C
         DataError: the views see no surface.
     """
     open3d = load_open3d()
-    given = pipeline.datamanager.dataparser.recording.event_camera
+    given = run.recording.event_camera
     lens = CameraIntrinsics(given.width, given.height, given.fx, given.fy, given.cx, given.cy)
-    poses = homogeneous(corrected_poses(pipeline, spread_times(pipeline, num_views)))
-    colors, depths = _views(pipeline, lens, poses)
+    poses = homogeneous(corrected_poses(run, spread_times(run.scene.window, num_views)))
+    colors, depths = _views(run, lens, poses)
     directions, _ = lens.pixel_directions()
     # From OpenGL's axes to OpenCV's.
     in_camera = torch.from_numpy(directions) * torch.tensor([1.0, -1.0, -1.0])
     points = poses[:, None, None, :3, 3] + depths[..., None] * torch.einsum(
         "nij,hwj->nhwi", poses[:, :3, :3], in_camera
     )
-    low, high = _box(pipeline, points[depths > 0].numpy())
+    low, high = _box(run, points[depths > 0].numpy())
     depths[((points < torch.from_numpy(low)) | (points > torch.from_numpy(high))).any(-1)] = 0
     voxel = float((high - low).max()) / resolution
     core, image = open3d.core, open3d.t.geometry.Image
@@ -95,7 +95,7 @@ def extract_mesh(pipeline: AENeRFPipeline, num_views: int, resolution: int) -> C
         grid.integrate(blocks, seen, shown, matrix, matrix, extrinsics, 1.0, farthest, _TRUNCATION)
     mesh = grid.extract_triangle_mesh(weight_threshold=_LEAST_VIEWS)
     if len(mesh.triangle.indices) == 0:
-        raise _no_surface(pipeline)
+        raise _no_surface(run)
     return ColoredMesh(
         mesh.vertex.positions.numpy().astype(np.float64),
         mesh.triangle.indices.numpy().astype(np.int64),
@@ -103,29 +103,29 @@ def extract_mesh(pipeline: AENeRFPipeline, num_views: int, resolution: int) -> C
     )
 
 
-def _views(pipeline: AENeRFPipeline, lens: CameraIntrinsics, poses: Tensor) -> tuple[NDArray[np.float32], Tensor]:
+def _views(run: TrainedRun, lens: CameraIntrinsics, poses: Tensor) -> tuple[NDArray[np.float32], Tensor]:
     """Return display values (N, H, W, 3), and float64 distances (N, H, W) along the rays in units of the recording."""
     colors, depths = [], []
     with progress_bar() as progress:
         task = progress.add_task("Rendering views", total=len(poses))
         for pose in poses:
-            outputs = render(pipeline, lens, pose)
+            outputs = render(run, lens, pose)
             colors.append(outputs["rgb"].clamp(0, 1).float().cpu().numpy())
             depths.append(outputs["depth"][..., 0].double().cpu())
             progress.advance(task)
     return np.stack(colors), torch.stack(depths)
 
 
-def _box(pipeline: AENeRFPipeline, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _box(run: TrainedRun, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lowest and the highest corner (3,) of the box that is meshed, in the recording's world.
 
     Args:
-        pipeline: of the run.
+        run: trained.
         points: (N, 3) that the views see.
     """
     if len(points) == 0:
-        raise _no_surface(pipeline)
-    stated = pipeline.datamanager.dataparser.recording.scene_box
+        raise _no_surface(run)
+    stated = run.recording.scene_box
     if stated is not None:
         low, high = stated.double().numpy()
         return low, high
@@ -134,5 +134,5 @@ def _box(pipeline: AENeRFPipeline, points: NDArray[np.float64]) -> tuple[NDArray
     return low - margin, high + margin
 
 
-def _no_surface(pipeline: AENeRFPipeline) -> DataError:
-    return DataError(pipeline.datamanager.get_datapath(), "the run renders no surface", "train it longer")
+def _no_surface(run: TrainedRun) -> DataError:
+    return DataError(run.data, "the run renders no surface", "train it longer")

@@ -11,13 +11,13 @@ from torch import Tensor
 from aenerf_ns.camera.alignment import align
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
+from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.export.camera_model_files import PlacedImage
 from aenerf_ns.recording.recording import SPLITS, ReferenceView, Split
 from aenerf_ns.recording.views import thinned, views_within
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 
-def placed_views(pipeline: AENeRFPipeline) -> list[tuple[PlacedImage, Path]]:
+def placed_views(run: TrainedRun) -> list[tuple[PlacedImage, Path]]:
     """Return the images of a run's recording where the corrected poses put them, and their files.
 
     An image with a time is at the corrected pose of that time, with the place on the rig that it has beside the
@@ -27,8 +27,8 @@ def placed_views(pipeline: AENeRFPipeline) -> list[tuple[PlacedImage, Path]]:
     Raises:
         DataError: the recording has no images, or their files are missing.
     """
-    recording = pipeline.datamanager.dataparser.recording
-    window = pipeline.datamanager.train_dataset.scene.window
+    recording = run.recording
+    window = run.scene.window
     split_of: dict[Path, tuple[Split, ReferenceView]] = {}
     for split in SPLITS:
         views = views_within(recording.reference_views[split], window)
@@ -37,10 +37,8 @@ def placed_views(pipeline: AENeRFPipeline) -> list[tuple[PlacedImage, Path]]:
     found = {file: entry for file, entry in split_of.items() if file.is_file()}
     if not found:
         problem = "its images are missing" if split_of else "it has no images"
-        raise DataError(
-            pipeline.datamanager.get_datapath(), problem, "aenerf export-frames renders images along the trajectory"
-        )
-    poses = _carried_over(pipeline, [view for _, view in found.values()])
+        raise DataError(run.data, problem, "aenerf export-frames renders images along the trajectory")
+    poses = _carried_over(run, [view for _, view in found.values()])
     common = Path(os.path.commonpath([file.parent for file in found]))
     return [
         (PlacedImage(file.relative_to(common).as_posix(), recording.frame_camera, pose.numpy(), split), file)
@@ -48,11 +46,11 @@ def placed_views(pipeline: AENeRFPipeline) -> list[tuple[PlacedImage, Path]]:
     ]
 
 
-def _carried_over(pipeline: AENeRFPipeline, views: list[ReferenceView]) -> Tensor:
+def _carried_over(run: TrainedRun, views: list[ReferenceView]) -> Tensor:
     """Return the poses (N, 4, 4), OpenCV axes, of views in the frame of the corrected poses."""
-    correction = pipeline.model.camera_optimizer
-    recording = pipeline.datamanager.dataparser.recording
-    _, corrected, reference = (pipeline.in_recording(poses) for poses in correction.compared_poses())
+    correction = run.model.camera_optimizer
+    recording = run.recording
+    _, corrected, reference = (run.scene.to_recording(poses) for poses in correction.compared_poses())
     alignment = align(corrected, reference).inverse()
     given = recording.reference_trajectory
     poses = []
@@ -62,15 +60,15 @@ def _carried_over(pipeline: AENeRFPipeline, views: list[ReferenceView]) -> Tenso
             if correction.has_ground_truth:
                 # From the units of the true trajectory to those of the corrected poses.
                 on_rig[:3, 3] *= alignment.scale
-            poses.append(homogeneous(corrected_poses(pipeline, torch.tensor([view.time])))[0] @ on_rig)
+            poses.append(homogeneous(corrected_poses(run, torch.tensor([view.time])))[0] @ on_rig)
         else:
             poses.append(homogeneous(alignment(view.camera_to_world[:3])))
     return torch.stack(poses)
 
 
 @torch.no_grad()
-def corrected_poses(pipeline: AENeRFPipeline, times: Tensor) -> Tensor:
+def corrected_poses(run: TrainedRun, times: Tensor) -> Tensor:
     """Return the corrected poses (N, 3, 4) at (N,) times in nanoseconds: OpenCV axes, in the recording's world."""
-    correction = pipeline.model.camera_optimizer
-    seconds = correction.trajectory.seconds(times.to(pipeline.device))
-    return pipeline.in_recording(correction.pose(seconds))
+    correction = run.model.camera_optimizer
+    seconds = correction.trajectory.seconds(times.to(run.device))
+    return run.scene.to_recording(correction.pose(seconds))

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.text import MAX_ROWS
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 
-def spread_times(pipeline: AENeRFPipeline, count: int) -> Tensor:
-    """Return (count,) times in nanoseconds, evenly spread over the time window of a run, its gaps left out."""
-    window = pipeline.datamanager.train_dataset.scene.window
+def spread_times(window: TimeWindow, count: int) -> Tensor:
+    """Return (count,) times in nanoseconds, evenly spread over a time window, its gaps left out."""
     if count < 1:
         raise DataError("aenerf", f"{count} views", "give one or more")
     starts, ends = torch.tensor(window.pieces()).T
@@ -42,24 +41,22 @@ def regular_times(start: int, end: int, rate: float) -> Tensor:
     return torch.arange(start, end + 1, max(round(min(1e9 / rate, end - start + 1)), 1))
 
 
-def times_at_rate(pipeline: AENeRFPipeline, rate: float) -> Tensor:
-    """Return times in nanoseconds, so many a second, in the time window of a run but not in its gaps.
+def times_at_rate(window: TimeWindow, rate: float) -> Tensor:
+    """Return times in nanoseconds, so many a second, in a time window but not in its gaps.
 
     Raises:
         DataError: the rate is not positive, or too high for the run.
     """
-    window = pipeline.datamanager.train_dataset.scene.window
     times = regular_times(window.start, window.end, rate)
     return times[torch.from_numpy(window.contains(times))]
 
 
-def times_of_seconds(pipeline: AENeRFPipeline, seconds: Sequence[float]) -> Tensor:
+def times_of_seconds(window: TimeWindow, seconds: Sequence[float]) -> Tensor:
     """Return times in nanoseconds for times in seconds on the clock of the events.
 
     Raises:
         DataError: a time is not in the time window of the run.
     """
-    window = pipeline.datamanager.train_dataset.scene.window
     times = [round(one * 1e9) if math.isfinite(one * 1e9) else window.start - 1 for one in seconds]
     for one, time in zip(seconds, times, strict=True):
         if not window.contains(time):

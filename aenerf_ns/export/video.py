@@ -13,6 +13,8 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import homogeneous
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.export.event_pictures import RenderedEvents, recorded_between
 from aenerf_ns.export.placing import corrected_poses
@@ -20,8 +22,6 @@ from aenerf_ns.export.rendering import render
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.images import read_image
 from aenerf_ns.recording.recording import SPLITS
-from aenerf_ns.training.pipeline import AENeRFPipeline
-from aenerf_ns.training.view_metrics import to_image
 
 # A panel is enlarged by a whole factor until it is so high; a line of text above it is so high.
 _LEAST_HEIGHT, _LABEL = 240, 16
@@ -29,29 +29,29 @@ _GAP = 4
 
 
 @torch.no_grad()
-def side_by_side(pipeline: AENeRFPipeline, times: Tensor) -> Iterator[NDArray[np.uint8]]:
+def side_by_side(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]:
     """Yield the pictures (height, width, 3) of a video, one for each time but the first.
 
     The panels are the recorded events since the time before, the events that the rendering triggers meanwhile, the
     rendering, its depth, and the last image that was taken until then, where there are images on the trajectory.
 
     Args:
-        pipeline: of the run, in evaluation mode.
+        run: in evaluation mode.
         times: (N,) in nanoseconds, increasing, at least two.
     """
-    recording = pipeline.datamanager.dataparser.recording
-    lens, device = recording.event_camera, pipeline.device
+    recording = run.recording
+    lens, device = recording.event_camera, run.device
     triggered = RenderedEvents(recording.sensor, lens.width, lens.height)
-    images = _timed_images(pipeline)
-    poses = homogeneous(corrected_poses(pipeline, times))
-    triggered(render(pipeline, lens, poses[0])["log_radiance"].cpu().numpy())
+    images = _timed_images(run)
+    poses = homogeneous(corrected_poses(run, times))
+    triggered(render(run, lens, poses[0])["log_radiance"].cpu().numpy())
     depths: tuple[float, float] | None = None
     with progress_bar() as progress:
         task = progress.add_task("Rendering the video", total=len(times) - 1)
         for time, pose, net in zip(
             times[1:].tolist(), poses[1:], recorded_between(recording.event_file, times.numpy()), strict=True
         ):
-            outputs = render(pipeline, lens, pose)
+            outputs = render(run, lens, pose)
             depth = outputs["depth"]
             seen = depth[depth > 0]
             if depths is None and len(seen):
@@ -64,22 +64,22 @@ def side_by_side(pipeline: AENeRFPipeline, times: Tensor) -> Iterator[NDArray[np
                 "depth": _depth_panel(depth, depths),
             }
             if images:
-                panels["image"] = _image_panel(pipeline, images, time)
+                panels["image"] = _image_panel(run, images, time)
             yield _joined(panels, f"{(time - int(times[0])) * 1e-9:.3f} s")
             progress.advance(task)
 
 
-def _timed_images(pipeline: AENeRFPipeline) -> list[tuple[int, Path]]:
-    views = pipeline.datamanager.dataparser.recording.reference_views
+def _timed_images(run: TrainedRun) -> list[tuple[int, Path]]:
+    views = run.recording.reference_views
     taken = {view.time: view.file for split in SPLITS for view in views[split] if view.time is not None}
     return sorted((time, file) for time, file in taken.items() if file.is_file())
 
 
-def _image_panel(pipeline: AENeRFPipeline, images: list[tuple[int, Path]], time: int) -> NDArray[np.uint8]:
-    lens = pipeline.datamanager.dataparser.recording.event_camera
+def _image_panel(run: TrainedRun, images: list[tuple[int, Path]], time: int) -> NDArray[np.uint8]:
+    lens = run.recording.event_camera
     last = max(int(np.searchsorted([taken for taken, _ in images], time, side="right")) - 1, 0)
     image = torch.from_numpy(np.array(read_image(images[last][1]).convert("RGB"))) / 255
-    shown = to_image(pipeline.model.reference_display(image))
+    shown = to_image(run.model.reference_display(image))
     if shown.size != (lens.width, lens.height):
         # Of another camera than the events.
         shown = shown.resize((lens.width, lens.height))

@@ -13,6 +13,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS, TRAJECTORY_SECONDS
 from aenerf_ns.camera.time_window import TimeWindow
@@ -116,14 +117,16 @@ class EventDataParser(DataParser):
             trajectory.crop(window.start, window.end), recording.scene_box
         )
 
-        def to_scene(poses: Tensor) -> Tensor:
-            moved = transform @ poses
-            return torch.cat([moved[..., :3], scale * moved[..., 3:]], -1)
+        rotation, translation = transform.split((3, 1), -1)
+        frame = Similarity(torch.tensor(scale, dtype=torch.float64), rotation, scale * translation[:, 0])
 
-        trajectory = trajectory.transform(to_scene).crop(window.start, window.end)
+        def to_scene(poses: Tensor) -> Tensor:
+            return frame(poses[:, :3] @ OPENCV_TO_OPENGL)
+
+        trajectory = recording.trajectory.transform(to_scene).crop(window.start, window.end)
         ground_truth = recording.ground_truth
         if ground_truth is not None:
-            ground_truth = ground_truth.transform(lambda poses: to_scene(poses @ OPENCV_TO_OPENGL))
+            ground_truth = ground_truth.transform(to_scene)
             trajectory.knots_covered_by(ground_truth)
         if split == "train":
             times, images = viewer_cameras(trajectory, recording.reference_views["train"])
@@ -137,7 +140,7 @@ class EventDataParser(DataParser):
             for view in views:
                 check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
-            poses = to_scene(poses @ OPENCV_TO_OPENGL)
+            poses = to_scene(poses)
             _check_distance(poses, trajectory if ground_truth is None else ground_truth)
             cameras = recording.frame_camera.cameras(poses)
             cameras.metadata[REFERENCE_SECONDS] = seconds_on_trajectory(views, trajectory)
@@ -154,6 +157,7 @@ class EventDataParser(DataParser):
             alpha_color=None if recording.image_background is None else torch.tensor(recording.image_background),
             metadata={
                 SCENE_KEY: SceneRecording(
+                    frame=frame,
                     trajectory=trajectory,
                     ground_truth=ground_truth,
                     event_camera=recording.event_camera,

@@ -7,10 +7,11 @@ from pathlib import Path
 
 from torch import Tensor
 
+from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
-from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 
@@ -23,6 +24,7 @@ class SceneRecording:
     """The part of a recording that the dataparser hands on.
 
     Attributes:
+        frame: maps the recording's world, in the units of its poses, to the scene's.
         trajectory: the estimated trajectory of the event camera, camera-to-world, OpenGL camera axes, scene units.
         ground_truth: the true trajectory, with the same conventions, or None where it is not known. It serves
             evaluation only.
@@ -38,6 +40,7 @@ class SceneRecording:
             lens took at known times; none for the other splits. Only a method that says so trains on them.
     """
 
+    frame: Similarity
     trajectory: Trajectory
     ground_truth: Trajectory | None
     event_camera: CameraIntrinsics
@@ -49,3 +52,23 @@ class SceneRecording:
     image_encoding: ImageEncoding
     bounded: bool
     frames: tuple[tuple[int, Path], ...] = ()
+
+    @property
+    def scale(self) -> float:
+        """Units of the scene in a unit of the recording."""
+        return float(self.frame.scale)
+
+    def to_scene(self, poses: Tensor) -> Tensor:
+        """Map poses of the recording to the scene.
+
+        Args:
+            poses: (..., 3 or 4, 4) float64 camera-to-world, OpenCV camera axes, in the recording's world.
+
+        Returns:
+            (..., 3, 4) float64 camera-to-world, OpenGL camera axes, in the scene's frame and units.
+        """
+        return self.frame(poses[..., :3, :].cpu() @ OPENCV_TO_OPENGL)
+
+    def to_recording(self, poses: Tensor) -> Tensor:
+        """Map (..., 3, 4) poses of the scene back to the recording: the inverse of :meth:`to_scene`."""
+        return self.frame.inverse()(poses.cpu().double()) @ OPENCV_TO_OPENGL

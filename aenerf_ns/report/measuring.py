@@ -11,11 +11,12 @@ import numpy as np
 from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
+from aenerf_ns.evaluation.evaluate import evaluate
+from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.report.pair_residuals import pair_residuals
 from aenerf_ns.report.poses import measure_poses
 from aenerf_ns.report.run_files import read_record, read_scalars
 from aenerf_ns.report.view_pictures import ViewPictures, chosen_views, picture_views
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -82,7 +83,7 @@ class RunReport:
 def measure_run(
     name: str,
     config: TrainerConfig,
-    pipeline: AENeRFPipeline,
+    run: TrainedRun,
     candidates: Sequence[str] = (),
     shown: dict[str, str] | None = None,
 ) -> RunReport:
@@ -91,36 +92,35 @@ def measure_run(
     Args:
         name: of the run.
         config: of the run.
-        pipeline: of the run, as it is opened to be tested.
+        run: as it is opened to be tested.
         candidates: the files of the views that may be shown; none means that all may.
         shown: the files of the views to show, and why; None chooses among the candidates by this run's metrics.
     """
-    pipeline.eval()
+    run.model.eval()
     folder = config.get_base_dir()
-    report = RunReport(name, folder, _settings(config, pipeline), read_record(folder), read_scalars(folder))
+    report = RunReport(name, folder, _settings(config, run), read_record(folder), read_scalars(folder))
     missing = report.missing
     if report.record is None:
         missing.append("Commit, command, machine, seconds and peak memory: the run was made by an earlier version.")
     if report.scalars is None:
         missing.append("Curves: the run was made by an earlier version, which kept no scalars.")
-    _views(report, pipeline, candidates, shown)
-    _data(report, pipeline)
-    pipeline.eval()
-    report.poses = measure_poses(pipeline)
+    _views(report, run, candidates, shown)
+    _data(report, run)
+    report.poses = measure_poses(run)
     if report.poses["errors"] is None:
         missing.append("Pose errors: the recording has no true poses.")
     return report
 
 
-def _settings(config: TrainerConfig, pipeline: AENeRFPipeline) -> dict[str, Any]:
-    scene = pipeline.datamanager.train_dataset.scene
+def _settings(config: TrainerConfig, run: TrainedRun) -> dict[str, Any]:
+    scene = run.scene
     camera = scene.event_camera
     return {
-        "data": str(pipeline.datamanager.get_datapath()),
+        "data": str(run.data),
         "method": config.method_name,
-        "supervision": type(pipeline.model.supervision).__name__,
-        "pose_correction": pipeline.model.config.camera_optimizer.mode,
-        "color_correction": pipeline.model.color_correction.protocol,
+        "supervision": type(run.model.supervision).__name__,
+        "pose_correction": run.model.config.camera_optimizer.mode,
+        "color_correction": run.model.color_correction.protocol,
         "steps": config.max_num_iterations,
         "seed": config.machine.seed,
         "sensor": f"{camera.width} x {camera.height} pixels",
@@ -129,15 +129,11 @@ def _settings(config: TrainerConfig, pipeline: AENeRFPipeline) -> dict[str, Any]
     }
 
 
-def _views(
-    report: RunReport, pipeline: AENeRFPipeline, candidates: Sequence[str], shown: dict[str, str] | None
-) -> None:
-    data = pipeline.datamanager
-    if not data.has_reference_views and not pipeline.model.camera_optimizer.has_ground_truth:
+def _views(report: RunReport, run: TrainedRun, candidates: Sequence[str], shown: dict[str, str] | None) -> None:
+    if run.views is None and not run.model.camera_optimizer.has_ground_truth:
         report.missing.append("PSNR, SSIM and LPIPS: the recording has no test views.")
         return
-    report.evaluation = pipeline.get_average_eval_image_metrics(get_std=True)
-    pipeline.eval()
+    report.evaluation = evaluate(run)
     if not report.views:
         report.missing.append("PSNR, SSIM and LPIPS: the recording has no test views.")
         return
@@ -153,17 +149,17 @@ def _views(
         shown = {views[index]["file"]: reason for index, reason in chosen.items()}
     report.chosen = shown
     indices = {view["file"]: index for index, view in enumerate(report.views)}
-    pictures, report.contrast = picture_views(pipeline, [indices[file] for file in shown])
+    pictures, report.contrast = picture_views(run, [indices[file] for file in shown])
     report.pictures = dict(zip(shown, pictures, strict=True))
 
 
-def _data(report: RunReport, pipeline: AENeRFPipeline) -> None:
+def _data(report: RunReport, run: TrainedRun) -> None:
     """Measure what needs the events, where they still are."""
     # Imported lazily, because numba is slow to import.
     from aenerf_ns.checking.picture import warped_picture
     from aenerf_ns.checking.report import Report
 
-    dataset = pipeline.datamanager.train_dataset
+    dataset = run.dataset
     scene = dataset.scene
     report.data = {"pose_gaps_ns": [list(gap) for gap in scene.window.gaps], "check": [], "problems": []}
     if not scene.event_file.path.is_file():
@@ -171,8 +167,8 @@ def _data(report: RunReport, pipeline: AENeRFPipeline) -> None:
             f"Rate, polarity, pairs and the check: the events are no longer at {scene.event_file.path}."
         )
         return
-    recording = pipeline.datamanager.dataparser.recording
-    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    recording = run.recording
+    scale = run.scene.scale
     check = Report(recording, scene.window, scale, report.data["check"].append)
     statistics = check.statistics
     report.data |= {
@@ -187,7 +183,7 @@ def _data(report: RunReport, pipeline: AENeRFPipeline) -> None:
         report.missing.append("The check's picture: too few events have a pose.")
     else:
         report.check_picture = Image.fromarray(warped_picture(check.warped))
-    report.pairs = pair_residuals(pipeline)
+    report.pairs = pair_residuals(run)
     if report.pairs is None:
         report.missing.append("Rendered against measured changes: the batches of this method are no pairs of events.")
     else:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.supervision.event_pairs import PairSampler, PairSupervision
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 _NUM_PAIRS = 20_000
 # Upper ends of the classes of pairs by their number of events.
@@ -22,30 +22,30 @@ _LEAST = 10
 
 
 @torch.no_grad()
-def pair_residuals(pipeline: AENeRFPipeline) -> dict[str, Any] | None:
+def pair_residuals(run: TrainedRun) -> dict[str, Any] | None:
     """Render newly drawn pairs that end at events, the same in every call, and compare their changes.
 
     Args:
-        pipeline: of the run, in evaluation mode. Its events are there.
+        run: in evaluation mode. Its events are there.
 
     Returns:
         In units of the mean contrast threshold: a ``histogram`` of rendered against measured changes with its
         ``edges``, their ``correlation``, the mean absolute residual ``by_length`` (events of a pair) and ``by_tile``,
         None where there are too few pairs. None for a run whose batches are no pairs.
     """
-    sampler, supervision = pipeline.datamanager.train_pixel_sampler, pipeline.model.supervision
+    sampler, supervision = run.sampler, run.model.supervision
     if not isinstance(sampler, PairSampler) or not isinstance(supervision, PairSupervision):
         return None
-    devices = [pipeline.device] if torch.device(pipeline.device).type == "cuda" else []
+    devices = [run.device] if run.device.type == "cuda" else []
     with torch.random.fork_rng(devices):
         torch.manual_seed(0)
         rays, batch = sampler.sample(2 * _NUM_PAIRS, training=False)
     num_pairs = len(batch["channel"])
     pieces = []
-    chunk = pipeline.model.config.eval_num_rays_per_chunk // 2
+    chunk = run.model.config.eval_num_rays_per_chunk // 2
     for begin in range(0, num_pairs, chunk):
-        chosen = torch.arange(begin, min(begin + chunk, num_pairs), device=pipeline.device)
-        outputs = pipeline.model(rays[torch.cat([chosen, chosen + num_pairs])])
+        chosen = torch.arange(begin, min(begin + chunk, num_pairs), device=run.device)
+        outputs = run.model(rays[torch.cat([chosen, chosen + num_pairs])])
         part = {name: values[chosen] for name, values in batch.items()}
         unit = supervision.unit(outputs)
         pieces.append(torch.stack([one / unit for one in supervision.changes(outputs, part)]))
@@ -61,7 +61,7 @@ def pair_residuals(pipeline: AENeRFPipeline) -> dict[str, Any] | None:
         "correlation": float(np.corrcoef(measured, rendered)[0, 1]),
         "mean_residual": float(residual.mean()),
         "by_length": _by_length(length, residual),
-        "by_tile": _by_tile(pixel, residual, pipeline.datamanager.train_dataset.scene.event_camera),
+        "by_tile": _by_tile(pixel, residual, run.scene.event_camera),
     }
 
 

@@ -7,8 +7,9 @@ from typing import Any
 import torch
 
 from aenerf_ns.camera.alignment import align
+from aenerf_ns.evaluation.poses import camera_speeds
+from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.report.trajectory_errors import as_evo_prints, correction_components, errors_over_time
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 # Poses that are drawn. More are not seen, and make the page large.
 _MOST_DRAWN = 600
@@ -17,11 +18,11 @@ _AT_ONCE = 2000
 
 
 @torch.no_grad()
-def measure_poses(pipeline: AENeRFPipeline) -> dict[str, Any]:
+def measure_poses(run: TrainedRun) -> dict[str, Any]:
     """Return the errors of all poses, and positions, errors and corrections along the trajectory, thinned.
 
     Args:
-        pipeline: of the run, in evaluation mode.
+        run: in evaluation mode.
 
     Returns:
         ``num_poses``: given poses that the true ones cover, where these are known, else all. ``evo``: see
@@ -31,20 +32,20 @@ def measure_poses(pipeline: AENeRFPipeline) -> dict[str, Any]:
         ``errors``, ``correction``, ``speed`` and ``turn_rate_degrees``. ``evo`` and ``errors`` are None without true
         poses, ``correction`` is None where poses are not corrected.
     """
-    correction, scene = pipeline.model.camera_optimizer, pipeline.datamanager.train_dataset.scene
+    correction, scene = run.model.camera_optimizer, run.scene
     given, true = scene.trajectory, scene.ground_truth
     times = given.times if true is None else given.knots_covered_by(true)
     seconds = given.seconds(times)
-    corrected = [correction.pose(part.to(pipeline.device)).cpu() for part in seconds.split(_AT_ONCE)]
+    corrected = [correction.pose(part.to(run.device)).cpu() for part in seconds.split(_AT_ONCE)]
     poses = {"estimated": given.interpolate(times), "corrected": torch.cat(corrected)}
     reference = poses["estimated"] if true is None else true.interpolate(times)
     every = -(-len(times) // _MOST_DRAWN)
-    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    scale = scene.scale
     positions = {name: align(one, reference)(one.double()) for name, one in poses.items()}
     if true is not None:
         positions["true"] = reference
     drawn = seconds[::every].contiguous()
-    speeds, turn_rates = pipeline.camera_speeds(drawn)
+    speeds, turn_rates = camera_speeds(correction, scene, drawn)
     measured: dict[str, Any] = {
         "num_poses": len(times),
         "seconds": drawn.tolist(),
@@ -55,9 +56,9 @@ def measure_poses(pipeline: AENeRFPipeline) -> dict[str, Any]:
         "errors": None,
         "correction": None,
     }
-    in_recording = {name: pipeline.in_recording(one) for name, one in poses.items()}
+    in_recording = {name: scene.to_recording(one) for name, one in poses.items()}
     if true is not None:
-        truth = pipeline.in_recording(reference)
+        truth = scene.to_recording(reference)
         measured["evo"] = {name: as_evo_prints(one, truth) for name, one in in_recording.items()}
         measured["errors"] = {
             name: {kind: values[::every] for kind, values in errors_over_time(one, truth).items()}

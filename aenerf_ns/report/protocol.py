@@ -6,8 +6,9 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from aenerf_ns.training.pipeline import AENeRFPipeline
-from aenerf_ns.training.view_metrics import view_files
+from aenerf_ns.evaluation.poses import describe_test_poses
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.evaluation.view_metrics import view_files
 
 
 @dataclass(frozen=True)
@@ -25,14 +26,13 @@ class Protocol:
     truths: dict[str, int]
 
 
-def read_protocol(pipeline: AENeRFPipeline) -> Protocol:
+def read_protocol(run: TrainedRun) -> Protocol:
     """Return how a run will be measured, as it is opened to be tested."""
     truths = {}
-    if pipeline.datamanager.has_reference_views:
-        dataset = pipeline.datamanager.eval_dataset
-        for index, file in enumerate(view_files(pipeline)):
-            truths[file] = zlib.crc32(dataset.get_numpy_image(index).tobytes())
-    return Protocol(pipeline.model.color_correction.description, pipeline.test_poses, truths)
+    if run.views is not None:
+        for index, file in enumerate(view_files(run)):
+            truths[file] = zlib.crc32(run.views.get_numpy_image(index).tobytes())
+    return Protocol(run.model.color_correction.description, describe_test_poses(run.model.camera_optimizer), truths)
 
 
 def protocol_differences(names: Sequence[str], protocols: Sequence[Protocol]) -> list[str]:

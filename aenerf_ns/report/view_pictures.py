@@ -11,9 +11,9 @@ import torch
 from nerfstudio.utils import colormaps
 from PIL import Image
 
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.training.pipeline import AENeRFPipeline
-from aenerf_ns.training.view_metrics import to_image
 
 ERROR_RANGE = 0.25
 """The mean absolute difference of display values in [0, 1] that an error picture shows brightest."""
@@ -61,25 +61,25 @@ def chosen_views(psnr: Sequence[float]) -> dict[int, str]:
 
 
 @torch.no_grad()
-def picture_views(pipeline: AENeRFPipeline, indices: Sequence[int]) -> tuple[list[ViewPictures], list[float]]:
+def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPictures], list[float]]:
     """Render reference views from where they are placed.
 
     Args:
-        pipeline: of the run, in evaluation mode.
+        run: in evaluation mode.
         indices: of the views.
 
     Returns:
         The pictures of each view; and the contrast of each channel over all pixels of these views: the standard
         deviation of the rendered log-radiance, before colour correction, as a share of that of the images.
     """
-    model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
-    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    model, dataset = run.model, run.views
+    scale = run.scene.scale
     pictures, rendered, true = [], [], []
     with progress_bar() as progress:
         task = progress.add_task("Rendering views", total=len(indices))
         for index in indices:
-            outputs = model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(pipeline.device))
-            image = dataset.get_image_float32(index).to(pipeline.device)
+            outputs = model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(run.device))
+            image = dataset.get_image_float32(index).to(run.device)
             pictures.append(_pictures(outputs, model.reference_display(image), scale))
             rendered.append(outputs["log_radiance"].flatten(0, 1).double())
             # As the colour correction is fitted.

@@ -1,15 +1,14 @@
-"""The pipeline: fits the colour correction, checks every step, loads strictly and evaluates."""
+"""The pipeline: checks every step, fits the color correction, diagnoses the poses, and loads strictly."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import comms
@@ -18,24 +17,18 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.utils.writer import GLOBAL_BUFFER, EventName
 from torch import Tensor
 
-from aenerf_ns.camera.alignment import pose_errors
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
-from aenerf_ns.method.color_correction import NoColorCorrection
-from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
+from aenerf_ns.errors import errors_as_one_line
+from aenerf_ns.evaluation.color_fit import ColorFit
+from aenerf_ns.evaluation.evaluate import evaluate, measure_reference_views
+from aenerf_ns.evaluation.pose_diagnosis import LAST_PART, diagnose
+from aenerf_ns.evaluation.poses import compare_with_ground_truth
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.evaluation.view_metrics import average_metrics
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.device import require_device
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
-from aenerf_ns.training.pose_diagnosis import LAST_PART, diagnose
-from aenerf_ns.training.pose_refinement import NUM_STEPS, RefinedViews
 from aenerf_ns.training.training_state import TrainingState
-from aenerf_ns.training.view_metrics import (
-    IMAGE_METRICS,
-    average_metrics,
-    describe_views,
-    measure_views,
-    picture_names,
-)
 from aenerf_ns.viewer.panel import RecordingPanel
 from aenerf_ns.viewer.recording_view import RecordingView
 
@@ -54,23 +47,6 @@ class AENeRFPipelineConfig(VanillaPipelineConfig):
     refine_test_poses: bool = True
     """Evaluate a trained run a second time, with test poses that are refined photometrically. Besides the picture, that
     takes some 13,000 rays a view and their gradients."""
-
-
-@dataclass(frozen=True)
-class _Pixels:
-    """Pixels that a colour correction is fitted on.
-
-    Attributes:
-        cameras: of the views.
-        view: (N, 1) index of each pixel's camera.
-        coordinates: (N, 2) row and column.
-        radiance: (N, channels) of the reference image there, or None where there are no references.
-    """
-
-    cameras: Cameras
-    view: Tensor
-    coordinates: Tensor
-    radiance: Tensor | None = None
 
 
 class AENeRFPipeline(VanillaPipeline):
@@ -96,15 +72,11 @@ class AENeRFPipeline(VanillaPipeline):
         self.training_state = TrainingState()
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
-        # Chosen once: otherwise every fit would read the images again.
-        self._pixels_of_split: dict[str, _Pixels] = {}
+        self.color_fit = ColorFit(self.model, self.datamanager.train_dataset, self.datamanager.reference_views)
         self._unchecked_losses: dict[str, Tensor] = {}
         self._steps_per_log = 1
-        self._warn_of_test_views()
-        # The viewer finds its elements there, where one runs.
-        self.recording = RecordingPanel(
-            RecordingView(self.model, self.datamanager.train_dataset, self.in_recording, self.pose_errors)
-        )
+        # The viewer, where one runs, finds its elements here and names their folder after the attribute.
+        self.recording = RecordingPanel(RecordingView(self.model, self.datamanager.train_dataset))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:
         """Load all of a checkpoint. The framework would silently drop what does not fit.
@@ -143,7 +115,7 @@ class AENeRFPipeline(VanillaPipeline):
         if step_check(step, self._steps_per_log, run_at_zero=True):
             metrics = self.model.get_metrics_dict(outputs, batch) | self._rate(batch)
             if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
-                errors = self.pose_errors()
+                errors = compare_with_ground_truth(self.model.camera_optimizer, self.datamanager.train_dataset.scene)
                 if errors is not None:
                     metrics |= errors["corrected"]
         losses = self.model.get_loss_dict(outputs, batch, metrics)
@@ -181,7 +153,8 @@ class AENeRFPipeline(VanillaPipeline):
             if step == max(last_step - max(round(LAST_PART * num_steps), 1), trainer._start_step):
                 earlier_poses.append(self.model.camera_optimizer.compared_poses()[1])
             if step == last_step:
-                self._pose_diagnosis = diagnose(self, *earlier_poses)
+                sampler = self.datamanager.train_pixel_sampler
+                self._pose_diagnosis = diagnose(self.model, self.datamanager.train_dataset, sampler, *earlier_poses)
                 CONSOLE.print(self._pose_diagnosis["summary"], soft_wrap=True)
 
         def fit(step: int) -> None:
@@ -189,9 +162,9 @@ class AENeRFPipeline(VanillaPipeline):
             if not comms.is_main_process():
                 return
             if step == last_step or step_check(step, trainer.config.steps_per_save):
-                self.fit_color_correction()
+                self.color_fit.fit()
             elif step_check(step, _ROUGH_FIT_INTERVAL, run_at_zero=True):
-                self.fit_color_correction(_ROUGH_FIT_SHARE)
+                self.color_fit.fit(_ROUGH_FIT_SHARE)
 
         def check_losses(step: int) -> None:
             # With mixed precision only the losses are left to check. The scaler drops gradients that are not finite. If
@@ -215,12 +188,6 @@ class AENeRFPipeline(VanillaPipeline):
             for function in (check_losses, diagnose_poses, fit, lambda step: self.recording.after_step())
         ]
         return [*super().get_training_callbacks(training_callback_attributes), *callbacks]
-
-    def replace_color_correction(self, protocol: ColorCorrectionProtocol) -> None:
-        """Replace the run's colour correction by another protocol, fitted anew on the run's data."""
-        self.model.color_correction = self.model.new_color_correction(protocol).to(self.device)
-        self._warn_of_test_views()
-        self.fit_color_correction()
 
     def _require_finite(self, optimizers: list[torch.optim.Optimizer], step: int) -> None:
         """Raise SystemExit unless the step's losses and the gradients of optimizers are finite.
@@ -248,189 +215,32 @@ class AENeRFPipeline(VanillaPipeline):
             "--mixed-precision if on, and with poses of sensible scale"
         )
 
-    @torch.no_grad()
-    def fit_color_correction(self, share: float = 1.0) -> None:
-        """Fit the colour correction on its protocol's reference views.
-
-        Without such views, the percentiles of the training cameras' renderings are stretched over the display's range.
-
-        Args:
-            share: share of the configured number of pixels to fit on. A share below 1 makes a rough fit.
-        """
-        correction = self.model.color_correction
-        if isinstance(correction, NoColorCorrection):
-            return
-        if correction.split not in self._pixels_of_split:
-            self._pixels_of_split[correction.split] = self._pixels(correction.split)
-        pixels = self._pixels_of_split[correction.split]
-        count = max(round(share * len(pixels.view)), 1)
-        # Reference views are carried over to the frame that the corrected poses have at this step.
-        cameras = replace(pixels.cameras, camera_to_worlds=self.model.camera_optimizer.apply_to_camera(pixels.cameras))
-        rays = cameras.generate_rays(pixels.view[:count], coords=pixels.coordinates[:count])
-        log_radiance = self.model.render_log_radiance(rays)
-        if pixels.radiance is None:
-            correction.stretch(log_radiance)
-        else:
-            correction.fit(log_radiance, pixels.radiance[:count], len(cameras), rough=share < 1)
-
-    def _warn_of_test_views(self) -> None:
-        if self.model.color_correction.protocol == "affine-test":
-            CONSOLE.print(
-                "[yellow]Colour correction affine-test is fitted on the test views themselves: only to compare with "
-                "figures that were made so."
-            )
-
-    def _pixels(self, split: Literal["val", "test"]) -> _Pixels:
-        """Return random pixels of all reference views of a split, the same in every run.
-
-        Without references the pixels are those of the training cameras.
-        """
-        references = self.datamanager.reference_views(split)
-        views = references or self.datamanager.train_dataset
-        generator = torch.Generator().manual_seed(0)
-        cameras = views.cameras
-        count = max(self.model.config.color_correction_num_rays, len(views))
-        # Every view is drawn as often as the others, in random order, so any part is spread over the views too.
-        index = (torch.arange(count) % len(views))[torch.randperm(count, generator=generator)]
-        size = torch.cat([cameras.height, cameras.width], -1)[index]
-        pixels = (torch.rand(count, 2, generator=generator) * size).long()
-        device = self.device
-        chosen = _Pixels(cameras.to(device), index[:, None].to(device), (pixels + 0.5).to(device))
-        if references is None:
-            return chosen
-        image = torch.zeros(count, 3)
-        for view in range(len(views)):
-            rows, columns = pixels[index == view].T
-            image[index == view] = views.get_image_float32(view)[rows, columns, :3]
-        return replace(chosen, radiance=self.model.reference_radiance(image).to(device))
-
-    def in_recording(self, poses: Tensor) -> Tensor:
-        """Convert scene poses (N, 3, 4) with OpenGL axes to the recording's world and units, with OpenCV axes."""
-        outputs = self.datamanager.train_dataparser_outputs
-        to_scene = homogeneous(outputs.dataparser_transform.double())
-        poses = homogeneous(poses.cpu())
-        poses[:, :3, 3] /= outputs.dataparser_scale
-        return (torch.linalg.inv(to_scene) @ poses @ OPENCV_TO_OPENGL)[:, :3]
-
-    def in_scene(self, poses: Tensor) -> Tensor:
-        """Convert poses (N, 3, 4) or (N, 4, 4) of the recording's world, OpenCV axes, to scene poses, OpenGL axes."""
-        outputs = self.datamanager.train_dataparser_outputs
-        poses = homogeneous(outputs.dataparser_transform.double()) @ homogeneous(poses[:, :3].cpu()) @ OPENCV_TO_OPENGL
-        poses[:, :3, 3] *= outputs.dataparser_scale
-        return poses[:, :3]
-
-    def camera_speeds(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how fast the corrected camera moves and turns at (N,) float64 seconds since the trajectory's start.
-
-        Returns:
-            (N,) units of the recording per second, and (N,) degrees per second.
-        """
-        with torch.no_grad():
-            pose, rate = self.model.camera_optimizer.pose_and_rate(seconds.to(self.device))
-        scale = self.datamanager.train_dataparser_outputs.dataparser_scale
-        # The derivative of a rotation R is R [ω]ₓ, whose norm is √2 |ω|.
-        turning = (pose[..., :3].mT @ rate[..., :3]).flatten(1).norm(dim=-1) / math.sqrt(2)
-        return rate[..., 3].norm(dim=-1).cpu() / scale, torch.rad2deg(turning).cpu()
-
-    def pose_errors(self) -> dict[str, dict[str, float]] | None:
-        """Return the errors of the ``estimated`` and of the ``corrected`` poses, in the units of the recording.
-
-        They are those of :func:`~aenerf_ns.camera.alignment.pose_errors`. None where the true poses are not known.
-        """
-        correction = self.model.camera_optimizer
-        if not correction.has_ground_truth:
-            return None
-        estimated, corrected, reference = (self.in_recording(poses) for poses in correction.compared_poses())
-        return {"estimated": pose_errors(estimated, reference), "corrected": pose_errors(corrected, reference)}
-
-    def _require_reference_views(self) -> None:
-        if not self.datamanager.has_reference_views:
-            raise SystemExit(
-                f"Error: {self.datamanager.get_datapath()}: the {self.datamanager.test_split} split has no reference "
-                "images to evaluate on; ns-render shows what was reconstructed"
-            )
-
-    @property
-    def test_poses(self) -> str:
-        """How the cameras of the reference views are placed."""
-        if self.model.camera_optimizer.has_ground_truth:
-            return "Sim(3) of the corrected to the true trajectory"
-        if not self.model.camera_optimizer.is_learned:
-            return "as the dataset gives them"
-        return "corrected pose at the time of the view, else Sim(3) of the corrected to the estimated trajectory"
+    def trained_run(self) -> TrainedRun:
+        """Return what evaluation, reports and exports need of this pipeline."""
+        data = self.datamanager
+        return TrainedRun(
+            model=self.model,
+            data=Path(data.get_datapath()),
+            recording=data.dataparser.recording,
+            dataset=data.train_dataset,
+            views=data.eval_dataset if data.has_reference_views else None,
+            read_reference_views=data.reference_views,
+            sampler=data.train_pixel_sampler,
+            refine_test_poses=self.config.refine_test_poses,
+            pose_diagnosis=self._pose_diagnosis,
+        )
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Return mean metrics over the reference views, and the protocol that they were computed with.
-
-        The views are rendered from where they are placed. Of a trained run, ``refined_test_poses`` holds the metrics of
-        the views that are rendered from photometrically refined poses, and ``views`` those of each view
-        (:func:`~aenerf_ns.training.view_metrics.describe_views`). No camera stays moved.
-
-        Without reference views, but with known true poses, return the errors of the poses alone.
+        """Return all figures of :func:`~aenerf_ns.evaluation.evaluate.evaluate`; while training, the metrics alone.
 
         Raises:
-            SystemExit: there are neither views nor true poses; or, outside training, a metric is not a number.
+            SystemExit: with one clear line, when there is nothing to evaluate on or the model renders no numbers.
         """
-        metrics: dict[str, Any] = {}
-        placed: list[dict[str, float]] = []
-        refined = None
-        if self.datamanager.has_reference_views or not self.model.camera_optimizer.has_ground_truth:
-            self._require_reference_views()
-            placed = self._measure(self.datamanager.fixed_indices_eval_dataloader, output_path)
-            metrics = self._checked(average_metrics(placed, get_std))
-        if self.test_mode == "test":
-            # In the other mode, the trainer's log takes numbers only.
-            metrics["color_correction"] = self.model.color_correction.description
-            metrics["num_views"] = len(self.datamanager.eval_dataset) if self.datamanager.has_reference_views else 0
-            metrics["pose_correction"] = self.model.config.camera_optimizer.mode
-            metrics |= self.model.camera_optimizer.offsets()
-            metrics["pose_errors"] = self.pose_errors()
-            metrics["pose_diagnosis"] = self._pose_diagnosis
-            metrics["test_poses"] = self.test_poses
-            if metrics["num_views"] and self.config.refine_test_poses:
-                refined = self._measure(RefinedViews(self.model, self.datamanager.fixed_indices_eval_dataloader))
-                metrics["refined_test_poses"] = self._metrics_of_refined_test_poses(refined, get_std)
-            metrics |= self.model.supervision.learned()
-            if self.model.image_metrics.lpips_absent is not None:
-                metrics["lpips"] = None
-                metrics["lpips_absent"] = self.model.image_metrics.lpips_absent
-            metrics["views"] = describe_views(self, placed, refined) if placed else []
-        return metrics
-
-    def _measure(
-        self, views: Iterable[tuple[Cameras, dict[str, Any]]], output_path: Path | None = None
-    ) -> list[dict[str, float]]:
-        """Return the metrics of each reference view, and write its pictures as ns-eval names them."""
-        self.eval()
-        names = picture_names(self.datamanager.eval_dataset.image_filenames)
-        measured = measure_views(self.model, views, names, output_path, "eval")
-        self.train()
-        return measured
-
-    def _metrics_of_refined_test_poses(self, refined: list[dict[str, float]], get_std: bool) -> dict[str, Any]:
-        """Return the mean metrics of the reference views from refined poses, and how the poses were refined."""
-        metrics = self._checked(average_metrics(refined, get_std))
-        # The time to render includes no refinement, so it says nothing new.
-        metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in IMAGE_METRICS}
-        if self.model.image_metrics.lpips_absent is not None:
-            metrics["lpips"] = None
-        how = f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {self.test_poses}"
-        return {**metrics, "test_poses": how}
-
-    def _checked(self, metrics: dict[str, Any]) -> dict[str, Any]:
-        """Return metrics of the reference views without standard deviations that do not exist.
-
-        Raises:
-            SystemExit: outside training, a metric is not a number.
-        """
-        # A single view has no standard deviation, and JSON has no NaN.
-        metrics = {k: value for k, value in metrics.items() if not (k.endswith("_std") and math.isnan(value))}
-        undefined = [name for name, value in metrics.items() if math.isnan(value)]
-        if undefined and self.test_mode == "test":
-            raise SystemExit(
-                f"Error: {', '.join(undefined)} of the {self.datamanager.test_split} views is not a number: "
-                "the run renders values that are not finite; train it again"
-            )
-        return metrics
+        run = self.trained_run()
+        with errors_as_one_line():
+            if self.test_mode == "test":
+                return evaluate(run, output_path, get_std)
+            # The trainer's log takes numbers only.
+            return average_metrics(measure_reference_views(run, output_path), get_std)

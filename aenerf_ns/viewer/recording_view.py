@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import tempfile
-from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.evaluation.poses import compare_with_ground_truth
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
@@ -41,21 +41,11 @@ class RecordingView:
     Args:
         model: with the poses as corrected so far.
         dataset: the training data.
-        in_recording: converts scene poses (N, 3, 4) to the recording's world and units, with OpenCV axes.
-        pose_errors: returns the errors of the estimated and the corrected poses, None where the true ones are unknown.
     """
 
-    def __init__(
-        self,
-        model: AENeRFModel,
-        dataset: EventDataset,
-        in_recording: Callable[[Tensor], Tensor],
-        pose_errors: Callable[[], Mapping[str, Mapping[str, float]] | None],
-    ) -> None:
+    def __init__(self, model: AENeRFModel, dataset: EventDataset) -> None:
         self._model = model
         self._dataset = dataset
-        self._in_recording = in_recording
-        self._pose_errors = pose_errors
         self.camera = dataset.scene.event_camera
         self.duration = dataset.scene.trajectory.duration
 
@@ -166,8 +156,8 @@ class RecordingView:
         return "\n\n".join([self._pose_figures(), self._threshold_figures(), self._color_figures()])
 
     def _pose_figures(self) -> str:
-        errors = self._pose_errors()
         correction = self._model.camera_optimizer
+        errors = compare_with_ground_truth(correction, self._dataset.scene)
         if errors is not None:
             rows = [
                 "| pose error | given | corrected |",
@@ -207,7 +197,7 @@ class RecordingView:
         """Return the corrected poses at the times of the given ones in TUM format, in the recording's world."""
         correction = self._model.camera_optimizer
         times = correction.trajectory.times
-        poses = self._in_recording(correction.pose(correction.trajectory.seconds(times)))
+        poses = self._dataset.scene.to_recording(correction.pose(correction.trajectory.seconds(times)))
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "trajectory.txt")
             write_tum_trajectory(path, Trajectory(times.cpu(), poses))

@@ -127,8 +127,8 @@ class _Record:
         self._poses[step] = self._errors()
 
     def _errors(self) -> dict[str, Any]:
-        correction = self._pipeline.model.camera_optimizer
-        _, corrected, reference = (self._pipeline.in_recording(poses) for poses in correction.compared_poses())
+        correction, scene = self._pipeline.model.camera_optimizer, self._pipeline.datamanager.train_dataset.scene
+        _, corrected, reference = (scene.to_recording(poses) for poses in correction.compared_poses())
         errors = pose_errors(corrected, reference)
         seconds = correction._compared_seconds.cpu()
         return {

@@ -68,7 +68,7 @@ class _Worker:
         pipeline = self._trainer.pipeline
         # Commits that refine the poses of the views would do it each time.
         pipeline.config.refine_test_poses = False
-        pipeline.fit_color_correction()
+        pipeline.color_fit.fit()
         return pipeline.get_average_eval_image_metrics()["psnr"]
 
     def parts(self, steps: int) -> dict[str, float]:

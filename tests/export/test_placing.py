@@ -15,19 +15,18 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
+from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.export import mesh
 from aenerf_ns.export.camera_model_files import PlacedImage
 from aenerf_ns.export.placing import corrected_poses, placed_views
 from aenerf_ns.export.rendering import points_seen
 from aenerf_ns.export.times import spread_times, times_at_rate, times_of_seconds
-from aenerf_ns.recording.scene import SCENE_KEY
-from aenerf_ns.training.pipeline import AENeRFPipeline
 
 SECOND = 10**9
 
 
 @pytest.fixture
-def pipeline(tmp_path: Path) -> AENeRFPipeline:
+def run(tmp_path: Path) -> TrainedRun:
     """A run whose correction is far from none. Its first test view was taken on the trajectory."""
     make_pipeline_config(tmp_path / "made")
     file = tmp_path / "made" / "transforms.json"
@@ -36,41 +35,41 @@ def pipeline(tmp_path: Path) -> AENeRFPipeline:
     file.write_text(json.dumps(meta))
     made = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
     torch.nn.init.normal_(made.model.camera_optimizer.twists.control_twists, std=0.05)
-    return made.eval()
+    return made.eval().trained_run()
 
 
-def test_images_are_at_the_corrected_poses(pipeline: AENeRFPipeline) -> None:
-    placed = placed_views(pipeline)
+def test_images_are_at_the_corrected_poses(run: TrainedRun) -> None:
+    placed = placed_views(run)
     assert [(image.name, image.split) for image, _ in placed] == [
         ("val/00000.png", "val"), ("val/00001.png", "val"),
         ("test/00000.png", "test"), ("test/00001.png", "test"), ("test/00002.png", "test"),
     ]  # fmt: skip
     assert all(file.is_file() for _, file in placed)
-    recording = pipeline.datamanager.dataparser.recording
+    recording = run.recording
     timed, untimed = placed[2][0].camera_to_world, placed[3][0].camera_to_world
     given = recording.reference_views["test"]
-    corrected = corrected_poses(pipeline, torch.tensor([SECOND // 4]))[0]
+    corrected = corrected_poses(run, torch.tensor([SECOND // 4]))[0]
     on_rig = (
         np.linalg.inv(homogeneous(recording.trajectory.interpolate(SECOND // 4))) @ given[0].camera_to_world.numpy()
     )
     np.testing.assert_allclose(timed, homogeneous(corrected).numpy() @ on_rig, atol=1e-9)
     # As the evaluation places it: renderings from there are compared with the image.
-    cameras = pipeline.datamanager.reference_views("test").cameras
-    expected = pipeline.in_recording(pipeline.model.camera_optimizer.apply_to_camera(cameras).double())
+    cameras = run.read_reference_views("test").cameras
+    expected = run.scene.to_recording(run.model.camera_optimizer.apply_to_camera(cameras).double())
     np.testing.assert_allclose(untimed[:3], expected[1], atol=1e-5)
     np.testing.assert_allclose(timed[:3], expected[0], atol=1e-5)
     # And back.
     np.testing.assert_allclose(
-        pipeline.in_scene(torch.from_numpy(timed)[None])[0],
-        pipeline.model.camera_optimizer.apply_to_camera(cameras)[0],
+        run.scene.to_scene(torch.from_numpy(timed)[None])[0],
+        run.model.camera_optimizer.apply_to_camera(cameras)[0],
         atol=1e-5,
     )
 
 
-def test_points_lie_on_the_rays_of_their_pixels(pipeline: AENeRFPipeline) -> None:
-    pipeline.model.field.average_init_density = 1e3
-    images = [image for image, _ in placed_views(pipeline)]
-    points = points_seen(pipeline, images, 40)
+def test_points_lie_on_the_rays_of_their_pixels(run: TrainedRun) -> None:
+    run.model.field.average_init_density = 1e3
+    images = [image for image, _ in placed_views(run)]
+    points = points_seen(run, images, 40)
     assert 20 < len(points.positions) <= 40
     for position, index, (column, row) in zip(points.positions, points.images, points.pixels, strict=True):
         image: PlacedImage = images[index]
@@ -81,34 +80,32 @@ def test_points_lie_on_the_rays_of_their_pixels(pipeline: AENeRFPipeline) -> Non
 
 
 def test_a_recording_without_images_has_no_cameras_to_export(tmp_path: Path) -> None:
-    pipeline = make_pipeline(tmp_path / "made", "test", num_views=-1, true_world=lambda poses: poses)
+    run = make_pipeline(tmp_path / "made", "test", num_views=-1, true_world=lambda poses: poses).trained_run()
     with pytest.raises(DataError, match="it has no images; aenerf export-frames renders"):
-        placed_views(pipeline)
+        placed_views(run)
 
 
-def test_times_leave_gaps_out(pipeline: AENeRFPipeline) -> None:
-    dataset = pipeline.datamanager.train_dataset
+def test_times_leave_gaps_out() -> None:
     window = TimeWindow(0, SECOND, ((SECOND // 10, SECOND // 2),))
-    dataset.metadata[SCENE_KEY] = replace(dataset.scene, window=window)
-    times = spread_times(pipeline, 60)
+    times = spread_times(window, 60)
     assert window.contains(times).all()
     # In equal steps, but for the gap: a sixth of the time is before it.
     assert int((times <= SECOND // 10).sum()) == 10
     assert (np.diff(times)[np.diff(times) < SECOND // 10] - SECOND // 100 <= 1).all()
-    assert times_at_rate(pipeline, 20).tolist() == [0, 5 * 10**7, 10**8, *range(SECOND // 2, SECOND + 1, 5 * 10**7)]
-    assert times_of_seconds(pipeline, [0.05, 0.75]).tolist() == [5 * 10**7, 75 * 10**7]
+    assert times_at_rate(window, 20).tolist() == [0, 5 * 10**7, 10**8, *range(SECOND // 2, SECOND + 1, 5 * 10**7)]
+    assert times_of_seconds(window, [0.05, 0.75]).tolist() == [5 * 10**7, 75 * 10**7]
     for seconds in (0.2, 1.5, float("nan"), float("inf")):
         with pytest.raises(DataError, match="is not in the run's time, 0 to 1 s"):
-            times_of_seconds(pipeline, [seconds])
+            times_of_seconds(window, [seconds])
     with pytest.raises(DataError, match="a rate of 0"):
-        times_at_rate(pipeline, 0)
+        times_at_rate(window, 0)
     with pytest.raises(DataError, match="a rate of 1e\\+09 gives 1e\\+09 times"):
-        times_at_rate(pipeline, 1e9)
+        times_at_rate(window, 1e9)
     # Less than one time in the run.
-    assert times_at_rate(pipeline, 1e-300).tolist() == [0]
+    assert times_at_rate(window, 1e-300).tolist() == [0]
 
 
-def test_a_mesh_is_in_the_units_of_the_recording(pipeline: AENeRFPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesh_is_in_the_units_of_the_recording(run: TrainedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     # What a camera sees of a ball before it: the distance along the ray to its near side.
     center, radius = np.array([0.0, 0.1, 1.5]), 0.4
 
@@ -123,9 +120,8 @@ def test_a_mesh_is_in_the_units_of_the_recording(pipeline: AENeRFPipeline, monke
 
     monkeypatch.setattr(mesh, "render", render)
     lens = CameraIntrinsics(96, 72, 80.0, 80.0, 48.0, 36.0)
-    parser = pipeline.datamanager.dataparser
-    monkeypatch.setitem(vars(parser), "recording", replace(parser.recording, event_camera=lens))
-    made = mesh.extract_mesh(pipeline, num_views=5, resolution=48)
+    run = replace(run, recording=replace(run.recording, event_camera=lens))
+    made = mesh.extract_mesh(run, num_views=5, resolution=48)
     distance = np.linalg.norm(made.vertices - center, axis=1)
     assert len(made.faces) > 500
     # To a voxel and a pixel: the visible cap is less than a metre wide.

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 
+from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.time_window import TimeWindow
@@ -40,6 +41,7 @@ def make_scene(
     sensor: SensorModel, trajectory: Trajectory, camera: CameraIntrinsics = CAMERA, bounded: bool = False
 ) -> SceneRecording:
     return SceneRecording(
+        frame=Similarity(torch.ones(()), torch.eye(3), torch.zeros(3)),
         trajectory=trajectory,
         ground_truth=None,
         event_camera=camera,

@@ -55,7 +55,7 @@ def train_and_keep(trainer: Trainer) -> None:
         share_batches(trainer)
     datamanager, pipeline = trainer.pipeline.datamanager, trainer.pipeline
     next_train, times = datamanager.next_train, []
-    fit, fits = pipeline.fit_color_correction, []
+    fit, fits = pipeline.color_fit.fit, []
 
     def watched(step: int) -> Any:
         rays, batch = next_train(step)
@@ -66,7 +66,7 @@ def train_and_keep(trainer: Trainer) -> None:
         fits.append(share)
         fit(*share)
 
-    datamanager.next_train, pipeline.fit_color_correction = watched, fitted
+    datamanager.next_train, pipeline.color_fit.fit = watched, fitted
     before = {name: value.clone() for name, value in pipeline.model.state_dict().items()}
     train_alone(trainer)
     kept = {"times": times[0], "before": before, "weights": pipeline.model.state_dict(), "num_fits": len(fits)}

@@ -11,6 +11,7 @@ from helpers.small_pipelines import make_pipeline
 from nerfstudio.cameras.rays import RayBundle
 
 from aenerf_ns.camera.image_encoding import encode
+from aenerf_ns.evaluation.color_fit import replace_color_correction
 from aenerf_ns.method.color_correction import (
     COLOR_CORRECTIONS,
     AffineColorCorrection,
@@ -183,12 +184,12 @@ def test_each_protocol_is_fitted_on_its_own_views(test_mode: Literal["test", "va
     camera = pipeline.datamanager.reference_views("test").cameras[0:1]
     rays = camera.generate_rays(0, keep_shape=False)
     for protocol, (description, color) in expected.items():
-        pipeline.replace_color_correction(protocol)
+        replace_color_correction(pipeline.trained_run(), protocol)
         assert pipeline.model.color_correction.description.startswith(description)
         # All references are alike, so whatever is rendered becomes their colour.
         shown = pipeline.model.eval()(rays)["rgb"]
         torch.testing.assert_close(shown, color.expand_as(shown), atol=0.02, rtol=0)
-    pipeline.replace_color_correction("none")
+    replace_color_correction(pipeline.trained_run(), "none")
     outputs = pipeline.model.eval()(rays)
     torch.testing.assert_close(outputs["rgb"], encode(torch.exp(outputs["log_radiance"]), "srgb"))
     assert pipeline.model.color_correction.description == "none"
@@ -203,14 +204,14 @@ def test_without_reference_views_every_fitted_protocol_says_that_it_is_a_stretch
         ("network", "percentile stretch, no validation views (protocol network)"),
         ("affine-test", "affine-test, fitted on the 1 test views themselves"),
     ):
-        pipeline.replace_color_correction(protocol)
+        replace_color_correction(pipeline.trained_run(), protocol)
         assert pipeline.model.color_correction.description == description
 
 
 def test_a_rough_fit_leaves_the_network_out(tmp_path: Path) -> None:
     pipeline = make_pipeline(tmp_path / "made", "val")
-    pipeline.replace_color_correction("network")
-    pipeline.fit_color_correction(1 / 8)
+    replace_color_correction(pipeline.trained_run(), "network")
+    pipeline.color_fit.fit(1 / 8)
     assert pipeline.model.color_correction.description.endswith("its affine part only")
     # What the framework asks an optimizer for is what it was.
     names = {name for name, _ in pipeline.model.named_parameters()}
@@ -227,13 +228,13 @@ def test_reference_views_are_placed_by_the_poses_of_the_moment(tmp_path: Path, m
         return render(rays)
 
     monkeypatch.setattr(pipeline.model, "render_log_radiance", spy)
-    pipeline.fit_color_correction()
+    pipeline.color_fit.fit()
     correction = pipeline.model.camera_optimizer
     assert correction.twists is not None
     with torch.no_grad():
         # The whole scene moves 0.5 along the camera's y axis.
         correction.twists.control_twists[:, 1] = 0.5 / correction.trajectory.extent
-    pipeline.fit_color_correction()
+    pipeline.color_fit.fit()
     before, after = seen
     expected = correction.apply_to_camera(pipeline.datamanager.reference_views("val").cameras)[0, :, 3]
     torch.testing.assert_close(after, expected.expand_as(after))

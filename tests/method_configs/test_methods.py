@@ -61,7 +61,7 @@ def shrunk(config: TrainerConfig) -> TrainerConfig:
 
 def evaluated(pipeline: AENeRFPipeline) -> float:
     """The PSNR of the validation views."""
-    pipeline.fit_color_correction()
+    pipeline.color_fit.fit()
     return pipeline.get_average_eval_image_metrics()["psnr"]
 
 

@@ -113,7 +113,7 @@ def test_errors_are_those_of_evo_over_all_poses_of_the_files(random_poses: torch
     ) as writer:
         writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 7 * SECOND, -1)], 6, 4))
         writer.add_trajectories(given, true)
-    found = measure_poses(make_pipeline(tmp_path / "data", "test"))
+    found = measure_poses(make_pipeline(tmp_path / "data", "test").trained_run())
     assert found["num_poses"] == 2501
     assert all(
         len(found["errors"]["estimated"][kind]) == len(found["seconds"]) == 501 for kind in found["errors"]["estimated"]

@@ -15,11 +15,11 @@ from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.evaluation.pose_diagnosis import diagnose, summary
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.training.pipeline import AENeRFPipeline
-from aenerf_ns.training.pose_diagnosis import diagnose, summary
 
 CAMERA = CameraIntrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
 SECOND = 10**9
@@ -59,7 +59,8 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def diagnosed(pipeline: AENeRFPipeline) -> dict[str, Any]:
-    return diagnose(pipeline, pipeline.model.camera_optimizer.compared_poses()[1])
+    run = pipeline.trained_run()
+    return diagnose(run.model, run.dataset, run.sampler, run.model.camera_optimizer.compared_poses()[1])
 
 
 def move(pipeline: AENeRFPipeline, size: float) -> None:

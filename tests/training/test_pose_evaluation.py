@@ -24,11 +24,12 @@ from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotation, rotation_from_vector
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
+from aenerf_ns.evaluation.pose_refinement import refine_camera
+from aenerf_ns.evaluation.poses import camera_speeds, compare_with_ground_truth
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
-from aenerf_ns.training.pose_refinement import refine_camera
 
 SECOND = 10**9
 
@@ -185,7 +186,7 @@ def test_the_true_poses_may_be_in_another_world(tmp_path: Path) -> None:
     world = some_similarity(2.5)
     plain = make_pipeline(tmp_path / "plain", "test")
     moved = make_pipeline(tmp_path / "moved", "test", true_world=lambda poses: world(poses[..., :3, :]))
-    errors = moved.pose_errors()
+    errors = compare_with_ground_truth(moved.model.camera_optimizer, moved.datamanager.train_dataset.scene)
     assert errors is not None
     # With digits as the files have them.
     assert all(errors["estimated"][name] < 1e-5 for name in ("rotation_error_degrees", "translation_error"))
@@ -196,7 +197,7 @@ def test_the_true_poses_may_be_in_another_world(tmp_path: Path) -> None:
     assert (given.camera_to_worlds - expected.camera_to_worlds).abs().max() > 0.5
     torch.testing.assert_close(correction.apply_to_camera(given), expected.camera_to_worlds, rtol=0, atol=1e-5)
     truth = read_tum_trajectory(tmp_path / "moved" / "trajectory_ground_truth.txt")
-    in_recording = moved.in_recording(correction.compared_poses()[2])
+    in_recording = moved.trained_run().scene.to_recording(correction.compared_poses()[2])
     torch.testing.assert_close(in_recording, truth.camera_to_worlds, rtol=0, atol=1e-6)
 
 
@@ -326,7 +327,8 @@ def test_views_on_the_trajectory_have_their_times_and_the_camera_s_speed(
     rotations = rotation_from_vector(turning[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64))
     poses = torch.cat([rotations, torch.zeros(21, 3, 1)], -1)
     pipeline.model.camera_optimizer.trajectory = Trajectory(SECOND // 20 * np.arange(21), poses)
-    _, turn_rates = pipeline.camera_speeds(torch.tensor([0.5], dtype=torch.float64))
+    run = pipeline.trained_run()
+    _, turn_rates = camera_speeds(run.model.camera_optimizer, run.scene, torch.tensor([0.5], dtype=torch.float64))
     assert float(turn_rates) == pytest.approx(math.degrees(1), rel=1e-4)
 
 

@@ -26,6 +26,7 @@ from helpers.small_viewers import (
 from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 
+from aenerf_ns.evaluation.poses import compare_with_ground_truth
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
@@ -190,10 +191,10 @@ def test_points_are_limited_for_slow_links(viewer: Viewer, pipeline: AENeRFPipel
 def test_figures_tell_errors_thresholds_and_colours(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     panel = pipeline.recording
     with viewer.train_lock:
-        pipeline.fit_color_correction()
+        pipeline.color_fit.fit()
         panel.draw()
     text = panel.accuracy.content
-    errors = pipeline.pose_errors()
+    errors = compare_with_ground_truth(pipeline.model.camera_optimizer, pipeline.datamanager.train_dataset.scene)
     given, corrected = (errors[name]["rotation_error_degrees"] for name in ("estimated", "corrected"))
     assert given > 1
     assert f"| rotation (°) | {given:.3f} | {corrected:.3f} |" in text
@@ -231,7 +232,8 @@ def test_buttons_send_files_to_the_browser_that_clicks(
     written = read_tum_trajectory(tmp_path / "poses.txt")
     correction = pipeline.model.camera_optimizer
     assert torch.equal(written.times, correction.trajectory.times)
-    expected = pipeline.in_recording(correction.pose(correction.trajectory.seconds(written.times)).detach())
+    poses = correction.pose(correction.trajectory.seconds(written.times)).detach()
+    expected = pipeline.datamanager.train_dataset.scene.to_recording(poses)
     torch.testing.assert_close(written.camera_to_worlds, expected, atol=1e-9, rtol=0)
     viewer.control_panel._max_res.value = 96
     browser.click(pipeline.recording.write_snapshot)

@@ -13,12 +13,14 @@ from torch import Tensor
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import PoseCorrection
+from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.supervision.base import Sampler
 from aenerf_ns.supervision.event_pairs import PairSampler
 
 if TYPE_CHECKING:
     from aenerf_ns.checking.hypotheses import Comparison
-    from aenerf_ns.training.pipeline import AENeRFPipeline
 
 LAST_PART = 0.1
 """The part of a run, at its end, over which the movement of the corrected poses is taken."""
@@ -57,24 +59,26 @@ _CLOCK_SHARE = 0.9
 _PENALTY_SHARE = 0.1
 
 
-def diagnose(pipeline: AENeRFPipeline, earlier: Tensor) -> dict[str, Any]:
+def diagnose(model: AENeRFModel, dataset: EventDataset, sampler: Sampler | None, earlier: Tensor) -> dict[str, Any]:
     """Return figures that tell whether pose correction failed, and a ``summary`` of them in words.
 
     Args:
-        pipeline: a pipeline at the end of training, with pose correction.
+        model: at the end of training, with pose correction.
+        dataset: that it was trained on.
+        sampler: that drew the batches.
         earlier: (N, 3, 4) corrected poses of :meth:`PoseCorrection.compared_poses`, when the last part of the run
             (:data:`LAST_PART`) began.
 
     Returns:
         Plain values, which JSON and checkpoints can hold; see docs/method.md.
     """
-    correction = pipeline.model.camera_optimizer
-    estimated, corrected, _ = (pipeline.in_recording(poses) for poses in correction.compared_poses())
+    correction, scene = model.camera_optimizer, dataset.scene
+    estimated, corrected, _ = (scene.to_recording(poses) for poses in correction.compared_poses())
     # After alignment, because the scene may drift together with all poses, which changes nothing.
     size = pose_errors(corrected, estimated)
-    movement = pose_errors(pipeline.in_recording(earlier), corrected)
-    stretches = _stretches(pipeline)
-    extent = correction.translation_unit / pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    movement = pose_errors(scene.to_recording(earlier), corrected)
+    stretches = _stretches(model, sampler)
+    extent = correction.translation_unit / scene.scale
     figures = {
         "correction_rotation_degrees": size["rotation_error_degrees"],
         "correction_translation_recording_units": size["translation_error"],
@@ -83,11 +87,10 @@ def diagnose(pipeline: AENeRFPipeline, earlier: Tensor) -> dict[str, Any]:
         "last_tenth_rotation_degrees": movement["rotation_error_degrees"],
         "last_tenth_translation_recording_units": movement["translation_error"],
         "penalty_share_of_loss": _penalty_share(correction, stretches),
-        **_contrast(pipeline),
+        **_contrast(correction, dataset),
         "stretches": stretches,
     }
-    focal = pipeline.datamanager.train_dataset.scene.event_camera.fx
-    return {"summary": summary(figures, focal), **figures}
+    return {"summary": summary(figures, scene.event_camera.fx), **figures}
 
 
 def summary(figures: dict[str, Any], focal: float) -> str:
@@ -170,16 +173,15 @@ def _penalty_share(correction: PoseCorrection, stretches: list[dict[str, Any]]) 
 
 
 @torch.no_grad()
-def _stretches(pipeline: AENeRFPipeline) -> list[dict[str, Any]]:
+def _stretches(model: AENeRFModel, sampler: Sampler | None) -> list[dict[str, Any]]:
     """Return the reconstruction loss of newly drawn pairs by stretch of time, beside the loss of a constant field.
 
     The list is empty where batches are not of pairs.
     """
-    sampler, model = pipeline.datamanager.train_pixel_sampler, pipeline.model
     if not isinstance(sampler, PairSampler):
         return []
     # The same pairs every time, without the random numbers that training would draw next.
-    devices = [pipeline.device] if torch.device(pipeline.device).type == "cuda" else []
+    devices = [model.device] if model.device.type == "cuda" else []
     with torch.random.fork_rng(devices):
         torch.manual_seed(0)
         rays, batch = sampler.sample(2 * _DRAWN * _NUM_STRETCHES * _PAIRS_PER_STRETCH, training=False)
@@ -214,7 +216,7 @@ def _stretches(pipeline: AENeRFPipeline) -> list[dict[str, Any]]:
     return found
 
 
-def _contrast(pipeline: AENeRFPipeline) -> dict[str, Any]:
+def _contrast(correction: PoseCorrection, dataset: EventDataset) -> dict[str, Any]:
     """Return the contrast of events warped by the estimated and the corrected poses, and by a camera that turns more.
 
     All values are None where there are too few events.
@@ -223,7 +225,6 @@ def _contrast(pipeline: AENeRFPipeline) -> dict[str, Any]:
     from aenerf_ns.checking.contrast import WarpedEvents
     from aenerf_ns.checking.hypotheses import Hypothesis
 
-    dataset = pipeline.datamanager.train_dataset
     camera = dataset.scene.event_camera
     surplus = max(len(dataset.pairs.rows) - _MAX_ROWS, 0)
     events = dataset.pairs.events(slice(surplus // 2 + 1, len(dataset.pairs.rows) - (surplus + 1) // 2))
@@ -238,7 +239,7 @@ def _contrast(pipeline: AENeRFPipeline) -> dict[str, Any]:
     )
     if len(events) < _LEAST_EVENTS:
         return figures
-    estimated, corrected = _dense_poses(pipeline.model.camera_optimizer)
+    estimated, corrected = _dense_poses(correction)
     warped = WarpedEvents([events], corrected, camera)
     comparison = warped.compare(Hypothesis("estimated", poses=lambda _: homogeneous(estimated.camera_to_worlds)))
     assert comparison is not None

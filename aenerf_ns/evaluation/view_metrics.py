@@ -5,21 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 from torch import Tensor
 
+from aenerf_ns.evaluation.poses import camera_speeds
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.progress import progress_bar
 
-if TYPE_CHECKING:
-    from aenerf_ns.method.model import AENeRFModel
-    from aenerf_ns.training.pipeline import AENeRFPipeline
-
 IMAGE_METRICS = ("psnr", "ssim", "lpips")
-"""The metrics that tell of a picture. The others tell how long it took."""
+"""Image-quality metrics. All others are timings."""
 
 
 @torch.no_grad()
@@ -61,13 +60,13 @@ def measure_views(
     return measured
 
 
-def average_metrics(metrics: Sequence[dict[str, float]], get_std: bool) -> dict[str, float]:
-    """Return the mean, and with ``get_std`` the standard deviation, of each metric of views."""
+def average_metrics(metrics: Sequence[dict[str, float]], with_deviations: bool) -> dict[str, float]:
+    """Compute the mean of each metric of views, and its standard deviation if asked for and if there are two views."""
     averages = {}
     for name in metrics[0]:
-        deviation, mean = torch.std_mean(torch.tensor([one[name] for one in metrics]))
+        deviation, mean = torch.std_mean(torch.tensor([view[name] for view in metrics]))
         averages[name] = float(mean)
-        if get_std:
+        if with_deviations and len(metrics) > 1:
             averages[f"{name}_std"] = float(deviation)
     return averages
 
@@ -92,20 +91,19 @@ def picture_names(files: Sequence[Path]) -> list[str]:
     return [f"{index:04d}_{stem}" for index, stem in enumerate(stems)]
 
 
-def view_files(pipeline: AENeRFPipeline) -> list[str]:
+def view_files(run: TrainedRun) -> list[str]:
     """Return the file of each reference view, relative to the dataset where it lies within."""
-    data = Path(pipeline.datamanager.get_datapath())
-    files = pipeline.datamanager.eval_dataset.image_filenames
-    return [str(file.relative_to(data) if file.is_relative_to(data) else file) for file in files]
+    files = [] if run.views is None else run.views.image_filenames
+    return [str(file.relative_to(run.data) if file.is_relative_to(run.data) else file) for file in files]
 
 
 def describe_views(
-    pipeline: AENeRFPipeline, placed: Sequence[dict[str, float]], refined: Sequence[dict[str, float]] | None
+    run: TrainedRun, placed: Sequence[dict[str, float]], refined: Sequence[dict[str, float]] | None
 ) -> list[dict[str, Any]]:
-    """Return what is known of each reference view, in plain values.
+    """Describe each reference view in plain values.
 
     Args:
-        pipeline: whose reference views they are.
+        run: with its views.
         placed: metrics of each view from where its camera is placed.
         refined: the same from photometrically refined poses, or None where they were not refined.
 
@@ -115,13 +113,13 @@ def describe_views(
         trajectory then ``camera_speed``, in units of the recording per second, and
         ``camera_turn_rate_degrees``, per second. They are None of a view off the trajectory.
     """
-    dataset = pipeline.datamanager.eval_dataset
-    seconds = dataset.reference_seconds
+    assert run.views is not None
+    seconds = run.views.reference_seconds
     on_trajectory = seconds.isfinite()
-    speeds, turn_rates = pipeline.camera_speeds(seconds.nan_to_num(0.0))
-    start = dataset.scene.trajectory.start
+    speeds, turn_rates = camera_speeds(run.model.camera_optimizer, run.scene, seconds.nan_to_num(0.0))
+    start = run.scene.trajectory.start
     views = []
-    for index, file in enumerate(view_files(pipeline)):
+    for index, file in enumerate(view_files(run)):
         timed = bool(on_trajectory[index])
         view: dict[str, Any] = {
             "file": file,

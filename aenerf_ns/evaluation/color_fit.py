@@ -1,0 +1,113 @@
+"""Fitting the color correction of a run on reference views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.method.color_correction import NoColorCorrection
+from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
+from aenerf_ns.method.model import AENeRFModel
+from aenerf_ns.recording.dataset import EventDataset
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Pixels that a color correction is fitted on.
+
+    Attributes:
+        cameras: of the views.
+        view: (N, 1) index of each pixel's camera.
+        coordinates: (N, 2) row and column.
+        radiance: (N, channels) of the reference image there, or None where there are no references.
+    """
+
+    cameras: Cameras
+    view: Tensor
+    coordinates: Tensor
+    radiance: Tensor | None = None
+
+
+class ColorFit:
+    """Fits a model's color correction on pixels of its protocol's reference views, the same in every run.
+
+    Without such views, the percentiles of the training cameras' renderings are stretched over the display's range.
+
+    Args:
+        model: whose color correction is fitted.
+        dataset: the training cameras.
+        read_reference_views: reads the reference views of a split; None where there are none.
+    """
+
+    def __init__(
+        self,
+        model: AENeRFModel,
+        dataset: EventDataset,
+        read_reference_views: Callable[[Literal["val", "test"]], EventDataset | None],
+    ) -> None:
+        self._model = model
+        self._dataset = dataset
+        self._read_reference_views = read_reference_views
+        # Chosen once: otherwise every fit would read the images again.
+        self._pixels: _Pixels | None = None
+        if model.color_correction.protocol == "affine-test":
+            CONSOLE.print(
+                "[yellow]Colour correction affine-test is fitted on the test views themselves: only to compare with "
+                "figures that were made so."
+            )
+
+    @torch.no_grad()
+    def fit(self, share: float = 1.0) -> None:
+        """Fit the color correction.
+
+        Args:
+            share: share of the configured number of pixels to fit on. A share below 1 makes a rough fit.
+        """
+        model, correction = self._model, self._model.color_correction
+        if isinstance(correction, NoColorCorrection):
+            return
+        if self._pixels is None:
+            self._pixels = self._choose_pixels(correction.split)
+        pixels = self._pixels
+        count = max(round(share * len(pixels.view)), 1)
+        # Reference views are carried over to the frame that the corrected poses have at this step.
+        cameras = replace(pixels.cameras, camera_to_worlds=model.camera_optimizer.apply_to_camera(pixels.cameras))
+        rays = cameras.generate_rays(pixels.view[:count], coords=pixels.coordinates[:count])
+        log_radiance = model.render_log_radiance(rays)
+        if pixels.radiance is None:
+            correction.stretch(log_radiance)
+        else:
+            correction.fit(log_radiance, pixels.radiance[:count], len(cameras), rough=share < 1)
+
+    def _choose_pixels(self, split: Literal["val", "test"]) -> _Pixels:
+        """Choose random pixels of all reference views of a split, or of the training cameras where there are none."""
+        references = self._read_reference_views(split)
+        views = references or self._dataset
+        generator = torch.Generator().manual_seed(0)
+        cameras, device = views.cameras, self._model.device
+        count = max(self._model.config.color_correction_num_rays, len(views))
+        # Every view is drawn as often as the others, in random order, so any part is spread over the views too.
+        index = (torch.arange(count) % len(views))[torch.randperm(count, generator=generator)]
+        size = torch.cat([cameras.height, cameras.width], -1)[index]
+        pixels = (torch.rand(count, 2, generator=generator) * size).long()
+        chosen = _Pixels(cameras.to(device), index[:, None].to(device), (pixels + 0.5).to(device))
+        if references is None:
+            return chosen
+        image = torch.zeros(count, 3)
+        for view in range(len(views)):
+            rows, columns = pixels[index == view].T
+            image[index == view] = views.get_image_float32(view)[rows, columns, :3]
+        return replace(chosen, radiance=self._model.reference_radiance(image).to(device))
+
+
+def replace_color_correction(run: TrainedRun, protocol: ColorCorrectionProtocol) -> None:
+    """Replace the color correction of a run by another protocol, fitted anew on the run's data."""
+    run.model.color_correction = run.model.new_color_correction(protocol).to(run.device)
+    ColorFit(run.model, run.dataset, run.read_reference_views).fit()

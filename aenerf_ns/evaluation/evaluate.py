@@ -1,0 +1,116 @@
+"""The metrics of a run, and the protocol that they are computed with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.evaluation.pose_refinement import NUM_STEPS, RefinedViews
+from aenerf_ns.evaluation.poses import compare_with_ground_truth, describe_test_poses
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.evaluation.view_metrics import (
+    IMAGE_METRICS,
+    average_metrics,
+    describe_views,
+    measure_views,
+    picture_names,
+)
+
+
+def evaluate(run: TrainedRun, output: Path | None = None, with_deviations: bool = True) -> dict[str, Any]:
+    """Compute mean metrics over the reference views, the errors of the poses, and the protocol behind them.
+
+    The views are rendered from where they are placed. ``refined_test_poses`` holds the metrics of the views that are
+    rendered from photometrically refined poses, and ``views`` those of each view
+    (:func:`~aenerf_ns.evaluation.view_metrics.describe_views`). No camera stays moved.
+
+    Without reference views, but with known true poses, the errors of the poses are all.
+
+    Args:
+        run: as it is opened to be tested.
+        output: folder for pictures, or None.
+        with_deviations: add the standard deviations over the views.
+
+    Raises:
+        DataError: there are neither views nor true poses, or the model renders values that are not finite.
+    """
+    model = run.model
+    correction, supervision = model.camera_optimizer, model.supervision
+    metrics: dict[str, Any] = {}
+    placed: list[dict[str, float]] = []
+    refined = None
+    if run.views is not None or not correction.has_ground_truth:
+        placed = measure_reference_views(run, output)
+        metrics = average_metrics(placed, with_deviations)
+        _require_finite(metrics, run)
+    metrics["color_correction"] = model.color_correction.description
+    metrics["num_views"] = len(placed)
+    metrics["pose_correction"] = correction.config.mode
+    metrics |= correction.offsets()
+    metrics["pose_errors"] = compare_with_ground_truth(correction, run.scene)
+    metrics["pose_diagnosis"] = run.pose_diagnosis
+    metrics["test_poses"] = describe_test_poses(correction)
+    if placed and run.refine_test_poses:
+        refined = measure_reference_views(run, refine=True)
+        metrics["refined_test_poses"] = _describe_refined(run, refined, with_deviations)
+    metrics |= supervision.learned()
+    if model.image_metrics.lpips_absent is not None:
+        metrics["lpips"] = None
+        metrics["lpips_absent"] = model.image_metrics.lpips_absent
+    metrics["views"] = describe_views(run, placed, refined) if placed else []
+    return metrics
+
+
+def measure_reference_views(
+    run: TrainedRun, output: Path | None = None, refine: bool = False
+) -> list[dict[str, float]]:
+    """Compute the metrics of each reference view.
+
+    Args:
+        run: with its views.
+        output: folder for pictures, which are named as ns-eval names them, or None.
+        refine: render from photometrically refined poses.
+
+    Raises:
+        DataError: there are no reference views.
+    """
+    if run.views is None:
+        raise DataError(run.data, "it has no reference images to evaluate on", "ns-render shows what was reconstructed")
+    was_training = run.model.training
+    run.model.eval()
+    loader = FixedIndicesEvalDataloader(input_dataset=run.views, device=run.device)
+    names = picture_names(run.views.image_filenames)
+    measured = measure_views(run.model, RefinedViews(run.model, loader) if refine else loader, names, output, "eval")
+    run.model.train(was_training)
+    return measured
+
+
+def _describe_refined(run: TrainedRun, refined: Sequence[dict[str, float]], with_deviations: bool) -> dict[str, Any]:
+    """Return the mean metrics of the reference views from refined poses, and how the poses were refined."""
+    metrics = average_metrics(refined, with_deviations)
+    _require_finite(metrics, run)
+    # The time to render includes no refinement, so it says nothing new.
+    metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in IMAGE_METRICS}
+    if run.model.image_metrics.lpips_absent is not None:
+        metrics["lpips"] = None
+    start = describe_test_poses(run.model.camera_optimizer)
+    return {
+        **metrics,
+        "test_poses": f"photometric refinement, {NUM_STEPS} Levenberg-Marquardt steps, from: {start}",
+    }
+
+
+def _require_finite(metrics: dict[str, float], run: TrainedRun) -> None:
+    """Raise a DataError if a metric is not a number."""
+    undefined = [name for name, value in metrics.items() if math.isnan(value)]
+    if undefined:
+        raise DataError(
+            run.data,
+            f"{', '.join(undefined)} of the test views is not a number: the model renders values that are not finite",
+            "train it again",
+        )
