@@ -26,7 +26,7 @@ class SharpSoftplus(nn.Softplus):
     def forward(self, inputs: Tensor) -> Tensor:
         """Return log(1 + exp(β x)) / β."""
         fits = inputs.device.type == "cpu" and is_float_in_memory(inputs)
-        kernels = kernels_or_none(f"{__package__}.activation_numba", inputs.device) if fits else None
+        kernels = kernels_or_none(f"{__package__}.kernels.activation", inputs.device) if fits else None
         if kernels is None:
             return super().forward(inputs)
         # Outside forward mode, too: there the tangent is None.

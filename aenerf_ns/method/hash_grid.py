@@ -136,7 +136,7 @@ class HashEncoding(FrameworkHashEncoding):
 
 
 def _module(implementation: str) -> str:
-    return f"{__package__}.hash_grid_{implementation}"
+    return f"{__package__}.kernels.hash_grid_{implementation}"
 
 
 class _HashGrid(torch.autograd.Function):

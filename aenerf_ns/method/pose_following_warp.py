@@ -100,7 +100,7 @@ class PoseFollowingWarp(nn.Module):
     def _look_up(self, grid: Tensor, unit: Tensor) -> Tensor:
         """Return values (N, columns) of a grid (r, r, r, columns) between its cells, at unit places (N, 3)."""
         fits = unit.device.type == "cpu" and is_float_in_memory(grid) and is_float_in_memory(unit)
-        kernels = kernels_or_none(f"{__package__}.comoving_numba", unit.device) if fits else None
+        kernels = kernels_or_none(f"{__package__}.kernels.pose_following_warp", unit.device) if fits else None
         if kernels is not None:
             found: Tensor = _LookUp.apply(grid, unit.contiguous(), kernels)
             return found
