@@ -60,3 +60,19 @@ def reading(source: str | Path) -> Iterator[None]:
     except OSError as error:
         place, reason = error.filename or source, error.strerror or str(error)
         raise DataError(place, f"it cannot be read ({reason})", "check its name and its rights") from None
+
+
+@contextmanager
+def value_errors_as_data_error(source: str | Path, remedy: str = "correct it there") -> Iterator[None]:
+    """Turn a ValueError within the context, such as that of an impossible camera, into a :class:`DataError`.
+
+    Args:
+        source: the file that the values were read from.
+        remedy: how the user can mend it.
+    """
+    try:
+        yield
+    except DataError:
+        raise
+    except ValueError as error:
+        raise DataError(source, str(error), remedy) from None

@@ -12,7 +12,7 @@ from pathlib import Path
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_table import CHECK_SIZE
 from aenerf_ns.files.event_text import TextEventFile
@@ -82,12 +82,9 @@ def _read_calibration(path: Path, size: tuple[int, int]) -> CameraIntrinsics:
     rows = read_rows(path, "fx fy cx cy k1 k2 p1 p2 k3")
     if not rows:
         raise DataError(path, "the file is empty", "it must hold fx fy cx cy k1 k2 p1 p2 k3")
-    fx, fy, cx, cy, *distortion = parse_numbers(path, rows)[0].tolist()
-    try:
-        # OpenCV's principal point counts from the centre of the first pixel.
-        return CameraIntrinsics(*size, fx, fy, cx + 0.5, cy + 0.5, "radial_tangential", tuple(distortion))
-    except ValueError as error:
-        raise DataError(path, str(error), "it must hold fx fy cx cy k1 k2 p1 p2 k3") from None
+    values = parse_numbers(path, rows)[0].tolist()
+    with value_errors_as_data_error(path, "it must hold fx fy cx cy k1 k2 p1 p2 k3"):
+        return CameraIntrinsics.from_opencv(size, values[:4], values[4:])
 
 
 ecd_dataparser = DataParserSpecification(

@@ -21,26 +21,16 @@ from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
 
 # The sequences do not contain their calibration. This is the authors' ("03_calib" in uzh-rpg/bundles-eds).
-# Distortion: k1, k2, p1, p2, k3.
-_EVENT_CAMERA = CameraIntrinsics(
-    640,
-    480,
-    560.8520948927032,
-    560.6295819972383,
-    313.00733235019237 + 0.5,
-    217.32858679842997 + 0.5,
-    "radial_tangential",
-    (-0.09776467241921379, 0.2143738428636279, -0.004710710105172864, -0.004215916089401789, 0.0),
+# Distortion: k1, k2, p1, p2.
+_EVENT_CAMERA = CameraIntrinsics.from_opencv(
+    (640, 480),
+    (560.8520948927032, 560.6295819972383, 313.00733235019237, 217.32858679842997),
+    (-0.09776467241921379, 0.2143738428636279, -0.004710710105172864, -0.004215916089401789),
 )
-_FRAME_CAMERA = CameraIntrinsics(
-    640,
-    480,
-    766.536025127154,
-    767.5749459126396,
-    291.0503512057777 + 0.5,
-    227.4060484950132 + 0.5,
-    "radial_tangential",
-    (-0.36965913545735024, 0.17414034009883844, 0.003915245015812422, 0.003666687416655559, 0.0),
+_FRAME_CAMERA = CameraIntrinsics.from_opencv(
+    (640, 480),
+    (766.536025127154, 767.5749459126396, 291.0503512057777, 227.4060484950132),
+    (-0.36965913545735024, 0.17414034009883844, 0.003915245015812422, 0.003666687416655559),
 )
 # Takes points from the frame camera's to the event camera's coordinates.
 _EVENT_FROM_FRAME = (

@@ -11,7 +11,7 @@ import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.event_arrays import XYTP_MATRIX, NpyEventFile, load_npy
@@ -100,11 +100,8 @@ def _read_camera(path: Path) -> CameraIntrinsics:
         raise DataError(path, f"it has type {bounds.dtype} and shape {bounds.shape}", "it must be N x 17 decimals")
     # A row is a 3 x 5 matrix and two depths. The last column of the matrix is height, width and focal length.
     height, width, focal = np.asarray(bounds[0, :15], dtype=np.float64).reshape(3, 5)[:, 4].tolist()
-    try:
-        # ESIM counts pixels from the centre of the first pixel.
-        return CameraIntrinsics(width, height, focal, focal, width / 2 + 0.5, height / 2 + 0.5)
-    except ValueError as error:
-        raise DataError(path, str(error), "its fifth column must hold height, width and focal length") from None
+    with value_errors_as_data_error(path, "its fifth column must hold height, width and focal length"):
+        return CameraIntrinsics.from_opencv((width, height), (focal, focal, width / 2, height / 2))
 
 
 enerf_esim_dataparser = DataParserSpecification(

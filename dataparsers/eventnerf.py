@@ -15,7 +15,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory, require_rigid
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
@@ -199,7 +199,7 @@ def read_intrinsics(folder: Path, width: int, height: int) -> CameraIntrinsics:
         raise DataError(folder, "it holds no .txt file", "copy the intrinsics of the dataset to it")
     matrix = read_matrix(files[0], 4, 5).tolist()
     k1, k2 = matrix[4][:2] if len(matrix) == 5 else (0.0, 0.0)
-    try:
+    with value_errors_as_data_error(files[0], "it must hold the matrix of the intrinsics"):
         # NeRF++ counts pixels from the edge of the image, as CameraIntrinsics does.
         return CameraIntrinsics(
             width,
@@ -210,8 +210,6 @@ def read_intrinsics(folder: Path, width: int, height: int) -> CameraIntrinsics:
             cy=matrix[1][2],
             distortion=(k1, k2, 0.0, 0.0, 0.0),
         )
-    except ValueError as error:
-        raise DataError(files[0], str(error), "it must hold the matrix of the intrinsics") from None
 
 
 eventnerf_dataparser = DataParserSpecification(

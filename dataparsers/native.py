@@ -9,13 +9,13 @@ from typing import Literal
 import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
-from aenerf_ns.files.json_object import JsonObject, read_camera, read_image_encoding
+from aenerf_ns.files.limits import file_inside
+from aenerf_ns.files.transforms import EventCamera, Transforms, read_transforms, rigid_motion
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig, SensorOptions
@@ -43,102 +43,78 @@ class NativeDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)
-        meta = JsonObject.read(folder / "transforms.json")
+        path = folder / "transforms.json"
+        meta, frame_camera = read_transforms(path)
         if self.config.auto_scale_poses is None:
-            self.config.auto_scale_poses = meta.get("auto_scale_poses", bool, True)
-        block = meta.block("event_camera")
-        event_camera = read_camera(block, "width", "height")
+            self.config.auto_scale_poses = meta.auto_scale_poses
+        event_camera = meta.event_camera.intrinsics()
         true_poses = folder / "trajectory_ground_truth.txt"
         trained_on = folder / "trajectory_estimated.txt" if self.config.poses == "estimated" else true_poses
         trajectory = read_tum_trajectory(trained_on)
         ground_truth = read_tum_trajectory(true_poses) if true_poses.exists() else None
-        frames = meta.get("frames", list, [])
-        sensor = self._sensor(block)
-        box = meta.get("scene_box", list, None)
-        max_pose_gap = meta.get("max_pose_gap_ns", int, None)
-        if max_pose_gap is not None and max_pose_gap <= 0:
-            raise meta.error("max_pose_gap_ns", f"is {max_pose_gap}, not a positive number of nanoseconds")
+        if meta.event_camera.file is None:
+            raise DataError(path, "event_camera: missing field file", "name the file of the events there")
+        event_file = file_inside(folder, meta.event_camera.file, path)
         return Recording(
-            event_file=Hdf5EventFile(block.file("file"), event_camera.width, event_camera.height),
+            event_file=Hdf5EventFile(event_file, event_camera.width, event_camera.height),
             event_camera=event_camera,
-            sensor=sensor,
+            sensor=self._sensor(path, meta.event_camera),
             trajectory=trajectory,
-            frame_camera=read_camera(meta, "w", "h") if frames else event_camera,
-            reference_views=_reference_views(
-                meta,
-                frames,
-                trajectory if ground_truth is None else ground_truth,
-                ground_truth is not None,
-                block.rigid_motion("T_frame_event"),
-            ),
-            image_encoding=read_image_encoding(meta),
-            scene_box=None if box is None else _scene_box(meta, box),
+            frame_camera=frame_camera,
+            reference_views=_read_views(path, meta, trajectory, ground_truth),
+            image_encoding=meta.image_encoding,
+            scene_box=None if meta.scene_box is None else torch.tensor(meta.scene_box, dtype=torch.float64),
             ground_truth=ground_truth,
-            max_pose_gap=max_pose_gap,
+            max_pose_gap=meta.max_pose_gap_ns,
         )
 
-    def _sensor(self, block: JsonObject) -> SensorModel:
+    def _sensor(self, path: Path, stated: EventCamera) -> SensorModel:
         """Return the sensor with the values of the options, and the dataset's values where the options give none."""
-        values = self.config.given_sensor_values()
+        values = {**stated.sensor_values(), **self.config.given_sensor_values()}
         for name in ("positive_contrast_threshold", "negative_contrast_threshold"):
             if name not in values:
-                values[name] = block.get(name, float)
-        if "refractory_period" not in values:
-            values["refractory_period"] = block.get("refractory_period_ns", int, 0)
-        pattern = block.get("bayer_pattern", str, "")
-        try:
-            return SensorModel(**values, bayer_pattern=pattern)
-        except ValueError as error:
-            raise DataError(block.path, f"event_camera: {error}", "correct it there or among the options") from None
+                raise DataError(path, f"event_camera: missing field {name}", "state it there or among the options")
+        with value_errors_as_data_error(path, "correct it there or among the options"):
+            return SensorModel(**values)
 
 
-def _scene_box(meta: JsonObject, value: list) -> Tensor:
-    box = meta.numbers("scene_box", value, (2, 3))
-    if (box[0] >= box[1]).any():
-        raise meta.error("scene_box", f"has corners {box.tolist()}, the first not below the second")
-    return box
-
-
-def _reference_views(
-    meta: JsonObject, frames: list, trajectory: Trajectory, has_ground_truth: bool, frame_from_event: Tensor | None
+def _read_views(
+    path: Path, meta: Transforms, trajectory: Trajectory, ground_truth: Trajectory | None
 ) -> dict[Split, list[ReferenceView]]:
     """Return the images of each split. A frame that has a time but no pose gets the reference trajectory's pose."""
-    if frame_from_event is None:
-        frame_from_event = torch.eye(4, dtype=torch.float64)
+    reference = trajectory if ground_truth is None else ground_truth
+    mount = rigid_motion(path, "event_camera.T_frame_event", meta.event_camera.T_frame_event)
     views: dict[str, ReferenceView] = {}
     known: set[str] = set()
-    num_without_pose = 0
-    for index in range(len(frames)):
-        frame = meta.entry_block("frames", index)
-        name = frame.get("file_path", str)
+    for index, frame in enumerate(meta.frames):
+        name, time, key = frame.file_path, frame.timestamp, f"frames[{index}]"
         if name in known:
-            raise frame.error("file_path", f"names {name} again")
+            raise DataError(path, f"{key} names {name} again", "list each image once")
         known.add(name)
-        file = frame.file("file_path")
+        file = file_inside(path.parent, name, path)
         if not file.is_file():
-            raise frame.error("file_path", f"names {name}, which does not exist")
-        time = frame.time("timestamp")
-        pose = frame.rigid_motion("transform_matrix")
-        if pose is None and time is not None and has_ground_truth and not trajectory.start <= time <= trajectory.end:
-            num_without_pose += 1
+            raise DataError(path, f"{key} names {name}, which does not exist", "copy the images too")
+        if frame.transform_matrix is not None:
+            pose = rigid_motion(path, f"{key}.transform_matrix", frame.transform_matrix) @ OPENCV_TO_OPENGL
+        elif time is None:
+            raise DataError(path, f"{key} has neither transform_matrix nor timestamp", "give one of them")
+        elif ground_truth is not None and not ground_truth.start <= time <= ground_truth.end:
             continue
-        if pose is not None:
-            pose = pose @ OPENCV_TO_OPENGL
-        elif time is not None:
-            pose = homogeneous(trajectory.interpolate(time)) @ torch.linalg.inv(frame_from_event)
         else:
-            raise frame.error("transform_matrix", "is missing, and so is timestamp")
+            pose = homogeneous(reference.interpolate(time)) @ torch.linalg.inv(mount)
         views[name] = ReferenceView(file, pose, time)
-    if num_without_pose:
+    if len(views) < len(known):
         CONSOLE.print(
-            f"{num_without_pose} of {len(frames)} frames are left out: the true trajectory has no pose for them."
+            f"{len(known) - len(views)} of {len(known)} frames are left out: the true trajectory has no pose for them."
         )
     splits: dict[Split, list[ReferenceView]] = {}
     for split in SPLITS:
-        names = meta.names(f"{split}_filenames")
+        names = getattr(meta, f"{split}_filenames")
         unknown = [name for name in names if name not in known]
         if unknown:
-            raise meta.error(f"{split}_filenames", f"names {unknown[0]}, which is not among the frames")
+            raise DataError(
+                path, f"{split}_filenames names {unknown[0]}, which is not among the frames", "add it there"
+            )
         splits[split] = [views[name] for name in names if name in views]
     return splits
 

@@ -5,17 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from numpy.typing import NDArray
 
-from aenerf_ns.camera.intrinsics import CameraIntrinsics, LensModel
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import POSITION_TIMESTAMP_POLARITY, NpzEventFile, read_npz_member
-from aenerf_ns.files.json_object import JsonObject
+from aenerf_ns.files.json_file import read_json
+from aenerf_ns.files.limits import file_inside
+from aenerf_ns.files.transforms import Matrix, Vector, rigid_motion
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.images import image_size_and_mode
@@ -25,7 +29,19 @@ from aenerf_ns.recording.views import IMAGE_SUFFIXES
 
 # Half the side of the box around the synthetic scenes, in the authors' configuration.
 _HALF_EXTENT = 1.5
-_LENS_MODELS: dict[str, LensModel] = {"plumb_bob": "radial_tangential", "equidistant": "fisheye"}
+
+
+class _View(msgspec.Struct):
+    file_path: str
+    transform_matrix: Matrix
+
+
+class _Views(msgspec.Struct):
+    """A split of posed views. One camera took all of them: ``intrinsics``, or else a pinhole of ``camera_angle_x``."""
+
+    frames: list[_View]
+    camera_angle_x: Annotated[float, msgspec.Meta(gt=0, lt=math.pi)] | None = None
+    intrinsics: tuple[Vector, Vector, Vector] | None = None
 
 
 @dataclass
@@ -91,30 +107,18 @@ def _word(path: Path, name: str) -> str:
 def _read_calibration(path: Path) -> tuple[CameraIntrinsics, SensorModel]:
     matrix = _numbers(path, "intrinsics", (3, 3))
     distortion = _numbers(path, "distortion_params", (-1,)).tolist()
-    lens: LensModel = "radial_tangential"
-    if distortion:
-        model = _word(path, "distortion_model")
-        if model not in _LENS_MODELS:
-            raise DataError(path, f"distortion_model is {model!r}", f"use one of {', '.join(_LENS_MODELS)}")
-        lens = _LENS_MODELS[model]
-    # Four numbers are OpenCV's k1, k2, p1 and p2: k3 is zero.
-    distortion += [0.0] * ((5 if lens == "radial_tangential" else 4) - len(distortion))
     single = {
         name: float(_numbers(path, name, ()))
         for name in ("img_width", "img_height", "pos_contrast_threshold", "neg_contrast_threshold", "refractory_period")
     }
     if not all(map(math.isfinite, single.values())):
         raise DataError(path, f"a value of {single} is not finite", "calibrate the camera")
-    try:
-        camera = CameraIntrinsics(
-            single["img_width"],  # type: ignore[arg-type]
-            single["img_height"],  # type: ignore[arg-type]
-            float(matrix[0, 0]),
-            float(matrix[1, 1]),
-            float(matrix[0, 2]) + 0.5,
-            float(matrix[1, 2]) + 0.5,
-            lens,
-            tuple(distortion),
+    with value_errors_as_data_error(path):
+        camera = CameraIntrinsics.from_opencv(
+            (single["img_width"], single["img_height"]),
+            _pinhole(matrix),
+            distortion,
+            _word(path, "distortion_model") if distortion else "none",
         )
         sensor = SensorModel(
             single["pos_contrast_threshold"],
@@ -122,11 +126,12 @@ def _read_calibration(path: Path) -> tuple[CameraIntrinsics, SensorModel]:
             round(single["refractory_period"]),
             _word(path, "bayer_pattern"),  # type: ignore[arg-type]
         )
-    except DataError:
-        raise
-    except ValueError as error:
-        raise DataError(path, str(error), "correct it there") from None
     return camera, sensor
+
+
+def _pinhole(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx and cy of a (3, 3) matrix."""
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
 
 
 def _read_poses(path: Path) -> Trajectory:
@@ -149,49 +154,40 @@ def _read_views(folder: Path) -> tuple[CameraIntrinsics | None, dict[Split, list
     root = next((place for place in (folder / "views", folder.parent / "views") if place.is_dir()), None)
     camera, splits = None, {}
     for split in ("val", "test"):
-        views: list[ReferenceView] = []
+        splits[split] = []
         path = folder if root is None else root / f"transforms_{split}.json"
-        if path.is_file():
-            meta = JsonObject.read(path)
-            for index in range(len(meta.get("frames", list))):
-                views.append(_read_view(meta.entry_block("frames", index)))
-        if views:
-            own = _view_camera(meta, views[0].file)
+        if not path.is_file():
+            continue
+        meta = read_json(path, _Views)
+        splits[split] = [_read_view(path, f"frames[{index}]", view) for index, view in enumerate(meta.frames)]
+        if splits[split]:
+            own = _view_camera(path, meta, splits[split][0].file)
             if camera not in (None, own):
                 raise DataError(path, "its camera is not that of the other split", "give both splits one camera")
             camera = own
-        splits[split] = views
     return camera, splits  # type: ignore[return-value]
 
 
-def _read_view(frame: JsonObject) -> ReferenceView:
-    name = frame.get("file_path", str)
+def _read_view(path: Path, key: str, view: _View) -> ReferenceView:
     # The dataset leaves the suffix out.
-    inside = frame.file("file_path")
+    inside = file_inside(path.parent, view.file_path, path)
     files = [inside.with_name(f"{inside.name}{suffix}") for suffix in ("", *IMAGE_SUFFIXES)]
     file = next((file for file in files if file.is_file()), None)
     if file is None:
-        raise frame.error("file_path", f"names {name}, which is no PNG or JPEG image")
-    pose = frame.rigid_motion("transform_matrix")
-    if pose is None:
-        raise frame.error("transform_matrix", "is missing")
+        raise DataError(path, f"{key} names {view.file_path}, which is no PNG or JPEG image", "copy the images too")
+    pose = rigid_motion(path, f"{key}.transform_matrix", view.transform_matrix)
     return ReferenceView(file, pose @ OPENCV_TO_OPENGL, None)
 
 
-def _view_camera(meta: JsonObject, image: Path) -> CameraIntrinsics:
+def _view_camera(path: Path, meta: _Views, image: Path) -> CameraIntrinsics:
     width, height = image_size_and_mode(image)[0]
-    try:
-        if "camera_angle_x" in meta:
-            focal = width / 2 / math.tan(meta.get("camera_angle_x", float) / 2)
+    with value_errors_as_data_error(path):
+        if meta.camera_angle_x is not None:
+            focal = width / 2 / math.tan(meta.camera_angle_x / 2)
             return CameraIntrinsics(width, height, focal, focal, width / 2, height / 2)
-        matrix = meta.numbers("intrinsics", meta.get("intrinsics", list), (3, 3)).tolist()
-        return CameraIntrinsics(
-            width, height, fx=matrix[0][0], fy=matrix[1][1], cx=matrix[0][2] + 0.5, cy=matrix[1][2] + 0.5
-        )
-    except DataError:
-        raise
-    except (ValueError, ZeroDivisionError) as error:
-        raise meta.error("intrinsics:", str(error)) from None
+        if meta.intrinsics is None:
+            raise DataError(path, "it has neither camera_angle_x nor intrinsics", "give one of them")
+        return CameraIntrinsics.from_opencv((width, height), _pinhole(np.array(meta.intrinsics)))
 
 
 robust_enerf_dataparser = DataParserSpecification(

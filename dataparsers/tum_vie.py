@@ -5,17 +5,19 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Generic, Literal, TypeVar
 
+import msgspec
 import numpy as np
 import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
-from aenerf_ns.files.json_object import JsonObject
+from aenerf_ns.files.json_file import read_json
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
@@ -25,11 +27,60 @@ from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_traj
 _EVENT_FILE = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
 # Sequences recorded with calibration A. All others were recorded with calibration B.
 _SET_A = {"loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"}
-# Indices into the lists of the calibration.
-_EVENT_CAMERAS = {"left": 2, "right": 3}
-_FRAME_CAMERAS = {"left": 0, "right": 1}
+# Indices of the event camera and of the frame camera in the lists of the calibration.
+_INDICES = {"left": (2, 0), "right": (3, 1)}
 # The ratio C+ / C- and the refractory period (ns) are the estimates of Robust e-NeRF.
 _SENSOR = SensorModel(1.458 * 0.25, 0.25, 1375)
+
+
+T = TypeVar("T")
+
+
+class _Pose(msgspec.Struct):
+    px: float
+    py: float
+    pz: float
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+
+    def matrix(self, path: Path) -> Tensor:
+        """Return the (4, 4) float64 matrix. Errors name ``path``, the file."""
+        values = np.array([msgspec.structs.astuple(self)])
+        return poses_from_quaternions(path, values[:, :3], values[:, 3:])[0]
+
+
+class _Lens(msgspec.Struct):
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float
+    k2: float
+    k3: float
+    k4: float
+
+
+class _Camera(msgspec.Struct):
+    camera_type: Literal["kb4"]
+    intrinsics: _Lens
+
+
+class _Cameras(msgspec.Struct):
+    """Left and right frame camera, left and right event camera."""
+
+    T_imu_cam: tuple[_Pose, _Pose, _Pose, _Pose]
+    intrinsics: tuple[_Camera, _Camera, _Camera, _Camera]
+    resolution: tuple[tuple[int, int], tuple[int, int], tuple[int, int], tuple[int, int]]
+
+
+class _Mocap(msgspec.Struct):
+    T_imu_marker: _Pose
+
+
+class _File(msgspec.Struct, Generic[T]):
+    value0: T
 
 
 @dataclass
@@ -60,14 +111,15 @@ class TumVieDataParser(EventDataParser):
         events, sequence, side = _choose(Path(self.config.data))
         folder = events.parent
         which = "A" if sequence in _SET_A else "B"
-        cameras = _read_json(folder, f"camera-calibration{which}.json")
-        mocap = _read_json(folder, f"mocap-imu-calibration{which}.json")
-        event_camera = _camera(cameras, _EVENT_CAMERAS[side])
-        frame_camera = _camera(cameras, _FRAME_CAMERAS[side])
-        imu_from_event = _pose(cameras.entry_block("T_imu_cam", _EVENT_CAMERAS[side]))
-        imu_from_frame = _pose(cameras.entry_block("T_imu_cam", _FRAME_CAMERAS[side]))
+        path = _find_calibration(folder, f"camera-calibration{which}.json")
+        mocap_path = _find_calibration(folder, f"mocap-imu-calibration{which}.json")
+        cameras = read_json(path, _File[_Cameras]).value0
+        (event_camera, imu_from_event), (frame_camera, imu_from_frame) = (
+            _read_camera(path, cameras, index) for index in _INDICES[side]
+        )
         # The motion capture gives the poses of its marker.
-        marker_from_event = torch.linalg.inv(_pose(mocap.block("T_imu_marker"))) @ imu_from_event
+        imu_from_marker = read_json(mocap_path, _File[_Mocap]).value0.T_imu_marker.matrix(mocap_path)
+        marker_from_event = torch.linalg.inv(imu_from_marker) @ imu_from_event
         ground_truth_folder = folder / f"{sequence}-vi_gt_data"
         markers = read_tum_trajectory(ground_truth_folder / "mocap_data.txt", "us")
         reference = markers.transform(lambda poses: poses @ marker_from_event)
@@ -117,41 +169,20 @@ def _choose(data: Path) -> tuple[Path, str, str]:
     return files[0], match["sequence"], match["side"]
 
 
-def _read_json(folder: Path, name: str) -> JsonObject:
-    """Read a calibration file, which is beside the sequence or one folder up."""
-    place = folder.parent if not (folder / name).is_file() and (folder.parent / name).is_file() else folder
-    if not (place / name).is_file():
-        raise DataError(place / name, "there is no such file", "download the dataset's calibration to this folder")
-    return JsonObject.read(place / name).block("value0")
+def _find_calibration(folder: Path, name: str) -> Path:
+    """Return the path of a calibration file, which is beside the sequence or one folder up."""
+    for place in (folder, folder.parent):
+        if (place / name).is_file():
+            return place / name
+    raise DataError(folder / name, "there is no such file", "download the dataset's calibration to this folder")
 
 
-def _pose(meta: JsonObject) -> Tensor:
-    values = np.array([[meta.get(name, float) for name in ("px", "py", "pz", "qx", "qy", "qz", "qw")]])
-    return poses_from_quaternions(meta.path, values[:, :3], values[:, 3:])[0]
-
-
-def _camera(meta: JsonObject, index: int) -> CameraIntrinsics:
-    block = meta.entry_block("intrinsics", index)
-    model = block.get("camera_type", str)
-    if model != "kb4":
-        raise block.error("camera_type", f"is {model!r}, not 'kb4'")
-    values = block.block("intrinsics")
-    width, height = meta.numbers(f"resolution[{index}]", meta.entry("resolution", index), (2,)).tolist()
-    try:
-        return CameraIntrinsics(
-            width,
-            height,
-            fx=values.get("fx", float),
-            fy=values.get("fy", float),
-            cx=values.get("cx", float) + 0.5,
-            cy=values.get("cy", float) + 0.5,
-            lens_model="fisheye",
-            distortion=tuple(values.get(name, float) for name in ("k1", "k2", "k3", "k4")),
-        )
-    except DataError:
-        raise
-    except ValueError as error:
-        raise block.error("intrinsics:", str(error)) from None
+def _read_camera(path: Path, cameras: _Cameras, index: int) -> tuple[CameraIntrinsics, Tensor]:
+    """Return a camera's lens, and the (4, 4) motion from its coordinates to the IMU's."""
+    lens = msgspec.structs.astuple(cameras.intrinsics[index].intrinsics)
+    with value_errors_as_data_error(path):
+        camera = CameraIntrinsics.from_opencv(cameras.resolution[index], lens[:4], lens[4:], "kb4")
+    return camera, cameras.T_imu_cam[index].matrix(path)
 
 
 tum_vie_dataparser = DataParserSpecification(

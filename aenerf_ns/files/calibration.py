@@ -10,10 +10,10 @@ from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.json_object import JsonObject, read_camera, read_image_encoding
 from aenerf_ns.files.kalibr import read_camchain
+from aenerf_ns.files.transforms import read_transforms, rigid_motion
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
         frame_camera: name in the camchain of the camera that took the images. None: the event camera.
 
     Raises:
-        DataError: the file is missing or malformed, or it does not tell which camera is meant.
+        DataError: the file is missing or malformed, or it holds several cameras and none is named.
     """
     if path.suffix == ".json":
         return _read_json(path)
@@ -64,23 +64,8 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
 
 def _read_json(path: Path) -> Calibration:
     """Read calibration.json, which has the names of the native dataset's transforms.json."""
-    meta = JsonObject.read(path)
-    block = meta.block("event_camera")
-    event = read_camera(block, "width", "height")
-    frame_from_event = block.rigid_motion("T_frame_event")
-    if frame_from_event is None:
-        frame_from_event = torch.eye(4, dtype=torch.float64)
-    default = SensorModel()
-    try:
-        sensor = SensorModel(
-            block.get("positive_contrast_threshold", float, default.positive_contrast_threshold),
-            block.get("negative_contrast_threshold", float, default.negative_contrast_threshold),
-            block.get("refractory_period_ns", int, 0),
-            block.get("bayer_pattern", str, ""),
-        )
-    except DataError:
-        raise
-    except ValueError as error:
-        raise block.error("sensor:", str(error)) from None
-    frame = read_camera(meta, "w", "h") if "w" in meta else event
-    return Calibration(event, frame, frame_from_event, sensor, read_image_encoding(meta))
+    meta, frame_camera = read_transforms(path)
+    with value_errors_as_data_error(path):
+        sensor = SensorModel(**meta.event_camera.sensor_values())
+    frame_from_event = rigid_motion(path, "event_camera.T_frame_event", meta.event_camera.T_frame_event)
+    return Calibration(meta.event_camera.intrinsics(), frame_camera, frame_from_event, sensor, meta.image_encoding)

@@ -3,20 +3,40 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, Literal
 
+import msgspec
 import torch
 from torch import Tensor
 
-from aenerf_ns.camera.intrinsics import CameraIntrinsics, LensModel
-from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.json_object import JsonObject, require_shallow
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.json_file import convert
+from aenerf_ns.files.limits import require_file
 from aenerf_ns.files.plain_yaml import read_plain_yaml
+from aenerf_ns.files.transforms import Matrix, Row, rigid_motion
 
-_LENS_MODELS: dict[str, LensModel] = {
-    "radtan": "radial_tangential",
-    "equidistant": "fisheye",
-    "none": "radial_tangential",
-}
+_REMEDY = "give the camchain that Kalibr wrote"
+
+
+class _Camera(msgspec.Struct, kw_only=True):
+    """A camera of the chain. ``T_cn_cnm1`` takes points from the coordinates of the camera before it to its own."""
+
+    intrinsics: Row
+    resolution: tuple[int, int]
+    camera_model: Literal["pinhole"] = "pinhole"
+    distortion_model: str = "radtan"
+    distortion_coeffs: list[float] = []
+    T_cn_cnm1: Matrix | None = None
+
+    def __post_init__(self) -> None:
+        if self.distortion_model != "none" and len(self.distortion_coeffs) != 4:
+            raise ValueError(f"it has {len(self.distortion_coeffs)} distortion_coeffs, not 4")
+        self.lens()
+
+    def lens(self) -> CameraIntrinsics:
+        distortion = [] if self.distortion_model == "none" else self.distortion_coeffs
+        return CameraIntrinsics.from_opencv(self.resolution, self.intrinsics, distortion, self.distortion_model)
 
 
 def read_camchain(path: Path) -> dict[str, tuple[CameraIntrinsics, Tensor]]:
@@ -29,44 +49,17 @@ def read_camchain(path: Path) -> dict[str, tuple[CameraIntrinsics, Tensor]]:
     Raises:
         DataError: the file is missing or malformed, or a camera model is not supported.
     """
-    with reading(path):
-        if not path.is_file():
-            raise DataError(path, "there is no such file", "give the camchain that Kalibr wrote")
-    chain = read_plain_yaml(path)
-    if not isinstance(chain, dict) or not all(isinstance(name, str) for name in chain):
-        raise DataError(path, "not a list of cameras", "give the camchain that Kalibr wrote")
-    require_shallow(path, chain)
+    require_file(path)
+    chain = convert(path, read_plain_yaml(path), dict[str, Any], _REMEDY)
     # Some datasets add matrices beside the cameras, such as MVSEC its T_cam0_lidar.
     chain = {name: value for name, value in chain.items() if isinstance(value, dict)}
     if not chain:
-        raise DataError(path, "not a list of cameras", "give the camchain that Kalibr wrote")
+        raise DataError(path, "it holds no camera", _REMEDY)
     cameras: dict[str, tuple[CameraIntrinsics, Tensor]] = {}
     from_first = torch.eye(4, dtype=torch.float64)
     for name in sorted(chain):
-        meta = JsonObject(path, chain[name], f"{name}.")
-        step = meta.rigid_motion("T_cn_cnm1")
-        if cameras and step is not None:
-            from_first = step @ from_first
-        cameras[name] = (_camera(meta), from_first)
+        camera = convert(path, chain[name], _Camera, _REMEDY, name)
+        if cameras:
+            from_first = rigid_motion(path, f"{name}.T_cn_cnm1", camera.T_cn_cnm1) @ from_first
+        cameras[name] = (camera.lens(), from_first)
     return cameras
-
-
-def _camera(meta: JsonObject) -> CameraIntrinsics:
-    if meta.get("camera_model", str, "pinhole") != "pinhole":
-        raise meta.error("camera_model", f"is {meta.get('camera_model', str)!r}, not 'pinhole'")
-    model = meta.get("distortion_model", str, "radtan")
-    if model not in _LENS_MODELS:
-        raise meta.error("distortion_model", f"is {model!r}, not one of {', '.join(_LENS_MODELS)}")
-    lens = _LENS_MODELS[model]
-    fx, fy, cx, cy = meta.numbers("intrinsics", meta.get("intrinsics", list), (4,)).tolist()
-    width, height = meta.numbers("resolution", meta.get("resolution", list), (2,)).tolist()
-    distortion = [0.0] * 4
-    if model != "none":
-        distortion = meta.numbers("distortion_coeffs", meta.get("distortion_coeffs", list), (4,)).tolist()
-    if lens == "radial_tangential":
-        distortion.append(0.0)
-    try:
-        # Kalibr puts the origin at the centre of the first pixel, this project at its corner.
-        return CameraIntrinsics(width, height, fx, fy, cx + 0.5, cy + 0.5, lens, tuple(distortion))
-    except ValueError as error:
-        raise meta.error("intrinsics:", str(error)) from None

@@ -149,18 +149,18 @@ FAULTS = {
     "no calibration": (remove("calibration.json"), "it holds 0 of calibration.json and camchain.yaml"),
     "no poses": (remove("trajectory.txt"), "trajectory.txt: there is no such file"),
     "no JSON": (write_text("calibration.json", "fx"), "calibration.json: not valid JSON"),
-    "no event camera": (write_text("calibration.json", "{}"), "calibration.json: event_camera is missing"),
+    "no event camera": (write_text("calibration.json", "{}"), "required field `event_camera`"),
     "negative threshold": (
         edit_json("calibration.json", lambda m: m["event_camera"].update(positive_contrast_threshold=-1)),
-        "event_camera.sensor: positive_contrast_threshold must be",
+        "calibration.json: positive_contrast_threshold must be",
     ),
     "unknown lens": (
         edit_json("calibration.json", lambda m: m["event_camera"].update(camera_model="FOV")),
-        "event_camera.camera_model is 'FOV'",
+        "event_camera: the lens model is 'FOV'",
     ),
     "unknown encoding": (
         edit_json("calibration.json", lambda m: m.update(image_encoding="log")),
-        'image_encoding is "log"',
+        "image_encoding: invalid enum value 'log'",
     ),
     "scaled mount": (
         edit_json("calibration.json", lambda m: m["event_camera"].update(T_frame_event=SCALED)),
@@ -198,11 +198,11 @@ FAULTS = {
                 yaml.dump({"cam0": {**CAMCHAIN["cam0"], "distortion_model": "fov"}})
             ),
         ),
-        "camchain.yaml: cam0.distortion_model is 'fov', not one of radtan",
+        "camchain.yaml: cam0: the lens model is 'fov', not one of",
     ),
     "camchain of numbers": (
         lambda folder: (remove("calibration.json")(folder), (folder / "camchain.yaml").write_text("cam0: 3")),
-        "camchain.yaml: not a list of cameras",
+        "camchain.yaml: it holds no camera",
     ),
     "no YAML": (
         lambda folder: (remove("calibration.json")(folder), (folder / "camchain.yaml").write_text("{:")),

@@ -147,16 +147,19 @@ def set_attribute(name: str, value: object) -> Callable[[Path], None]:
 NATIVE_FAULTS = {
     "no transforms": (remove("transforms.json"), "transforms.json: there is no such file"),
     "no JSON": (write_text("transforms.json", "{"), "transforms.json: not valid JSON"),
-    "a list": (write_text("transforms.json", "[]"), "not a JSON object"),
-    "no event camera": (edit_transforms(lambda m: m.pop("event_camera")), "event_camera is missing"),
-    "no focal length": (edit_transforms(lambda m: m["event_camera"].pop("fl_x")), "event_camera.fl_x is missing"),
+    "a list": (write_text("transforms.json", "[]"), "expected `object`, got `array`"),
+    "no event camera": (edit_transforms(lambda m: m.pop("event_camera")), "required field `event_camera`"),
+    "no focal length": (
+        edit_transforms(lambda m: m["event_camera"].pop("fl_x")),
+        "required field `fl_x`",
+    ),
     "width is a word": (
         edit_transforms(lambda m: m["event_camera"].update(width="wide")),
-        "event_camera.width is 'wide'",
+        "event_camera.width: expected `int`",
     ),
     "no threshold": (
         edit_transforms(lambda m: m["event_camera"].pop("positive_contrast_threshold")),
-        "event_camera.positive_contrast_threshold is missing",
+        "event_camera: missing field positive_contrast_threshold",
     ),
     "negative threshold": (
         edit_transforms(lambda m: m["event_camera"].update(negative_contrast_threshold=-1)),
@@ -165,7 +168,7 @@ NATIVE_FAULTS = {
     "unknown Bayer pattern": (edit_transforms(lambda m: m["event_camera"].update(bayer_pattern="GRBG")), '"GRBG"'),
     "unknown lens": (
         edit_transforms(lambda m: m["event_camera"].update(camera_model="KB4")),
-        "camera_model is 'KB4', not one",
+        "event_camera: the lens model is 'KB4', not one",
     ),
     "image of another size": (resize_image("images/val/00000.png"), "00000.png: the image has 3 x 2 pixels"),
     "mirrored pose": (
@@ -180,9 +183,15 @@ NATIVE_FAULTS = {
         edit_transforms(lambda m: m["frames"].append(m["frames"][0])),
         r"names images/train/00000.png again",
     ),
-    "unknown encoding": (edit_transforms(lambda m: m.update(image_encoding="log")), 'image_encoding is "log"'),
+    "unknown encoding": (
+        edit_transforms(lambda m: m.update(image_encoding="log")),
+        "invalid enum value 'log'",
+    ),
     "box inside out": (edit_transforms(lambda m: m.update(scene_box=[[1, 1, 1], [0, 0, 0]])), "scene_box has corners"),
-    "box is flat": (edit_transforms(lambda m: m.update(scene_box=[[1, 1, 1]])), "scene_box must be 2 x 3"),
+    "box is flat": (
+        edit_transforms(lambda m: m.update(scene_box=[[1, 1, 1]])),
+        "expected `array` of length 2",
+    ),
     "missing image": (remove("images/val/00000.png"), "names images/val/00000.png, which does not exist"),
     "unknown split file": (
         edit_transforms(lambda m: m.update(test_filenames=["x.png"])),
@@ -190,11 +199,11 @@ NATIVE_FAULTS = {
     ),
     "short matrix": (
         edit_transforms(lambda m: m["frames"][0].update(transform_matrix=[[1]])),
-        r"frames\[0\].transform_matrix must be 4 x 4",
+        r"frames\[0\].transform_matrix: expected `array` of length 4",
     ),
     "neither pose nor time": (
         edit_transforms(lambda m: [f.pop(k, None) for f in m["frames"] for k in ("transform_matrix", "timestamp")]),
-        r"frames\[0\].transform_matrix is missing, and so is timestamp",
+        r"frames\[0\] has neither transform_matrix nor timestamp",
     ),
     "no events": (remove("events.h5"), "events.h5: there is no such event file"),
     "not HDF5": (write_text("events.h5", "t x y p"), "events.h5: not a readable HDF5 file"),

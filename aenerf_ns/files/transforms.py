@@ -1,0 +1,132 @@
+"""The keys of transforms.json and of calibration.json (docs/dataset_format.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import torch
+from torch import Tensor
+
+from aenerf_ns.camera.image_encoding import ImageEncoding
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.trajectory import require_rigid
+from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
+
+Vector = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+Matrix = tuple[Row, Row, Row, Row]
+
+
+class _Camera(msgspec.Struct, kw_only=True):
+    """A camera by Nerfstudio's names of intrinsics, in pixels from the edge of the image."""
+
+    width: int
+    height: int
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    camera_model: str = "OPENCV"
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.intrinsics()
+
+    def intrinsics(self) -> CameraIntrinsics:
+        """Return the camera's lens."""
+        return CameraIntrinsics.from_transforms(self.width, self.height, msgspec.structs.asdict(self))
+
+
+class FrameCamera(_Camera, kw_only=True):
+    """The camera that took the images, whose keys stand at the top of the file."""
+
+    width: int = msgspec.field(name="w")
+    height: int = msgspec.field(name="h")
+
+
+class EventCamera(_Camera, kw_only=True):
+    """The event camera and its sensor. ``T_frame_event`` takes points from its coordinates to the frame camera's."""
+
+    file: str | None = None
+    positive_contrast_threshold: float | None = None
+    negative_contrast_threshold: float | None = None
+    refractory_period_ns: int = 0
+    bayer_pattern: str = ""
+    T_frame_event: Matrix | None = None
+
+    def sensor_values(self) -> dict[str, Any]:
+        """Return the stated values by their names in :class:`~aenerf_ns.events.sensor.SensorModel`."""
+        values = {
+            "positive_contrast_threshold": self.positive_contrast_threshold,
+            "negative_contrast_threshold": self.negative_contrast_threshold,
+            "refractory_period": self.refractory_period_ns,
+            "bayer_pattern": self.bayer_pattern,
+        }
+        return {name: value for name, value in values.items() if value is not None}
+
+
+class Frame(msgspec.Struct, kw_only=True):
+    """An image. ``transform_matrix`` is camera-to-world with OpenGL camera axes."""
+
+    file_path: str
+    transform_matrix: Matrix | None = None
+    timestamp: Nanoseconds | None = None
+
+
+class Transforms(msgspec.Struct, kw_only=True):
+    """The whole file, apart from the keys of :class:`FrameCamera`."""
+
+    event_camera: EventCamera
+    image_encoding: ImageEncoding = "srgb"
+    frames: list[Frame] = []
+    train_filenames: list[str] = []
+    val_filenames: list[str] = []
+    test_filenames: list[str] = []
+    scene_box: tuple[Vector, Vector] | None = None
+    max_pose_gap_ns: Annotated[int, msgspec.Meta(gt=0)] | None = None
+    auto_scale_poses: bool = True
+
+    def __post_init__(self) -> None:
+        if self.scene_box is not None and not all(low < high for low, high in zip(*self.scene_box, strict=True)):
+            raise ValueError(f"scene_box has corners {self.scene_box}, the first not below the second")
+
+
+def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
+    """Read transforms.json or calibration.json.
+
+    Returns:
+        The file, and the lens of the camera that took the images: the event camera's where the file states no other.
+
+    Raises:
+        DataError: the file is missing or malformed, or a value is impossible.
+    """
+    values = read_json(path, dict)
+    meta = convert(path, values, Transforms)
+    if "w" not in values and not meta.frames:
+        return meta, meta.event_camera.intrinsics()
+    return meta, convert(path, values, FrameCamera).intrinsics()
+
+
+def rigid_motion(path: Path, name: str, matrix: Matrix | None) -> Tensor:
+    """Return the (4, 4) float64 matrix of a rotation and a translation, the identity for None.
+
+    Args:
+        path: the file.
+        name: the matrix' key in it.
+        matrix: the value.
+
+    Raises:
+        DataError: it is not a rotation and a translation.
+    """
+    if matrix is None:
+        return torch.eye(4, dtype=torch.float64)
+    motion = torch.tensor(matrix, dtype=torch.float64)
+    require_rigid(motion[None], f"{path}: {name}")
+    return motion
