@@ -13,20 +13,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.limits import file_inside, read_text
-from aenerf_ns.files.text import MAX_TIME
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from aenerf_ns.camera.image_encoding import ImageEncoding
-    from aenerf_ns.camera.intrinsics import CameraIntrinsics, LensModel
-
-# For each camera model of Nerfstudio: the lens, and the names of its distortion parameters in OpenCV's order.
-LENS_MODELS: dict[str, tuple[LensModel, tuple[str, ...]]] = {
-    "OPENCV": ("radial_tangential", ("k1", "k2", "p1", "p2", "k3")),
-    "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4")),
-}
-
 
 DATASET_REMEDY = "see the dataset format in the docs"
 
@@ -114,26 +103,9 @@ class JsonObject:
             raise self.error(name, f"is {_told(value)}, not of type {kind.__name__}")
         return kind(value)
 
-    def names(self, name: str) -> list[str]:
-        """Return the list of texts ``name``, which is empty by default."""
-        values = self.get(name, list, [])
-        for value in values:
-            if not isinstance(value, str):
-                raise self.error(name, f"holds {_told(value)}, not a name")
-        return values
-
     def file(self, name: str) -> Path:
         """Return the path of the file that ``name`` names, which lies in the folder of this file."""
         return file_inside(self.path.parent, self.get(name, str), self.path)
-
-    def time(self, name: str) -> int | None:
-        """Return the seconds ``name`` in exact nanoseconds, or None if they are absent."""
-        if self.get(name, float, None) is None:
-            return None
-        seconds = Decimal(self._values[name])
-        if abs(seconds) * 1_000_000_000 > MAX_TIME:
-            raise self.error(name, f"is {seconds:g}, which is no time in seconds")
-        return int((seconds * 1_000_000_000).to_integral_value())
 
     def holds(self, name: str, kind: type) -> bool:
         """Tell whether there is a value of ``name`` that has this type."""
@@ -170,16 +142,6 @@ class JsonObject:
         if not isinstance(value, dict):
             raise self.error(f"{name}[{index}]", f"is {_told(value)}, not an object")
         return JsonObject(self.path, value, f"{self._prefix}{name}[{index}].", self._remedy)
-
-    def rigid_motion(self, name: str) -> Tensor | None:
-        """Return the (4, 4) float64 matrix ``name`` of a rotation and a translation, or None if it is absent."""
-        if name not in self._values:
-            return None
-        from aenerf_ns.camera.trajectory import require_rigid
-
-        matrix = self.numbers(name, self._values[name], (4, 4))
-        require_rigid(matrix[None], f"{self.path}: {self._prefix}{name}")
-        return matrix
 
     def numbers(self, name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
         """Convert a value to a float64 tensor of a shape; None stands for any length. Errors call the value ``name``.
@@ -261,40 +223,3 @@ def _told(value: Any) -> str:
 
 def _number_or_text(value: Any) -> float | str:
     return float(value) if isinstance(value, Decimal) else str(value)
-
-
-def read_camera(meta: JsonObject, width: str, height: str) -> CameraIntrinsics:
-    """Read a camera from Nerfstudio's names of intrinsics; ``width`` and ``height`` are the keys of its size."""
-    from aenerf_ns.camera.intrinsics import CameraIntrinsics
-
-    model = meta.get("camera_model", str, "OPENCV")
-    if model not in LENS_MODELS:
-        raise meta.error("camera_model", f"is {model!r}, not one of {', '.join(LENS_MODELS)}")
-    lens, names = LENS_MODELS[model]
-    try:
-        return CameraIntrinsics(
-            meta.get(width, int),
-            meta.get(height, int),
-            fx=meta.get("fl_x", float),
-            fy=meta.get("fl_y", float),
-            cx=meta.get("cx", float),
-            cy=meta.get("cy", float),
-            lens_model=lens,
-            distortion=tuple(meta.get(name, float, 0.0) for name in names),
-        )
-    except DataError:
-        raise
-    except ValueError as error:
-        raise meta.error("intrinsics:", str(error)) from None
-
-
-def read_image_encoding(meta: JsonObject) -> ImageEncoding:
-    """Return the encoding of the images' values. The default is sRGB.
-
-    Raises:
-        DataError: the encoding is neither sRGB nor linear.
-    """
-    encoding: ImageEncoding = meta.get("image_encoding", str, "srgb")
-    if encoding not in ("srgb", "linear"):
-        raise DataError(meta.path, f'image_encoding is "{encoding}"', 'use "srgb" or "linear"')
-    return encoding
