@@ -110,7 +110,7 @@ class Mesh:
             chosen = in_camera[generator.choice(len(in_camera), _NUM_POINTS // len(poses), replace=False)]
             along = chosen @ pose[:, :3].T
             hits = caster.cast(np.hstack([np.broadcast_to(pose[:, 3], along.shape), along]).astype(np.float32))
-            distance = hits["t_hit"][:, None]
+            distance = hits.distance[:, None]
             points.append((pose[:, 3] + distance * along)[np.isfinite(distance[:, 0])])
         return np.concatenate(points)
 

@@ -25,58 +25,33 @@ Events = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArra
 
 
 @numba.njit(cache=True)
-def _filter(image, channel_weights, intensity):
-    """Fill ``intensity`` (H, W) and return how many values of the image are negative or not finite."""
-    height, width, channels = image.shape
-    invalid = 0
-    for y in range(height):
-        for x in range(width):
-            total = 0.0
-            for c in range(channels):
-                value = float(image[y, x, c])
-                if not 0.0 <= value < math.inf:
-                    invalid += 1
-                total += channel_weights[y & 1, x & 1, c] * value
-            intensity[y, x] = total
-    return invalid
+def _fire(time, positive, packing, keys, position):
+    """Write the key of an event, unless ``keys`` is empty, and return the position after it."""
+    first_time, time_shift, pixel_key = packing
+    if len(keys) > 0:
+        keys[position] = (time - first_time) << time_shift | pixel_key | positive
+    return position + 1
 
 
 @numba.njit(cache=True)
-def _bits(count):
-    """Return the number of bits that hold 0 to count - 1."""
-    bits = 0
-    while 1 << bits < count:
-        bits += 1
-    return bits
-
-
-@numba.njit(cache=True)
-def _pixel_events(
-    start_log,
-    end_log,
-    start_time,
-    end_time,
-    reference_log,
-    reference_time,
-    positive_threshold,
-    negative_threshold,
-    refractory_period,
-    frame_time,
-    time_shift,
-    pixel_key,
-    keys,
-    position,
-    write,
-):
+def _linear_events(interval, reference_log, reference_time, sensor, packing, keys, position):
     """Fire the events of one pixel while its log-intensity is linear.
 
-    ``reference_time`` lies before ``start_time`` if the pixel already has its reference. Otherwise the pixel takes its
+    ``reference_time`` lies before the interval if the pixel already has its reference. Otherwise the pixel takes its
     reference at that time, in this interval or in a later one: the initial reference, or the one after a refractory
     period.
+
+    Args:
+        interval: log-intensity at its start and at its end, and these times.
+        reference_log, reference_time: state of the pixel.
+        sensor: positive and negative threshold, and refractory period.
+        packing, keys, position: see `_fire`.
 
     Returns:
         the new reference, its time, and the position after the last event.
     """
+    start_log, end_log, start_time, end_time = interval
+    positive_threshold, negative_threshold, refractory_period = sensor
     rise = end_log - start_log
     duration = end_time - start_time
     polarity = 1 if rise > 0.0 else -1
@@ -96,9 +71,7 @@ def _pixel_events(
             break
         crossing = start_time + np.int64(np.rint(duration * ((crossing_log - start_log) / rise)))
         time = min(max(crossing, earliest + 1), end_time)
-        if write:
-            keys[position] = (time - frame_time) << time_shift | pixel_key | (polarity > 0)
-        position += 1
+        position = _fire(time, polarity > 0, packing, keys, position)
         if refractory_period > 0:
             # Counted from the rounded time stamp. The log-intensity then changed by exactly the threshold over the
             # interval [t_prev + refractory period, t] that a reader of the stream forms.
@@ -109,89 +82,55 @@ def _pixel_events(
 
 
 @numba.njit(cache=True)
-def _noisy_pixel_events(
-    start_log,
-    end_log,
-    start_time,
-    end_time,
-    reference_log,
-    reference_time,
-    positive_threshold,
-    negative_threshold,
-    refractory_period,
-    noise_times,
-    noise_polarities,
-    time_shift,
-    pixel_key,
-    keys,
-    position,
-    write,
+def _pixel_events(
+    interval, reference_log, reference_time, sensor, noise_times, noise_polarities, packing, keys, position
 ):
     """Fire the events of one pixel in one frame interval, which noise events cut into pieces.
 
     A noise event acts like any other: the pixel is blind for the refractory period, or takes the log-intensity of that
-    moment as its reference.
+    moment as its reference. For the arguments and the values returned see `_linear_events`.
     """
+    start_log, end_log, start_time, end_time = interval
     piece_log, piece_time = start_log, start_time
     for i in range(len(noise_times) + 1):
         time = noise_times[i] if i < len(noise_times) else end_time
         log = start_log + (end_log - start_log) * ((time - start_time) / (end_time - start_time))
-        reference_log, reference_time, position = _pixel_events(
-            piece_log,
-            log if time < end_time else end_log,
-            piece_time,
-            time,
-            reference_log,
-            reference_time,
-            positive_threshold,
-            negative_threshold,
-            refractory_period,
-            start_time,
-            time_shift,
-            pixel_key,
-            keys,
-            position,
-            write,
+        piece = piece_log, log if time < end_time else end_log, piece_time, time
+        reference_log, reference_time, position = _linear_events(
+            piece, reference_log, reference_time, sensor, packing, keys, position
         )
         piece_log, piece_time = log, time
         if i < len(noise_times) and reference_time < time:
-            if write:
-                keys[position] = (time - start_time) << time_shift | pixel_key | (noise_polarities[i] > 0)
-            position += 1
+            position = _fire(time, noise_polarities[i] > 0, packing, keys, position)
             reference_log = log
-            if refractory_period > 0:
-                reference_time = time + refractory_period
+            if sensor[2] > 0:
+                reference_time = time + sensor[2]
     return reference_log, reference_time, position
 
 
 @numba.njit(cache=True)
-def _frame_events(
-    start_log,
-    end_log,
-    start_time,
-    end_time,
-    reference_log,
-    reference_time,
-    positive_threshold,
-    negative_threshold,
-    refractory_period,
-    noise_pixels,
-    noise_times,
-    noise_polarities,
-):
+def _frame_events(frames, times, references, thresholds, refractory_period, noise, bits):
     """Fire the events of all pixels in one frame interval: count them in one pass and write them in a second one.
 
-    Noise events are sorted by pixel, row by row, then by time.
+    Args:
+        frames: log-intensity (H, W) at the start and at the end.
+        times: of the start and of the end.
+        references: log-intensity and time (H, W) of the pixels' references, changed in place.
+        thresholds: positive and negative (H, W).
+        refractory_period: of all pixels.
+        noise: pixels, times and polarities of noise events, sorted by pixel, row by row, then by time.
+        bits: numbers of bits that hold x and y.
 
     Returns:
         keys that hold time, y, x and polarity, from the highest bits to the lowest. Sorting the keys orders the stream.
     """
-    height, width = start_log.shape
-    x_bits, y_bits = _bits(width), _bits(height)
+    height, width = frames[0].shape
+    x_bits, y_bits = bits
+    noise_pixels, noise_times, noise_polarities = noise
     keys = np.empty(0, np.int64)
     position = 0
-    for write in (False, True):
-        if write:
+    for is_written in (False, True):
+        if is_written:
             keys = np.empty(position, np.int64)
         position, last = 0, 0
         for y in range(height):
@@ -199,41 +138,20 @@ def _frame_events(
                 first = last
                 while last < len(noise_pixels) and noise_pixels[last] == y * width + x:
                     last += 1
-                log, time, position = _noisy_pixel_events(
-                    start_log[y, x],
-                    end_log[y, x],
-                    start_time,
-                    end_time,
-                    reference_log[y, x],
-                    reference_time[y, x],
-                    positive_threshold[y, x],
-                    negative_threshold[y, x],
-                    refractory_period,
+                log, time, position = _pixel_events(
+                    (frames[0][y, x], frames[1][y, x], times[0], times[1]),
+                    references[0][y, x],
+                    references[1][y, x],
+                    (thresholds[0][y, x], thresholds[1][y, x], refractory_period),
                     noise_times[first:last],
                     noise_polarities[first:last],
-                    x_bits + y_bits + 1,
-                    (y << x_bits | x) << 1,
+                    (times[0], x_bits + y_bits + 1, (y << x_bits | x) << 1),
                     keys,
                     position,
-                    write,
                 )
-                if write:
-                    reference_log[y, x], reference_time[y, x] = log, time
+                if is_written:
+                    references[0][y, x], references[1][y, x] = log, time
     return keys
-
-
-@numba.njit(cache=True)
-def _unpack(keys, start_time, height, width):
-    x_bits, y_bits = _bits(width), _bits(height)
-    count = len(keys)
-    x, y = np.empty(count, np.uint16), np.empty(count, np.uint16)
-    t, p = np.empty(count, np.int64), np.empty(count, np.int8)
-    for i in range(count):
-        p[i] = 2 * (keys[i] & 1) - 1
-        x[i] = keys[i] >> 1 & (1 << x_bits) - 1
-        y[i] = keys[i] >> (1 + x_bits) & (1 << y_bits) - 1
-        t[i] = start_time + (keys[i] >> (1 + x_bits + y_bits))
-    return x, y, t, p
 
 
 class EventSimulator:
@@ -291,6 +209,11 @@ class EventSimulator:
         self.sensor = sensor
         self.log_epsilon = log_epsilon
         self.shot_noise_rate = noise.shot_noise_rate
+        self._bits = (width - 1).bit_length(), (height - 1).bit_length()
+        self._channel_weights = np.array(LUMINANCE)
+        if sensor.bayer_pattern:
+            y, x = np.indices((height, width))
+            self._channel_weights = np.eye(3)[np.asarray(RGGB)[y & 1, x & 1]]
         self._leak = noise.leak_rate * sensor.positive_contrast_threshold * 1e-9
         self._rng = np.random.default_rng(seed)
         spread = noise.contrast_threshold_spread
@@ -316,11 +239,10 @@ class EventSimulator:
         """
         intensity = self._to_intensity(np.asarray(image))
         time_ns = int(time_ns)
-        # NumPy's logarithm is vectorized, numba's is not.
-        log_intensity = np.log(intensity + self.log_epsilon)
         if self._log_intensity is None:
-            self._start_ns = time_ns
-        log_intensity += self._leak * (time_ns - self._start_ns)
+            self._start_ns = self._time_ns = time_ns
+        log_intensity = np.log(intensity + self.log_epsilon) + self._leak * (time_ns - self._start_ns)
+        x_bits, y_bits = self._bits
         if self._log_intensity is None:
             self._reference_log = log_intensity.copy()
             self._reference_time = np.full(log_intensity.shape, time_ns, np.int64)
@@ -328,25 +250,27 @@ class EventSimulator:
                 self._reference_time += self._rng.integers(0, self.sensor.refractory_period, log_intensity.shape)
             keys = np.empty(0, np.int64)
         else:
-            longest = np.iinfo(np.int64).max >> (_bits(self.width) + _bits(self.height) + 1)
+            longest = np.iinfo(np.int64).max >> (x_bits + y_bits + 1)
             if not 0 < time_ns - self._time_ns <= longest:
                 raise ValueError(
                     f"frame times must increase, by at most {longest} ns: got {time_ns} ns after {self._time_ns} ns"
                 )
             keys = _frame_events(
-                self._log_intensity,
-                log_intensity,
-                self._time_ns,
-                time_ns,
-                self._reference_log,
-                self._reference_time,
-                self.positive_contrast_threshold,
-                self.negative_contrast_threshold,
+                (self._log_intensity, log_intensity),
+                (self._time_ns, time_ns),
+                (self._reference_log, self._reference_time),
+                (self.positive_contrast_threshold, self.negative_contrast_threshold),
                 self.sensor.refractory_period,
-                *self._shot_noise(intensity, time_ns),
+                self._shot_noise(intensity, time_ns),
+                self._bits,
             )
             keys.sort()
-        events = _unpack(keys, self._time_ns, self.height, self.width)
+        events = (
+            (keys >> 1 & (1 << x_bits) - 1).astype(np.uint16),
+            (keys >> (1 + x_bits) & (1 << y_bits) - 1).astype(np.uint16),
+            self._time_ns + (keys >> (1 + x_bits + y_bits)),
+            (2 * (keys & 1) - 1).astype(np.int8),
+        )
         self._log_intensity, self._time_ns = log_intensity, time_ns
         return events
 
@@ -370,23 +294,17 @@ class EventSimulator:
         return pixels[order], times[order], polarities[order]
 
     def _to_intensity(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the radiance (H, W) that each pixel sees through its filter."""
         size = (self.height, self.width)
-        if image.shape == (*size, 3):
-            weights = np.broadcast_to(LUMINANCE, (2, 2, 3))
-            if self.sensor.bayer_pattern:
-                weights = np.eye(3)[RGGB]
-        elif image.shape == size and not self.sensor.bayer_pattern:
-            image, weights = image[..., None], np.ones((2, 2, 1))
-        else:
+        if image.shape != (*size, 3) and (image.shape != size or self.sensor.bayer_pattern):
             wanted = f"{(*size, 3)}" if self.sensor.bayer_pattern else f"{size} or {(*size, 3)}"
             raise ValueError(f"image must have shape {wanted}, got {image.shape}")
-        intensity = np.empty(size)
-        if (
-            image.dtype != np.float32
-        ):  # the renderer's float32 is not copied; all other types share one compiled version
-            image = image.astype(np.float64)
-        image = np.ascontiguousarray(image)
-        invalid = _filter(image, np.ascontiguousarray(weights, np.float64), intensity)
-        if invalid:
-            raise ValueError(f"radiance must be finite and not negative, got {invalid} other values")
-        return intensity
+        image = image.astype(np.float64)
+        num_invalid = np.count_nonzero(~((image >= 0) & (image < math.inf)))
+        if num_invalid:
+            raise ValueError(f"radiance must be finite and not negative, got {num_invalid} other values")
+        if image.ndim == 2:
+            return image
+        # Not a matrix product, which may round equal pixels differently.
+        red, green, blue = np.moveaxis(image * self._channel_weights, -1, 0)
+        return red + green + blue

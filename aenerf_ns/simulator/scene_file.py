@@ -255,15 +255,7 @@ def _exposed(scene: SimulationScene, renderer: Renderer) -> Renderer:
         brightest = max(brightest, float(radiance[alpha > 0].max(initial=0.0)))
     if brightest == 0:
         raise DataError(scene.name, "no light reaches what the camera sees", "give it light, or another path")
-    gain = _BRIGHTEST / brightest
-    seen = renderer.surroundings
-    return replace(
-        renderer,
-        light=(gain * renderer.light).astype(np.float32),
-        surroundings=seen._replace(texels=(gain * seen.texels).astype(np.float32)),
-        limit=1.0,
-        reflections=renderer.reflections and renderer.reflections.scaled(gain),
-    )
+    return replace(renderer.with_gain(_BRIGHTEST / brightest), limit=1.0)
 
 
 def _array(values: JsonObject, name: str, shape: tuple[int | None, ...]) -> Array:

@@ -80,9 +80,9 @@ def _overlapped(triangles: Array, asked: NDArray[np.bool_], tolerance: float) ->
             continue
         origin = np.einsum("k,fkd->fd", weight, triangles[source]) + tolerance * normals[source]
         rays = np.concatenate([origin, -normals[source]], axis=1).astype(np.float32)
-        hits = caster.all_hits(rays)
-        one, other = source[hits["ray_ids"].astype(np.int64)], hits["primitive_ids"].astype(np.int64)
-        near = (hits["t_hit"] < 2 * tolerance) & (piece[one] != piece[other])
+        ray, other, distance = caster.all_hits(rays)
+        one = source[ray]
+        near = (distance < 2 * tolerance) & (piece[one] != piece[other])
         near &= (normals[one] * normals[other]).sum(axis=1) > 0.99
         one, other = one[near], other[near]
         size = piece_area[piece[one]] - piece_area[piece[other]]

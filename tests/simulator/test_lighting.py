@@ -84,7 +84,7 @@ def test_ambient_light_bounces_and_emission_lights_nothing() -> None:
     glow = np.where(normals_and_areas(mesh)[0][:, 2] > 0.9, 3.0, 0.0)  # the floor
     mesh, _ = prepared(dataclasses.replace(mesh, emission=glow), 0.5)
     scene = light_mesh(mesh, NIGHT, [], BLACK, ambient=0.1)
-    light = scene.light[0][scene.arrays.light_point]
+    light = scene.light[0][scene.surface.light_point]
     expected = 0.1 * (1 - 0.5**13) / 0.5 + mesh.emission
     np.testing.assert_allclose(light, np.broadcast_to(expected[:, None, None], light.shape), rtol=1e-4)
 
@@ -141,7 +141,7 @@ def test_a_closed_box_balances_its_energy() -> None:
     lamp = AreaLight((0, 0, 0.3), (0.2, 0, 0), (0, -0.2, 0), (10.0,) * 3)
     scene = light_mesh(mesh, NIGHT, [lamp], BLACK)
     area = normals_and_areas(mesh)[1]
-    at_faces = scene.light[0][scene.arrays.light_point].mean(axis=1)
+    at_faces = scene.light[0][scene.surface.light_point].mean(axis=1)
     mean = (area[:, None] * at_faces).sum(0) / area.sum()
     expected = 10.0 * 0.16 / 24.0 / (1 - albedo)
     # Twelve bounces leave 0.8^13 of the brightest channel out.

@@ -138,9 +138,9 @@ def test_small_bodies_reflect_as_widely_as_their_pixels_curve() -> None:
 
 def test_the_shiny_object_is_the_object_with_coats(toy: SimulationScene, monkeypatch: pytest.MonkeyPatch) -> None:
     # Light takes seconds, and the coats do not change it.
-    monkeypatch.setattr(lighting, "_light", lambda *args: toy.renderer.light.copy())
+    monkeypatch.setattr(lighting, "compute_light", lambda *args: toy.renderer.light.copy())
     shiny = built_in_scene("shiny_object")
-    for one, same in zip(toy.renderer.arrays, shiny.renderer.arrays, strict=True):
+    for one, same in zip(toy.renderer.surface, shiny.renderer.surface, strict=True):
         np.testing.assert_array_equal(one, same)
     np.testing.assert_array_equal(toy.path(0.3), shiny.path(0.3))
     intrinsics = toy.intrinsics(*SIZE)

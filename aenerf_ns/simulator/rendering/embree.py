@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,7 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from aenerf_ns.open3d_import import load_open3d
 
 NOTHING = np.uint32(0xFFFFFFFF)
-"""Stands for the triangle where a ray hits none."""
+"""Stands for the face where a ray hits none."""
+
+
+class Hits(NamedTuple):
+    """The first hit of each ray."""
+
+    face: NDArray[np.uint32]  # (N,) `NOTHING` where the ray hits no face
+    distance: NDArray[np.float32]  # (N,) in lengths of the direction, inf where the ray hits no face
+    coordinates: NDArray[np.float32]  # (N, 2) barycentric coordinates of the second and third corner
 
 
 class RayCaster:
@@ -35,27 +45,21 @@ class RayCaster:
             self._tensor(np.ascontiguousarray(faces, np.uint32)),
         )
 
-    def cast(self, rays: NDArray[np.float32]) -> dict[str, NDArray]:
-        """Return the first hit of each ray.
-
-        Returns:
-            ``primitive_ids`` (N,) uint32, `NOTHING` where the ray hits no triangle; ``t_hit`` (N,), the distance in
-            lengths of the direction, inf where the ray hits none; ``primitive_uvs`` (N, 2), barycentric coordinates of
-            the second and third corner.
-        """
+    def cast(self, rays: NDArray[np.float32]) -> Hits:
+        """Find the first hit of each ray."""
         hits = self._scene.cast_rays(self._tensor(rays), nthreads=numba.get_num_threads())
-        return {name: hits[name].numpy() for name in ("primitive_ids", "t_hit", "primitive_uvs")}
+        return Hits(*(hits[name].numpy() for name in ("primitive_ids", "t_hit", "primitive_uvs")))
 
     def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Tell for each ray (N,) whether a triangle lies between its origin and origin + direction."""
-        return self._scene.test_occlusions(
-            self._tensor(rays), tnear=0.0, tfar=1.0, nthreads=numba.get_num_threads()
-        ).numpy()
+        tensor, threads = self._tensor(rays), numba.get_num_threads()
+        return self._scene.test_occlusions(tensor, tnear=0.0, tfar=1.0, nthreads=threads).numpy()
 
-    def all_hits(self, rays: NDArray[np.float32]) -> dict[str, NDArray]:
-        """Return every intersection (M,) of every ray: ``ray_ids``, ``primitive_ids`` and ``t_hit``."""
+    def all_hits(self, rays: NDArray[np.float32]) -> tuple[NDArray, NDArray, NDArray]:
+        """Find all hits (M,) of all rays: the numbers of the rays and of the faces (int64), and the distances."""
         hits = self._scene.list_intersections(self._tensor(rays), nthreads=numba.get_num_threads())
-        return {name: hits[name].numpy() for name in ("ray_ids", "primitive_ids", "t_hit")}
+        ray, face = (hits[name].numpy().astype(np.int64) for name in ("ray_ids", "primitive_ids"))
+        return ray, face, hits["t_hit"].numpy()
 
     def distance(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return the distance (N,) of points (N, 3) from the nearest triangle."""

@@ -42,19 +42,19 @@ class Environment:
         Returns:
             the even part, at most 32 rows high, and the small bright part at full resolution.
         """
-        solid_angle = _row_weights(len(self.radiance))[:, None]
+        solid_angle = row_weights(len(self.radiance))[:, None]
         luminance = self.radiance.mean(axis=-1)
         mean = float((luminance * solid_angle).sum() / solid_angle.sum() / luminance.shape[1])
         even = np.minimum(1.0, _BRIGHT * mean / np.maximum(luminance, 1e-12))[..., None] * self.radiance
         coarse = even
         while len(coarse) > _COARSE_ROWS and len(coarse) % 2 == 0 and coarse.shape[1] % 2 == 0:
-            weight = _row_weights(len(coarse)).reshape(-1, 2, 1, 1)
+            weight = row_weights(len(coarse)).reshape(-1, 2, 1, 1)
             rows = (coarse.reshape(-1, 2, *coarse.shape[1:]) * weight).sum(axis=1) / weight.sum(axis=1)
             coarse = 0.5 * (rows[:, 0::2] + rows[:, 1::2])
         return coarse.astype(np.float32), (self.radiance - even).astype(np.float32)
 
 
-def _row_weights(rows: int) -> Array:
+def row_weights(rows: int) -> Array:
     """Return the solid angle (rows,) of each row, up to a factor."""
     return -np.diff(np.cos(np.pi * np.arange(rows + 1) / rows))
 

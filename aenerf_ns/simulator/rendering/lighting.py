@@ -19,12 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
-from aenerf_ns.simulator.rendering.environment import Environment
+from aenerf_ns.simulator.rendering.environment import Environment, row_weights
 from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position_ids
-from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps, panorama
-from aenerf_ns.simulator.rendering.reflections import reflections
-from aenerf_ns.simulator.rendering.renderer import Renderer, surroundings
-from aenerf_ns.simulator.rendering.surface import MeshArrays, face_normal, mesh_arrays, ray_offset
+from aenerf_ns.simulator.rendering.mip_maps import lookup, mip_maps, panorama
+from aenerf_ns.simulator.rendering.reflections import make_reflections
+from aenerf_ns.simulator.rendering.renderer import Renderer, make_surroundings
+from aenerf_ns.simulator.rendering.surface import Surface, face_normal, make_surface
+from aenerf_ns.simulator.rendering.vectors import add_scaled, cross, dot, length, row, subtract
 
 _CREASE = math.cos(math.radians(40.0))
 """Cosine of the angle below which adjacent faces belong to one smooth surface."""
@@ -68,10 +69,10 @@ def light_points(mesh: Mesh) -> LightPoints:
     """
     a, b, c = mesh.vertices[mesh.faces.T]
     normals, _ = normals_and_areas(mesh)
-    place = position_ids(mesh.vertices)[mesh.faces].reshape(-1)
-    order = np.argsort(place, kind="stable")
-    start = np.searchsorted(place[order], np.arange(place.max() + 2))
-    corner = np.empty(len(place), np.int64)
+    position_id = position_ids(mesh.vertices)[mesh.faces].reshape(-1)
+    order = np.argsort(position_id, kind="stable")
+    start = np.searchsorted(position_id[order], np.arange(position_id.max() + 2))
+    corner = np.empty(len(position_id), np.int64)
     count = _smooth_parts(start, order, normals, corner)
     corners = np.stack([a, b, c], axis=1)
     towards, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
@@ -88,11 +89,11 @@ def light_points(mesh: Mesh) -> LightPoints:
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     # An edge that belongs to one face only marks the boundary of a surface. A point on the boundary moves onto the face
     # that leads furthest inside. Other points stay, because a step along a face of a curved surface leaves the surface.
-    neighbors = np.concatenate([np.roll(place.reshape(-1, 3), turn, axis=1).reshape(-1) for turn in (1, 2)])
-    edges = np.concatenate([corner, corner]) * (place.max() + 1) + neighbors
+    neighbors = np.concatenate([np.roll(position_id.reshape(-1, 3), turn, axis=1).reshape(-1) for turn in (1, 2)])
+    edges = np.concatenate([corner, corner]) * (position_id.max() + 1) + neighbors
     edge, uses = np.unique(edges, return_counts=True)
     is_open = np.zeros(count, bool)
-    is_open[edge[uses == 1] // (place.max() + 1)] = True
+    is_open[edge[uses == 1] // (position_id.max() + 1)] = True
     leads = (inwards * (total(inwards) / faces_at)[corner]).sum(axis=1)
     best = np.empty(count, np.int64)
     best_last = np.lexsort((leads, corner))
@@ -106,27 +107,25 @@ def light_points(mesh: Mesh) -> LightPoints:
 def _smooth_parts(start, order, normals, part):
     """Number the crease-free groups of the corners at each position, ``order[start[i]:start[i + 1]]``."""
     count = 0
-    for place in range(len(start) - 1):
-        corners = order[start[place] : start[place + 1]]
+    for position in range(len(start) - 1):
+        corners = order[start[position] : start[position + 1]]
         for corner in corners:
             part[corner] = -1
-        for first in range(len(corners)):
-            if part[corners[first]] >= 0:
+        for first in corners:
+            if part[first] >= 0:
                 continue
-            part[corners[first]] = count
+            part[first] = count
             # Grow the group from face to face.
             grown = True
             while grown:
                 grown = False
-                for i in range(len(corners)):
-                    if part[corners[i]] != count:
+                for member in corners:
+                    if part[member] != count:
                         continue
-                    one = normals[corners[i] // 3]
-                    for j in range(len(corners)):
-                        other = normals[corners[j] // 3]
-                        cosine = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
-                        if part[corners[j]] < 0 and cosine > _CREASE:
-                            part[corners[j]] = count
+                    for other in corners:
+                        cosine = dot(row(normals, member // 3), row(normals, other // 3))
+                        if part[other] < 0 and cosine > _CREASE:
+                            part[other] = count
                             grown = True
             count += 1
     return count
@@ -159,30 +158,27 @@ def light_mesh(
         seed: seed of the sampling.
     """
     points = light_points(mesh)
-    arrays = mesh_arrays(mesh, points.corner)
-    textures = mip_maps(mesh.textures, bits16=True)
+    surface = make_surface(mesh, points.corner)
     emitters = np.array([[a.center, a.half_u, a.half_v, a.radiance] for a in lamps], np.float64).reshape(-1, 4, 3)
-    light = _light(arrays, textures, caster, points, environment, emitters, ambient, seed)
+    light = compute_light(surface, caster, points, environment, emitters, ambient, seed)
     glow = np.zeros(len(points.position), np.float32)
     np.maximum.at(glow, points.corner, mesh.emission[:, None].astype(np.float32))
     light += glow[:, None]
-    shown = surroundings(environment if show_environment else None)
     gloss = None
     if mesh.gloss[:, 0].any():
-        gloss = reflections(mesh, points.corner, points.normal, emitters, surroundings(environment), ambient)
-    return Renderer(arrays, textures, caster, light, background, shown, math.inf, gloss)
+        gloss = make_reflections(mesh, points.corner, points.normal, emitters, make_surroundings(environment), ambient)
+    shown = make_surroundings(environment if show_environment else None)
+    return Renderer(surface, caster, light, background, shown, math.inf, gloss)
 
 
 def baked_mesh(mesh: Mesh, caster: RayCaster, background: Array) -> Renderer:
     """Return a renderer of a mesh whose colors are radiance, in front of a uniform background (3,)."""
-    arrays = mesh_arrays(mesh, np.zeros_like(mesh.faces))
-    light, textures = np.ones((2, 1, 3), np.float32), mip_maps(mesh.textures, bits16=True)
-    return Renderer(arrays, textures, caster, light, background, surroundings(None), math.inf, None)
+    surface, light = make_surface(mesh, np.zeros_like(mesh.faces)), np.ones((2, 1, 3), np.float32)
+    return Renderer(surface, caster, light, background, make_surroundings(None), math.inf, None)
 
 
-def _light(
-    arrays: MeshArrays,
-    textures: MipMaps,
+def compute_light(
+    surface: Surface,
     caster: RayCaster,
     points: LightPoints,
     environment: Environment,
@@ -191,19 +187,18 @@ def _light(
     seed: int,
 ) -> NDArray[np.float32]:
     """Compute irradiance / pi (2, G, 3) in front of the light points and behind them."""
-    count = len(points.position)
-    extent, offset = float(np.abs(arrays.vertices).max()), ray_offset(arrays)
+    count, offset = len(points.position), surface.ray_offset
     normals = np.concatenate([points.normal, -points.normal])
     positions = np.concatenate([points.position, points.position]) + offset * normals
     size = np.concatenate([points.size, points.size])
     jitter = np.random.default_rng(seed).random((2 * count, 2))
     even, bright = environment.split()
     sky = mip_maps([even], bits16=False)
-    sun = _Sun(bright) if bright.max() > 0 else None
+    sun = _Sun(bright, 8.0 * float(np.abs(surface.vertices).max())) if bright.max() > 0 else None
     directions = _plane_sequence(_DIRECTIONS)
 
     sharp = np.zeros((2 * count, 3), np.float32)
-    soft = np.zeros((2 * count, 3), np.float32)
+    sky_light = np.zeros((2 * count, 3), np.float32)
     links = np.empty((2 * count, _DIRECTIONS), np.int32)
     buried = np.empty(2 * count, np.bool_)
     with progress_bar() as progress:
@@ -218,51 +213,49 @@ def _light(
                 received = weights.reshape(len(p), -1).mean(axis=1)
                 sharp[part] += received[:, None] * emitter[3].astype(np.float32)
             if sun is not None:
-                rays, weights, colors = sun.rays(p, n, j, 8.0 * extent)
+                rays, weights, colors = sun.rays(p, n, j)
                 _clear_blocked(caster, rays, weights)
                 sharp[part] += (weights[:, None] * colors).reshape(len(p), -1, 3).mean(axis=1)
             rays = np.empty((len(p) * _DIRECTIONS, 6), np.float32)
             _gathering_rays(p, n, j, directions, rays)
             hits = caster.cast(rays)
-            _gather(
-                arrays,
-                count,
-                rays,
-                hits["primitive_ids"],
-                hits["t_hit"],
-                hits["primitive_uvs"],
-                size[part],
-                sky,
-                links[part],
-                soft[part],
-                buried[part],
-            )
-    albedo = _albedo(arrays, textures, count)
-    direct = sharp + soft + np.float32(ambient)
+            _gather(surface, count, rays, hits, size[part], sky, links[part], sky_light[part], buried[part])
+    albedo = _mean_albedo(surface, count)
+    direct = sharp + sky_light + np.float32(ambient)
     light = direct
     for _ in range(_BOUNCES):
         reflected = np.empty_like(light)
         _follow_links(links, albedo, light, reflected)
         light = direct + reflected
-    del links
-    neighbors = np.unique(
-        np.concatenate([np.stack([points.corner[:, i], points.corner[:, i - 1]], axis=1) for i in range(3)]), axis=0
-    )
-    neighbors = np.concatenate([neighbors, neighbors[:, ::-1]])
+    sides = [np.stack([points.corner[:, i], points.corner[:, i - 1]], axis=1) for i in range(3)]
+    light = _smooth(light, sharp, buried, np.unique(np.concatenate(sides), axis=0))
+    return np.ascontiguousarray(light.reshape(2, count, 3), np.float32)
+
+
+def _smooth(
+    light: NDArray[np.float32], sharp: NDArray[np.float32], buried: NDArray[np.bool_], edges: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Smooth the light but for its sharp part, all (2 G, 3), and fill it in where points are buried.
+
+    ``edges`` (M, 2) are pairs of neighboring points.
+    """
+    count = len(light) // 2
+    neighbors = np.concatenate([edges, edges[:, ::-1]])
     neighbors = np.concatenate([neighbors, neighbors + count])
     soft = light - sharp
     for _ in range(_SMOOTHING):
-        soft = _means(neighbors, soft, ~buried)
+        soft = _neighbor_means(neighbors, soft, ~buried)
     light = sharp + soft
     for _ in range(2):
         # A point inside or beneath another object has no light of its own. It takes the mean of its neighbors' light.
         known = ~buried
-        filled = _means(neighbors[buried[neighbors[:, 0]]], light, known)
+        around_buried = neighbors[buried[neighbors[:, 0]]]
+        filled = _neighbor_means(around_buried, light, known)
         found = np.zeros(2 * count, np.bool_)
-        found[neighbors[buried[neighbors[:, 0]] & known[neighbors[:, 1]], 0]] = True
+        found[around_buried[known[around_buried[:, 1]], 0]] = True
         light[found] = filled[found]
-        buried &= ~found
-    return np.ascontiguousarray(light.reshape(2, count, 3), np.float32)
+        buried = buried & ~found
+    return light
 
 
 def _plane_sequence(count: int) -> Array:
@@ -271,7 +264,7 @@ def _plane_sequence(count: int) -> Array:
     return (np.arange(1, count + 1)[:, None] * np.array([1 / plastic, 1 / plastic**2])) % 1.0
 
 
-def _means(neighbors: NDArray[np.int64], values: NDArray, known: NDArray[np.bool_]) -> NDArray:
+def _neighbor_means(neighbors: NDArray[np.int64], values: NDArray, known: NDArray[np.bool_]) -> NDArray:
     """Return the mean (N, C) over each point and its neighbors, of those that are known; the point's value if none is.
 
     ``neighbors`` (M, 2) are pairs of points.
@@ -283,65 +276,54 @@ def _means(neighbors: NDArray[np.int64], values: NDArray, known: NDArray[np.bool
     return np.where(weight[:, None] > 0, total / np.maximum(weight, 1)[:, None], values).astype(np.float32)
 
 
-def _albedo(arrays: MeshArrays, textures: MipMaps, count: int) -> NDArray[np.float32]:
+def _mean_albedo(surface: Surface, count: int) -> NDArray[np.float32]:
     """Return the mean color (G, 3) of the faces at each light point."""
-    color = np.empty((len(arrays.faces), 3), np.float32)
-    _face_colors(arrays, textures, color)
-    corner = arrays.light_point.reshape(-1)
-    colors = np.repeat(color, 3, axis=0)
-    total = np.stack([np.bincount(corner, column, count) for column in colors.T], axis=1)
+    color = np.empty((len(surface.faces), 3), np.float32)
+    _face_colors(surface, color)
+    corner = surface.light_point.reshape(-1)
+    total = np.stack([np.bincount(corner, column, count) for column in np.repeat(color, 3, axis=0).T], axis=1)
     return (total / np.bincount(corner, minlength=count)[:, None]).astype(np.float32)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _face_colors(arrays, textures, colors):
+def _face_colors(surface, colors):
     """Fill the mean color of each face, from the mip level that has about two texels on the face."""
-    for face in numba.prange(len(arrays.faces)):
-        i, j, k = arrays.faces[face]
+    for face in numba.prange(len(surface.faces)):
+        i, j, k = surface.faces[face]
         for c in range(3):
-            colors[face, c] = (arrays.color[i, c] + arrays.color[j, c] + arrays.color[k, c]) / 3.0
-        if arrays.texture[face] >= 0:
-            uv = arrays.uv
-            nx, ny, nz = face_normal(arrays, face)
-            side = math.sqrt(0.5 * math.sqrt(nx * nx + ny * ny + nz * nz))
-            r, g, b = lookup(
-                textures,
-                arrays.texture[face],
-                (uv[i, 0] + uv[j, 0] + uv[k, 0]) / 3.0,
-                (uv[i, 1] + uv[j, 1] + uv[k, 1]) / 3.0,
-                side * arrays.density[face],
-                True,
-            )
-            colors[face, 0] *= r / 65535.0
-            colors[face, 1] *= g / 65535.0
-            colors[face, 2] *= b / 65535.0
+            colors[face, c] = (surface.color[i, c] + surface.color[j, c] + surface.color[k, c]) / 3.0
+        if surface.texture[face] >= 0:
+            u = (surface.uv[i, 0] + surface.uv[j, 0] + surface.uv[k, 0]) / 3.0
+            v = (surface.uv[i, 1] + surface.uv[j, 1] + surface.uv[k, 1]) / 3.0
+            side = math.sqrt(0.5 * length(face_normal(surface, face)))
+            texel = lookup(surface, surface.texture[face], u, v, side * surface.density[face], True)
+            for c in range(3):
+                colors[face, c] *= texel[c] / 65535.0
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _lamp_rays(points, normals, jitter, lamp, offset, rays, weights):
     """Fill segments to a lamp (4, 3), and the irradiance / pi that each alone would bring from unit radiance."""
-    center, half_u, half_v = lamp[0], lamp[1], lamp[2]
-    nx = half_u[1] * half_v[2] - half_u[2] * half_v[1]
-    ny = half_u[2] * half_v[0] - half_u[0] * half_v[2]
-    nz = half_u[0] * half_v[1] - half_u[1] * half_v[0]
+    half_u, half_v = row(lamp, 1), row(lamp, 2)
+    # A quarter of the lamp's area long.
+    lamp_normal = cross(half_u, half_v)
     for n in numba.prange(len(points)):
+        point, normal = row(points, n), row(normals, n)
         for sample in range(_STRATA * _STRATA):
             a = 2.0 * (sample % _STRATA + jitter[n, 0]) / _STRATA - 1.0
             b = 2.0 * (sample // _STRATA + jitter[n, 1]) / _STRATA - 1.0
-            dx = center[0] + a * half_u[0] + b * half_v[0] - points[n, 0]
-            dy = center[1] + a * half_u[1] + b * half_v[1] - points[n, 1]
-            dz = center[2] + a * half_u[2] + b * half_v[2] - points[n, 2]
-            square = dx * dx + dy * dy + dz * dz
+            direction = subtract(add_scaled(add_scaled(row(lamp, 0), a, half_u), b, half_v), point)
+            square = dot(direction, direction)
             distance = math.sqrt(square)
-            cosine = (normals[n, 0] * dx + normals[n, 1] * dy + normals[n, 2] * dz) / distance
-            # The normal of the lamp has the length of a quarter of its area.
-            facing = -(nx * dx + ny * dy + nz * dz) / distance
+            cosine = dot(normal, direction) / distance
+            facing = -dot(lamp_normal, direction) / distance
             reach = (distance - offset) / distance
             k = n * _STRATA * _STRATA + sample
-            rays[k, 0], rays[k, 1], rays[k, 2] = points[n, 0], points[n, 1], points[n, 2]
-            rays[k, 3], rays[k, 4], rays[k, 5] = reach * dx, reach * dy, reach * dz
-            lit = cosine > 0.0 and facing > 0.0 and reach > 0.0
-            weights[k] = 4.0 * facing * cosine / (math.pi * square) if lit else 0.0
+            rays[k, 0], rays[k, 1], rays[k, 2] = point
+            for axis in range(3):
+                rays[k, 3 + axis] = reach * direction[axis]
+            is_lit = cosine > 0.0 and facing > 0.0 and reach > 0.0
+            weights[k] = 4.0 * facing * cosine / (math.pi * square) if is_lit else 0.0
 
 
 def _clear_blocked(caster: RayCaster, rays: NDArray[np.float32], weights: NDArray[np.float32]) -> None:
@@ -351,22 +333,26 @@ def _clear_blocked(caster: RayCaster, rays: NDArray[np.float32], weights: NDArra
 
 
 class _Sun:
-    """Sample the small and bright part of an environment in proportion to its luminance."""
+    """Sample the small and bright part of an environment in proportion to its luminance.
 
-    def __init__(self, radiance: NDArray[np.float32]) -> None:
+    Args:
+        radiance: (rows, columns, 3) of the bright part, zero elsewhere.
+        distance: length of the segments towards it, in meters.
+    """
+
+    def __init__(self, radiance: NDArray[np.float32], distance: float) -> None:
         rows, columns = radiance.shape[:2]
-        solid_angle = 2 * np.pi / columns * -np.diff(np.cos(np.pi * np.arange(rows + 1) / rows))
+        solid_angle = 2 * np.pi / columns * row_weights(rows)
         power = (radiance.mean(axis=-1, dtype=np.float64) * solid_angle[:, None]).reshape(-1)
-        texel = np.flatnonzero(power)
-        self._shape = rows, columns
-        self._texel = texel
-        self._cumulative = np.cumsum(power[texel]) / power[texel].sum()
-        per_power = radiance.reshape(-1, 3)[texel] / radiance.reshape(-1, 3)[texel].mean(axis=-1, keepdims=True)
+        self._shape, self._distance = (rows, columns), distance
+        self._texel = np.flatnonzero(power)
+        self._cumulative = np.cumsum(power[self._texel]) / power[self._texel].sum()
+        bright = radiance.reshape(-1, 3)[self._texel]
         # Radiance divided by the probability density of the direction.
-        self._color = (per_power * power.sum()).astype(np.float32)
+        self._color = (bright / bright.mean(axis=-1, keepdims=True) * power.sum()).astype(np.float32)
 
     def rays(
-        self, points: Array, normals: Array, jitter: Array, reach: float
+        self, points: Array, normals: Array, jitter: Array
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return segments (N * samples, 6), weights and colors. The mean of weight times color is irradiance / pi."""
         rows, columns = self._shape
@@ -384,7 +370,7 @@ class _Sun:
         ring, turn = np.sqrt(1 - height * height), 2 * np.pi * (0.5 - (texel % columns + u) / columns)
         direction = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
         cosine = (direction.reshape(len(points), -1, 3) * normals[:, None]).sum(axis=-1).reshape(-1)
-        rays = np.concatenate([np.repeat(points, _SUN_SAMPLES, axis=0), reach * direction], axis=1)
+        rays = np.concatenate([np.repeat(points, _SUN_SAMPLES, axis=0), self._distance * direction], axis=1)
         weights = np.maximum(cosine, 0) / np.pi
         return rays.astype(np.float32), weights.astype(np.float32), self._color[index]
 
@@ -393,7 +379,7 @@ class _Sun:
 def _gathering_rays(points, normals, jitter, directions, rays):
     """Fill rays in cosine-weighted directions: ``directions`` (K, 2) in the unit square, shifted by the jitter."""
     for n in numba.prange(len(points)):
-        nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
+        nx, ny, nz = row(normals, n)
         # Tangent frame without a branch per axis: Duff et al., JCGT 2017.
         sign = math.copysign(1.0, nz)
         a = -1.0 / (sign + nz)
@@ -405,14 +391,14 @@ def _gathering_rays(points, normals, jitter, directions, rays):
             square = (directions[k, 1] + jitter[n, 1]) % 1.0
             u, v, w = math.sqrt(square) * math.cos(angle), math.sqrt(square) * math.sin(angle), math.sqrt(1.0 - square)
             ray = rays[n * len(directions) + k]
-            ray[0], ray[1], ray[2] = points[n, 0], points[n, 1], points[n, 2]
+            ray[0], ray[1], ray[2] = row(points, n)
             ray[3] = u * tx + v * bx + w * nx
             ray[4] = u * ty + v * by + w * ny
             ray[5] = u * tz + v * bz + w * nz
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _gather(arrays, half, rays, hits, distance, coordinates, size, sky, links, received, buried):
+def _gather(surface, half, rays, hits, size, sky, links, received, buried):
     """Fill, for each point, where its rays end, the light of the sky, and whether the point is buried.
 
     A link is the light point nearest to the hit, plus ``half`` for the back of a surface, or -1 for the sky. A point is
@@ -423,27 +409,23 @@ def _gather(arrays, half, rays, hits, distance, coordinates, size, sky, links, r
         red, green, blue, behind, near = 0.0, 0.0, 0.0, 0, 0
         for k in range(count):
             i = n * count + k
-            dx, dy, dz = rays[i, 3], rays[i, 4], rays[i, 5]
-            face = hits[i]
+            direction, face = (rays[i, 3], rays[i, 4], rays[i, 5]), hits.face[i]
             if face == NOTHING:
                 links[n, k] = -1
-                r, g, b = panorama(sky, dx, dy, dz, 1.0)
+                r, g, b = panorama(sky, direction, 1.0)
                 red += r
                 green += g
                 blue += b
                 continue
-            nx, ny, nz = face_normal(arrays, face)
-            facing = dx * nx + dy * ny + dz * nz
-            second_weight, third_weight = coordinates[i, 0], coordinates[i, 1]
+            facing = dot(direction, face_normal(surface, face))
+            second_weight, third_weight = hits.coordinates[i, 0], hits.coordinates[i, 1]
             nearest = 0
             if max(second_weight, third_weight) > 1.0 - second_weight - third_weight:
                 nearest = 1 if second_weight >= third_weight else 2
-            links[n, k] = arrays.light_point[face, nearest] + (half if facing > 0.0 else 0)
+            links[n, k] = surface.light_point[face, nearest] + (half if facing > 0.0 else 0)
             behind += facing > 0.0
-            near += distance[i] < size[n]
-        received[n, 0] = red / count
-        received[n, 1] = green / count
-        received[n, 2] = blue / count
+            near += hits.distance[i] < size[n]
+        received[n, 0], received[n, 1], received[n, 2] = red / count, green / count, blue / count
         buried[n] = behind > 0.75 * count or near == count
 
 
@@ -461,6 +443,4 @@ def _follow_links(links, albedo, light, reflected):
             red += albedo[point, 0] * light[link, 0]
             green += albedo[point, 1] * light[link, 1]
             blue += albedo[point, 2] * light[link, 2]
-        reflected[n, 0] = red / count
-        reflected[n, 1] = green / count
-        reflected[n, 2] = blue / count
+        reflected[n, 0], reflected[n, 1], reflected[n, 2] = red / count, green / count, blue / count

@@ -128,10 +128,9 @@ def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[M
         # The rays end just behind the face. Hits beyond that are listed too, and ignored.
         rays = np.concatenate([points + above * normal, -above * normal], axis=1).astype(np.float32)
         for start in range(0, len(rays), 1 << 18):
-            hits = caster.all_hits(rays[start : start + (1 << 18)])
-            one = hits["ray_ids"].astype(np.int64) + start
-            other = hits["primitive_ids"].astype(np.int64)
-            near = (np.abs(hits["t_hit"] - 1) * above < resolution) & (one != other)
+            one, other, distance = caster.all_hits(rays[start : start + (1 << 18)])
+            one = one + start
+            near = (np.abs(distance - 1) * above < resolution) & (one != other)
             near &= np.abs((normal[one] * normal[other]).sum(axis=1)) > 0.999
             near &= order[one] != order[other]
             one, other = one[near], other[near]

@@ -10,6 +10,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from aenerf_ns.simulator.rendering.vectors import length
+
 
 class MipMaps(NamedTuple):
     """Pictures and their successive halvings, L levels in all, stored one after the other."""
@@ -67,6 +69,7 @@ def _halved(picture: NDArray[np.floating], axis: int) -> NDArray[np.floating]:
 def lookup(maps, picture, u, v, footprint, repeats):
     """Interpolate a picture at (u, v), in widths and heights of the picture, trilinearly.
 
+    ``maps`` has the fields of `MipMaps`.
     ``footprint`` is the side of the region to average, in texels of the finest level. Columns always repeat.
     Rows repeat if ``repeats`` is true; otherwise the first and the last row extend to infinity.
     """
@@ -105,8 +108,8 @@ def lookup(maps, picture, u, v, footprint, repeats):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def panorama(maps, dx, dy, dz, footprint):
+def panorama(maps, direction, footprint):
     """Interpolate an equirectangular picture (see `Environment`) in a direction of any length."""
-    turn = math.atan2(dy, dx) / (2.0 * math.pi)
-    down = math.acos(max(-1.0, min(1.0, dz / math.sqrt(dx * dx + dy * dy + dz * dz)))) / math.pi
+    turn = math.atan2(direction[1], direction[0]) / (2.0 * math.pi)
+    down = math.acos(max(-1.0, min(1.0, direction[2] / length(direction)))) / math.pi
     return lookup(maps, 0, 0.5 - turn, down, footprint, False)

@@ -13,7 +13,6 @@ A surface that is seen in a reflection shows the light that a diffuse surface re
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
@@ -21,13 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.simulator.arrays import Array
-from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
+from aenerf_ns.simulator.rendering.embree import NOTHING, Hits, RayCaster
 from aenerf_ns.simulator.rendering.mesh import Mesh
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, panorama
-from aenerf_ns.simulator.rendering.surface import FOOTPRINT, MeshArrays, diffuse_radiance, face_normal, ray_offset
+from aenerf_ns.simulator.rendering.surface import FOOTPRINT, Surface, diffuse_radiance, face_normal
+from aenerf_ns.simulator.rendering.vectors import add_scaled, cross, divide, dot, interpolate, length, row, subtract
 
-_LOWEST = 0.01
-"""Least sine of the angle between a mirrored ray and its face. An interpolated normal may mirror rays into the face."""
+_MIN_SINE = 0.01
+"""Of the angle between a mirrored ray and its face. An interpolated normal may mirror rays into the face."""
 
 
 class Coats(NamedTuple):
@@ -39,24 +39,16 @@ class Coats(NamedTuple):
     normal: Array  # (G, 3) unit
 
 
-@dataclass(frozen=True)
-class Reflections:
-    """The coats of a mesh, and the light that they reflect beside the light from the mesh itself.
-
-    Attributes:
-        coats: the coats.
-        lamps: (L, 4, 3) center, half sides and radiance.
-        environment: light from far away.
-        ambient: radiance that arrives from everywhere.
-    """
+class Reflections(NamedTuple):
+    """The coats of a mesh, and the light that they reflect beside the light from the mesh itself."""
 
     coats: Coats
-    lamps: Array
-    environment: MipMaps
-    ambient: float
+    lamps: Array  # (L, 4, 3) center, half sides and radiance
+    environment: MipMaps  # light from far away
+    ambient: float  # radiance that arrives from everywhere
 
     def scaled(self, gain: float) -> Reflections:
-        """Return the reflections of the same surfaces in ``gain`` times the light."""
+        """Return the reflections of the same coats in ``gain`` times the light."""
         return Reflections(
             self.coats,
             self.lamps * np.array([1.0, 1.0, 1.0, gain])[:, None],
@@ -65,176 +57,137 @@ class Reflections:
         )
 
 
-def reflections(
+def make_reflections(
     mesh: Mesh, light_point: NDArray[np.integer], normal: Array, lamps: Array, environment: MipMaps, ambient: float
 ) -> Reflections:
-    """Return the reflections of a mesh.
+    """Build the reflections of a mesh.
 
     Args:
         mesh: the mesh.
         light_point: (F, 3) light point of each corner.
         normal: (G, 3) unit normals of the light points. They are interpolated over the faces.
-        lamps: (L, 4, 3) center, half sides and radiance.
-        environment: light from far away.
-        ambient: radiance that reaches every surface from all sides.
+        lamps, environment, ambient: see `Reflections`.
     """
     specular, roughness = mesh.gloss.T.astype(np.float32)
     corners, normals = mesh.vertices[mesh.faces], normal[light_point]
-    length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
+    side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
     turn = np.linalg.norm(np.roll(normals, -1, axis=1) - normals, axis=-1)
-    curvature = (turn / np.maximum(length, 1e-300)).max(axis=1).astype(np.float32)
+    curvature = (turn / np.maximum(side, 1e-300)).max(axis=1).astype(np.float32)
     coats = Coats(specular, np.float32(math.sqrt(2.0)) * roughness**2, curvature, normal)
     return Reflections(coats, lamps, environment, ambient)
 
 
 def add_reflections(
-    reflected: Reflections,
-    arrays: MeshArrays,
-    textures: MipMaps,
+    reflections: Reflections,
+    surface: Surface,
     light: NDArray[np.float32],
     caster: RayCaster,
     rays: NDArray[np.float32],
-    hits: dict[str, NDArray],
+    hits: Hits,
     focal_length: float,
-    samples: int,
     limit: float,
     radiance: NDArray[np.float32],
 ) -> None:
     """Add to a picture what its glossy surfaces reflect, and take from it what they keep from their diffuse ground.
 
     Args:
-        reflected, arrays, textures, light, caster: see `Renderer`.
+        reflections, surface, light, caster, limit: see `Renderer`.
         rays: (rows * columns * samples, 6) rays through the picture, one meter long along the optical axis.
-        hits: what the rays hit, from the ray caster.
+        hits: what the rays hit.
         focal_length: in pixels.
-        samples: rays per pixel.
-        limit: the radiance of a glossy surface is clipped to this value.
         radiance: (rows, columns, 3) diffuse picture, changed in place.
     """
-    seen = np.flatnonzero(hits["primitive_ids"] != NOTHING)
-    seen = seen[reflected.coats.specular[hits["primitive_ids"][seen]] > 0]
-    first = tuple(hits[name][seen] for name in ("primitive_ids", "primitive_uvs", "t_hit"))
-    mirrored = np.empty((len(seen), 6), np.float32)
-    optics, diffuse = np.empty((len(seen), 3)), np.empty((len(seen), 3))
-    offset = ray_offset(arrays)
+    glossy = np.flatnonzero(hits.face != NOTHING)
+    glossy = glossy[reflections.coats.specular[hits.face[glossy]] > 0]
+    first = Hits(*(column[glossy] for column in hits))
+    mirrored = np.empty((len(glossy), 6), np.float32)
+    optics, diffuse, change = (np.empty((len(glossy), 3)) for _ in range(3))
     _mirror(
-        arrays, textures, light, reflected.coats, rays[seen], *first, focal_length, offset, mirrored, optics, diffuse
-    )
-    second = caster.cast(mirrored)
-    change = np.empty((len(seen), 3))
-    second_hits = tuple(second[name] for name in ("primitive_ids", "primitive_uvs", "t_hit"))
+        surface, light, reflections.coats, rays[glossy], first, focal_length, surface.ray_offset,
+        mirrored, optics, diffuse,
+    )  # fmt: skip
+    _, lamps, environment, ambient = reflections
     _reflect(
-        arrays,
-        textures,
-        light,
-        reflected.lamps,
-        reflected.environment,
-        reflected.ambient,
-        mirrored,
-        *second_hits,
-        optics,
-        diffuse,
-        limit,
-        change,
+        surface, light, lamps, environment, ambient, mirrored, caster.cast(mirrored), optics, diffuse, limit, change
     )
     rows, columns = radiance.shape[:2]
+    samples = len(rays) // (rows * columns)
     for channel in range(3):
-        total = np.bincount(seen // samples, change[:, channel], rows * columns)
+        total = np.bincount(glossy // samples, change[:, channel], rows * columns)
         radiance[..., channel] += total.reshape(rows, columns) / samples
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _mirror(
-    arrays, textures, light, coats, rays, faces, coordinates, depth, focal_length, offset, mirrored, optics, diffuse
-):
+def _mirror(surface, light, coats, rays, hits, focal_length, offset, mirrored, optics, diffuse):
     """Fill the mirrored rays (N, 6) of rays that hit glossy faces, with unit directions, and the diffuse light there.
 
     ``optics`` (N, 3) are the Fresnel reflectance, the standard deviation of the reflected directions over the sample's
     region, in radians, and the side of that region in meters.
     """
     for n in numba.prange(len(rays)):
-        face = faces[n]
-        wj, wk = float(coordinates[n, 0]), float(coordinates[n, 1])
-        wi = 1.0 - wj - wk
-        dx, dy, dz = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        dx, dy, dz = dx / length, dy / length, dz / length
-        gx, gy, gz = face_normal(arrays, face)
-        facing = gx * dx + gy * dy + gz * dz
+        face, weights = hits.face[n], _weights(hits, n)
+        direction = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
+        size = length(direction)
+        direction = divide(direction, size)
+        face_direction = face_normal(surface, face)
+        facing = dot(face_direction, direction)
         side = 0 if facing < 0.0 else 1
+        # Both normals are turned towards the camera.
         towards = 1.0 if side == 0 else -1.0
-        area = towards * math.sqrt(gx * gx + gy * gy + gz * gz)
-        gx, gy, gz = gx / area, gy / area, gz / area
-        li, lj, lk = arrays.light_point[face, 0], arrays.light_point[face, 1], arrays.light_point[face, 2]
-        normal = coats.normal
-        nx = wi * normal[li, 0] + wj * normal[lj, 0] + wk * normal[lk, 0]
-        ny = wi * normal[li, 1] + wj * normal[lj, 1] + wk * normal[lk, 1]
-        nz = wi * normal[li, 2] + wj * normal[lj, 2] + wk * normal[lk, 2]
-        norm = towards * math.sqrt(nx * nx + ny * ny + nz * nz)
-        nx, ny, nz = nx / norm, ny / norm, nz / norm
-        cosine = -(nx * dx + ny * dy + nz * dz)
-        rx, ry, rz = dx + 2.0 * cosine * nx, dy + 2.0 * cosine * ny, dz + 2.0 * cosine * nz
-        rise = max(_LOWEST - (rx * gx + ry * gy + rz * gz), 0.0)
-        rx, ry, rz = rx + rise * gx, ry + rise * gy, rz + rise * gz
-        norm = math.sqrt(rx * rx + ry * ry + rz * rz)
-        distance = depth[n] * length
-        mirrored[n, 0] = rays[n, 0] + distance * dx + offset * gx
-        mirrored[n, 1] = rays[n, 1] + distance * dy + offset * gy
-        mirrored[n, 2] = rays[n, 2] + distance * dz + offset * gz
-        mirrored[n, 3], mirrored[n, 4], mirrored[n, 5] = rx / norm, ry / norm, rz / norm
+        area = towards * length(face_direction)
+        face_direction = divide(face_direction, area)
+        normal = interpolate(coats.normal, row(surface.light_point, face), weights)
+        normal = divide(normal, towards * length(normal))
+        cosine = -dot(normal, direction)
+        reflected = add_scaled(direction, 2.0 * cosine, normal)
+        rise = max(_MIN_SINE - dot(reflected, face_direction), 0.0)
+        reflected = add_scaled(reflected, rise, face_direction)
+        reflected = divide(reflected, length(reflected))
+        depth = hits.distance[n]
+        origin = add_scaled(add_scaled(row(rays, n), depth * size, direction), offset, face_direction)
+        for axis in range(3):
+            mirrored[n, axis], mirrored[n, 3 + axis] = origin[axis], reflected[axis]
 
         specular = coats.specular[face]
         # No surface reflects less than 2 % at normal incidence. Below that, the reflectance at grazing angles fades too
         # (Lagarde and de Rousiers, 2014).
         grazing = min(50.0 * specular, 1.0)
         optics[n, 0] = specular + (grazing - specular) * (1.0 - min(max(cosine, 0.0), 1.0)) ** 5
-        footprint = FOOTPRINT * depth[n] / (focal_length * math.sqrt(max(abs(facing / area), 0.02)))
+        footprint = FOOTPRINT * depth / (focal_length * math.sqrt(max(abs(facing / area), 0.02)))
         bend, view = coats.curvature[face] * footprint, 0.5 * FOOTPRINT / focal_length
         optics[n, 1] = math.sqrt(coats.lobe[face] ** 2 + bend * bend + view * view)
         optics[n, 2] = footprint
-        diffuse[n, 0], diffuse[n, 1], diffuse[n, 2] = diffuse_radiance(
-            arrays, textures, light, face, side, wi, wj, wk, footprint
-        )
+        diffuse[n, 0], diffuse[n, 1], diffuse[n, 2] = diffuse_radiance(surface, light, face, side, weights, footprint)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _weights(hits, n):
+    """Return the barycentric coordinates of a hit."""
+    wj, wk = float(hits.coordinates[n, 0]), float(hits.coordinates[n, 1])
+    return 1.0 - wj - wk, wj, wk
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _reflect(
-    arrays,
-    textures,
-    light,
-    lamps,
-    environment,
-    ambient,
-    rays,
-    faces,
-    coordinates,
-    distance,
-    optics,
-    diffuse,
-    limit,
-    change,
-):
+def _reflect(surface, light, lamps, environment, ambient, rays, hits, optics, diffuse, limit, change):
     """Fill how the radiance (N, 3) of glossy surfaces differs from the diffuse radiance, given their mirrored rays."""
     for n in numba.prange(len(rays)):
-        dx, dy, dz = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
-        reflectance, lobe, footprint = optics[n, 0], optics[n, 1], optics[n, 2]
-        face = faces[n]
+        direction = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
+        reflectance, lobe, footprint = row(optics, n)
+        face, distance = hits.face[n], hits.distance[n]
         if face == NOTHING:
             # A region of side 2 s has about the spread of a Gaussian of standard deviation s, once interpolated.
             per_radian = environment.level[0, 2] / (2.0 * math.pi)
-            r, g, b = panorama(environment, dx, dy, dz, 2.0 * lobe * per_radian)
+            r, g, b = panorama(environment, direction, 2.0 * lobe * per_radian)
         else:
-            gx, gy, gz = face_normal(arrays, face)
-            facing = gx * dx + gy * dy + gz * dz
-            slant = max(abs(facing) / math.sqrt(gx * gx + gy * gy + gz * gz), 0.02)
-            wj, wk = float(coordinates[n, 0]), float(coordinates[n, 1])
-            region = (footprint + 2.0 * lobe * distance[n]) / math.sqrt(slant)
-            r, g, b = diffuse_radiance(
-                arrays, textures, light, face, 0 if facing < 0.0 else 1, 1.0 - wj - wk, wj, wk, region
-            )
+            normal = face_normal(surface, face)
+            facing = dot(normal, direction)
+            slant = max(abs(facing) / length(normal), 0.02)
+            region = (footprint + 2.0 * lobe * distance) / math.sqrt(slant)
+            side = 0 if facing < 0.0 else 1
+            r, g, b = diffuse_radiance(surface, light, face, side, _weights(hits, n), region)
         r, g, b = r + ambient, g + ambient, b + ambient
         for lamp in lamps:
-            covered = _covered(lamp, rays[n], distance[n], lobe)
+            covered = _covered_share(lamp, row(rays, n), direction, distance, lobe)
             r += covered * (lamp[3, 0] - r)
             g += covered * (lamp[3, 1] - g)
             b += covered * (lamp[3, 2] - b)
@@ -244,31 +197,26 @@ def _reflect(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _covered(lamp, ray, reach, lobe):
+def _covered_share(lamp, origin, direction, reach, lobe):
     """Return the share of a Gaussian lobe around a ray that a lamp (4, 3) covers. The ray ends at ``reach``."""
-    ux, uy, uz = lamp[1, 0], lamp[1, 1], lamp[1, 2]
-    vx, vy, vz = lamp[2, 0], lamp[2, 1], lamp[2, 2]
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
-    facing = nx * dx + ny * dy + nz * dz
+    half_u, half_v = row(lamp, 1), row(lamp, 2)
+    normal = cross(half_u, half_v)
+    facing = dot(normal, direction)
     if facing >= 0.0:
         return 0.0
-    cx, cy, cz = lamp[0, 0] - ray[0], lamp[0, 1] - ray[1], lamp[0, 2] - ray[2]
-    distance = (nx * cx + ny * cy + nz * cz) / facing
+    from_center = subtract(origin, row(lamp, 0))
+    distance = -dot(normal, from_center) / facing
     if not 0.0 < distance < reach:
         return 0.0
-    px, py, pz = distance * dx - cx, distance * dy - cy, distance * dz - cz
-    square = nx * nx + ny * ny + nz * nz
+    meeting = add_scaled(from_center, distance, direction)
+    square = dot(normal, normal)
     share = 1.0
-    # The vector (sx, sy, sz) along which the place in units of one half side grows: across the other half side.
-    for sx, sy, sz in (
-        (vy * nz - vz * ny, vz * nx - vx * nz, vx * ny - vy * nx),
-        (ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux),
-    ):
-        place = (sx * px + sy * py + sz * pz) / square
-        # The lobe's direction moves the place on the lamp's plane by this vector per meter of distance and radian.
-        along = (sx * dx + sy * dy + sz * dz) / facing
-        mx, my, mz = sx - along * nx, sy - along * ny, sz - along * nz
-        width = math.sqrt(2.0 * (mx * mx + my * my + mz * mz)) * lobe * distance / square
-        share *= 0.5 * (math.erf((1.0 - place) / width) + math.erf((1.0 + place) / width))
+    # The vector along which the position in units of one half side grows: across the other half side.
+    for growth in (cross(half_v, normal), cross(normal, half_u)):
+        position = dot(growth, meeting) / square
+        # The lobe's direction moves the position on the lamp's plane by this vector per meter of distance and radian.
+        along = dot(growth, direction) / facing
+        moved = add_scaled(growth, -along, normal)
+        width = math.sqrt(2.0 * dot(moved, moved)) * lobe * distance / square
+        share *= 0.5 * (math.erf((1.0 - position) / width) + math.erf((1.0 + position) / width))
     return share

@@ -8,11 +8,9 @@ meters, and the world's z axis points up. A camera has OpenCV axes (x right, y d
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -23,134 +21,98 @@ from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, mip_maps, panorama
 from aenerf_ns.simulator.rendering.reflections import Reflections, add_reflections
-from aenerf_ns.simulator.rendering.surface import FOOTPRINT, MeshArrays, diffuse_radiance
+from aenerf_ns.simulator.rendering.surface import FOOTPRINT, Surface, diffuse_radiance
+from aenerf_ns.simulator.rendering.vectors import cross, dot, interpolate, row, subtract
 
 POINT_SPREAD = 0.5
 """Standard deviation of a pixel's Gaussian point-spread function, in pixels."""
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _direction(rotation, intrinsics, x, y, offset):
+    """Return the direction of a ray, one meter long along the optical axis, ``offset`` pixels from a pixel's center."""
+    fx, fy, cx, cy = intrinsics
+    through = (x + 0.5 + offset[0] - cx) / fx, (y + 0.5 + offset[1] - cy) / fy, 1.0
+    return dot(row(rotation, 0), through), dot(row(rotation, 1), through), dot(row(rotation, 2), through)
+
+
 # Not parallel: starting threads for this little work takes longer than the work, above all on a busy machine.
 @numba.njit(cache=True, error_model="numpy")
-def _camera_rays(rotation, center, intrinsics, offsets, window, rays):
-    """Fill the rays (N, 6) of a window of the picture. Directions reach one meter along the optical axis."""
-    fx, fy, cx, cy = intrinsics
-    samples = len(offsets)
-    left, right, top, bottom = window
-    for y in range(top, bottom):
-        for x in range(left, right):
-            for s in range(samples):
-                u = (x + 0.5 + offsets[s, 0] - cx) / fx
-                v = (y + 0.5 + offsets[s, 1] - cy) / fy
-                ray = rays[((y - top) * (right - left) + x - left) * samples + s]
-                for axis in range(3):
-                    ray[axis] = center[axis]
-                    ray[3 + axis] = rotation[axis, 0] * u + rotation[axis, 1] * v + rotation[axis, 2]
+def _camera_rays(rotation, center, intrinsics, offsets, width, rays):
+    """Fill the rays (rows * width * samples, 6) of a picture."""
+    for i in range(len(rays)):
+        pixel, sample = divmod(i, len(offsets))
+        y, x = divmod(pixel, width)
+        rays[i, 0], rays[i, 1], rays[i, 2] = center[0], center[1], center[2]
+        rays[i, 3], rays[i, 4], rays[i, 5] = _direction(rotation, intrinsics, x, y, offsets[sample])
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _meet(vertices, a, b, c, ox, oy, oz, dx, dy, dz):
-    """Intersect a ray with a triangle's plane (Möller and Trumbore, 1997).
+def _intersect(surface, face, origin, direction):
+    """Intersect a ray with the plane of a face (Möller and Trumbore, 1997).
 
     Returns:
-        the second and third barycentric coordinates, clamped to the triangle, and the normal, whose length is twice the
-        area.
+        the barycentric coordinates, clamped to the face, and the normal, whose length is twice the area.
     """
-    ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
-    ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
-    vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    sx, sy, sz = ox - ax, oy - ay, oz - az
-    determinant = -(nx * dx + ny * dy + nz * dz)
-    qx, qy, qz = sy * dz - sz * dy, sz * dx - sx * dz, sx * dy - sy * dx
-    second = (vx * qx + vy * qy + vz * qz) / determinant
-    third = -(ux * qx + uy * qy + uz * qz) / determinant
+    a, b, c = row(surface.faces, face)
+    corner = row(surface.vertices, a)
+    u, v = subtract(row(surface.vertices, b), corner), subtract(row(surface.vertices, c), corner)
+    normal = cross(u, v)
+    from_corner = subtract(origin, corner)
+    determinant = -dot(normal, direction)
+    q = cross(from_corner, direction)
+    second, third = dot(v, q) / determinant, -dot(u, q) / determinant
     # A ray nearly parallel to the plane may meet it anywhere or nowhere.
     second = second if 0.0 <= second < 1e9 else 0.0
     third = third if 0.0 <= third < 1e9 else 0.0
     total = second + third
     if total > 1.0:
         second, third = second / total, third / total
-    return second, third, nx, ny, nz
+    return (1.0 - second - third, second, third), normal
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _shade(
-    arrays,
-    textures,
-    light,
-    hits,
-    window,
-    rotation,
-    center,
-    intrinsics,
-    offsets,
-    background,
-    sky,
-    limit,
-    radiance,
-    depth,
-    alpha,
+    surface, light, hit_faces, rotation, center, intrinsics, offsets, background, sky, limit, radiance, depth, alpha
 ):
     """Shade the hits of `_camera_rays` and fill ``radiance``, ``depth`` and ``alpha``.
 
     A ray that hits nothing sees the panorama ``sky``, or ``background`` if ``sky`` is empty.
     """
-    vertices, faces, texture = arrays.vertices, arrays.faces, arrays.texture
     height, width = depth.shape
-    fx, fy, cx, cy = intrinsics
-    samples = len(offsets)
-    ox, oy, oz = center[0], center[1], center[2]
-    has_sky = len(sky.level) > 0
-    left, right, top, bottom = window
+    focal, samples = intrinsics[0], len(offsets)
+    origin, axis = (center[0], center[1], center[2]), (rotation[0, 2], rotation[1, 2], rotation[2, 2])
     for y in numba.prange(height):
         for x in range(width):
             red, green, blue, total_depth, found = 0.0, 0.0, 0.0, 0.0, 0
             for s in range(samples):
-                u = (x + 0.5 + offsets[s, 0] - cx) / fx
-                v = (y + 0.5 + offsets[s, 1] - cy) / fy
-                dx = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
-                dy = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
-                dz = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]
-                face = NOTHING
-                if left <= x < right and top <= y < bottom:
-                    face = hits[((y - top) * (right - left) + x - left) * samples + s]
+                direction = _direction(rotation, intrinsics, x, y, offsets[s])
+                face = hit_faces[(y * width + x) * samples + s]
                 if face == NOTHING:
-                    if has_sky:
+                    r, g, b = background[0], background[1], background[2]
+                    if len(sky.level) > 0:
                         per_radian = sky.level[0, 2] / (2.0 * math.pi)
-                        r, g, b = panorama(sky, dx, dy, dz, FOOTPRINT / fx * per_radian)
-                        red += min(r, limit)
-                        green += min(g, limit)
-                        blue += min(b, limit)
-                    else:
-                        red += background[0]
-                        green += background[1]
-                        blue += background[2]
-                    continue
-                i, j, k = faces[face, 0], faces[face, 1], faces[face, 2]
-                wj, wk, nx, ny, nz = _meet(vertices, i, j, k, ox, oy, oz, dx, dy, dz)
-                wi = 1.0 - wj - wk
-                px = wi * vertices[i, 0] + wj * vertices[j, 0] + wk * vertices[k, 0] - ox
-                py = wi * vertices[i, 1] + wj * vertices[j, 1] + wk * vertices[k, 1] - oy
-                pz = wi * vertices[i, 2] + wj * vertices[j, 2] + wk * vertices[k, 2] - oz
-                distance = rotation[0, 2] * px + rotation[1, 2] * py + rotation[2, 2] * pz
-                facing = nx * dx + ny * dy + nz * dz
-                side = 0 if facing < 0.0 else 1
-                footprint = 0.0
-                if texture[face] >= 0:
-                    # A pixel covers depth / focal length, stretched where the surface is seen at a slant; the geometric
-                    # mean of its two sides keeps textures crisp there without aliasing.
-                    lengths = math.sqrt((nx * nx + ny * ny + nz * nz) * (dx * dx + dy * dy + dz * dz))
-                    slant = max(abs(facing) / lengths, 0.02)
-                    footprint = FOOTPRINT * distance / (fx * math.sqrt(slant))
-                r, g, b = diffuse_radiance(arrays, textures, light, face, side, wi, wj, wk, footprint)
+                        r, g, b = panorama(sky, direction, FOOTPRINT / focal * per_radian)
+                        r, g, b = min(r, limit), min(g, limit), min(b, limit)
+                else:
+                    weights, normal = _intersect(surface, face, origin, direction)
+                    point = interpolate(surface.vertices, row(surface.faces, face), weights)
+                    distance = dot(axis, subtract(point, origin))
+                    facing = dot(normal, direction)
+                    footprint = 0.0
+                    if surface.texture[face] >= 0:
+                        # A pixel covers depth / focal length, stretched where the surface is seen at a slant; the
+                        # geometric mean of its two sides keeps textures crisp there without aliasing.
+                        slant = max(abs(facing) / math.sqrt(dot(normal, normal) * dot(direction, direction)), 0.02)
+                        footprint = FOOTPRINT * distance / (focal * math.sqrt(slant))
+                    side = 0 if facing < 0.0 else 1
+                    r, g, b = diffuse_radiance(surface, light, face, side, weights, footprint)
+                    total_depth += distance
+                    found += 1
                 red += r
                 green += g
                 blue += b
-                total_depth += distance
-                found += 1
-            radiance[y, x, 0] = red / samples
-            radiance[y, x, 1] = green / samples
-            radiance[y, x, 2] = blue / samples
+            radiance[y, x, 0], radiance[y, x, 1], radiance[y, x, 2] = red / samples, green / samples, blue / samples
             depth[y, x] = total_depth / found if found > 0 else math.inf
             alpha[y, x] = found / samples
 
@@ -160,8 +122,7 @@ class Renderer:
     """Render a lit mesh.
 
     Attributes:
-        arrays: the mesh.
-        textures: textures of the mesh.
+        surface: the mesh.
         caster: casts rays against the mesh.
         light: (2, G, 3) irradiance / pi at the light points, in front of the faces and behind them.
         background: (3,) radiance where a ray hits nothing and ``surroundings`` is empty.
@@ -170,8 +131,7 @@ class Renderer:
         reflections: reflections of glossy surfaces, or None if all surfaces are diffuse.
     """
 
-    arrays: MeshArrays
-    textures: MipMaps
+    surface: Surface
     caster: RayCaster
     light: NDArray[np.float32]
     background: Array
@@ -180,12 +140,7 @@ class Renderer:
     reflections: Reflections | None
 
     def render(
-        self,
-        camera_to_world: ArrayLike,
-        intrinsics: Sequence[float],
-        width: int,
-        height: int,
-        samples: int,
+        self, camera_to_world: ArrayLike, intrinsics: Sequence[float], width: int, height: int, samples: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Render a picture through a pinhole camera.
 
@@ -203,72 +158,40 @@ class Renderer:
         Raises:
             ValueError: `sample_offsets` has no pattern with this number of samples.
         """
-        pose = np.asarray(camera_to_world, np.float64)
+        pose, lens, offsets = (
+            np.asarray(camera_to_world, np.float64),
+            tuple(map(float, intrinsics)),
+            sample_offsets(samples),
+        )
         rotation, center = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
-        lens, offsets = np.asarray(intrinsics, np.float64), sample_offsets(samples)
-        window = self._window(rotation, center, lens, offsets, width, height)
-        left, right, top, bottom = window
-        rays = np.empty(((bottom - top) * (right - left) * len(offsets), 6), np.float32)
-        _camera_rays(rotation, center, lens, offsets, window, rays)
+        rays = np.empty((height * width * samples, 6), np.float32)
+        _camera_rays(rotation, center, lens, offsets, width, rays)
         hits = self.caster.cast(rays)
         radiance = np.empty((height, width, 3), np.float32)
         depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
         _shade(
-            self.arrays,
-            self.textures,
-            self.light,
-            hits["primitive_ids"],
-            window,
-            rotation,
-            center,
-            lens,
-            offsets,
-            self.background,
-            self.surroundings,
-            self.limit,
-            radiance,
-            depth,
-            alpha,
-        )
+            self.surface, self.light, hits.face, rotation, center, lens, offsets, self.background, self.surroundings,
+            self.limit, radiance, depth, alpha,
+        )  # fmt: skip
         if self.reflections is not None:
             add_reflections(
-                self.reflections,
-                self.arrays,
-                self.textures,
-                self.light,
-                self.caster,
-                rays,
-                hits,
-                lens[0],
-                len(offsets),
-                self.limit,
-                radiance[top:bottom, left:right],
+                self.reflections, self.surface, self.light, self.caster, rays, hits, lens[0], self.limit, radiance
             )
         return radiance, depth, alpha
 
-    @cached_property
-    def _corners(self) -> Array:
-        """The corners (8, 3) of the mesh's bounding box."""
-        used = self.arrays.vertices[self.arrays.faces.reshape(-1)]
-        return np.array(list(itertools.product(*np.stack([used.min(axis=0), used.max(axis=0)], axis=1))))
-
-    def _window(
-        self, rotation: Array, center: Array, lens: Array, offsets: Array, width: int, height: int
-    ) -> tuple[int, int, int, int]:
-        """Return left, right, top and bottom of the part of the picture outside which no ray hits the mesh."""
-        corners = (self._corners - center) @ rotation
-        if corners[:, 2].min() <= 0:
-            return 0, width, 0, height
-        pixels = lens[:2] * corners[:, :2] / corners[:, 2:] + lens[2:]
-        # One pixel more than the rays' offsets, because the ray caster rounds to float32.
-        reach = np.abs(offsets).max(axis=0) + 1.0
-        left, top = np.floor((pixels.min(axis=0) - reach).clip(0, (width, height))).astype(int).tolist()
-        right, bottom = np.ceil((pixels.max(axis=0) + reach).clip(0, (width, height))).astype(int).tolist()
-        return left, right, top, bottom
+    def with_gain(self, gain: float) -> Renderer:
+        """Return the renderer of the same scene in ``gain`` times the light. The background does not change."""
+        seen = self.surroundings
+        return replace(
+            self,
+            light=(gain * self.light).astype(np.float32),
+            surroundings=seen._replace(texels=(gain * seen.texels).astype(np.float32)),
+            reflections=self.reflections and self.reflections.scaled(gain),
+        )
 
 
-def surroundings(environment: Environment | None) -> MipMaps:
-    """Return the panorama behind a mesh, empty where there is no environment to be seen."""
+def make_surroundings(environment: Environment | None) -> MipMaps:
+    """Build the panorama behind a mesh, empty where there is no environment to be seen."""
     return mip_maps([] if environment is None else [environment.radiance], bits16=False)
 
 

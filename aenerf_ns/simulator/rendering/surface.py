@@ -10,14 +10,18 @@ from numpy.typing import NDArray
 
 from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.rendering.mesh import Mesh
-from aenerf_ns.simulator.rendering.mip_maps import lookup
+from aenerf_ns.simulator.rendering.mip_maps import lookup, mip_maps
+from aenerf_ns.simulator.rendering.vectors import cross, interpolate, row, subtract
 
 FOOTPRINT = 0.5
 """Side of the texture region that a sample averages, in pixels: about the distance between the samples of a pixel."""
 
 
-class MeshArrays(NamedTuple):
-    """The arrays of a mesh that the compiled functions read: V vertices, F faces, G light points."""
+class Surface(NamedTuple):
+    """The arrays of a mesh that the compiled functions read: V vertices, F faces, G light points.
+
+    The last three are the `MipMaps` of the textures. numba takes no tuples within tuples in parallel functions.
+    """
 
     vertices: Array  # (V, 3)
     faces: NDArray[np.int32]  # (F, 3)
@@ -26,16 +30,24 @@ class MeshArrays(NamedTuple):
     texture: NDArray[np.int32]  # (F,) -1 for none
     density: NDArray[np.float32]  # (F,) texels per meter
     light_point: NDArray[np.int32]  # (F, 3) light point of each corner
+    texels: NDArray[np.uint16]
+    level: NDArray[np.int64]
+    first_level: NDArray[np.int64]
+
+    @property
+    def ray_offset(self) -> float:
+        """Distance in meters before the surface at which a ray that leaves it must start."""
+        return max(1e-4, 2e-5 * float(np.abs(self.vertices).max()))
 
 
-def mesh_arrays(mesh: Mesh, light_point: NDArray[np.integer]) -> MeshArrays:
-    """Return the arrays of a mesh, given the light points (F, 3) of its faces' corners."""
+def make_surface(mesh: Mesh, light_point: NDArray[np.integer]) -> Surface:
+    """Build the arrays of a mesh, given the light points (F, 3) of its faces' corners."""
     a, b, c = mesh.vertices[mesh.faces.T]
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     p, q, r = mesh.uv[mesh.faces.T]
     in_texture = np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
     texels = np.array([*(len(image) * image.shape[1] for image in mesh.textures), 0.0])
-    return MeshArrays(
+    return Surface(
         mesh.vertices,
         mesh.faces.astype(np.int32),
         mesh.uv,
@@ -43,48 +55,33 @@ def mesh_arrays(mesh: Mesh, light_point: NDArray[np.integer]) -> MeshArrays:
         mesh.texture.astype(np.int32),
         np.sqrt(in_texture * texels[mesh.texture] / np.maximum(area, 1e-300)).astype(np.float32),
         light_point.astype(np.int32),
+        *mip_maps(mesh.textures, bits16=True),
     )
 
 
-def ray_offset(arrays: MeshArrays) -> float:
-    """Return how far before a surface, in meters, a ray must start that leaves the surface."""
-    return max(1e-4, 2e-5 * float(np.abs(arrays.vertices).max()))
-
-
 @numba.njit(cache=True, error_model="numpy")
-def face_normal(arrays, face):
+def face_normal(surface, face):
     """Return the vector along a face's normal whose length is twice the face's area."""
-    v = arrays.vertices
-    i, j, k = arrays.faces[face, 0], arrays.faces[face, 1], arrays.faces[face, 2]
-    ax, ay, az = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1], v[j, 2] - v[i, 2]
-    bx, by, bz = v[k, 0] - v[i, 0], v[k, 1] - v[i, 1], v[k, 2] - v[i, 2]
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    a, b, c = row(surface.faces, face)
+    origin = row(surface.vertices, a)
+    return cross(subtract(row(surface.vertices, b), origin), subtract(row(surface.vertices, c), origin))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def diffuse_radiance(arrays, textures, light, face, side, wi, wj, wk, footprint):
+def diffuse_radiance(surface, light, face, side, weights, footprint):
     """Return the light that a point of a face reflects evenly: its albedo times the light that it receives.
 
-    ``side`` is 0 for the front and 1 for the back. ``wi``, ``wj`` and ``wk`` are the point's barycentric coordinates.
-    ``footprint`` is the side of the texture region to average, in meters.
+    ``light`` (2, G, 3) is that of the light points. ``side`` is 0 for the front and 1 for the back. ``weights`` are the
+    point's barycentric coordinates. ``footprint`` is the side of the texture region to average, in meters.
     """
-    i, j, k = arrays.faces[face, 0], arrays.faces[face, 1], arrays.faces[face, 2]
-    li, lj, lk = arrays.light_point[face, 0], arrays.light_point[face, 1], arrays.light_point[face, 2]
-    color, uv = arrays.color, arrays.uv
-    r = wi * light[side, li, 0] + wj * light[side, lj, 0] + wk * light[side, lk, 0]
-    g = wi * light[side, li, 1] + wj * light[side, lj, 1] + wk * light[side, lk, 1]
-    b = wi * light[side, li, 2] + wj * light[side, lj, 2] + wk * light[side, lk, 2]
-    r *= wi * color[i, 0] + wj * color[j, 0] + wk * color[k, 0]
-    g *= wi * color[i, 1] + wj * color[j, 1] + wk * color[k, 1]
-    b *= wi * color[i, 2] + wj * color[j, 2] + wk * color[k, 2]
-    if arrays.texture[face] >= 0:
-        tr, tg, tb = lookup(
-            textures,
-            arrays.texture[face],
-            wi * uv[i, 0] + wj * uv[j, 0] + wk * uv[k, 0],
-            wi * uv[i, 1] + wj * uv[j, 1] + wk * uv[k, 1],
-            footprint * arrays.density[face],
-            True,
-        )
-        r, g, b = r * tr / 65535.0, g * tg / 65535.0, b * tb / 65535.0
+    corners, uv = row(surface.faces, face), surface.uv
+    r, g, b = interpolate(light[side], row(surface.light_point, face), weights)
+    red, green, blue = interpolate(surface.color, corners, weights)
+    r, g, b = r * red, g * green, b * blue
+    if surface.texture[face] >= 0:
+        (i, j, k), (wi, wj, wk) = corners, weights
+        u = wi * uv[i, 0] + wj * uv[j, 0] + wk * uv[k, 0]
+        v = wi * uv[i, 1] + wj * uv[j, 1] + wk * uv[k, 1]
+        red, green, blue = lookup(surface, surface.texture[face], u, v, footprint * surface.density[face], True)
+        r, g, b = r * red / 65535.0, g * green / 65535.0, b * blue / 65535.0
     return r, g, b
