@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 # Glob patterns, from the root of the repository, of the pages and files outside docs/ that are on the site.
 OUTSIDE = (
-    *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE"),
+    *("README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "examples/*"),
     *("benchmarks/**/*.md", "benchmarks/**/*.py", "benchmarks/results/**/*"),
 )
 
