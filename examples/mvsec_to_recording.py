@@ -29,7 +29,7 @@ with h5py.File(f"{name}_data.hdf5") as file:
 with h5py.File(f"{name}_gt.hdf5") as file:
     poses, times = file["davis"][side]["pose"][:], file["davis"][side]["pose_ts"][:]
 with (folder / "trajectory.txt").open("w") as trajectory:
-    for time, pose in zip(times, poses):
+    for time, pose in zip(times, poses, strict=True):
         values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
         trajectory.write(f"{time:.9f} {' '.join(f'{value:.12g}' for value in values)}\n")
 

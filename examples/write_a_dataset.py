@@ -33,12 +33,25 @@ for i in range(3):
 lens = {"fl_x": 60.0, "fl_y": 60.0, "cx": width / 2, "cy": height / 2}
 test_pose = [[1, 0, 0, 0.05], [0, -1, 0, 0], [0, 0, -1, -2], [0, 0, 0, 1]]
 meta = {
-    "w": width, "h": height, **lens, "image_encoding": "srgb",
+    "w": width,
+    "h": height,
+    **lens,
+    "image_encoding": "srgb",
     "event_camera": {
-        "file": "events.h5", "width": width, "height": height, **lens,
-        "camera_model": "OPENCV", "k1": -0.1, "k2": 0.02, "p1": 0.0, "p2": 0.0, "k3": 0.0,
-        "positive_contrast_threshold": 0.25, "negative_contrast_threshold": 0.25,
-        "refractory_period_ns": 1000, "bayer_pattern": "",
+        "file": "events.h5",
+        "width": width,
+        "height": height,
+        **lens,
+        "camera_model": "OPENCV",
+        "k1": -0.1,
+        "k2": 0.02,
+        "p1": 0.0,
+        "p2": 0.0,
+        "k3": 0.0,
+        "positive_contrast_threshold": 0.25,
+        "negative_contrast_threshold": 0.25,
+        "refractory_period_ns": 1000,
+        "bayer_pattern": "",
     },
     "frames": [
         {"file_path": "images/0.png", "timestamp": 0.25},

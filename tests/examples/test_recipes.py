@@ -1,4 +1,4 @@
-"""The scripts of docs/recipes.md turn files of the described layouts into recordings. JSON is YAML too."""
+"""The scripts that make recordings of published datasets, on small files of their layouts. JSON is YAML too."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.bag_writers import message_header, string
+from helpers.examples import run_example
 from helpers.published_datasets import (
     EPOCH,
     N_POSES,
@@ -21,20 +22,14 @@ from helpers.published_datasets import (
 )
 from numpy.typing import NDArray
 from PIL import Image
-from test_documented_examples import blocks, run
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.recording import Recording
 
-MVSEC, VECTOR, BAG = range(3)
 # Seconds since 1970, as the datasets have them.
 TIMES = EPOCH / 1e6 + np.linspace(0, 2, N_POSES)
-
-
-def script(index: int) -> str:
-    return blocks("recipes.md", "python")[index]
 
 
 def events_of(recording: Recording) -> dict[str, NDArray]:
@@ -71,10 +66,10 @@ def write_mvsec(folder: Path) -> dict[str, NDArray]:
     return events
 
 
-def test_mvsec_becomes_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mvsec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     events = write_mvsec(tmp_path)
-    run(script(MVSEC))
+    run_example("mvsec_to_recording")
     recording = recording_of(OwnRecordingDataParserConfig(data=Path("mvsec"), event_camera="cam0"))
     assert_same_events(recording, events)
     assert_same_poses(recording.trajectory.camera_to_worlds, make_poses())
@@ -85,10 +80,10 @@ def test_mvsec_becomes_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert np.asarray(Image.open(view.file)).tolist() == np.full((260, 346), 9).tolist()
 
 
-def test_poses_of_devo_stand_in_for_those_of_mvsec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_of_devo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_mvsec(tmp_path)
-    run(script(MVSEC))
+    run_example("mvsec_to_recording")
     estimated = make_poses()
     estimated[:, :3, 3] *= 0.1
     header = "# timestamp[secs] tx ty tz qx qy qz qw\n"
@@ -104,7 +99,7 @@ def test_poses_of_devo_stand_in_for_those_of_mvsec(tmp_path: Path, monkeypatch: 
         OwnRecordingDataParserConfig(**options).setup().get_dataparser_outputs("train")
 
 
-def test_vector_becomes_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     events = make_events(640, 480, EPOCH)
     with h5py.File("corner_slow1.synced.left_event.hdf5", "w") as file:
@@ -126,7 +121,7 @@ def test_vector_becomes_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ("small_scale_joint_camera_extrinsic_results", {"cam2": {"T_cam0_cam2": camera_from_event.tolist()}}),
     ):
         Path(f"{name}.yaml").write_text(json.dumps(content))
-    run(script(VECTOR))
+    run_example("vector_to_recording")
     options = {"data": Path("vector"), "events": Path("corner_slow1.synced.left_event.hdf5")}
     recording = recording_of(OwnRecordingDataParserConfig(**options))
     assert_same_events(recording, events)
@@ -135,7 +130,7 @@ def test_vector_becomes_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert recording.event_camera == expected
 
 
-def test_frames_of_a_bag_become_files_with_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_a_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rosbag1, typesys = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
     monkeypatch.chdir(tmp_path)
@@ -148,7 +143,7 @@ def test_frames_of_a_bag_become_files_with_times(tmp_path: Path, monkeypatch: py
         for stamp, frame in zip(stamps, frames, strict=True):
             end = string("mono8") + b"\0" + struct.pack("<2I", 4, frame.size) + frame.tobytes()
             writer.write(pictures, stamp, message_header(stamp, (3, 2)) + end)
-    run(script(BAG))
+    run_example("frames_of_a_bag")
     lines = Path("recording/images.txt").read_text().splitlines()
     assert lines == ["1600000000.000000007 images/000000.png", "1600000000.040000007 images/000001.png"]
     for index, frame in enumerate(frames):

@@ -1,14 +1,16 @@
-"""The code in the documents runs and does what the text says."""
+"""The examples and the code in the documents run and do what the text says."""
 
 from __future__ import annotations
 
 import json
 import re
+import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers.examples import EXAMPLES, run_example
 from helpers.small_datasets import make_trajectory, parse, write_native
 
 from aenerf_ns.camera.trajectory import homogeneous
@@ -16,35 +18,21 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
 
-DOCS = Path(__file__).parents[2] / "docs"
+FORMAT_PAGE = EXAMPLES.parent / "docs" / "dataset_format.md"
 
 
-def blocks(page: str, language: str) -> list[str]:
-    """The blocks of code in a language on a page."""
-    return re.findall(
-        rf"^```{language}\n(.*?)^```$", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-    )
-
-
-def run(code: str, **names: object) -> dict[str, object]:
-    """The names that the code defines."""
-    # A format's module is found by its name when its classes are made.
-    names["__name__"] = "__main__"
-    exec(compile(code, "document", "exec"), names)
-    return names
-
-
-def test_the_datasets_that_the_page_writes_are_those_it_describes_and_reads(
+def test_written_datasets_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    by_hand, with_writer, read, _ = blocks("dataset_format.md", "python")
-    run(by_hand)
-    (described,) = blocks("dataset_format.md", "json")
+    run_example("write_a_dataset")
+    (described,) = re.findall(
+        r"^```json\n(.*?)^```$", FORMAT_PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
     assert json.loads(described) == json.loads(Path("scene/transforms.json").read_text())
-    run(with_writer)
-    printed = capsys.readouterr().out
-    run(read)
+    run_example("write_a_dataset_with_the_writer")
+    capsys.readouterr()
+    run_example("read_a_dataset")
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.count("20,000 events gave") == 2
     assert "val ['1.png'] test ['2.png']" in printed
@@ -54,7 +42,7 @@ def test_the_datasets_that_the_page_writes_are_those_it_describes_and_reads(
     assert val.time == 1_600_000_000_500_000_001
 
 
-def test_the_smallest_file_of_cameras_is_enough(tmp_path: Path) -> None:
+def test_smallest_transforms(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     camera = json.loads((folder / "transforms.json").read_text())["event_camera"]
     required = [
@@ -72,7 +60,7 @@ def test_the_smallest_file_of_cameras_is_enough(tmp_path: Path) -> None:
     assert len(EventDataset(parse(NativeDataParserConfig(data=folder))).pairs)
 
 
-def test_the_documented_format_reads_a_folder(tmp_path: Path) -> None:
+def test_format_of_your_own(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     t = np.sort(rng.integers(0, 1_000_000, 500))
     np.savez(
@@ -80,29 +68,39 @@ def test_the_documented_format_reads_a_folder(tmp_path: Path) -> None:
     )
     poses = "".join(f"{0.1 * i:.1f} {0.1 * i:.1f} 0 -2 0 0 0 1\n" for i in range(11))
     (tmp_path / "poses.txt").write_text(poses)
-    module = run(blocks("dataset_format.md", "python")[-1])
+    module = run_example("npz_format")
     config = module["npz_dataparser"].config  # type: ignore[attr-defined]
     config.data = tmp_path
     dataset = EventDataset(parse(config))
     assert dataset.pairs.num_events == 500
     assert len(dataset.scene.trajectory) == 11
     assert dataset.scene.window.end == int(t[-1]) * 1_000
-    # The entry point names what the module registers.
-    (entry,) = blocks("dataset_format.md", "toml")
-    assert "aenerf_ns.dataparsers.npz:npz_dataparser" in entry
-    assert module["__doc__"].startswith("dataparsers/npz.py")  # type: ignore[attr-defined]
 
 
-def test_the_documented_way_back_to_the_world_is_the_inverse(tmp_path: Path) -> None:
+def test_way_back_to_the_world(tmp_path: Path) -> None:
     outputs = parse(NativeDataParserConfig(data=write_native(tmp_path / "made")))
     outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
     scene_opengl = outputs.metadata[SCENE_KEY].trajectory.camera_to_worlds.numpy()
-    (code,) = blocks("coordinate_frames.md", "python")
-    code, count = re.subn(r'Path\("outputs/[^"]*"\)', "run", code)
-    assert count == 1
-    names = run(code, run=tmp_path, scene_opengl=scene_opengl)
-    world = torch.from_numpy(np.asarray(names["world_opencv"]))
+    points, poses = runpy.run_path(str(EXAMPLES / "scene_to_world.py"))["load_world_from_scene"](tmp_path)
+    world = torch.from_numpy(poses(scene_opengl) @ np.diag([1.0, -1.0, -1.0, 1.0]))
     # The file holds float32.
     torch.testing.assert_close(world, make_trajectory().camera_to_worlds, rtol=0, atol=1e-5)
-    points = names["points"](scene_opengl[:, :, 3])  # type: ignore[operator]
-    np.testing.assert_allclose(points, homogeneous(make_trajectory().camera_to_worlds)[:, :3, 3], rtol=0, atol=1e-5)
+    expected = homogeneous(make_trajectory().camera_to_worlds)[:, :3, 3]
+    np.testing.assert_allclose(points(scene_opengl[:, :, 3]), expected, rtol=0, atol=1e-5)
+
+
+def test_supervision_of_your_own(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    runpy.run_path(str(EXAMPLES / "add_a_supervision.py"))["main"](data, tmp_path / "outputs", 3)
+    assert list((tmp_path / "outputs").rglob("step-000000002.ckpt"))
+
+
+def test_notebook(tmp_path: Path) -> None:
+    """Runs with few steps: the cells, not the picture, are tested."""
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    notebook = nbformat.read(EXAMPLES / "first_run.ipynb", 4)
+    (steps,) = [cell for cell in notebook.cells if "STEPS = 300" in cell.source]
+    steps.source = steps.source.replace("STEPS = 300", "STEPS = 3")
+    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert (tmp_path / "first_run" / "evaluation.json").is_file()
+    assert notebook.cells[-2].outputs[0].output_type == "execute_result"
