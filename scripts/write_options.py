@@ -67,7 +67,7 @@ INTRODUCTION = """\
 # Options
 
 This page lists this project's options of `ns-train` and of the dataset formats, with their defaults. `ns-train METHOD
---help` also lists Nerfstudio's own options; [some of them have no effect](nerfstudio.md#flags-without-effect). [The
+--help` also lists Nerfstudio's own options; [some of them have no effect](nerfstudio.md#commands-and-flags). [The
 method](method.md) explains the terms. Give `True` or `False` after an option whose default is one of them.
 
 `python scripts/write_options.py` writes this page from the configurations: do not edit it by hand.
@@ -76,7 +76,8 @@ method](method.md) explains the terms. Give `True` or `False` after an option wh
 PEERS_INTRODUCTION = """\
 ## Methods of other papers
 
-Options of `aenerf` that are not in this table have the same defaults in [these methods](peers.md), and options of
+Options of `aenerf` that are not in this table have the same defaults in [these
+methods](supervision.md#methods-of-other-papers), and options of
 `aenerf-small` in the small ones. Only `robust-enerf` has
 options of pairs and of the sensor.
 """
