@@ -3,44 +3,103 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.camera.time_window import TimeWindow
-from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.cli.arguments import Automatic, ConvertArguments
-from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
-from aenerf_ns.cli.termination import ended_by_exception
+from aenerf_ns.cli.dataset import DatasetCommand, training_command
+from aenerf_ns.cli.ranges import require_seed
+from aenerf_ns.cli.termination import sigterm_as_system_exit
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.filters import FilteredEventFile, hot_pixel_summary
-from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.poses_from_frames.structure_from_motion import compare_with_truth, estimate_poses
+from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.progress import tracked
-from aenerf_ns.recording.images import check_image
-from aenerf_ns.recording.output_lock import OutputLock
-from aenerf_ns.recording.recording import FrameSequence, Recording
-from aenerf_ns.recording.views import thinned, views_on_trajectory
-from aenerf_ns.recording.writer import NativeDatasetWriter
+
+if TYPE_CHECKING:
+    from aenerf_ns.camera.time_window import TimeWindow
+    from aenerf_ns.camera.trajectory import Trajectory
+    from aenerf_ns.events.filters import EventFilters, FilteredEventFile
+    from aenerf_ns.events.stream import EventFile, EventStream
+    from aenerf_ns.recording.dataparser import EventDataParser
+    from aenerf_ns.recording.output_lock import OutputLock
+    from aenerf_ns.recording.recording import FrameSequence, Recording
+    from aenerf_ns.recording.writer import NativeDatasetWriter
+
+# Takes exactly four words. As an optional tuple, the option would also take the dataset if it follows.
+_Region = Annotated[
+    tuple[int, int, int, int] | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=4,
+        metavar="X Y WIDTH HEIGHT",
+        instance_from_str=lambda words: tuple(int(word) for word in words),
+        is_instance=lambda value: value is None or isinstance(value, tuple),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
 
 
 @dataclass
-class Convert(ConvertArguments):
-    __doc__ = ConvertArguments.__doc__
+class Convert(DatasetCommand):
+    """Write a dataset of any format as a dataset folder of aenerf-ns, with some of the events left out where asked.
+    The events are read and written piece by piece, and the folder appears when it is complete."""
 
-    format: DatasetFormat = field(default_factory=Automatic)
+    output: Path
+    """Dataset folder to create."""
+    poses: Literal["given", "colmap"] = "given"
+    """given: take the dataset's poses. colmap: have COLMAP estimate poses from the recording's frames, without metric
+    scale. The given poses are then kept as ground truth, to compare with."""
+    start_time_ns: int | None = None
+    """Leave out events and images before this time on the clock of the events, in nanoseconds."""
+    end_time_ns: int | None = None
+    """Leave out events and images after this time on the clock of the events, in nanoseconds."""
+    region: _Region = None
+    """Keep only this part of the sensor, in pixels."""
+    drop_hot_pixels: bool = False
+    """Leave out pixels that fire by themselves. Reads the events twice."""
+    shortest_interval_ns: int = 0
+    """Leave out events that follow the last kept event of their pixel by less than this, in nanoseconds. Meant for
+    pixels that fire repeatedly for one change of light. Leaving out any other event loses a change of light of one
+    contrast threshold."""
+    pixel_share: float = 1.0
+    """Keep the events of this share of the pixels, chosen at random, to train on fewer events."""
+    seed: int = 0
+    """Seed of the choice of pixels, and of COLMAP."""
 
     def main(self) -> None:
         """Read the dataset and write it."""
-        self.judge()
-        with ended_by_exception(), OutputLock(self.output) as lock:
-            self._convert(lock)
+        require_absent(self.output)
+        require_seed(self.seed)
+        filters = self._make_filters()
+        parser = self.open_dataset()
+        from aenerf_ns.recording.output_lock import OutputLock
 
-    def _convert(self, lock: OutputLock) -> None:
-        filters = self.filters()
-        parser = open_dataset(self.data, self.format)
+        with sigterm_as_system_exit(), OutputLock(self.output) as lock:
+            self._convert(parser, filters, lock)
+
+    def _make_filters(self) -> EventFilters:
+        from aenerf_ns.events.filters import EventFilters
+
+        try:
+            return EventFilters(
+                start=self.start_time_ns,
+                end=self.end_time_ns,
+                region=self.region,
+                hot_pixels=self.drop_hot_pixels,
+                pixel_share=self.pixel_share,
+                shortest_interval=self.shortest_interval_ns,
+                seed=self.seed,
+            )
+        except ValueError as error:
+            raise DataError("aenerf convert", str(error), "see aenerf convert --help") from None
+
+    def _convert(self, parser: EventDataParser, filters: EventFilters, lock: OutputLock) -> None:
+        from aenerf_ns.events.filters import FilteredEventFile
+        from aenerf_ns.recording.images import check_image
+        from aenerf_ns.recording.views import thinned
+        from aenerf_ns.recording.writer import NativeDatasetWriter
+
         longest_gap = parser.config.max_pose_gap_ns
         report = None
         if self.poses == "colmap":
@@ -97,7 +156,9 @@ class Convert(ConvertArguments):
 
 
 def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) -> Trajectory:
-    """Return the poses that cover the time window, or all poses if the window has no bounds."""
+    """Crop the poses to the time window, or return all poses if the window has no bounds."""
+    from aenerf_ns.camera.time_window import TimeWindow
+
     first, last = recording.event_file.ordered_time_span()
     start, end = events.time_span()
     if end < start:
@@ -111,7 +172,9 @@ def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) ->
 
 
 def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDatasetWriter) -> tuple[int, int]:
-    """Write the kept events, and return how many events were read and how many were written."""
+    """Write the kept events, and count the events that were read and those that were written."""
+    from aenerf_ns.events.filters import hot_pixel_summary
+
     num_read = num_written = 0
 
     def read(description: str) -> Iterator[EventStream]:
@@ -135,7 +198,12 @@ def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDat
 def _with_estimated_poses(
     frames: FrameSequence, window: TimeWindow, source: Path, seed: int
 ) -> tuple[Recording, dict[str, Any]]:
-    """Return the recording with COLMAP's poses as the estimated poses, and COLMAP's report."""
+    """Estimate poses with COLMAP, and return the recording with them and COLMAP's report."""
+    from aenerf_ns.camera.trajectory import Trajectory
+    from aenerf_ns.poses_from_frames.structure_from_motion import compare_with_truth, estimate_poses
+    from aenerf_ns.recording.recording import Recording
+    from aenerf_ns.recording.views import views_on_trajectory
+
     capture = frames.capture
     if capture.frame_camera != capture.event_camera:
         raise DataError(

@@ -1,35 +1,51 @@
-"""``aenerf evaluate``: the metrics of ``ns-eval``, under the run's colour correction or another one."""
+"""``aenerf evaluate``: the metrics of ``ns-eval``, under the run's color correction or another one."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.cli.arguments import EvaluateArguments
-from aenerf_ns.cli.trained_run import open_run
-from aenerf_ns.files.output_paths import created
+from aenerf_ns.cli.trained_run import RunPath, open_run
+from aenerf_ns.files.output_paths import creating, require_absent, require_writable
+from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 
 
 @dataclass
-class Evaluate(EvaluateArguments):
-    __doc__ = EvaluateArguments.__doc__
+class Evaluate:
+    """Compare a trained run's renderings with the test views, as ns-eval does and in the same JSON layout, optionally
+    under another protocol than the run's. Nothing in the run's folder changes."""
+
+    load_config: RunPath
+    output: Path
+    """JSON file to write."""
+    color_correction: ColorCorrectionProtocol | None = None
+    """Fit this color correction on the run's data and use it; by default the correction stored with the run."""
+    render_output: Path | None = None
+    """Folder for pictures, from the test poses as placed: truth beside reconstruction, accumulation, depth."""
+    nerfbaselines: Path | None = None
+    """Folder to create in the layout of nerfbaselines: results.json, and the predictions that `nerfbaselines evaluate`
+    reads, from the test poses as placed."""
 
     def main(self) -> None:
         """Load the run, evaluate it and write the metrics."""
-        self.judge()
-        # Imported lazily, because these imports take seconds.
+        require_writable(self.output)
+        if self.render_output is not None:
+            require_writable(self.render_output / "0000.png", "--render-output")
+        if self.nerfbaselines is not None:
+            require_absent(self.nerfbaselines, "--nerfbaselines")
+        config, run, checkpoint = open_run(self.load_config)
         from aenerf_ns.evaluation.color_fit import replace_color_correction
         from aenerf_ns.evaluation.evaluate import evaluate
 
-        config, run, checkpoint = open_run(self.load_config)
         of_run = run.model.color_correction.protocol
         used = self.color_correction or of_run
         if self.color_correction is not None:
             replace_color_correction(run, used)
         if self.render_output is not None:
-            with created(self.render_output, "--render-output"):
+            with creating(self.render_output, "--render-output"):
                 self.render_output.mkdir(exist_ok=True)
         results = evaluate(run, self.render_output)
         evaluation = {
@@ -42,23 +58,23 @@ class Evaluate(EvaluateArguments):
             },
             "results": results,
         }
-        with created(self.output, "--output"):
+        with creating(self.output):
             self.output.write_text(json.dumps(evaluation, indent=2) + "\n", "utf8")
         if results["num_views"] == 0:
             CONSOLE.print(f"{self.output}: errors of the poses; there are no views to evaluate on.")
             return
         if self.nerfbaselines is not None:
-            # Imported lazily, because few evaluations need it.
             from aenerf_ns.export.predictions import export_predictions
 
-            with created(self.nerfbaselines, "--nerfbaselines"):
+            with creating(self.nerfbaselines, "--nerfbaselines"):
                 export_predictions(run, self.nerfbaselines, config, results["views"])
         refined = results.get("refined_test_poses")
-        figures = {"placed": results} | ({"refined": refined} if refined else {})
+        metrics = {"placed": results} | ({"refined": refined} if refined else {})
         shown = "; ".join(
-            f"PSNR {one['psnr']:.2f} dB, SSIM {one['ssim']:.3f} with test poses {name}" for name, one in figures.items()
+            f"PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.3f} with test poses {name}"
+            for name, values in metrics.items()
         )
         CONSOLE.print(
-            f"{self.output}: {shown}; {results['num_views']} views; colour correction {results['color_correction']}.",
+            f"{self.output}: {shown}; {results['num_views']} views; color correction {results['color_correction']}.",
             soft_wrap=True,
         )

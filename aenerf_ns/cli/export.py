@@ -1,22 +1,227 @@
-"""``python -m aenerf_ns.cli.export``: ``ns-export``, on machines without the libusb that Open3D needs as well.
-
-``ns-export`` imports Open3D before it loads plugins, so a plugin cannot help it.
-"""
+"""``aenerf export-trajectory``, ``-cameras``, ``-frames``, ``-mesh`` and ``-video``: a trained run for other tools."""
 
 from __future__ import annotations
 
-from aenerf_ns.errors import errors_as_one_line
-from aenerf_ns.open3d_import import load_open3d
+import shutil
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.cli.ranges import RATES, require_range
+from aenerf_ns.cli.trained_run import RunPath, open_run
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.output_paths import creating, require_absent, require_writable
+
+_MESH_SUFFIXES = (".ply", ".glb", ".obj")
+# More than anybody needs. They would fill the memory.
+_MAX_POINTS, _MAX_VIEWS = 10_000_000, 10_000
 
 
-def main() -> None:
-    """Run ``ns-export`` with the arguments of the process."""
-    with errors_as_one_line():
-        load_open3d()
-    from nerfstudio.scripts import exporter
+@dataclass
+class ExportTrajectory:
+    """Write the poses of a trained run in TUM format: t tx ty tz qx qy qz qw, in seconds, camera-to-world, OpenCV axes,
+    in the world and the units of the recording."""
 
-    exporter.entrypoint()
+    load_config: RunPath
+    output: Path
+    """Text file to write."""
+    poses: Literal["corrected", "estimated", "ground-truth"] = "corrected"
+    """corrected: after the run's pose correction. estimated: as given to the run. ground-truth: the true poses, within
+    the run's time window."""
+    rate: float | None = None
+    """Poses a second; by default at the times of the given poses."""
+
+    def main(self) -> None:
+        """Load the run and write its poses."""
+        if self.rate is not None:
+            require_range("rate", self.rate, *RATES)
+        require_writable(self.output)
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        import torch
+
+        from aenerf_ns.camera.trajectory import Trajectory
+        from aenerf_ns.export.times import regular_times
+        from aenerf_ns.files.tum_trajectory import write_tum_trajectory
+
+        correction = run.model.camera_optimizer
+        estimated = correction.trajectory
+        trajectory = estimated
+        if self.poses == "ground-truth":
+            trajectory = run.scene.ground_truth
+            if trajectory is None:
+                raise DataError(run.data, "it has no true poses", "export corrected or estimated ones")
+            trajectory = trajectory.to(run.device).crop(estimated.start, estimated.end)
+        times = trajectory.times
+        if self.rate is not None:
+            times = regular_times(trajectory.start, trajectory.end, self.rate).to(times.device)
+        source = correction if self.poses == "corrected" else trajectory
+        with torch.no_grad():
+            poses = source.pose(trajectory.seconds(times))
+        written = Trajectory(times.cpu(), run.scene.to_recording(poses))
+        with creating(self.output):
+            write_tum_trajectory(self.output, written)
+        CONSOLE.print(f"{self.output}: {len(written)} {self.poses} poses.")
 
 
-if __name__ == "__main__":
-    main()
+@dataclass
+class ExportCameras:
+    """Write the cameras of a recording's images, at the corrected poses of a trained run, so that a trainer of splats
+    or NeRFs starts from them: a COLMAP model (sparse/0), transforms.json, and points of the scene. All are in the world
+    and the units of the recording. The images are linked."""
+
+    load_config: RunPath
+    output: Path
+    """Folder to create."""
+    copy: bool = False
+    """Copy the images in place of linking them."""
+    num_points: int = 20_000
+    """The most points of the scene to write, of those that the run renders. Trainers of splats begin with them."""
+
+    def main(self) -> None:
+        """Load the run and write cameras, points and images."""
+        require_absent(self.output)
+        require_range("num-points", self.num_points, 1, _MAX_POINTS)
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        from aenerf_ns.export.camera_model_files import IMAGE_FOLDER
+        from aenerf_ns.export.frames import write_cameras
+        from aenerf_ns.export.placing import placed_views
+        from aenerf_ns.export.rendering import points_seen
+
+        placed = placed_views(run)
+        images = [image for image, _ in placed]
+        points = points_seen(run, images, self.num_points)
+        with creating(self.output):
+            for image, file in placed:
+                target = self.output / IMAGE_FOLDER / image.name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                if self.copy:
+                    shutil.copyfile(file, target)
+                else:
+                    target.symlink_to(file.resolve())
+            write_cameras(self.output, images, points)
+        CONSOLE.print(
+            f"{self.output}: {len(images)} images with cameras, {len(points.positions)} points. Train on them with:\n"
+            f"  ns-train splatfacto --data {self.output} nerfstudio-data --load-3D-points True\n"
+            f"  ns-train nerfacto --data {self.output} colmap --colmap-path sparse/0",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+@dataclass
+class ExportFrames:
+    """Render frames and depths from the corrected poses at chosen times, and write them with their times and their
+    cameras as export-cameras does, in the world and the units of the recording."""
+
+    load_config: RunPath
+    output: Path
+    """Folder to create."""
+    rate: float | None = None
+    """Frames a second of the recording; 10 by default."""
+    times: tuple[float, ...] = ()
+    """Times of the frames in seconds, on the clock of the events, in place of a rate."""
+    num_points: int = 20_000
+    """The most points of the scene to write."""
+
+    def main(self) -> None:
+        """Load the run, render and write."""
+        require_absent(self.output)
+        require_range("num-points", self.num_points, 1, _MAX_POINTS)
+        if self.rate is not None:
+            if self.times:
+                raise DataError("aenerf export-frames", "--rate and --times are given", "leave out one of the two")
+            require_range("rate", self.rate, *RATES)
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        from aenerf_ns.export.frames import export_frames
+        from aenerf_ns.export.times import times_at_rate, times_of_seconds
+
+        if self.times:
+            times = times_of_seconds(run.scene.window, self.times)
+        else:
+            times = times_at_rate(run.scene.window, 10.0 if self.rate is None else self.rate)
+        with creating(self.output):
+            export_frames(run, self.output, times, self.num_points)
+        CONSOLE.print(f"{self.output}: {len(times)} frames with depths, times and cameras.", soft_wrap=True)
+
+
+@dataclass
+class ExportMesh:
+    """Fuse the depths that a trained run renders along its corrected trajectory in a truncated signed distance field,
+    and write the surface as a colored mesh, in the world and the units of the recording."""
+
+    load_config: RunPath
+    output: Path
+    """Mesh file to write: .ply, .glb or .obj."""
+    resolution: int = 256
+    """Voxels along the longest side of the box: the scene's box where the dataset states one, else the box of what the
+    views see."""
+    num_views: int = 60
+    """Views, evenly spread over the time of the run."""
+
+    def main(self) -> None:
+        """Load the run, extract the mesh and write it."""
+        if self.output.suffix not in _MESH_SUFFIXES:
+            raise DataError(self.output, "not a mesh file", "choose another --output, ending with .ply, .glb or .obj")
+        require_writable(self.output)
+        require_range("resolution", self.resolution, 8, 2048)
+        require_range("num-views", self.num_views, 1, _MAX_VIEWS)
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        import trimesh
+
+        from aenerf_ns.export.mesh import extract_mesh
+
+        mesh = extract_mesh(run, self.num_views, self.resolution)
+        written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
+        with creating(self.output):
+            written.export(self.output)
+        sides = " x ".join(f"{side:.3g}" for side in written.extents)
+        CONSOLE.print(
+            f"{self.output}: {len(mesh.faces)} triangles, {sides} units of the recording.",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+@dataclass
+class ExportVideo:
+    """Write a video along the corrected trajectory of a trained run. Beside each other it shows the recorded events,
+    the events that the rendering triggers, the rendering, its depth, and the last image that was taken on the
+    trajectory, where there are images."""
+
+    load_config: RunPath
+    output: Path
+    """Video file to write, ending with .mp4."""
+    rate: float = 50.0
+    """Frames a second of the recording. A frame shows the events since the frame before."""
+    frame_rate: float = 25.0
+    """Frames a second of the video: with the defaults, it shows everything at half the speed."""
+
+    def main(self) -> None:
+        """Load the run, render and write the video."""
+        if self.output.suffix.lower() != ".mp4":
+            raise DataError(self.output, "only videos of the kind .mp4 are written", "end the --output with .mp4")
+        require_range("rate", self.rate, *RATES)
+        require_range("frame-rate", self.frame_rate, 0.1, 1000)
+        require_writable(self.output)
+        _, run, _ = open_run(self.load_config, test_mode="inference")
+        from aenerf_ns.cli.video_file import new_video
+        from aenerf_ns.export.times import times_at_rate
+        from aenerf_ns.export.video import side_by_side
+
+        run.scene.event_file.require()
+        times = times_at_rate(run.scene.window, self.rate)
+        if len(times) < 2:
+            raise DataError("--rate", f"{self.rate:g} frames a second give no two frames", "give a higher one")
+        pictures = side_by_side(run, times)
+        first = next(pictures)
+        with (
+            creating(self.output),
+            closing(new_video(self.output, first.shape[1], first.shape[0], self.frame_rate)) as video,
+        ):
+            video.send(first.tobytes())
+            for picture in pictures:
+                video.send(picture.tobytes())
+        CONSOLE.print(f"{self.output}: {len(times) - 1} frames.", soft_wrap=True)

@@ -2,70 +2,66 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
+from typing import Any
 
 import tyro
 
-from aenerf_ns.cli import first_look
 from aenerf_ns.errors import DataError
+
+_COMMANDS = {
+    "simulate": "simulate:Simulate",
+    "simulate-video": "simulate_video:SimulateVideo",
+    "convert": "convert:Convert",
+    "check": "check:Check",
+    "reconstruct": "reconstruct:Reconstruct",
+    "evaluate": "evaluate:Evaluate",
+    "report": "report:ReportCommand",
+    "export-trajectory": "export:ExportTrajectory",
+    "export-cameras": "export:ExportCameras",
+    "export-frames": "export:ExportFrames",
+    "export-mesh": "export:ExportMesh",
+    "export-video": "export:ExportVideo",
+}
+_POSITIONAL = ("--data", "--video", "--load-config")
 
 
 def main() -> None:
     """Run the ``aenerf`` command.
 
-    Bad input ends the process with one line and exit status 1, bad arguments with exit status 2.
+    Bad arguments end the process with exit status 2, bad data with one line and exit status 1, or 2 for ``check``.
     """
-    words = sys.argv[1:]
-    with _error_as_status(2):
-        arguments = first_look.parsed(words)
-    if arguments is not None:
-        with _error_as_status(2 if words[0] == "check" else 1):
-            first_look.judge(arguments)
-    # Not before, because these imports take seconds.
-    from aenerf_ns.cli.check import Check
-    from aenerf_ns.cli.convert import Convert
-    from aenerf_ns.cli.evaluate import Evaluate
-    from aenerf_ns.cli.export_cameras import ExportCameras
-    from aenerf_ns.cli.export_frames import ExportFrames
-    from aenerf_ns.cli.export_mesh import ExportMesh
-    from aenerf_ns.cli.export_trajectory import ExportTrajectory
-    from aenerf_ns.cli.export_video import ExportVideo
-    from aenerf_ns.cli.reconstruct import Reconstruct
-    from aenerf_ns.cli.report import Report
-    from aenerf_ns.cli.simulate import Simulate
-
-    with _error_as_status(2):
-        command = tyro.extras.subcommand_cli_from_dict(
-            {
-                "simulate": Simulate,
-                "convert": Convert,
-                "check": Check,
-                "reconstruct": Reconstruct,
-                "evaluate": Evaluate,
-                "report": Report,
-                "export-trajectory": ExportTrajectory,
-                "export-cameras": ExportCameras,
-                "export-frames": ExportFrames,
-                "export-mesh": ExportMesh,
-                "export-video": ExportVideo,
-            },
-            prog="aenerf",
-            description=first_look.DESCRIPTION,
-        )
-    with _error_as_status(1):
-        command.main()
-
-
-@contextmanager
-def _error_as_status(status: int) -> Iterator[None]:
-    """End the process with one line and a status in place of a DataError."""
+    words = _with_positional_first(sys.argv[1:])
+    names = words[:1] if words and words[0] in _COMMANDS else _COMMANDS
+    command = tyro.extras.subcommand_cli_from_dict(
+        {name: _load_command(name) for name in names},
+        prog="aenerf",
+        description="AE-NeRF tools; train with ns-train aenerf.",
+        args=words,
+    )
     try:
-        yield
+        command.main()
     except DataError as error:
         print(f"Error: {error}", file=sys.stderr)
-        sys.exit(status)
+        sys.exit(getattr(command, "error_status", 1))
+
+
+def _load_command(name: str) -> Any:
+    module, _, attribute = _COMMANDS[name].partition(":")
+    return getattr(importlib.import_module(f"aenerf_ns.cli.{module}"), attribute)
+
+
+def _with_positional_first(words: Sequence[str]) -> Sequence[str]:
+    """Turn ``--data DATA``, as users of ns-train type it, into the positional argument after the command's name."""
+    for index, word in enumerate(words):
+        option, equals, value = word.partition("=")
+        if index > 0 and option.replace("_", "-") in _POSITIONAL:
+            rest = words[index + 1 :] if equals else words[index + 2 :]
+            given = [value] if equals else words[index + 1 : index + 2]
+            return [words[0], *given, *words[1:index], *rest]
+    return words
 
 
 if __name__ == "__main__":

@@ -4,46 +4,70 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
 
-from aenerf_ns.camera.trajectory import homogeneous
-from aenerf_ns.cli.arguments import Automatic, ReconstructArguments
-from aenerf_ns.cli.dataset_format import DatasetFormat, open_dataset, training_command
-from aenerf_ns.cli.termination import ended_by_exception
-from aenerf_ns.cli.video_file import new_video
+from aenerf_ns.cli.dataset import DatasetCommand, training_command
+from aenerf_ns.cli.ranges import require_range
+from aenerf_ns.cli.termination import sigterm_as_system_exit
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.progress import tracked
-from aenerf_ns.reconstruction.images import FilteredImages, ImageSource, NetworkImages, images_of
-from aenerf_ns.reconstruction.weights import load_network
-from aenerf_ns.recording.images import check_image
-from aenerf_ns.recording.output_lock import OutputLock
-from aenerf_ns.recording.recording import SPLITS, Recording
-from aenerf_ns.recording.views import thinned
-from aenerf_ns.recording.writer import NativeDatasetWriter
+from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL
+from aenerf_ns.reconstruction.weights import require_weights
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from aenerf_ns.events.stream import EventStream
+    from aenerf_ns.reconstruction.images import ImageSource
+    from aenerf_ns.recording.dataparser import EventDataParser
+    from aenerf_ns.recording.output_lock import OutputLock
+    from aenerf_ns.recording.recording import Recording
+    from aenerf_ns.recording.writer import NativeDatasetWriter
 
 _VIDEO, _VIDEO_RATE = "reconstruction.mp4", 25
 
 
 @dataclass
-class Reconstruct(ReconstructArguments):
-    __doc__ = ReconstructArguments.__doc__
+class Reconstruct(DatasetCommand):
+    """Make images of a recording's events, and write a dataset folder with these images as training images, at the
+    interpolated poses of their times. The events and the other images are those of the recording. reconstruction.mp4
+    in the folder shows the images one after another."""
 
-    format: DatasetFormat = field(default_factory=Automatic)
+    output: Path
+    """Dataset folder to create."""
+    method: Literal["high-pass", "firenet", "e2vid"] = "high-pass"
+    """high-pass: the asynchronous high-pass filter of Scheerlinck et al. (2018), which needs no weights. firenet and
+    e2vid: the networks of Scheerlinck et al. (2020) and Rebecq et al. (2021), whose weights you have."""
+    weights: Path | None = None
+    """Weights file of the network, as its authors distribute it."""
+    events_per_pixel: float = EVENTS_PER_PIXEL
+    """Events between two images, as a share of the sensor's pixels."""
 
     def main(self) -> None:
         """Read the dataset, reconstruct the images and write them."""
-        self.judge()
-        with ended_by_exception(), OutputLock(self.output) as lock:
-            self._reconstruct(lock)
+        require_absent(self.output)
+        require_range("events-per-pixel", self.events_per_pixel, 1e-6, 1e6)
+        if self.method != "high-pass":
+            require_weights(self.method, self.weights)
+        elif self.weights is not None:
+            raise DataError(self.weights, "the high-pass filter has no weights", "leave out --weights")
+        parser = self.open_dataset()
+        from aenerf_ns.recording.output_lock import OutputLock
 
-    def _reconstruct(self, lock: OutputLock) -> None:
-        parser = open_dataset(self.data, self.format)
+        with sigterm_as_system_exit(), OutputLock(self.output) as lock:
+            self._reconstruct(parser, lock)
+
+    def _reconstruct(self, parser: EventDataParser, lock: OutputLock) -> None:
+        from aenerf_ns.camera.trajectory import homogeneous
+        from aenerf_ns.cli.video_file import new_video
+        from aenerf_ns.recording.writer import NativeDatasetWriter
+
         recording = parser.recording
         source = self._source(recording)
         camera, longest_gap = recording.event_camera, parser.config.max_pose_gap_ns
@@ -77,6 +101,11 @@ class Reconstruct(ReconstructArguments):
         )
 
     def _source(self, recording: Recording) -> ImageSource:
+        import torch
+
+        from aenerf_ns.reconstruction.images import FilteredImages, NetworkImages
+        from aenerf_ns.reconstruction.weights import load_network
+
         camera, sensor = recording.event_camera, recording.sensor
         if self.method == "high-pass":
             return FilteredImages(camera.width, camera.height, sensor)
@@ -87,6 +116,8 @@ class Reconstruct(ReconstructArguments):
         self, recording: Recording, source: ImageSource, longest_gap: int | None, writer: NativeDatasetWriter
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Write the events, and yield time and image of each batch of them that ends at a time with a pose."""
+        from aenerf_ns.reconstruction.images import images_of
+
         events = recording.event_file
         known = recording.trajectory.known_time(longest_gap)
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
@@ -96,26 +127,30 @@ class Reconstruct(ReconstructArguments):
                 writer.events.append(chunk)
                 yield chunk
 
-        num_made = num_placed = 0
+        num_images = num_posed = 0
         for time, image in images_of(copied(), num_events, source):
-            num_made += 1
+            num_images += 1
             if known.contains(time):
-                num_placed += 1
+                num_posed += 1
                 yield time, image
-        if num_placed == 0:
+        if num_posed == 0:
             raise DataError(
                 events.path,
-                f"its events make {num_made} images of {num_events} events each, none at a time with a pose",
+                f"its events make {num_images} images of {num_events} events each, none at a time with a pose",
                 "give a smaller --events-per-pixel, or poses that cover the events",
             )
-        if num_placed < num_made:
+        if num_posed < num_images:
             CONSOLE.print(
-                f"{num_made - num_placed} of {num_made} images are left out: no pose is known at their times."
+                f"{num_images - num_posed} of {num_images} images are left out: no pose is known at their times."
             )
 
 
 def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> None:
     """Copy the validation and test views, with which every method on this recording is evaluated."""
+    from aenerf_ns.recording.images import check_image
+    from aenerf_ns.recording.recording import SPLITS
+    from aenerf_ns.recording.views import thinned
+
     views = {split: thinned(recording.reference_views[split], recording.max_views) for split in SPLITS[1:]}
     if recording.frame_camera != recording.event_camera:
         if any(views.values()):

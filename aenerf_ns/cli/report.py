@@ -8,29 +8,41 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from nerfstudio.engine.trainer import TrainerConfig
+import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.cli.export_arguments import ReportArguments
 from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.output_paths import cannot_be_created
+from aenerf_ns.files.output_paths import creating, require_run, require_writable
 
 if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+
     from aenerf_ns.report.measuring import RunReport
     from aenerf_ns.report.protocol import Protocol
 
 
 @dataclass
-class Report(ReportArguments):
-    __doc__ = ReportArguments.__doc__
+class ReportCommand:
+    """Measure trained runs and write report.html, one page that opens without a network, with views.csv and
+    report.json beside it. Several runs are compared view by view."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
+    """The runs: each by its config.yml or its folder."""
+    output: Path = Path("report")
+    """Folder to write to. Files of an earlier report there are replaced."""
+    allow_different_protocols: bool = False
+    """Compare runs although they were measured differently. The page then says how."""
 
     def main(self) -> None:
         """Measure the runs and write the page."""
-        self.judge()
-        # Imported lazily, because these imports take seconds.
+        if not self.runs:
+            raise DataError("aenerf report", "no run is given", "name the folder or the config.yml of one or more")
+        require_writable(self.output / "report.html")
+        for run in self.runs:
+            require_run(run)
         from aenerf_ns.report.comparison import paired_differences, views_left_out
         from aenerf_ns.report.measuring import measure_run
         from aenerf_ns.report.page import make_page
@@ -64,8 +76,7 @@ class Report(ReportArguments):
         paired = paired_differences(reports, shared)
         left_out = views_left_out(reports, shared)
         page = make_page(reports, paired, mixed, shared)
-        try:
-            self.output.mkdir(parents=True, exist_ok=True)
+        with creating(self.output / "report.html"):
             (self.output / "report.html").write_text(page, "utf8")
             _write_views(self.output / "views.csv", reports)
             figures = {
@@ -75,14 +86,12 @@ class Report(ReportArguments):
                 "protocol_differences": mixed,
             }
             (self.output / "report.json").write_text(json.dumps(figures, indent=1) + "\n", "utf8")
-        except OSError as error:
-            raise cannot_be_created(self.output, error) from None
         size = len(page.encode()) / 1e6
         CONSOLE.print(f"{self.output / 'report.html'}: {size:.1f} MB, with views.csv and report.json.", soft_wrap=True)
 
 
 def _names(configs: Sequence[TrainerConfig]) -> list[str]:
-    """Return names that tell the runs apart, as short as that allows."""
+    """Name the runs apart, as shortly as that allows."""
     parts = [(config.experiment_name, config.method_name, config.timestamp) for config in configs]
     for chosen in ((0,), (1,), (0, 1), (2,), (0, 1, 2)):
         names = ["/".join(str(part[index]) for index in chosen) for part in parts]

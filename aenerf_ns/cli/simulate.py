@@ -1,82 +1,116 @@
-"""``aenerf simulate``: make a dataset of a built-in scene, of a mesh or of a video."""
+"""``aenerf simulate``: a dataset of a built-in scene or of a mesh."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.noise import perturb
-from aenerf_ns.camera.trajectory import Trajectory, homogeneous
-from aenerf_ns.cli.arguments import SimulateArguments
-from aenerf_ns.cli.dataset_format import training_command
-from aenerf_ns.cli.termination import ended_by_exception
+from aenerf_ns.cli.dataset import training_command
+from aenerf_ns.cli.ranges import value_error_as_data_error
+from aenerf_ns.cli.simulation import SimulationCommand
+from aenerf_ns.cli.termination import sigterm_as_system_exit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
-from aenerf_ns.files.calibration import read_calibration
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.poses_from_frames.structure_from_motion import estimate_poses
-from aenerf_ns.poses_from_frames.video import Video, open_video
-from aenerf_ns.recording.output_lock import OutputLock
-from aenerf_ns.recording.recording import Split
-from aenerf_ns.recording.views import evenly_spread
-from aenerf_ns.recording.writer import NativeDatasetWriter, PoselessRecordingWriter
-from aenerf_ns.simulator.open_scene import open_scene
-from aenerf_ns.simulator.simulated_poses import poses_from_frames
-from aenerf_ns.simulator.simulation import Simulation
-from aenerf_ns.simulator.video_events import VideoInterval, video_events
+from aenerf_ns.files.text import MAX_ROWS
+from aenerf_ns.simulator.options import BUILT_IN, DURATIONS, require_scene_file
 
-_FRAME_RATE = 25.0
+if TYPE_CHECKING:
+    from aenerf_ns.camera.intrinsics import CameraIntrinsics
+    from aenerf_ns.camera.trajectory import Trajectory
+    from aenerf_ns.recording.output_lock import OutputLock
+    from aenerf_ns.simulator.simulation import Simulation
+
+_RANGES = {
+    "width": (1, 1 << 14),
+    "height": (1, 1 << 14),
+    "duration": DURATIONS,
+    "pose_rate": (1e-3, 1e6),
+    "exposure": (1e-9, 1e3),
+}
 
 
 @dataclass
-class Simulate(SimulateArguments):
-    __doc__ = SimulateArguments.__doc__
+class Simulate(SimulationCommand):
+    """Simulate an event camera that moves through a scene, and write a dataset for ns-train aenerf."""
+
+    scene: str = "room"
+    """room: a furnished room seen from inside. object: a toy locomotive seen from around it. shiny_object: the
+    same, varnished and polished. A .glb, .obj or .ply file: a mesh seen from around it. A .json file: a mesh, its light
+    and the camera's path (docs/simulator.md)."""
+    speed: Literal["easy", "hard"] = "easy"
+    """easy: constant speed. hard: the same path at 8^sin(2 pi t) times that speed."""
+    width: int = 346
+    """Pixel columns of the sensor."""
+    height: int = 260
+    """Pixel rows of the sensor."""
+    duration: float | None = None
+    """Seconds that the path takes at constant speed. Default: the duration in scene.json, or 4."""
+    pose_rate: float = 250.0
+    """Poses a second in the trajectories; with --poses colmap, in the true trajectory."""
+    poses: Literal["noise", "colmap"] = "noise"
+    """Source of the estimated poses. noise: the true poses with noise. colmap: COLMAP estimates a pose for each frame
+    of a camera at the position of the event sensor, as in a DAVIS, and may lose or misplace frames."""
+    frame_rate: float = 25.0
+    """Frames a second for COLMAP."""
+    exposure: float = 0.003
+    """Seconds for which a frame is exposed. Motion blurs the frame meanwhile."""
 
     def main(self) -> None:
-        """Render the scene along its path, or read the video, and write the dataset."""
-        self.judge()
-        with ended_by_exception(), OutputLock(self.output) as lock:
-            if self.video is None:
-                self._simulate_scene(lock)
-            else:
-                self._simulate_video(self.video, lock)
+        """Render the scene along its path and write the dataset."""
+        self.require_possible(_RANGES)
+        require_event_sensor_size(self.width, self.height, "aenerf simulate")
+        if self.duration is not None:
+            self._require_poses(self.duration)
+        if self.poses == "colmap" and any(self.pose_noise):
+            remedy = "leave the pose noise out, because COLMAP makes errors of its own"
+            raise DataError("aenerf simulate", f"pose noise {self.pose_noise} with --poses colmap", remedy)
+        if self.scene not in BUILT_IN:
+            require_scene_file(Path(self.scene))
+        sensor = self.make_sensor()
+        from aenerf_ns.recording.output_lock import OutputLock
 
-    def _simulate_scene(self, lock: OutputLock) -> None:
+        with sigterm_as_system_exit(), OutputLock(self.output) as lock:
+            self._simulate(sensor, lock)
+
+    def _require_poses(self, duration: float) -> None:
+        """Raise a DataError if the trajectories of a duration in seconds have one pose, or more than readers take."""
+        num_poses = self.pose_rate * duration
+        # The last pose is at the end, and one that is closer to it than half an interval is left out.
+        if num_poses <= 0.5:
+            raise DataError("--pose-rate", f"{self.pose_rate:g} a second gives one pose", "give a higher rate")
+        if num_poses > MAX_ROWS:
+            raise DataError("--pose-rate", f"it gives {num_poses:.3g} poses", "give a lower rate or --duration")
+
+    def _simulate(self, sensor: SensorModel, lock: OutputLock) -> None:
+        import numpy as np
+        import torch
+
+        from aenerf_ns.camera.intrinsics import CameraIntrinsics
+        from aenerf_ns.camera.trajectory import homogeneous
+        from aenerf_ns.recording.recording import Split
+        from aenerf_ns.recording.writer import NativeDatasetWriter
+        from aenerf_ns.simulator.open_scene import open_scene
+        from aenerf_ns.simulator.simulation import Simulation
+
         scene = open_scene(self.scene, self.seed)
         duration = scene.duration if self.duration is None else self.duration
-        self.require_poses(duration)
+        self._require_poses(duration)
         for note in scene.notes:
             CONSOLE.print(note, highlight=False, markup=False)
         held_out: dict[Split, torch.Tensor] = {
             "val": torch.from_numpy(scene.validation_views(self.validation_views)),
             "test": torch.from_numpy(scene.test_views(self.test_views, self.seed)),
         }
-        try:
+        with value_error_as_data_error("simulate"):
             camera = CameraIntrinsics(self.width, self.height, *scene.intrinsics(self.width, self.height))
-            sensor = self.sensor()
             simulation = Simulation(
-                scene,
-                camera,
-                sensor,
-                self.speed,
-                duration,
-                self.max_displacement,
-                self.seed,
-                self.noise,
+                scene, camera, sensor, self.speed, duration, self.max_displacement, self.seed, self.noise
             )
             truth = simulation.trajectory(self.pose_rate)
-            estimated, report = self._estimate(simulation, camera, truth)
-        except DataError:
-            raise
-        except ValueError as error:
-            raise DataError("aenerf simulate", str(error), "see aenerf simulate --help") from error
+            estimated, report = self._estimate_poses(simulation, camera, truth)
         num_events = 0
         with NativeDatasetWriter(lock, camera, sensor, "srgb", scene.aabb) as writer:
             writer.add_trajectories(estimated, truth)
@@ -102,161 +136,16 @@ class Simulate(SimulateArguments):
             soft_wrap=True,
         )
 
-    def _estimate(
+    def _estimate_poses(
         self, simulation: Simulation, camera: CameraIntrinsics, truth: Trajectory
     ) -> tuple[Trajectory, dict[str, Any] | None]:
-        """Return the estimated trajectory and, if COLMAP estimated it, COLMAP's report."""
-        noise = (self.pose_noise_degrees, self.pose_noise_translation)
+        """Make the estimated trajectory and, if COLMAP estimates it, COLMAP's report."""
         if self.poses == "noise":
-            return perturb(truth, *noise, self.pose_noise_correlation_time, self.seed), None
+            return self.add_pose_noise(truth), None
+        from aenerf_ns.simulator.simulated_poses import poses_from_frames
+
         estimated, report, summary = poses_from_frames(
-            simulation,
-            camera,
-            truth,
-            _FRAME_RATE if self.frame_rate is None else self.frame_rate,
-            self.exposure,
-            self.seed,
+            simulation, camera, truth, self.frame_rate, self.exposure, self.seed
         )
         CONSOLE.print(summary)
         return estimated, report
-
-    def _simulate_video(self, source: Path, lock: OutputLock) -> None:
-        video = open_video(source, self.frame_rate)
-        require_event_sensor_size(video.width, video.height, source, "scale the frames down")
-        camera = self._video_camera(video)
-        try:
-            sensor = self.sensor()
-            poses = self._video_poses(video, camera)
-            intervals = video_events(video, sensor, self.noise, self.interpolation, self.max_displacement, self.seed)
-            if poses is None:
-                written = self._write_events(lock, video, camera, sensor, intervals)
-            else:
-                written = self._write_dataset(lock, video, sensor, poses, intervals)
-        except DataError:
-            raise
-        except ValueError as error:
-            raise DataError("aenerf simulate", str(error), "see aenerf simulate --help") from error
-        longest = np.diff(video.times).max() * 1e-6
-        CONSOLE.print(
-            f"{written}\nEvents between two frames, up to {longest:.3g} ms apart, are interpolated. What moves faster "
-            "than the frames follow, what blur smears, and what is clipped to white or black in the video is lost.",
-            highlight=False,
-            soft_wrap=True,
-        )
-
-    def _video_camera(self, video: Video) -> CameraIntrinsics | None:
-        """Return the lens of the video's camera, or None where no option states it."""
-        if self.calibration is not None:
-            camera = read_calibration(self.calibration, self.event_camera).event_camera
-            if (camera.width, camera.height) != (video.width, video.height):
-                raise DataError(
-                    self.calibration,
-                    f"its camera has {camera.width} x {camera.height} pixels, the frames of {video.source} "
-                    f"{video.width} x {video.height}",
-                    "give the calibration of the frames as they are",
-                )
-            return camera
-        if self.intrinsics is not None:
-            try:
-                return CameraIntrinsics(video.width, video.height, *self.intrinsics)
-            except ValueError as error:
-                raise DataError("aenerf simulate", f"--intrinsics: {error}", "give fl_x fl_y cx cy in pixels") from None
-        return None
-
-    def _video_poses(self, video: Video, camera: CameraIntrinsics | None) -> _VideoPoses | None:
-        """Return where the video's camera was, or None where no option tells."""
-        noise = (self.pose_noise_degrees, self.pose_noise_translation)
-        if self.trajectory is not None:
-            assert camera is not None
-            given = read_tum_trajectory(self.trajectory)
-            given.crop(int(video.times[0]), int(video.times[-1]))
-            if not any(noise):
-                return _VideoPoses(camera, given)
-            return _VideoPoses(camera, perturb(given, *noise, self.pose_noise_correlation_time, self.seed), given)
-        if self.poses == "colmap":
-            lens = (video.width, video.height) if camera is None else camera
-            found = estimate_poses(video, video.times, lens, video.source, self.seed)
-            CONSOLE.print(found.summary(), highlight=False, soft_wrap=True)
-            if camera is None:
-                CONSOLE.print(
-                    f"COLMAP estimates the lens: focal length {found.camera.fx:.1f} pixels, radial distortion "
-                    f"{found.camera.distortion[0]:.3g}.",
-                    highlight=False,
-                    soft_wrap=True,
-                )
-            return _VideoPoses(found.camera, found.trajectory, report=found.report())
-        return None
-
-    def _write_dataset(
-        self,
-        lock: OutputLock,
-        video: Video,
-        sensor: SensorModel,
-        poses: _VideoPoses,
-        intervals: Iterable[VideoInterval],
-    ) -> str:
-        """Write a dataset folder, and return a line about it."""
-        reference = poses.estimated if poses.truth is None else poses.truth
-        # The first frame lies before all events.
-        taken = [time for time in video.times[1:].tolist() if reference.start <= time <= reference.end]
-        chosen: dict[Split, list[int]] = {
-            "train": evenly_spread(taken, self.train_images),
-            "val": evenly_spread(taken[::2], self.validation_views),
-            "test": evenly_spread(taken[1::2], self.test_views),
-        }
-        with NativeDatasetWriter(lock, poses.camera, sensor, "srgb") as writer:
-            writer.add_trajectories(poses.estimated, poses.truth)
-            if poses.report is not None:
-                writer.add_poses_report(poses.report)
-            num_events = 0
-            for frame, time, events in intervals:
-                writer.events.append(events)
-                num_events += len(events)
-                for split, times in chosen.items():
-                    if time in times:
-                        writer.add_image(split, frame, homogeneous(reference.interpolate(time)), time)
-            _require_events(num_events, video)
-        counts = ", ".join(f"{len(times)} {split}" for split, times in chosen.items())
-        return (
-            f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(poses.estimated)} poses, images: "
-            f"{counts}.\nTrain with: {training_command(self.output)}"
-        )
-
-    def _write_events(
-        self,
-        lock: OutputLock,
-        video: Video,
-        camera: CameraIntrinsics | None,
-        sensor: SensorModel,
-        intervals: Iterable[VideoInterval],
-    ) -> str:
-        """Write the events and images of a video without poses, and return a line about them."""
-        kept = evenly_spread(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
-        with PoselessRecordingWriter(lock, camera, sensor) as writer:
-            num_events = 0
-            for frame, time, events in intervals:
-                writer.events.append(events)
-                num_events += len(events)
-                if time in kept:
-                    writer.add_image(frame, time)
-            _require_events(num_events, video)
-        missing = "trajectory.txt" if camera is not None else "calibration.json and trajectory.txt"
-        return (
-            f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(kept)} images, no poses.\n"
-            f"To train on them, add {missing} (docs/datasets/own_recording.md)."
-        )
-
-
-@dataclass(frozen=True)
-class _VideoPoses:
-    """The lens and the poses of a video's camera, the true poses if others are estimated, and COLMAP's report."""
-
-    camera: CameraIntrinsics
-    estimated: Trajectory
-    truth: Trajectory | None = None
-    report: dict[str, Any] | None = None
-
-
-def _require_events(num_events: int, video: Video) -> None:
-    if num_events == 0:
-        raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")

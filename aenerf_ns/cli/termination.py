@@ -1,4 +1,4 @@
-"""How a command ends when it is asked to."""
+"""SIGTERM during a command."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def ended_by_exception() -> Iterator[None]:
-    """Turn SIGTERM into :class:`SystemExit` within the context, so that a command that is ended cleans up.
+def sigterm_as_system_exit() -> Iterator[None]:
+    """Turn SIGTERM into :class:`SystemExit` within the context, so that a command that is terminated cleans up.
 
     Schedulers and ``kill`` send SIGTERM, which by default ends a process at once. Python already turns the keyboard's
     interrupt into an exception. Enter this context in the main thread only.

@@ -1,11 +1,13 @@
-"""How the commands open a trained run: not before its configuration is known to name nothing foreign."""
+"""How the commands open a trained run."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from aenerf_ns.cli.run_file import require_known_tags
+import tyro
+
+from aenerf_ns.cli.config_safety import require_known_names
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import require_run
 
@@ -13,6 +15,14 @@ if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
     from aenerf_ns.evaluation.run import TrainedRun
+
+
+RunPath = Annotated[
+    Path,
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="RUN", help="The run: its config.yml, or its folder. --load-config RUN works too."),
+]
+"""The run that a command works on."""
 
 
 def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tuple[TrainerConfig, TrainedRun, Path]:
@@ -30,8 +40,7 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
             whole checkpoint, or a value in its files is impossible.
     """
     config = require_run(run)
-    require_known_tags(config)
-    # Imported lazily, because these imports take seconds.
+    require_known_names(config)
     from nerfstudio.utils.eval_utils import eval_setup
 
     from aenerf_ns.training.pipeline import AENeRFPipeline
@@ -44,9 +53,9 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
         raise
     except Exception as error:
         # The framework and torch stumble over values of a wrong kind in any way.
-        told = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         remedy = "copy the run again, or train again; ns-eval --load-config shows the traceback"
-        raise DataError(config, f"the run cannot be opened ({told})", remedy) from error
+        raise DataError(config, f"the run cannot be opened ({reason})", remedy) from error
     if not isinstance(pipeline, AENeRFPipeline):
         raise DataError(config, f"the run is of method {opened.method_name}", "use ns-eval and ns-export")
     for name, value in pipeline.named_parameters():
@@ -58,7 +67,7 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
 
 
 def _require_checkpoints(config: TrainerConfig) -> TrainerConfig:
-    """Raise a DataError for a run without checkpoints, which the framework tells in several lines."""
+    """Raise a DataError for a run without checkpoints, of which the framework complains in several lines."""
     folder = config.get_checkpoint_dir()
     if not folder.is_dir():
         raise DataError(folder, "there is no such folder", "copy the run's checkpoints, or train again")

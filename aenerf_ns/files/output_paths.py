@@ -1,7 +1,4 @@
-"""The paths that a user gives to a command.
-
-They are judged twice: before the command imports the framework, which takes long, and where they are opened.
-"""
+"""The paths that a user gives to a command, which looks at them before it begins."""
 
 from __future__ import annotations
 
@@ -15,17 +12,17 @@ from aenerf_ns.errors import DataError, reading, reason
 
 
 def require_dataset(data: Path) -> None:
-    """Raise a DataError if a dataset's folder does not exist or may not be looked at."""
+    """Raise a DataError if a dataset's folder does not exist or may not be read."""
     with reading(data):
         if not data.exists():
             raise DataError(data, "there is no such folder", "give the folder of a dataset as --data")
 
 
 def require_run(run: Path) -> Path:
-    """Return the config.yml of a run, which is given by this file or by its folder.
+    """Find the config.yml of a run, which is given by this file or by its folder.
 
     Raises:
-        DataError: there is none, or it may not be looked at.
+        DataError: there is none, or it may not be read.
     """
     with reading(run):
         config = run / "config.yml" if run.is_dir() else run
@@ -34,7 +31,7 @@ def require_run(run: Path) -> Path:
     return config
 
 
-def require_new(output: Path, option: str = "--output") -> None:
+def require_absent(output: Path, option: str = "--output") -> None:
     """Raise a DataError if the folder that a command will write exists, or cannot have this name.
 
     Args:
@@ -44,12 +41,12 @@ def require_new(output: Path, option: str = "--output") -> None:
     try:
         exists = output.exists()
     except (OSError, ValueError) as error:
-        raise cannot_be_created(output, error, option) from None
+        raise output_error(output, error, option) from None
     if exists:
         raise DataError(output, "the folder exists already", f"remove it or choose another {option}")
 
 
-def require_writable(output: Path, option: str) -> None:
+def require_writable(output: Path, option: str = "--output") -> None:
     """Raise a DataError if a file that a command will write cannot be created.
 
     Args:
@@ -59,26 +56,26 @@ def require_writable(output: Path, option: str) -> None:
     try:
         if output.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        place = next(folder for folder in output.absolute().parents if folder.exists())
-        if not place.is_dir():
+        parent = next(folder for folder in output.absolute().parents if folder.exists())
+        if not parent.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
-        if not os.access(output if output.exists() else place, os.W_OK):
+        if not os.access(output if output.exists() else parent, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:
-        raise cannot_be_created(output, error, option) from None
+        raise output_error(output, error, option) from None
 
 
 @contextmanager
-def created(output: Path, option: str) -> Iterator[None]:
+def creating(output: Path, option: str = "--output") -> Iterator[None]:
     """Make the folder of a file that is written within the context, and turn errors of the system into a DataError."""
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
-        raise cannot_be_created(output, error, option) from None
+        raise output_error(output, error, option) from None
 
 
-def cannot_be_created(output: Path, error: OSError | ValueError, option: str = "--output") -> DataError:
-    """Return the error for a file or folder that a command cannot create."""
-    told = reason(error) if isinstance(error, OSError) else str(error)
-    return DataError(output, f"it cannot be created ({told})", f"choose another {option}")
+def output_error(output: Path, error: OSError | ValueError, option: str = "--output") -> DataError:
+    """Make the error for a file or folder that a command cannot create."""
+    text = reason(error) if isinstance(error, OSError) else str(error)
+    return DataError(output, f"it cannot be created ({text})", f"choose another {option}")

@@ -11,7 +11,7 @@ from pathlib import Path
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.output_paths import cannot_be_created, require_new
+from aenerf_ns.files.output_paths import output_error, require_absent
 
 try:
     import fcntl
@@ -43,7 +43,7 @@ class OutputLock:
         self.partial = output.with_name(f".{output.name}.partial")
         self._file = self.partial.with_name(f"{self.partial.name}.lock")
         try:
-            require_new(self.output)
+            require_absent(self.output)
             output.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = self._locked()
             try:
@@ -53,10 +53,10 @@ class OutputLock:
                 self.release()
                 raise
         except OSError as error:
-            raise cannot_be_created(output, error) from None
+            raise output_error(output, error) from None
         try:
             # The owner before may have finished in the meantime.
-            require_new(self.output)
+            require_absent(self.output)
         except DataError:
             self.release()
             raise

@@ -21,7 +21,7 @@ from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.errors import DataError, reason
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
-from aenerf_ns.files.output_paths import cannot_be_created
+from aenerf_ns.files.output_paths import output_error
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
@@ -60,7 +60,7 @@ class _FolderWriter(ABC):
         except OSError as error:
             shutil.rmtree(self._partial, ignore_errors=True)
             self._unlock()
-            raise cannot_be_created(self._folder, error) from None
+            raise output_error(self._folder, error) from None
 
     def __enter__(self: _Writer) -> _Writer:
         return self

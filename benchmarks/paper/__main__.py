@@ -12,7 +12,7 @@ import tyro
 from filelock import FileLock
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.cli.termination import ended_by_exception
+from aenerf_ns.cli.termination import sigterm_as_system_exit
 from aenerf_ns.errors import DataError
 from aenerf_ns.progress import progress_bar
 from benchmarks.paper.figures import draw
@@ -69,7 +69,7 @@ class Bench:
         )  # fmt: skip
         runner = Runner(self.output, self.device)
         # The exception reaches the command that is running, which is then ended too.
-        with ended_by_exception():
+        with sigterm_as_system_exit():
             failures = _make(runner, runs)
             self._report(runner, runs, failures)
         if failures:

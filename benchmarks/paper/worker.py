@@ -66,7 +66,7 @@ def main() -> None:
     from nerfstudio.scripts import train
     from nerfstudio.scripts.eval import ComputePSNR
 
-    from aenerf_ns.cli.export_trajectory import ExportTrajectory
+    from aenerf_ns.cli.export import ExportTrajectory
 
     sys.argv = ["ns-train", method, *options]
     train.entrypoint()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from decimal import Decimal
@@ -26,6 +27,7 @@ from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.text import format_seconds
@@ -176,6 +178,9 @@ def run(folder: Path, **options: Path) -> tuple[int, str]:
             Check(folder, **options).main()
         except SystemExit as end:
             status = int(end.code or 0)
+        except DataError as error:
+            status = Check.error_status
+            print(error, file=sys.stderr)
     return status, output.get()
 
 

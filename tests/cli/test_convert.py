@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -34,16 +33,13 @@ from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import convert as command
 from aenerf_ns.cli.convert import Convert
-from aenerf_ns.cli.dataset_format import Automatic, training_command
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
-from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.poses_from_frames.structure_from_motion import EstimatedPoses
-from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
@@ -104,9 +100,9 @@ def test_text_files_convert(tmp_path: Path) -> None:
     data = write_ecd(tmp_path / "made")
     given = tmp_path / "other.txt"
     write_tum_trajectory(given, perturb(read_tum_trajectory(data / "groundtruth.txt"), 2.0, 0.1, 0.1, 0))
-    for name, config in (("plain", EcdDataParserConfig()), ("other", EcdDataParserConfig(trajectory=given))):
-        config.data = data
-        after = convert(data, tmp_path / name, format=config)
+    for name, options in (("plain", ()), ("other", (f"trajectory={given}",))):
+        after = convert(data, tmp_path / name, format="ecd-data", format_options=options)
+        config = EcdDataParserConfig(data=data, trajectory=given if options else None)
         assert_same(config.setup().read_recording(), after)
         # An image of several splits is written once.
         assert len(list((tmp_path / name / "images").rglob("*.png"))) == 4
@@ -206,7 +202,7 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
         trajectory = Trajectory(times[:3], poses, source)
         return EstimatedPoses(np.array(times), trajectory, camera, [3], 9, 0.5, 100.0, 1.0)
 
-    monkeypatch.setattr(command, "estimate_poses", place)
+    monkeypatch.setattr("aenerf_ns.poses_from_frames.structure_from_motion.estimate_poses", place)
     data = write_ecd(tmp_path / "made")
     with command.CONSOLE.capture() as output:
         with_truth = convert(data, tmp_path / "with_truth", poses="colmap")
@@ -224,13 +220,13 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
     # All images are kept, with the true poses.
     assert [len(with_truth.reference_views[split]) for split in ("train", "val", "test")] == [4, 2, 2]
     (data / "groundtruth.txt").unlink()
-    without = convert(data, tmp_path / "without", poses="colmap", format=EcdDataParserConfig())
+    without = convert(data, tmp_path / "without", poses="colmap", format="ecd-data")
     assert without.ground_truth is None
     assert without.trajectory.times.tolist() == times
     assert [len(without.reference_views[split]) for split in ("train", "val", "test")] == [3, 2, 1]
     np.testing.assert_array_equal(columns(without)["t"], columns(with_truth)["t"])
     with pytest.raises(DataError, match=r"groundtruth.txt: there is no such file"):
-        convert(data, tmp_path / "given", format=EcdDataParserConfig())
+        convert(data, tmp_path / "given", format="ecd-data")
 
 
 def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
@@ -274,9 +270,8 @@ def test_malformed_datasets_are_one_clear_line_and_leave_nothing(
 ) -> None:
     data = (write_ecd if kind == "ecd" else write_native)(tmp_path / "made")
     change(data)
-    config: EventDataParserConfig = EcdDataParserConfig() if kind == "ecd" else NativeDataParserConfig()
     with pytest.raises(DataError, match=message) as error:
-        convert(data, tmp_path / "converted", format=config)
+        convert(data, tmp_path / "converted", format="ecd-data" if kind == "ecd" else "aenerf-data")
     assert "\n" not in str(error.value)
     assert [path.name for path in tmp_path.iterdir() if path != data] == []
 
@@ -303,7 +298,7 @@ def run(*arguments: str | Path) -> subprocess.Popen:
 
 def test_the_command_converts_and_says_what_is_wrong_on_stderr(tmp_path: Path) -> None:
     data = write_ecd(tmp_path / "made")
-    good = run("--data", data, "--output", tmp_path / "good", "ecd-data", "--refractory-period-ns", "7")
+    good = run("--data", data, "--output", tmp_path / "good", "--format-options", "refractory-period-ns=7")
     (data / "broken").mkdir()
     bad = run("--data", data / "broken", "--output", tmp_path / "bad")
     printed, _ = good.communicate(timeout=600)
@@ -328,16 +323,6 @@ def test_commands_print_one_command_to_train_with(tmp_path: Path) -> None:
         parser = NativeDataParserConfig(data=folder).setup()
         parser.get_dataparser_outputs("train")
         assert parser.config.auto_scale_poses is scale
-
-
-def test_the_command_to_train_with_has_the_options_that_were_given() -> None:
-    options = replace(FORMATS["ecd-data"], width=346, height=260)
-    planes = {"pipeline.model.near-plane": "0.3", "pipeline.model.far-plane": "20"}
-    assert training_command(Path("my data"), options, planes) == (
-        "ns-train aenerf --pipeline.model.near-plane 0.3 --pipeline.model.far-plane 20 ecd-data --width 346 "
-        "--height 260 --data 'my data'"
-    )
-    assert training_command(Path("data"), Automatic()) == "ns-train aenerf --data data"
 
 
 def test_a_killed_command_leaves_no_dataset(tmp_path: Path) -> None:

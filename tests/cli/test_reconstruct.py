@@ -132,7 +132,7 @@ def test_what_cannot_be_reconstructed_ends_with_one_line_and_leaves_nothing(data
         (Reconstruct(data, out, "e2vid"), "no weights are given; .* https://github.com/uzh-rpg/rpg_e2vid"),
         (Reconstruct(data, out, "firenet", weights), "there is no such file; .* firenet_1000.pth.tar"),
         (Reconstruct(data, out, weights=weights), "the high-pass filter has no weights"),
-        (Reconstruct(data, out, events_per_pixel=0.0), "0.0 events a pixel; give an --events-per-pixel above 0"),
+        (Reconstruct(data, out, events_per_pixel=0.0), "--events-per-pixel: 0.0 is out of range"),
         (Reconstruct(data, out, events_per_pixel=9.0), "make 0 images of 216 events each"),
         (Reconstruct(data, data), "the folder exists already"),
     ]

@@ -1,4 +1,4 @@
-"""``aenerf simulate --video``: the dataset that a video becomes with poses, with COLMAP's, and without any."""
+"""``aenerf simulate-video``: the dataset that a video becomes with poses, with COLMAP's, and without any."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from PIL import Image
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import main as program
-from aenerf_ns.cli import simulate as command
-from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.cli import simulate_video as command
+from aenerf_ns.cli.simulate_video import SimulateVideo
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
@@ -73,7 +73,7 @@ def camchain(tmp_path: Path) -> Path:
 
 def simulate(output: Path, **options: Any) -> str:
     with command.CONSOLE.capture() as printed:
-        Simulate(output, **options).main()
+        SimulateVideo(output, **options).main()
     return printed.get()
 
 
@@ -86,7 +86,7 @@ def test_the_command_makes_a_dataset_of_a_video_with_its_poses(
 ) -> None:
     output = tmp_path / "dataset"
     arguments = (
-        f"aenerf simulate --output {output} --video {frames} --trajectory {poses} --intrinsics 20 21 11.5 7.5 "
+        f"aenerf simulate-video {frames} --output {output} --trajectory {poses} --intrinsics 20 21 11.5 7.5 "
         "--interpolation linear --positive-contrast-threshold 0.3 --leak-rate 2 --seed 4"
     )
     monkeypatch.setattr(sys, "argv", arguments.split())
@@ -140,7 +140,7 @@ def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: 
         placed = Trajectory(times[:8], torch.eye(4, dtype=torch.float64).repeat(8, 1, 1), source)
         return EstimatedPoses(times, placed, camera, [8], 9, 0.5, 100.0, 1.0)
 
-    monkeypatch.setattr(command, "estimate_poses", place)
+    monkeypatch.setattr("aenerf_ns.poses_from_frames.structure_from_motion.estimate_poses", place)
     printed = simulate(tmp_path / "dataset", video=frames, poses="colmap")
     assert "8 of 10 frames registered" in printed
     assert "COLMAP estimates the lens: focal length 22.0 pixels, radial distortion 0.01" in printed
@@ -190,8 +190,6 @@ LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
 @pytest.mark.parametrize(
     ("files", "options", "message"),
     [
-        ((), {"speed": "hard"}, "--speed has no meaning for a video; leave"),
-        ((), {"duration": 2.0}, "--duration has no meaning for a video; leave"),
         (("trajectory",), {}, "--trajectory without the intrinsics of the camera; give --calibration"),
         (("trajectory",), {**LENS, "poses": "colmap"}, "--trajectory with --poses colmap; leave out one"),
         (("calibration",), LENS, "--calibration and --intrinsics are both given; leave out one"),
@@ -200,9 +198,9 @@ LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
         ((), {"intrinsics": (0.0, 21.0, 11.5, 7.5)}, "--intrinsics: fx must be from"),
         ((), {"pose_noise_degrees": 1.0}, "without poses to add it to; give --trajectory"),
         ((), {"positive_contrast_threshold": 0.0}, "positive_contrast_threshold must be from"),
-        ((), {"max_displacement": 0.0}, "--max-displacement 0; give a number from 0.01 to 100"),
+        ((), {"max_displacement": 0.0}, "--max-displacement: 0.0 is out of range"),
         ((), {"positive_contrast_threshold": 9.0, "negative_contrast_threshold": 9.0}, "no pixel changes by a"),
-        ((), {"frame_rate": 0.0}, "--frame-rate 0; give a number from 0.001"),
+        ((), {"frame_rate": 0.0}, "--frame-rate: 0.0 is out of range"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(
@@ -228,11 +226,6 @@ def test_poses_of_another_clock_are_refused(frames: Path, tmp_path: Path) -> Non
         simulate(tmp_path / "out", video=frames, trajectory=tmp_path / "late.txt", **LENS)
 
 
-def test_options_for_videos_are_refused_for_scenes(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="--interpolation has no meaning for a scene; leave the option out"):
-        simulate(tmp_path / "out", interpolation="linear")
-
-
 def test_frames_larger_than_any_event_sensor_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "large"
     folder.mkdir()
@@ -240,5 +233,5 @@ def test_frames_larger_than_any_event_sensor_are_refused(tmp_path: Path) -> None
         Image.new("L", (3840, 2160)).save(folder / f"{index}.png", compress_level=1)
     (folder / "images.txt").write_text("0 0.png\n1 1.png\n")
     with pytest.raises(DataError, match=r"an event sensor of 3840 x 2160 pixels is .*; scale the frames down, at"):
-        Simulate(tmp_path / "dataset", video=folder).main()
+        SimulateVideo(tmp_path / "dataset", video=folder).main()
     assert not list(tmp_path.glob("*dataset*"))

@@ -12,14 +12,10 @@ import torch
 import yaml
 from helpers.small_trainings import train_small_model
 
+from aenerf_ns.cli.config_safety import require_known_names
 from aenerf_ns.cli.evaluate import Evaluate
-from aenerf_ns.cli.export_cameras import ExportCameras
-from aenerf_ns.cli.export_frames import ExportFrames
-from aenerf_ns.cli.export_mesh import ExportMesh
-from aenerf_ns.cli.export_trajectory import ExportTrajectory
-from aenerf_ns.cli.export_video import ExportVideo
-from aenerf_ns.cli.report import Report
-from aenerf_ns.cli.run_file import require_known_tags
+from aenerf_ns.cli.export import ExportCameras, ExportFrames, ExportMesh, ExportTrajectory, ExportVideo
+from aenerf_ns.cli.report import ReportCommand
 from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.errors import DataError
@@ -35,21 +31,21 @@ from aenerf_ns.method_configs.robust_enerf import robust_enerf
 METHODS = (aenerf, aenerf_mlp, aenerf_small, e2vid_nerf, eventnerf, evnerf, paev3d, robust_enerf)
 
 
-def report_of_one(run: Path, output: Path) -> Report:
+def report_of_one(run: Path, output: Path) -> ReportCommand:
     """The report of one run, with the arguments of the other commands."""
-    return Report((run,), output)
+    return ReportCommand((run,), output)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.config.method_name)
 def test_the_configurations_of_the_methods_are_known(method: object, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(yaml.dump(replace(method.config, data=tmp_path)))
-    require_known_tags(tmp_path / "config.yml")
+    require_known_names(tmp_path / "config.yml")
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_configurations_of_the_formats_are_known(name: str, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(yaml.dump(type(FORMATS[name])(data=tmp_path)))
-    require_known_tags(tmp_path / "config.yml")
+    require_known_names(tmp_path / "config.yml")
 
 
 COMMANDS = (Evaluate, ExportTrajectory, ExportCameras, ExportFrames, ExportMesh, ExportVideo, report_of_one)
@@ -96,28 +92,28 @@ def test_what_could_run_is_refused_before_the_file_is_opened(
 def test_a_run_of_another_version_is_told_as_such(text: str, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(text)
     with pytest.raises(
-        DataError, match=r"line 1 names aenerf_ns\S+, not of this version; open it with the version that"
+        DataError, match=r"line 1 names aenerf_ns\S+, which this version does not have; open it with the version"
     ):
-        require_known_tags(tmp_path / "config.yml")
+        require_known_names(tmp_path / "config.yml")
 
 
 @pytest.mark.parametrize(
     ("contents", "problem"),
     [
-        (b"", "it is no configuration of a run"),
-        (b"a: 1", "it is no configuration of a run"),
+        (b"", "not the config.yml of a run"),
+        (b"a: 1", "not the config.yml of a run"),
         (b"a: [1", "it cannot be read"),
         (b"\xff\xfe\xff", "not text in UTF-8"),
         (b"a: \x00", "it cannot be read"),
         (b"[" * 10_000, "it has 10,000 opening brackets"),
         (b"[" * 2000, "it cannot be read"),
-        (b"a: !!int many", "it is no configuration of a run"),
+        (b"a: !!int many", "not the config.yml of a run"),
     ],
 )
 def test_what_is_no_configuration_is_one_line(contents: bytes, problem: str, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_bytes(contents)
     with pytest.raises(DataError, match=problem) as refused:
-        require_known_tags(tmp_path / "config.yml")
+        require_known_names(tmp_path / "config.yml")
     assert "\n" not in str(refused.value)
     with pytest.raises(DataError, match="there is no such file"):
         Evaluate(load_config=tmp_path / "nothing.yml", output=tmp_path / "out").main()

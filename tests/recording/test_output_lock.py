@@ -126,7 +126,7 @@ def test_a_file_system_without_locks_is_named_and_used(
     assert list(tmp_path.iterdir()) == [tmp_path / "made"]
 
 
-def test_an_output_that_cannot_be_created_is_one_line(tmp_path: Path) -> None:
+def test_an_output_that_output_error_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match=r"it cannot be created \(.*\); choose another --output"):
         OutputLock(tmp_path / "file" / "made")

@@ -35,12 +35,8 @@ from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, SpiralRen
 from PIL import Image
 
 from aenerf_ns.cli.evaluate import Evaluate
-from aenerf_ns.cli.export_cameras import ExportCameras
-from aenerf_ns.cli.export_frames import ExportFrames
-from aenerf_ns.cli.export_mesh import ExportMesh
-from aenerf_ns.cli.export_trajectory import ExportTrajectory
-from aenerf_ns.cli.export_video import ExportVideo
-from aenerf_ns.cli.report import Report
+from aenerf_ns.cli.export import ExportCameras, ExportFrames, ExportMesh, ExportTrajectory, ExportVideo
+from aenerf_ns.cli.report import ReportCommand
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
@@ -284,7 +280,7 @@ def test_a_point_cloud_is_in_the_world_of_the_recording(with_events: Path, works
 
 
 def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
-    Report((with_events.parent,), workspace / "report").main()
+    ReportCommand((with_events.parent,), workspace / "report").main()
     page = (workspace / "report" / "report.html").read_text()
     assert len(page.encode()) < 10e6
     (figures,) = json.loads((workspace / "report" / "report.json").read_text())["runs"]
@@ -352,8 +348,8 @@ def test_runs_with_other_test_views_are_not_compared_in_silence(
             match=r"test views: 3 \(room\) and 3 \(other\); both runs have 2 images of the same name and content; "
             ".* --allow-different-protocols",
         ):
-            Report((trained, with_other_views), workspace / "mixed").main()
-    Report((trained, with_other_views), workspace / "mixed", allow_different_protocols=True).main()
+            ReportCommand((trained, with_other_views), workspace / "mixed").main()
+    ReportCommand((trained, with_other_views), workspace / "mixed", allow_different_protocols=True).main()
     figures = json.loads((workspace / "mixed" / "report.json").read_text())
     assert figures["views_not_in_all_runs"] == {"room": ["images/test/00002.png"], "other": ["images/val/00000.png"]}
     ours, theirs = ({v["file"]: v for v in one["evaluation"]["views"]} for one in figures["runs"])

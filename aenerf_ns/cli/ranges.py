@@ -1,0 +1,33 @@
+"""Values of options that no command takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from aenerf_ns.errors import DataError
+
+RATES = (1e-6, 1e9)
+"""Range of the poses or frames a second that a command makes."""
+
+
+def require_range(option: str, value: float, low: float, high: float) -> None:
+    """Raise a DataError if the value of an option is outside a range or not a number."""
+    if not low <= value <= high:
+        raise DataError(f"--{option}", f"{value} is out of range", f"give a number from {low:g} to {high:g}")
+
+
+def require_seed(seed: int) -> None:
+    """Raise a DataError for a seed that a random generator does not take."""
+    require_range("seed", seed, 0, 2**63 - 1)
+
+
+@contextmanager
+def value_error_as_data_error(command: str) -> Iterator[None]:
+    """Turn a ValueError, with which a class refuses the value of an option, into a DataError that names the command."""
+    try:
+        yield
+    except DataError:
+        raise
+    except ValueError as error:
+        raise DataError(f"aenerf {command}", str(error), f"see aenerf {command} --help") from error

@@ -1,0 +1,242 @@
+"""``aenerf simulate-video``: the events of a video's camera, as a dataset or as a recording without poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from aenerf_ns.cli.dataset import training_command
+from aenerf_ns.cli.ranges import value_error_as_data_error
+from aenerf_ns.cli.simulation import SimulationCommand
+from aenerf_ns.cli.termination import sigterm_as_system_exit
+from aenerf_ns.errors import DataError, reading
+from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
+from aenerf_ns.files.limits import require_file
+from aenerf_ns.simulator.options import Interpolation
+
+if TYPE_CHECKING:
+    from aenerf_ns.camera.intrinsics import CameraIntrinsics
+    from aenerf_ns.camera.trajectory import Trajectory
+    from aenerf_ns.poses_from_frames.video import Video
+    from aenerf_ns.recording.output_lock import OutputLock
+    from aenerf_ns.simulator.video_events import VideoInterval
+
+_COMMAND = "aenerf simulate-video"
+
+
+@dataclass
+class SimulateVideo(SimulationCommand):
+    """Simulate an event camera in place of the camera of a video, and write a dataset for ns-train aenerf. Only events
+    and images are written without --trajectory and without --poses colmap."""
+
+    video: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
+    """The video: a file, or a folder of images with the list images.txt of their times (on each line: t[s] file)."""
+    interpolation: Interpolation = "flow"
+    """How the log-radiance changes between two frames of the video. flow: it moves along optical flow. linear: each
+    pixel changes linearly in time. linear is faster, but wrong where the picture moves by pixels between frames."""
+    poses: Literal["given", "colmap"] = "given"
+    """given: the poses of --trajectory, or none. colmap: COLMAP estimates a pose for each frame, and may lose or
+    misplace frames."""
+    trajectory: Path | None = None
+    """Poses of the video's camera, as t tx ty tz qx qy qz qw in seconds on the clock of the video, camera-to-world,
+    OpenCV camera axes. Needs the camera's intrinsics."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """Intrinsics of the video's camera without distortion: fl_x fl_y cx cy in pixels. cx and cy count from the edge of
+    the image."""
+    calibration: Path | None = None
+    """The video's camera: calibration.json, or the camchain.yaml that Kalibr writes. Without this option and without
+    --intrinsics, --poses colmap estimates the lens."""
+    event_camera: str | None = None
+    """Name of the video's camera in a camchain of several cameras, such as cam1."""
+    frame_rate: float | None = None
+    """The rate at which the camera took the frames, in place of the times that the video states, as for slow motion."""
+
+    def main(self) -> None:
+        """Read the video and write the dataset."""
+        self.require_possible({})
+        self._require_compatible()
+        sensor = self.make_sensor()
+        with reading(self.video):
+            if not self.video.exists():
+                raise DataError(self.video, "there is no such video", "give a file, or a folder of images")
+        for file in (self.trajectory, self.calibration):
+            if file is not None:
+                require_file(file)
+        from aenerf_ns.recording.output_lock import OutputLock
+
+        with sigterm_as_system_exit(), OutputLock(self.output) as lock, value_error_as_data_error("simulate-video"):
+            self._simulate(sensor, lock)
+
+    def _require_compatible(self) -> None:
+        """Raise a DataError for options that contradict each other."""
+        if self.calibration is not None and self.intrinsics is not None:
+            raise DataError(_COMMAND, "--calibration and --intrinsics are both given", "leave out one of them")
+        if any(self.pose_noise) and self.trajectory is None:
+            raise DataError(_COMMAND, f"pose noise {self.pose_noise} without poses to add it to", "give --trajectory")
+        if self.trajectory is not None:
+            if self.poses == "colmap":
+                raise DataError(_COMMAND, "--trajectory with --poses colmap", "leave out one of them")
+            if self.calibration is None and self.intrinsics is None:
+                raise DataError(
+                    _COMMAND,
+                    "--trajectory without the intrinsics of the camera",
+                    "give --calibration or --intrinsics, or let COLMAP estimate lens and poses with --poses colmap",
+                )
+
+    def _simulate(self, sensor: SensorModel, lock: OutputLock) -> None:
+        import numpy as np
+
+        from aenerf_ns.poses_from_frames.video import open_video
+        from aenerf_ns.simulator.video_events import video_events
+
+        video = open_video(self.video, self.frame_rate)
+        require_event_sensor_size(video.width, video.height, self.video, "scale the frames down")
+        camera = self._read_camera(video)
+        poses = self._find_poses(video, camera)
+        intervals = video_events(video, sensor, self.noise, self.interpolation, self.max_displacement, self.seed)
+        if poses is None:
+            written = self._write_events(lock, video, camera, sensor, intervals)
+        else:
+            written = self._write_dataset(lock, video, sensor, poses, intervals)
+        longest = np.diff(video.times).max() * 1e-6
+        CONSOLE.print(
+            f"{written}\nEvents between two frames, up to {longest:.3g} ms apart, are interpolated. What moves faster "
+            "than the frames follow, what blur smears, and what is clipped to white or black in the video is lost.",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+    def _read_camera(self, video: Video) -> CameraIntrinsics | None:
+        """Read the lens of the video's camera, or return None where no option states it."""
+        from aenerf_ns.camera.intrinsics import CameraIntrinsics
+        from aenerf_ns.files.calibration import read_calibration
+
+        if self.calibration is not None:
+            camera = read_calibration(self.calibration, self.event_camera).event_camera
+            if (camera.width, camera.height) != (video.width, video.height):
+                raise DataError(
+                    self.calibration,
+                    f"its camera has {camera.width} x {camera.height} pixels, the frames of {video.source} "
+                    f"{video.width} x {video.height}",
+                    "give the calibration of the frames as they are",
+                )
+            return camera
+        if self.intrinsics is not None:
+            try:
+                return CameraIntrinsics(video.width, video.height, *self.intrinsics)
+            except ValueError as error:
+                raise DataError("--intrinsics", str(error), "give fl_x fl_y cx cy in pixels") from None
+        return None
+
+    def _find_poses(self, video: Video, camera: CameraIntrinsics | None) -> _VideoPoses | None:
+        """Read or estimate the poses of the video's camera, or return None where no option asks for them."""
+        from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+        from aenerf_ns.poses_from_frames.structure_from_motion import estimate_poses
+
+        if self.trajectory is not None:
+            assert camera is not None
+            given = read_tum_trajectory(self.trajectory)
+            given.crop(int(video.times[0]), int(video.times[-1]))
+            if not any(self.pose_noise):
+                return _VideoPoses(camera, given)
+            return _VideoPoses(camera, self.add_pose_noise(given), given)
+        if self.poses == "colmap":
+            lens = (video.width, video.height) if camera is None else camera
+            found = estimate_poses(video, video.times, lens, video.source, self.seed)
+            CONSOLE.print(found.summary(), highlight=False, soft_wrap=True)
+            if camera is None:
+                CONSOLE.print(
+                    f"COLMAP estimates the lens: focal length {found.camera.fx:.1f} pixels, radial distortion "
+                    f"{found.camera.distortion[0]:.3g}.",
+                    highlight=False,
+                    soft_wrap=True,
+                )
+            return _VideoPoses(found.camera, found.trajectory, report=found.report())
+        return None
+
+    def _write_dataset(
+        self,
+        lock: OutputLock,
+        video: Video,
+        sensor: SensorModel,
+        poses: _VideoPoses,
+        intervals: Iterable[VideoInterval],
+    ) -> str:
+        """Write a dataset folder, and describe it in one line."""
+        from aenerf_ns.camera.trajectory import homogeneous
+        from aenerf_ns.recording.recording import Split
+        from aenerf_ns.recording.views import evenly_spread
+        from aenerf_ns.recording.writer import NativeDatasetWriter
+
+        reference = poses.estimated if poses.truth is None else poses.truth
+        # The first frame lies before all events.
+        taken = [time for time in video.times[1:].tolist() if reference.start <= time <= reference.end]
+        chosen: dict[Split, list[int]] = {
+            "train": evenly_spread(taken, self.train_images),
+            "val": evenly_spread(taken[::2], self.validation_views),
+            "test": evenly_spread(taken[1::2], self.test_views),
+        }
+        with NativeDatasetWriter(lock, poses.camera, sensor, "srgb") as writer:
+            writer.add_trajectories(poses.estimated, poses.truth)
+            if poses.report is not None:
+                writer.add_poses_report(poses.report)
+            num_events = 0
+            for frame, time, events in intervals:
+                writer.events.append(events)
+                num_events += len(events)
+                for split, times in chosen.items():
+                    if time in times:
+                        writer.add_image(split, frame, homogeneous(reference.interpolate(time)), time)
+            _require_events(num_events, video)
+        counts = ", ".join(f"{len(times)} {split}" for split, times in chosen.items())
+        return (
+            f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(poses.estimated)} poses, images: "
+            f"{counts}.\nTrain with: {training_command(self.output)}"
+        )
+
+    def _write_events(
+        self,
+        lock: OutputLock,
+        video: Video,
+        camera: CameraIntrinsics | None,
+        sensor: SensorModel,
+        intervals: Iterable[VideoInterval],
+    ) -> str:
+        """Write the events and images of a video without poses, and describe them in one line."""
+        from aenerf_ns.recording.views import evenly_spread
+        from aenerf_ns.recording.writer import PoselessRecordingWriter
+
+        kept = evenly_spread(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
+        with PoselessRecordingWriter(lock, camera, sensor) as writer:
+            num_events = 0
+            for frame, time, events in intervals:
+                writer.events.append(events)
+                num_events += len(events)
+                if time in kept:
+                    writer.add_image(frame, time)
+            _require_events(num_events, video)
+        missing = "trajectory.txt" if camera is not None else "calibration.json and trajectory.txt"
+        return (
+            f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(kept)} images, no poses.\n"
+            f"To train on them, add {missing} (docs/datasets/own_recording.md)."
+        )
+
+
+@dataclass(frozen=True)
+class _VideoPoses:
+    """The lens and the poses of a video's camera, the true poses if others are estimated, and COLMAP's report."""
+
+    camera: CameraIntrinsics
+    estimated: Trajectory
+    truth: Trajectory | None = None
+    report: dict[str, Any] | None = None
+
+
+def _require_events(num_events: int, video: Video) -> None:
+    if num_events == 0:
+        raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")

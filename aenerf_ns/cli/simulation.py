@@ -1,0 +1,105 @@
+"""What the two simulations have in common: the sensor, the errors of the poses, and the number of images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from aenerf_ns.cli.ranges import require_range, require_seed, value_error_as_data_error
+from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.files.output_paths import require_absent
+from aenerf_ns.simulator.options import SensorNoise
+
+if TYPE_CHECKING:
+    from aenerf_ns.camera.trajectory import Trajectory
+
+# Wider than anybody needs. Outside them a simulation would run for days, or fill the memory.
+_RANGES = {
+    "pose_noise_degrees": (0, 180),
+    "pose_noise_translation": (0, 1e6),
+    "pose_noise_correlation_time": (1e-6, 1e6),
+    "contrast_threshold_spread": (0, 10),
+    "leak_rate": (0, 1e6),
+    "shot_noise_rate": (0, 1e6),
+    "frame_rate": (1e-3, 1e6),
+    "max_displacement": (1e-2, 1e2),
+    "train_images": (0, 100_000),
+    "validation_views": (0, 100_000),
+    "test_views": (0, 100_000),
+}
+
+
+@dataclass
+class SimulationCommand:
+    """A command that simulates an event camera and writes a dataset."""
+
+    output: Path
+    """Dataset folder to create."""
+    _: KW_ONLY
+    pose_noise_degrees: float = 0.0
+    """Error of the estimated rotations: root mean square of its angle, in degrees."""
+    pose_noise_translation: float = 0.0
+    """Error of the estimated positions: root mean square of its length, in scene units (meters)."""
+    pose_noise_correlation_time: float = 0.25
+    """Correlation time of the pose errors in seconds."""
+    positive_contrast_threshold: float = 0.25
+    """C+: rise of log-radiance that triggers an event."""
+    negative_contrast_threshold: float = 0.25
+    """C-: fall of log-radiance that triggers an event."""
+    refractory_period_ns: int = 0
+    """Time for which a pixel is blind after each event, in nanoseconds."""
+    noise: tyro.conf.OmitArgPrefixes[SensorNoise] = field(default_factory=SensorNoise)
+    bayer_pattern: BayerPattern = ""
+    """RGGB for a color sensor."""
+    max_displacement: float = 0.5
+    """Pixels that 99 % of the picture may move between two rendered frames, or between two frames along the flow."""
+    train_images: int = 50
+    """Reference images along the trajectory. They are not used for training."""
+    validation_views: int = 20
+    """Reference views around the trajectory, or frames of the video, for color correction."""
+    test_views: int = 20
+    """Reference views from other positions, or other frames of the video, for evaluation."""
+    seed: int = 0
+    """Seed of everything random: the scene, the sensor, the pose noise and the test views."""
+
+    @property
+    def pose_noise(self) -> tuple[float, float]:
+        """Error of the estimated poses: degrees and scene units."""
+        return self.pose_noise_degrees, self.pose_noise_translation
+
+    def require_possible(self, ranges: Mapping[str, tuple[float, float]]) -> None:
+        """Raise a DataError if the output exists or a number is out of range.
+
+        Args:
+            ranges: lowest and highest value of options of one command.
+        """
+        require_absent(self.output)
+        ranges = {**_RANGES, **ranges}
+        for name, value in {**vars(self), **vars(self.noise)}.items():
+            if name in ranges and value is not None:
+                require_range(name.replace("_", "-"), value, *ranges[name])
+        require_seed(self.seed)
+
+    def make_sensor(self) -> SensorModel:
+        """Make the sensor.
+
+        Raises:
+            DataError: a value is impossible.
+        """
+        with value_error_as_data_error("simulate"):
+            return SensorModel(
+                self.positive_contrast_threshold,
+                self.negative_contrast_threshold,
+                self.refractory_period_ns,
+                self.bayer_pattern,
+            )
+
+    def add_pose_noise(self, poses: Trajectory) -> Trajectory:
+        """Add errors to true poses."""
+        from aenerf_ns.camera.noise import perturb
+
+        return perturb(poses, *self.pose_noise, self.pose_noise_correlation_time, self.seed)
