@@ -14,7 +14,7 @@ from aenerf_ns.cli.simulation import SimulationCommand
 from aenerf_ns.cli.termination import sigterm_as_system_exit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
-from aenerf_ns.files.text import MAX_ROWS
+from aenerf_ns.files.limits import MAX_ROWS
 from aenerf_ns.simulator.options import BUILT_IN, DURATIONS, require_scene_file
 
 if TYPE_CHECKING:

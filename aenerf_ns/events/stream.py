@@ -125,7 +125,7 @@ def require_event_file(path: Path) -> None:
     """Raise a DataError if the file does not exist."""
     with reading(path):
         if not path.is_file():
-            raise DataError(path, "there is no such event file", "check the path of the dataset")
+            raise DataError(path, "there is no such file", "check the path of the dataset")
 
 
 class EventFile(ABC):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.text import MAX_ROWS
+from aenerf_ns.files.limits import MAX_ROWS
 
 
 def spread_times(window: TimeWindow, count: int) -> Tensor:

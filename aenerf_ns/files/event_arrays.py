@@ -14,10 +14,10 @@ from typing import IO, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError, reading
-from aenerf_ns.events.stream import EventFile, require_event_file
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.event_table import EventLayout, EventTableFile
-from aenerf_ns.files.limits import require_file, require_unpacked_size
+from aenerf_ns.files.limits import bounded, require_unpacked_size
 from aenerf_ns.files.text import TimeUnit
 
 # Robust e-NeRF.
@@ -34,18 +34,20 @@ _XYTP_RECORDS = EventLayout({name: ("", name) for name in "xytp"}, time_unit=Non
 class NpzEventFile(EventTableFile):
     """Read an .npz file. Members that are not compressed are mapped into memory, others are read as a whole."""
 
+    kind = ".npz file"
+
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, NDArray]]:
-        self.require()
         yield {name: read_npz_member(self.path, name) for name in self._layout.arrays}
 
 
 class NpyEventFile(EventTableFile):
     """Read an .npy file: a matrix or an array of records, mapped into memory."""
 
+    kind = ".npy file"
+
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, NDArray]]:
-        self.require()
         yield {"": load_npy(self.path)}
 
 
@@ -64,12 +66,11 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
     Raises:
         DataError: the file is missing or malformed, or holds no events in a known layout.
     """
-    suffix = path.suffix.lower()
-    require_event_file(path)
-    if suffix == ".npy":
+    if path.suffix.lower() == ".npy":
         layout = XYTP_MATRIX if load_npy(path).dtype.names is None else _XYTP_RECORDS
         return NpyEventFile(path, width, height, layout, time_unit)
-    names = npz_members(path)
+    with bounded(path, ".npz file"), zipfile.ZipFile(path) as archive:
+        names = {name.removesuffix(".npy") for name in archive.namelist()}
     for layout in (XYTP_MEMBERS, POSITION_TIMESTAMP_POLARITY):
         if layout.arrays <= names:
             return NpzEventFile(path, width, height, layout, time_unit)
@@ -80,33 +81,21 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
     )
 
 
-def npz_members(path: Path) -> set[str]:
-    """Return the names of the arrays in an .npz file.
-
-    Raises:
-        DataError: the file is missing or not an .npz file.
-    """
-    with _open_npz(path) as archive:
-        return {name.removesuffix(".npy") for name in archive.namelist()}
-
-
 def read_npz_member(path: Path, name: str) -> NDArray:
-    """Return an array of an .npz file, mapped into memory where it is not compressed.
+    """Read an array of an .npz file, mapped into memory where it is not compressed.
 
     Raises:
         DataError: the file is missing or malformed, or has no such array, or the array holds Python objects or is
             larger than the file can explain.
     """
     with open_npz_member(path, name) as (member, entry):
-        header = _read_npy_header(member, entry.file_size)
-        if header.dtype.hasobject:
-            raise ValueError("it holds Python objects")
-        if entry.compress_type == zipfile.ZIP_STORED and header.num_bytes and header.shape:
+        header = _NpyHeader.read(member, entry.file_size)
+        if entry.compress_type == zipfile.ZIP_STORED:
             with path.open("rb") as file:
                 # The local header has a name and an extra field of other lengths (PKZIP's APPNOTE, 4.3.7).
                 file.seek(entry.header_offset + 26)
-                start = entry.header_offset + 30 + sum(struct.unpack("<HH", file.read(4))) + header.end
-            return np.memmap(path, header.dtype, "r", start, header.shape, header.order)
+                start = entry.header_offset + 30 + sum(struct.unpack("<HH", file.read(4)))
+            return header.map(path, start)
         values = np.frombuffer(member.read(header.num_bytes), np.uint8)
         if len(values) < header.num_bytes:
             raise ValueError("it ends too early")
@@ -121,72 +110,55 @@ def open_npz_member(path: Path, name: str) -> Iterator[tuple[IO[bytes], zipfile.
         DataError: the file is missing or malformed, or has no such array, or the array is unpacked to a size that the
             file cannot explain.
     """
-    with _open_npz(path) as archive:
-        try:
-            entry = archive.getinfo(f"{name}.npy")
-        except KeyError:
-            raise DataError(path, f"it has no array {name}", "see the formats in the docs") from None
+    with bounded(path, ".npz file"), zipfile.ZipFile(path) as archive:
+        if f"{name}.npy" not in archive.namelist():
+            raise DataError(path, f"it has no array {name}", "see the formats in the docs")
+        entry = archive.getinfo(f"{name}.npy")
         require_unpacked_size(path, f"its array {name}", entry.file_size, min(entry.compress_size, path.stat().st_size))
-        with _errors_as(path, f"its array {name} cannot be read"), archive.open(entry) as member:
+        with bounded(path, f"array {name}"), archive.open(entry) as member:
             yield member, entry
-
-
-@contextmanager
-def _open_npz(path: Path) -> Iterator[zipfile.ZipFile]:
-    with reading(path):
-        require_file(path)
-        try:
-            archive = zipfile.ZipFile(path)
-        except (zipfile.BadZipFile, ValueError, NotImplementedError, struct.error) as error:
-            raise DataError(path, f"not a readable .npz file ({error})", "write or copy it again") from None
-    with archive:
-        yield archive
-
-
-@contextmanager
-def _errors_as(path: Path, problem: str) -> Iterator[None]:
-    """Turn the errors of zipfile and NumPy within the context, for damaged or other files, into a DataError."""
-    try:
-        yield
-    except DataError:
-        raise
-    # zipfile, zlib, NumPy and the tokenizer it reads headers with raise whatever they stumble over.
-    except Exception as error:
-        raise DataError(path, f"{problem} ({error})", "write or copy it again") from None
 
 
 @dataclass(frozen=True)
 class _NpyHeader:
-    """The form of an array in an .npy file, and where its values begin in bytes."""
+    """The form of an array in an .npy file, and the position of its values in bytes."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
     order: Literal["C", "F"]
     end: int
 
+    @classmethod
+    def read(cls, file: IO[bytes], file_size: int) -> _NpyHeader:
+        """Read a header, and check that its array holds plain values and is as small as the file.
+
+        Raises:
+            ValueError, or another error: the header is malformed, or the array larger or of Python objects.
+        """
+        shape, is_fortran, dtype = read_npy_header(file)
+        if dtype.hasobject:
+            raise ValueError("it holds Python objects")
+        if not all(type(side) is int and side >= 0 for side in shape):
+            raise ValueError(f"its shape is {shape}")
+        header = cls(shape, dtype, "F" if is_fortran else "C", file.tell())
+        # NumPy's size of an item overflows.
+        if not 0 <= header.num_bytes <= file_size - header.end:
+            raise ValueError(f"its shape is {shape}, but it has {file_size:,} bytes")
+        return header
+
     @property
     def num_bytes(self) -> int:
         return math.prod(self.shape) * self.dtype.itemsize
 
-
-def _read_npy_header(file: IO[bytes], num_bytes: int) -> _NpyHeader:
-    """Read the header of an .npy file of a number of bytes, and check that its array is as small as the file.
-
-    Raises:
-        ValueError, or another error: the header is malformed or the array larger.
-    """
-    shape, is_fortran, dtype = read_npy_header(file)
-    if not all(type(side) is int and side >= 0 for side in shape):
-        raise ValueError(f"its shape is {shape}")
-    header = _NpyHeader(shape, dtype, "F" if is_fortran else "C", file.tell())
-    # NumPy's size of an item overflows.
-    if not dtype.hasobject and not 0 <= header.num_bytes <= num_bytes - header.end:
-        raise ValueError(f"its shape is {shape}, but it has {num_bytes:,} bytes")
-    return header
+    def map(self, path: Path, start: int = 0) -> NDArray:
+        """Map the array into memory, from an .npy file that begins at a position of a file."""
+        if not self.num_bytes:
+            return np.zeros(self.shape, self.dtype)
+        return np.memmap(path, self.dtype, "r", start + self.end, self.shape, self.order)
 
 
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Return shape, whether the order is Fortran's, and type of the array in an .npy file."""
+    """Read the shape of an array in an .npy file, whether its order is Fortran's, and its type."""
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         return np.lib.format.read_array_header_1_0(file)
@@ -194,20 +166,10 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def load_npy(path: Path) -> NDArray:
-    """Return the array of an .npy file, mapped into memory.
+    """Map the array of an .npy file into memory.
 
     Raises:
         DataError: the file is missing or malformed, or its array holds Python objects.
     """
-    with reading(path):
-        require_file(path)
-        with path.open("rb") as file, _errors_as(path, "not a readable .npy file"):
-            if file.read(2) == b"PK":
-                raise DataError(path, "it is an archive of several arrays", "name it .npz")
-            file.seek(0)
-            header = _read_npy_header(file, path.stat().st_size)
-            if header.dtype.hasobject:
-                raise ValueError("it holds Python objects")
-            if not header.num_bytes or not header.shape:
-                return np.zeros(header.shape, header.dtype)
-            return np.memmap(path, header.dtype, "r", header.end, header.shape, header.order)
+    with bounded(path, ".npy file"), path.open("rb") as file:
+        return _NpyHeader.read(file, path.stat().st_size).map(path)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError, reading
-from aenerf_ns.events.stream import EventFile, EventStream, require_event_file
-from aenerf_ns.files.event_table import EventLayout, EventTableFile
-from aenerf_ns.files.limits import require_unpacked_size
-from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.event_reader import EventReader
+from aenerf_ns.files.event_table import FORMATS_REMEDY, EventLayout, EventTableFile
+from aenerf_ns.files.limits import MAX_TIME, bounded, require_unpacked_size
+from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
 if TYPE_CHECKING:
     import h5py
@@ -25,10 +27,6 @@ _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 _UNITS: tuple[TimeUnit, ...] = ("ns", "us", "ms")
 # The number of the HDF5 filter of Prophesee's compression of events.
 _ECF = 0x8ECF
-# Bytes of an event, with columns that are not read.
-_MAX_ROW = 1 << 10
-# Bytes that are decompressed as one piece.
-_MAX_PIECE = 1 << 27
 # Events read at once: 50 MB.
 _CHUNK = 1 << 22
 # Events collected before they are written: many small writes are slow.
@@ -37,7 +35,7 @@ _WRITE_CHUNK = 1 << 18
 _HELD_BYTES = 1 << 22
 
 
-class Hdf5EventFile(EventFile):
+class Hdf5EventFile(EventReader):
     """Read the native file: /events/{x u16, y u16, t i64, p i8}.
 
     The group /events may have the attributes ``time_unit`` ("ns", "us" or "ms") and ``time_offset`` (an integer in that
@@ -48,17 +46,16 @@ class Hdf5EventFile(EventFile):
         time_unit: of the times where the file does not state it; "ns" by default.
     """
 
+    kind = "HDF5 file"
+
     def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
         super().__init__(path, width, height)
         self._time_unit = time_unit
 
     def _columns(self, file: h5py.File) -> tuple[dict[str, h5py.Dataset], int, int]:
         """Return the four columns, the nanoseconds of a tick, and the offset in nanoseconds."""
-        found = _datasets(self.path, file, [f"events/{name}" for name in _DTYPES])
-        columns: dict[str, Any] = {name: found[f"events/{name}"] for name in _DTYPES}
+        columns = _require_datasets(self.path, file, {name: f"events/{name}" for name in _DTYPES})
         for name, column in columns.items():
-            if column is None:
-                raise DataError(self.path, f"there is no dataset /events/{name}", "see the dataset format in the docs")
             if column.dtype != _DTYPES[name] or column.ndim != 1:
                 raise DataError(
                     self.path,
@@ -95,25 +92,24 @@ class Hdf5EventFile(EventFile):
             )
         return times * tick + offset
 
-    def read_chunks(self) -> Iterator[EventStream]:
+    def _chunks(self) -> Iterator[EventStream]:
         with _open(self.path) as file:
             columns, tick, offset = self._columns(file)
             for begin in range(0, len(columns["t"]), _CHUNK):
-                piece = slice(begin, begin + _CHUNK)
-                part = {name: _read(self.path, column, piece) for name, column in columns.items()}
-                part["t"] = self._times(part["t"], tick, offset)
-                yield EventStream(**part, width=self.width, height=self.height, source=self.path)
+                x, y, t, p = (_read(self.path, columns[name], slice(begin, begin + _CHUNK)) for name in "xytp")
+                yield self._stream((x, y, self._times(t, tick, offset), p))
 
-    def time_span(self) -> tuple[int, int]:
+    def _time_span(self) -> tuple[int, int] | None:
         with _open(self.path) as file:
             columns, tick, offset = self._columns(file)
-            if len(columns["t"]) == 0:
-                raise self.empty_error()
-            first, last = (_read(self.path, columns["t"], slice(i, i + 1)) for i in (0, len(columns["t"]) - 1))
-            start, end = self._times(np.concatenate([first, last]), tick, offset).tolist()
+            times = columns["t"]
+            if len(times) == 0:
+                return None
+            ends = [_read(self.path, times, slice(i, i + 1)) for i in (0, len(times) - 1)]
+            start, end = self._times(np.concatenate(ends), tick, offset).tolist()
             return start, end
 
-    def count(self) -> int:
+    def _count(self) -> int:
         with _open(self.path) as file:
             return len(self._columns(file)[0]["t"])
 
@@ -137,16 +133,15 @@ _LAYOUTS = (PROPHESEE_RECORDS, COLUMNS_IN_GROUP, COLUMNS_AT_TOP, TXYP_MATRIX)
 class Hdf5TableFile(EventTableFile):
     """Read an HDF5 file of another project."""
 
+    kind = "HDF5 file"
+
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, Any]]:
         with _open(self.path) as file:
-            arrays: dict[str, Any] = _datasets(self.path, file, self._layout.arrays)
-            for name, array in arrays.items():
-                if array is None:
-                    raise DataError(self.path, f"there is no dataset /{name}", "see the formats in the docs")
+            arrays: dict[str, Any] = _require_datasets(self.path, file, {name: name for name in self._layout.arrays})
             offset_name = self._layout.time_offset
             if offset_name is not None and offset_name in file:
-                offset = _datasets(self.path, file, [offset_name])[offset_name]
+                offset = _dataset(self.path, file, offset_name)
                 value = None if offset is None or offset.size != 1 else _scalar(offset[()])
                 if not isinstance(value, (int, np.integer)):
                     raise DataError(self.path, f"its {offset_name} is {value!r}", "store an integer")
@@ -169,16 +164,13 @@ def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | 
     Raises:
         DataError: the file is missing or not HDF5, or holds no events in a known layout.
     """
-    with _open(path) as file:
-        columns = _datasets(path, file, [f"events/{name}" for name in _DTYPES])
-        native = all(
-            column is not None and column.dtype == dtype
-            for column, dtype in zip(columns.values(), _DTYPES.values(), strict=True)
-        )
+    with bounded(path, "HDF5 file"), _open(path) as file:
+        columns = {name: _dataset(path, file, f"events/{name}") for name in _DTYPES}
+        native = all(column is not None and column.dtype == _DTYPES[name] for name, column in columns.items())
         if native and not {"ms_to_idx", "t_offset"} & set(file):
             return Hdf5EventFile(path, width, height, time_unit)
         for layout in _LAYOUTS:
-            if None not in _datasets(path, file, layout.arrays).values():
+            if all(_dataset(path, file, name) is not None for name in layout.arrays):
                 return Hdf5TableFile(path, width, height, layout, time_unit)
         raise DataError(
             path,
@@ -187,62 +179,52 @@ def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | 
         )
 
 
-@contextmanager
-def _open(path: Path) -> Iterator[h5py.File]:
-    """Open a file. Errors of HDF5 within the context become a DataError.
-
-    Raises:
-        DataError: the file is missing, cannot be read or is damaged.
-    """
+def _open(path: Path) -> h5py.File:
     # Imported lazily: every command of every method imports this module.
     import h5py
 
     with suppress(ImportError):
         # The import registers Blosc and other compression filters, where the extra is installed.
         import hdf5plugin  # noqa: F401
-    require_event_file(path)
-    # h5py's message for a missing right does not name it.
-    with reading(path):
-        path.open("rb").close()
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except DataError:
-        raise
-    # h5py raises each of them for a file that is damaged or made to be.
-    except (KeyError, MemoryError, OSError, RuntimeError, TypeError, ValueError) as error:
-        raise DataError(path, f"not a readable HDF5 file ({error})", "write or copy it again") from None
+    # h5py's messages for a missing file and a missing right do not name them.
+    path.open("rb").close()
+    return h5py.File(path, "r")
 
 
-def _datasets(path: Path, file: h5py.File, names: Iterable[str]) -> dict[str, h5py.Dataset | None]:
-    """Return the datasets of a file by their names, or None where there is none of a name.
+def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
+    """Return a dataset of a file, or None where there is none of this name.
 
     Raises:
-        DataError: a dataset has no values, has them in other files, or is larger than the file can explain.
+        DataError: it has no values, or has them in another file.
     """
     import h5py
 
-    found: dict[str, h5py.Dataset | None] = {}
-    for name in names:
-        item = file.get(name)
-        found[name] = item if isinstance(item, h5py.Dataset) else None
-    datasets = [dataset for dataset in found.values() if dataset is not None]
-    for dataset in datasets:
-        if dataset.file.filename != file.filename or dataset.external or dataset.is_virtual:
-            raise DataError(path, f"{dataset.name} is a link to another file", "copy its values into this file")
-        if dataset.shape is None:
-            raise DataError(path, f"{dataset.name} has no values", "write it again")
-        row = int(np.prod(dataset.shape[1:], dtype=object)) * dataset.dtype.itemsize
-        piece = int(np.prod(dataset.chunks or (), dtype=object)) * dataset.dtype.itemsize
-        if row > _MAX_ROW or piece > _MAX_PIECE:
-            raise DataError(
-                path,
-                f"{dataset.name} has rows of {row:,} bytes in pieces of {piece:,}",
-                f"write pieces of at most {_MAX_PIECE:,} bytes",
-            )
-    num_bytes = sum(int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize for dataset in datasets)
-    require_unpacked_size(path, "its events", num_bytes, sum(dataset.id.get_storage_size() for dataset in datasets))
-    return found
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        return None
+    if dataset.file.filename != file.filename or dataset.external or dataset.is_virtual:
+        raise DataError(path, f"{dataset.name} is a link to another file", "copy its values into this file")
+    if dataset.shape is None:
+        raise DataError(path, f"{dataset.name} has no values", "write it again")
+    return dataset
+
+
+def _require_datasets(path: Path, file: h5py.File, names: Mapping[str, str]) -> dict[str, h5py.Dataset]:
+    """Return datasets by their keys in a mapping to their names.
+
+    Raises:
+        DataError: one is missing, or has no values here, or all are larger than the file can explain.
+    """
+    datasets = {}
+    for key, name in names.items():
+        dataset = _dataset(path, file, name)
+        if dataset is None:
+            raise DataError(path, f"there is no dataset /{name}", FORMATS_REMEDY)
+        datasets[key] = dataset
+    # NumPy's sizes overflow.
+    size = sum(math.prod(dataset.shape) * dataset.dtype.itemsize for dataset in datasets.values())
+    require_unpacked_size(path, "its events", size, sum(d.id.get_storage_size() for d in datasets.values()))
+    return datasets
 
 
 def _read(path: Path, array: h5py.Dataset, index: slice) -> NDArray:

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files.text import MAX_TIME, NANOSECONDS, TimeUnit
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import CHUNK, EventReader
+from aenerf_ns.files.limits import MAX_TIME
+from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
-_COLUMNS = ("x", "y", "t", "p")
-# Events read at once: 32 MB of a matrix of float64.
-_CHUNK = 1 << 20
 CHECK_SIZE = "check the sensor size and the order of the columns"
 """The remedy that an error about a pixel outside the sensor names."""
+FORMATS_REMEDY = "see the formats in the docs"
 # Number of events that tell the unit of the times.
 SAMPLE = 4096
 
@@ -30,7 +30,7 @@ class EventLayout:
     """Where a file has the columns of its events.
 
     Attributes:
-        columns: for x, y, t and p the name of an array and a place in it: None for an array of numbers, the index of a
+        columns: for x, y, t and p the name of an array and the part of it: None for an array of numbers, the index of a
             column for a matrix, or the name of a field for an array of records.
         time_unit: of the times, or None for the rule of :func:`guess_time_unit`.
         time_offset: name of a number that is added to all times, in their unit. A missing number is 0.
@@ -42,11 +42,11 @@ class EventLayout:
 
     @property
     def arrays(self) -> set[str]:
-        """Return the names of the arrays that hold columns."""
+        """Names of the arrays that hold columns."""
         return {name for name, _ in self.columns.values()}
 
 
-class EventTableFile(EventFile):
+class EventTableFile(EventReader):
     """Read a file whose arrays hold events as an :class:`EventLayout` says. Formats implement :meth:`open_arrays`.
 
     Args:
@@ -78,46 +78,44 @@ class EventTableFile(EventFile):
         """Read a piece of an array."""
         return array[piece]
 
-    def read_chunks(self) -> Iterator[EventStream]:
+    def _chunks(self) -> Iterator[EventStream]:
         with self.open_arrays() as arrays:
             length, tick = self._length(arrays), self._tick(arrays)
-            for first in range(0, length, _CHUNK):
-                yield self._read(arrays, first, first + _CHUNK, tick)
+            for first in range(0, length, CHUNK):
+                yield self._read(arrays, first, first + CHUNK, tick)
 
-    def time_span(self) -> tuple[int, int]:
+    def _time_span(self) -> tuple[int, int] | None:
         with self.open_arrays() as arrays:
             length, tick = self._length(arrays), self._tick(arrays)
             if length == 0:
-                raise self.empty_error()
+                return None
             first, last = (self._read(arrays, index, index + 1, tick) for index in (0, length - 1))
             return int(first.t[0]), int(last.t[0])
 
-    def count(self) -> int:
+    def _count(self) -> int:
         with self.open_arrays() as arrays:
             return self._length(arrays)
 
     def _length(self, arrays: Mapping[str, Any]) -> int:
         """Return the number of events. Check that the arrays have the form that the layout says."""
         lengths = {}
-        for column, (name, place) in self._layout.columns.items():
-            array = arrays[name]
-            if array.dtype.kind not in ("V" if isinstance(place, str) else "iufb"):
-                raise DataError(self.path, f"column {column} has type {array.dtype}", "store numbers")
-            expected = 2 if isinstance(place, int) else 1
-            if array.ndim != expected:
+        for column, (name, part) in self._layout.columns.items():
+            array, label = arrays[name], name or "the array"
+            num_dimensions = 2 if isinstance(part, int) else 1
+            if array.ndim != num_dimensions:
                 raise DataError(
                     self.path,
-                    f"{name or 'the array'} has shape {tuple(array.shape)}",
-                    f"it must have {expected} dimension(s), the first that of the events",
+                    f"{label} has shape {tuple(array.shape)}",
+                    f"it must have {num_dimensions} dimension(s), the first that of the events",
                 )
-            if isinstance(place, int) and array.shape[1] <= place:
+            if isinstance(part, int) and array.shape[1] <= part:
                 raise DataError(
                     self.path,
-                    f"{name or 'the array'} has {array.shape[1]} columns",
-                    f"column {place} must hold {column} of the events",
+                    f"{label} has {array.shape[1]} columns",
+                    f"column {part} must hold {column} of the events",
                 )
-            if isinstance(place, str) and place not in (array.dtype.names or ()):
-                raise DataError(self.path, f"the records of {name or 'the array'} have no field {place}", _DOCS)
+            if isinstance(part, str) and part not in (array.dtype.names or ()):
+                raise DataError(self.path, f"the records of {label} have no field {part}", FORMATS_REMEDY)
             lengths[name] = len(array)
         if len(set(lengths.values())) > 1:
             raise DataError(self.path, f"its columns have lengths {lengths}", "store all with the same length")
@@ -126,9 +124,9 @@ class EventTableFile(EventFile):
     def _columns(self, arrays: Mapping[str, Any], first: int, last: int) -> dict[str, NDArray]:
         pieces = {name: self.read_array(arrays[name], slice(first, last)) for name in self._layout.arrays}
         columns = {}
-        for column, (name, place) in self._layout.columns.items():
+        for column, (name, part) in self._layout.columns.items():
             piece = pieces[name]
-            columns[column] = piece if place is None else piece[place] if isinstance(place, str) else piece[:, place]
+            columns[column] = piece if part is None else piece[part] if isinstance(part, str) else piece[:, part]
         return columns
 
     def _tick(self, arrays: Mapping[str, Any]) -> int:
@@ -146,11 +144,8 @@ class EventTableFile(EventFile):
             tick=tick,
             offset=offset,
             source=self.path,
-            place=lambda index: f"event {first + index}",
+            describe_event=lambda index: f"event {first + index}",
         )
-
-
-_DOCS = "see the formats in the docs"
 
 
 def guess_time_unit(times: NDArray) -> TimeUnit:
@@ -173,7 +168,7 @@ def events_from_columns(
     offset: int = 0,
     fraction: NDArray[np.float64] | None = None,
     source: str | Path,
-    place: Callable[[int], str] = "event {}".format,
+    describe_event: Callable[[int], str] = "event {}".format,
     size_remedy: str = CHECK_SIZE,
 ) -> EventStream:
     """Return the events of columns of any numeric type.
@@ -186,19 +181,19 @@ def events_from_columns(
         offset: added to the times, in their unit.
         fraction: (N,) added to the times, in their unit, where the times are integers; between −1 and 1.
         source: names the origin of the columns, for messages.
-        place: names the place of an event in the source, for messages.
+        describe_event: says which event one is in the source, for messages.
         size_remedy: what to do about a pixel outside the sensor.
 
     Raises:
         DataError: a value is not one that an event can have.
     """
-    for name in _COLUMNS:
+    for name in "xytp":
         if columns[name].dtype.kind not in "iufb":
             raise DataError(source, f"column {name} has type {columns[name].dtype}", "store numbers")
 
     def error(name: str, bad: NDArray[np.bool_], remedy: str) -> DataError:
         index = int(np.argmax(bad))
-        return DataError(source, f"{place(index)} has {name} = {columns[name][index]:g}", remedy)
+        return DataError(source, f"{describe_event(index)} has {name} = {columns[name][index]:g}", remedy)
 
     pixels = {}
     for name, size in (("x", width), ("y", height)):

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.files.event_reader import CHUNK, Columns
 
-# Events yielded at once: 13 MB.
-_CHUNK = 1 << 20
-# The largest number of events in one word.
-_MOST_PER_WORD = 12
+# Events that one word can hold.
+_MAX_PER_WORD = 12
 
 # The state of a decoder from one word to the next.
 _HIGH, _LOW, _ROW, _BASE, _POLARITY, _OFFSET = range(6)
@@ -31,8 +30,6 @@ _EVT3_HIGH_BITS = 12
 # Upper bits of a time that are up to this many steps of 4.096 ms below the last ones go back in time, and the file is
 # rejected. Any other upper bits are ahead, by up to 16.7 s.
 _EVT3_BEHIND = 16
-
-Columns = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
 
 
 def initial_state(offset: int = 0) -> NDArray[np.int64]:
@@ -51,7 +48,7 @@ def _decode_evt2(words, position, x, y, t, p, n, state):
     high, offset = state[_HIGH], state[_OFFSET]
     mask = (1 << _EVT2_HIGH_BITS) - 1
     half = 1 << (_EVT2_HIGH_BITS - 1)
-    while position < words.shape[0] and n + _MOST_PER_WORD <= x.shape[0]:
+    while position < words.shape[0] and n + _MAX_PER_WORD <= x.shape[0]:
         word = np.int64(words[position])
         kind = word >> 28
         if kind <= 0x1:
@@ -79,7 +76,7 @@ def _decode_evt3(words, position, x, y, t, p, n, state):
     mask = (1 << _EVT3_HIGH_BITS) - 1
     time = ((high << 12) | low) * 1000 + offset
     ready = high != _UNKNOWN and low != _UNKNOWN and row != _UNKNOWN
-    while position < words.shape[0] and n + _MOST_PER_WORD <= x.shape[0]:
+    while position < words.shape[0] and n + _MAX_PER_WORD <= x.shape[0]:
         word = np.int64(words[position])
         kind = word >> 12
         value = word & 0xFFF
@@ -158,7 +155,7 @@ def decode_words(
     Args:
         blocks: (N,) words in pieces; a piece may end anywhere.
         encoding: the encoding of the words.
-        state: from :func:`initial_state`. The iterator of the blocks may reset it between two blocks.
+        state: from :func:`initial_state`. The iterator of the blocks may reset it between two.
         source: the file, for messages.
 
     Yields:
@@ -175,28 +172,24 @@ def decode_words(
             position, n = encoding.decode(block, position, *columns, n, state)
             if position == len(block):
                 break
-            if n + _MOST_PER_WORD <= _CHUNK:
+            if n + _MAX_PER_WORD <= CHUNK:
                 raise DataError(
                     source,
                     f"word {num_before + position} is {block[position]:#x}, which {encoding.name} does not have",
                     "the file is damaged or in another encoding: copy or record it again",
                 )
-            yield _first(columns, n)
+            yield _begin_of(columns, n)
             columns, n = _empty_columns(), 0
         num_before += len(block)
     if n:
-        yield _first(columns, n)
+        yield _begin_of(columns, n)
 
 
 def _empty_columns() -> Columns:
-    return (
-        np.empty(_CHUNK, np.uint16),
-        np.empty(_CHUNK, np.uint16),
-        np.empty(_CHUNK, np.int64),
-        np.empty(_CHUNK, np.int8),
-    )
+    x, y = np.empty((2, CHUNK), np.uint16)
+    return x, y, np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int8)
 
 
-def _first(columns: Columns, n: int) -> Columns:
+def _begin_of(columns: Columns, n: int) -> Columns:
     x, y, t, p = columns
     return x[:n], y[:n], t[:n], p[:n]

@@ -27,8 +27,7 @@ from typing import Any, NoReturn, TypeVar
 import msgspec
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.limits import read_text, require_file
-from aenerf_ns.files.text import MAX_TIME
+from aenerf_ns.files.limits import MAX_TIME, read_text, require_file
 
 DATASET_REMEDY = "see the dataset format in the docs"
 

@@ -1,18 +1,146 @@
-"""Limits on the memory that the files of a dataset may take, and on the other files that they may name.
+"""The limits on the files of a dataset, and the one way in which their readers keep to them.
 
-Every reader of untrusted files checks sizes here before it allocates anything.
+A reader reads within :func:`bounded`: whatever a library raises there for a damaged file becomes one clear line, and
+memory and temporary files cannot grow far beyond what the size of the file explains. So no reader needs rules of its
+own for what a library might make of a file. What costs time and no memory, such as a small file that unpacks to events
+without end, is held by :func:`require_unpacked_size`.
 """
 
 from __future__ import annotations
 
+import re
+import resource
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePath
+from typing import TypeVar
 
 from aenerf_ns.errors import DataError, reading
 
-# Data of at most this size may be compressed by any factor.
+Item = TypeVar("Item")
+
+MAX_TIME = 4 * 10**18
+"""Nanoseconds, 126 years. The difference of two such times fits int64."""
+
+MAX_ROWS = 1_000_000
+"""Rows of a table that is read as a whole: poses at 1000 Hz for a quarter of an hour."""
+
+MAX_TABLE_BYTES = 1 << 27
+"""Bytes of such a table."""
+
+MAX_LINE = 1 << 16
+"""Bytes of a line of numbers."""
+
+MAX_PIECE = 1 << 27
+"""Bytes of a compressed piece of an event file, which have some megabytes."""
+
+MAX_HEADER = 1 << 20
+"""Bytes of a header of an event file, which have some kilobytes."""
+
+# What any file may take, which is enough to compile a parser and for a million events in several types.
 _FREE_BYTES = 1 << 28
 # Real events are compressed by a factor of 2 to 10, and a bomb by 1000 and more.
 _MAX_FACTOR = 100
+
+_STATUS, _MEMORY = Path("/proc/self/statm"), Path("/proc/meminfo")
+# Limits belong to the process: one thread reads at a time.
+_lock = threading.RLock()
+
+
+@contextmanager
+def bounded(path: Path, kind: str, extra: str = "") -> Iterator[None]:
+    """Read from a file within the context, in little memory, with one clear line for every error.
+
+    Args:
+        path: the file, or the folder of a bag.
+        kind: what the file should be, such as "HDF5 file".
+        extra: the optional dependencies that reading it may need.
+
+    Raises:
+        DataError: anything went wrong.
+    """
+    try:
+        with _little_memory(path):
+            yield
+    except DataError:
+        raise
+    except FileNotFoundError as error:
+        raise DataError(error.filename or path, "there is no such file", "check the path of the dataset") from error
+    except ImportError as error:
+        raise DataError(
+            path, f"a package is missing to read it ({error})", f"pip install 'aenerf-ns[{extra}]'"
+        ) from error
+    except MemoryError as error:
+        raise DataError(
+            path, "it takes far more memory than its size explains", "it is damaged, or made to fill the memory"
+        ) from error
+    # Libraries raise whatever they stumble over in a damaged file.
+    except Exception as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise DataError(
+            path, f"not a readable {kind} ({str(reason) or type(error).__name__})", "copy, record or write it again"
+        ) from error
+
+
+def bounded_items(items: Iterator[Item], path: Path, kind: str, extra: str = "") -> Iterator[Item]:
+    """Yield items, each of which is read from a file within :func:`bounded`."""
+    while True:
+        with bounded(path, kind, extra):
+            item = next(items, None)
+        if item is None:
+            return
+        yield item
+
+
+@contextmanager
+def _little_memory(path: Path) -> Iterator[None]:
+    """Within the context, let the process take only as much more memory, and write only files as large, as the size
+    of a file explains. Linux alone holds such limits."""
+    if not _STATUS.exists():
+        yield
+        return
+    files = list(path.iterdir()) if path.is_dir() else [path]
+    allowed = _max_unpacked(sum(file.stat().st_size for file in files if file.is_file()))
+    available = re.search(r"MemAvailable:\s*(\d+)", _MEMORY.read_text())
+    if available:
+        allowed = min(allowed, int(available[1]) << 10)
+    # In pages; the sixth number is that of memory that is written to.
+    in_use = int(_STATUS.read_text().split()[5]) * resource.getpagesize()
+    with _lock, _limit(resource.RLIMIT_DATA, in_use + allowed), _limit(resource.RLIMIT_FSIZE, allowed):
+        yield
+
+
+@contextmanager
+def _limit(kind: int, value: int) -> Iterator[None]:
+    before = resource.getrlimit(kind)
+    tighter = [limit for limit in (value, *before) if limit != resource.RLIM_INFINITY]
+    resource.setrlimit(kind, (min(tighter), before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(kind, before)
+
+
+def _max_unpacked(packed: int) -> int:
+    return _FREE_BYTES + _MAX_FACTOR * packed
+
+
+def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> None:
+    """Raise a DataError for data that states to be much larger than the bytes that hold it explain.
+
+    Args:
+        path: the file.
+        name: names the data in the file, for the message.
+        unpacked: size of the data in bytes.
+        packed: size of the compressed data in the file in bytes.
+    """
+    if unpacked > _max_unpacked(packed):
+        raise DataError(
+            path,
+            f"{name} unpacks to {unpacked:,} bytes or more, from {packed:,} in the file",
+            "it is damaged, or made to fill the memory: copy it again",
+        )
 
 
 def require_file(path: Path) -> None:
@@ -23,11 +151,11 @@ def require_file(path: Path) -> None:
 
 
 def read_text(path: Path, max_bytes: int) -> str:
-    """Return the text of a small file.
+    """Read a small file of text.
 
     Args:
         path: the file.
-        max_bytes: the most bytes that such a file can have.
+        max_bytes: the largest size that such a file can have.
 
     Raises:
         DataError: the file is missing, cannot be read, is larger, or is not UTF-8.
@@ -45,26 +173,7 @@ def require_at_most(path: Path, max_bytes: int) -> None:
     """Raise a DataError if a file is larger than a file of its kind can be."""
     size = path.stat().st_size
     if size > max_bytes:
-        raise DataError(
-            path, f"it has {size:,} bytes, and such a file at most {max_bytes:,}", "check what kind of file it is"
-        )
-
-
-def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> None:
-    """Raise a DataError for data that says to be much larger than the bytes that hold it explain.
-
-    Args:
-        path: the file.
-        name: names the data in the file, for the message.
-        unpacked: size of the data in bytes.
-        packed: size of the compressed data in the file in bytes.
-    """
-    if unpacked > max(_FREE_BYTES, _MAX_FACTOR * packed):
-        raise DataError(
-            path,
-            f"{name} has {unpacked:,} bytes when it is unpacked, but only {packed:,} in the file",
-            "write it again: it is damaged, or made to fill the memory",
-        )
+        raise DataError(path, f"file is too large ({size:,} bytes, limit {max_bytes:,})", "is it the right file?")
 
 
 def file_inside(folder: Path, name: str, source: Path) -> Path:
@@ -82,7 +191,7 @@ def file_inside(folder: Path, name: str, source: Path) -> Path:
     """
     path = PurePath(name)
     if not path.parts or "\0" in name:
-        raise DataError(source, f"it names the file {name!r}", "give the name of a file")
+        raise DataError(source, f"{name!r} is not a file name", "name the file")
     if path.is_absolute() or ".." in path.parts:
         raise DataError(
             source, f"it names {name}, outside the folder {folder}", "put the file, or a link to it, into the folder"

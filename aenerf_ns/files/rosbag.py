@@ -5,15 +5,16 @@
 * ``event_camera_msgs/EventPacket``: https://github.com/ros-event-camera/event_camera_msgs
 
 The package rosbags reads the bags. The messages are taken apart here, because rosbags makes a Python object of each
-event.
+event. Its AnyReader is not used: it refuses bags whose definitions of other messages are missing or do not match.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,18 +22,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError, reading
-from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files.bag_reader import Bag
-from aenerf_ns.files.sensor_size import sensor_size
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import Columns, EventReader, batches, resolve_sensor_size
+from aenerf_ns.files.limits import bounded, require_unpacked_size
+from aenerf_ns.files.plain_yaml import read_plain_yaml
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
+    from rosbags import rosbag1, rosbag2
 
-    from aenerf_ns.files.evt_words import Columns
-
-_CHUNK = 1 << 20
 _ROS1_MAGIC = b"#ROSBAG"
+BAG_MAGIC = (_ROS1_MAGIC, b"SQLite format 3\0", b"\x89MCAP0\r\n")
+"""The beginnings of bags: of ROS 1, and of the two storages of ROS 2."""
+_MCAP_MAGIC, _MCAP_FOOTER = BAG_MAGIC[2], 0x02
+
 _PACKET_TYPE = "event_camera_msgs/msg/EventPacket"
 _ARRAY_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 # ROS 1 serializes an event without padding. ROS 2 aligns each number to its size; see `_aligned_events`.
@@ -81,7 +84,7 @@ class _Message:
     content: NDArray
 
 
-class RosbagEventFile(EventFile):
+class RosbagEventFile(EventReader):
     """Read the events of one topic of a bag, at the times of ROS.
 
     An EventPacket has the times of the camera's own clock. One offset brings them all to the clock of ROS: the smallest
@@ -100,16 +103,21 @@ class RosbagEventFile(EventFile):
             rosbags is missing.
     """
 
+    extra = "rosbag"
+
     def __init__(
         self, path: Path, width: int | None = None, height: int | None = None, topic: str | None = None
     ) -> None:
         self.path = path
         self._topic = topic
+        self._is_ros2 = path.is_dir() or not _begins(path, _ROS1_MAGIC)
+        self.kind = f"bag of ROS {2 if self._is_ros2 else 1}"
         if width is None or height is None:
-            first = next(self._messages(), None)
+            with bounded(path, self.kind, self.extra):
+                first = next(self._messages(), None)
             if first is None:
                 raise self.empty_error()
-            width, height = sensor_size(path, (first.width, first.height), width, height)
+            width, height = resolve_sensor_size(path, (first.width, first.height), width, height)
         super().__init__(path, width, height)
 
     def require(self) -> None:
@@ -117,81 +125,55 @@ class RosbagEventFile(EventFile):
         if not self.path.is_dir():
             super().require()
 
-    def _open(self) -> Bag:
-        self.require()
-        try:
-            return Bag(self.path, self._is_ros2())
-        except ImportError:
-            raise DataError(
-                self.path, "a ROS bag is read with the package rosbags", "pip install 'aenerf-ns[rosbag]'"
-            ) from None
-        except DataError:
-            raise
-        # The parser raises whatever it stumbles over.
-        except Exception as error:
-            raise self._damaged(error) from None
+    @contextmanager
+    def _open(self) -> Iterator[rosbag1.Reader | rosbag2.Reader]:
+        from rosbags.rosbag1 import Reader as Ros1Reader
+        from rosbags.rosbag2 import Reader as Ros2Reader
 
-    def _is_ros2(self) -> bool:
         if self.path.is_dir():
-            return True
-        with reading(self.path), self.path.open("rb") as file:
-            return file.read(len(_ROS1_MAGIC)) != _ROS1_MAGIC
-
-    def _damaged(self, error: Exception) -> DataError:
-        reason = " ".join(str(error).split())[:150] or type(error).__name__
-        version, command = (2, "ros2 bag") if self._is_ros2() else (1, "rosbag")
-        return DataError(
-            self.path, f"not a readable bag of ROS {version} ({reason})", f"try `{command} reindex` or copy it again"
-        )
+            _require_distinct_files(self.path / "metadata.yaml")
+        elif _begins(self.path, _MCAP_MAGIC):
+            _require_records(self.path)
+        reader = Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path)
+        reader.open()
+        try:
+            yield reader
+        finally:
+            reader.close()
 
     def _messages(self, start: int | None = None) -> Iterator[_Message]:
         """Yield the messages of the topic in the order in which they were received, from a time in nanoseconds on."""
-        with closing(self._open()) as bag:
-            is_ros2 = self._is_ros2()
-            chosen = _choose(self.path, bag.connections, self._topic)
-            messages = bag.messages(chosen.topic, start)
-            while True:
+        files = [file for file in self.path.iterdir() if file.is_file()] if self.path.is_dir() else [self.path]
+        packed, total = sum(file.stat().st_size for file in files), 0
+        with self._open() as bag:
+            types = {connection.topic: connection.msgtype for connection in bag.connections}
+            topic = _choose(self.path, types, self._topic)
+            chosen = [connection for connection in bag.connections if connection.topic == topic]
+            for connection, _, data in bag.messages(chosen, start=start):
+                total += len(data)
+                require_unpacked_size(self.path, f"the topic {topic}", total, packed)
                 try:
-                    kind, data = next(messages)
-                except StopIteration:
-                    return
-                except DataError:
-                    raise
-                except Exception as error:
-                    raise self._damaged(error) from None
-                try:
-                    yield _parse(data, kind == _PACKET_TYPE, is_ros2)
+                    yield _parse(data, connection.msgtype == _PACKET_TYPE, self._is_ros2)
                 except struct.error:
                     raise DataError(
-                        self.path, f"a message of {chosen.topic} does not have the parts of its type", "copy it again"
+                        self.path, f"a message of {topic} does not have the parts of its type", "copy it again"
                     ) from None
 
     def _sized_messages(self, start: int | None) -> Iterator[_Message]:
         for message in self._messages(start):
-            sensor_size(self.path, (message.width, message.height), self.width, self.height)
+            resolve_sensor_size(self.path, (message.width, message.height), self.width, self.height)
             yield message
 
     def _columns(self, start: int | None = None) -> Iterator[Columns]:
-        """Yield columns x, y, t (nanoseconds) and p (±1) of the messages received from a time on."""
+        """Yield columns of the messages received from a time in nanoseconds on."""
         first = next(self._messages(), None)
-        if first is None:
-            return
-        if first.sequence is None:
-            yield from self._columns_of_arrays(start)
-        else:
+        if first is not None and first.sequence is not None:
             yield from self._columns_of_packets(start)
-
-    def _columns_of_arrays(self, start: int | None) -> Iterator[Columns]:
-        waiting: list[NDArray] = []
-        count = 0
-        for message in self._sized_messages(start):
-            waiting.append(message.content)
-            count += len(message.content)
-            if count >= _CHUNK:
-                yield _array_columns(waiting)
-                waiting, count = [], 0
-        if count:
-            yield _array_columns(waiting)
+        elif first is not None:
+            for events in batches(message.content for message in self._sized_messages(start)):
+                x, y = (events[name].astype(np.uint16) for name in "xy")
+                t = events["seconds"].astype(np.int64) * 1_000_000_000 + events["nanoseconds"]
+                yield x, y, t, np.where(events["polarity"], 1, -1).astype(np.int8)
 
     def _columns_of_packets(self, start: int | None) -> Iterator[Columns]:
         # Imported lazily: every command of every method imports this module, and numba is slow to import.
@@ -200,7 +182,6 @@ class RosbagEventFile(EventFile):
         state = initial_state()
 
         def blocks() -> Iterator[NDArray]:
-            offset = self._clock_offset()
             expected = None
             for message in self._sized_messages(start):
                 words = self._words(message)
@@ -210,8 +191,8 @@ class RosbagEventFile(EventFile):
                     time = _first_time(words)
                     if time is None:
                         continue
-                    laps = round((message.stamp - offset - time) / _LAP)
-                    state[:] = initial_state(offset + laps * _LAP)
+                    laps = round((message.stamp - self._clock_offset - time) / _LAP)
+                    state[:] = initial_state(self._clock_offset + laps * _LAP)
                 expected = (message.sequence or 0) + 1
                 yield words
 
@@ -229,8 +210,9 @@ class RosbagEventFile(EventFile):
         # Copied, so that the decoder is compiled for one kind of array.
         return message.content.view(_WORD).copy()
 
+    @cached_property
     def _clock_offset(self) -> int:
-        """Return the nanoseconds from the camera's clock to the clock of ROS."""
+        """Nanoseconds from the camera's clock to the clock of ROS."""
         offsets = [
             message.stamp - time
             for message in islice(self._messages(), _CLOCK_PACKETS)
@@ -242,39 +224,66 @@ class RosbagEventFile(EventFile):
         later = [(offset - offsets[0] + _LAP // 2) % _LAP - _LAP // 2 for offset in offsets]
         return offsets[0] + min(later)
 
-    def read_chunks(self) -> Iterator[EventStream]:
-        for x, y, t, p in self._columns():
-            yield EventStream(x, y, t, p, self.width, self.height, self.path)
+    def _chunks(self) -> Iterator[EventStream]:
+        yield from map(self._stream, self._columns())
 
-    def time_span(self) -> tuple[int, int]:
+    def _time_span(self) -> tuple[int, int] | None:
         first = next(self._columns(), None)
         if first is None:
-            raise self.empty_error()
-        with closing(self._open()) as bag:
-            bag_end = bag.end_time
-        for seconds in (*_TAIL_SECONDS, None):
+            return None
+        with self._open() as bag:
+            starts = [*(bag.end_time - seconds * 1_000_000_000 for seconds in _TAIL_SECONDS), None]
+        for start in starts:
             end = None
-            for _, _, t, _ in self._columns(None if seconds is None else bag_end - seconds * 1_000_000_000):
+            for _, _, t, _ in self._columns(start):
                 end = int(t[-1])
             if end is not None:
                 return int(first[2][0]), end
-        raise self.empty_error()
+        return None
 
 
-def _choose(path: Path, connections: list[Connection], topic: str | None) -> Connection:
-    """Return the connection with the events."""
-    known = {c.topic: c for c in connections if c.msgtype in (_PACKET_TYPE, *_ARRAY_TYPES)}
+def _begins(path: Path, magic: bytes) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(magic)) == magic
+
+
+def _require_distinct_files(metadata: Path) -> None:
+    """Raise a DataError for a bag of ROS 2 that lists a file twice: it would be read as often as it is listed."""
+    names = read_plain_yaml(metadata)["rosbag2_bagfile_information"]["relative_file_paths"]
+    if len(set(names)) < len(names):
+        raise DataError(metadata, f"it lists {len(names)} files, {len(set(names))} of them distinct", "list each once")
+
+
+def _require_records(path: Path) -> None:
+    """Raise a DataError for an MCAP file with records of no kind: rosbags reads a file of zeros without end."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        position = len(_MCAP_MAGIC)
+        while position < size:
+            file.seek(position)
+            head = file.read(9)
+            kind, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, 0)
+            if kind == 0:
+                raise DataError(path, f"it has no record at byte {position}", "copy it again")
+            if kind == _MCAP_FOOTER:
+                return
+            position += len(head) + length
+
+
+def _choose(path: Path, types: dict[str, str], topic: str | None) -> str:
+    """Return the topic with the events, from the type of each topic."""
+    known = sorted(name for name, kind in types.items() if kind in (_PACKET_TYPE, *_ARRAY_TYPES))
     if topic is None and len(known) == 1:
-        return next(iter(known.values()))
+        return known[0]
     if topic in known:
-        return known[topic]
+        return topic
     if not known:
-        types = ", ".join(sorted({c.msgtype.replace("/msg/", "/") for c in connections})) or "nothing"
+        found = ", ".join(sorted({kind.replace("/msg/", "/") for kind in types.values()})) or "nothing"
         raise DataError(
-            path, f"no topic holds events; the bag holds {types}", "EventArray of dvs_msgs and EventPacket are read"
+            path, f"no topic holds events; the bag holds {found}", "EventArray of dvs_msgs and EventPacket are read"
         )
     problem = "several topics hold events" if topic is None else f"topic {topic} holds no events"
-    raise DataError(path, problem, f"choose one of {', '.join(sorted(known))} as topic")
+    raise DataError(path, problem, f"choose one of {', '.join(known)} as topic")
 
 
 class _Fields:
@@ -353,16 +362,6 @@ def _aligned_events(fields: _Fields, count: int) -> bytes:
         return fields.rest(0)
     data = fields.rest(_ALIGNED_EVENT.itemsize * count - 3)
     return data[:4] + data[2:] + b"\0"
-
-
-def _array_columns(arrays: list[NDArray]) -> Columns:
-    events = np.concatenate(arrays)
-    return (
-        events["x"].astype(np.uint16),
-        events["y"].astype(np.uint16),
-        events["seconds"].astype(np.int64) * 1_000_000_000 + events["nanoseconds"],
-        np.where(events["polarity"], 1, -1).astype(np.int8),
-    )
 
 
 def _first_time(words: NDArray[np.uint16]) -> int | None:

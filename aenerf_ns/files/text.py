@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.limits import require_at_most, require_file
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.limits import MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
@@ -18,16 +18,6 @@ _UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", 
 
 POSE_COLUMNS = "t tx ty tz qx qy qz qw"
 """The columns of a trajectory in the format of the TUM RGB-D benchmark."""
-
-# In nanoseconds: 126 years. The difference of two such times fits int64.
-MAX_TIME = 4 * 10**18
-
-# Longer than any line of a file of events.
-_TAIL_BYTES = 4096
-
-MAX_ROWS = 1_000_000
-"""Rows of a table, which is read as a whole: poses at 1000 Hz for a quarter of an hour."""
-_MAX_BYTES = 1 << 27
 
 
 def read_rows(path: Path, columns: str) -> list[list[str]]:
@@ -42,10 +32,8 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     """
     expected = len(columns.split())
     rows: list[list[str]] = []
-    require_file(path)
-    with reading(path):
-        require_at_most(path, _MAX_BYTES)
-    with reading(path), path.open(encoding="utf-8", errors="replace") as file:
+    with bounded(path, "table of numbers"), path.open(encoding="utf-8", errors="replace") as file:
+        require_at_most(path, MAX_TABLE_BYTES)
         for number, line in enumerate(file, start=1):
             fields = line.split("#", 1)[0].split()
             if not fields:
@@ -58,19 +46,6 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
                 raise DataError(path, f"it has more than {MAX_ROWS:,} rows", "cut the recording, or leave rows out")
             rows.append(fields)
     return rows
-
-
-def last_row(path: Path) -> bytes:
-    """Return the last line of a file that is neither empty nor a comment, b"" where the end of the file has none."""
-    with reading(path), path.open("rb") as file:
-        file.seek(0, 2)
-        file.seek(max(file.tell() - _TAIL_BYTES, 0))
-        return next((line for line in reversed(file.read().splitlines()) if is_row(line)), b"")
-
-
-def is_row(line: bytes) -> bool:
-    """Tell whether a line is neither empty nor a comment."""
-    return bool(line.split(b"#", 1)[0].strip())
 
 
 def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:

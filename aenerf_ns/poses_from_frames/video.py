@@ -14,7 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.text import MAX_TIME
+from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.recording.images import image_size_and_mode, read_image, require_8_bits
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.text import MAX_TIME
+from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 
 

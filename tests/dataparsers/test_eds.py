@@ -53,7 +53,7 @@ def test_eds_views_are_those_of_the_frame_camera(tmp_path: Path) -> None:
 
 FAULTS = {
     "no poses": (remove("stamped*"), "stamped_groundtruth.txt: there is no such file"),
-    "no events": (remove("events.h5"), "events.h5: there is no such event file"),
+    "no events": (remove("events.h5"), "events.h5: there is no such file"),
     "no column": (lambda folder: h5py.File(folder / "events.h5", "a").pop("p"), "there is no dataset /p"),
     "five images": (write_text("images_timestamps.txt", "1\n2\n3\n4\n5\n"), "it has 5 times for 3 images"),
     "image time is a word": (write_text("images_timestamps.txt", "1\ntwo\n3\n"), "two is not a time in microseconds"),

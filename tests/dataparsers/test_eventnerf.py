@@ -56,7 +56,7 @@ def test_a_unit_of_time_may_be_given_for_poses_without_times(tmp_path: Path) -> 
 
 
 FAULTS = {
-    "no events": (remove("train/events"), "events.npz: there is no such event file"),
+    "no events": (remove("train/events"), "events.npz: there is no such file"),
     "two event files": (
         lambda folder: np.savez(folder / "train/events/b.npz"),
         "train/events: it holds 2 .npz files; there must be one",

@@ -30,7 +30,7 @@ def test_poses_of_paev3d_run_no_code(tmp_path: Path) -> None:
             return os.mkdir, (str(tmp_path / "harm"),)
 
     np.savez(file, object_poses=np.array([Harm()], dtype=object))
-    with pytest.raises(DataError, match=r"0003.npz: its array object_poses cannot be read .it asks for posix.mkdir"):
+    with pytest.raises(DataError, match=r"0003.npz: not a readable array object_poses .it asks for posix.mkdir"):
         recording_of(PAEv3DDataParserConfig(data=truth.data))
     assert not (tmp_path / "harm").exists()
 
@@ -47,7 +47,7 @@ def test_scenes_of_paev3d_are_told_apart(tmp_path: Path) -> None:
 
 
 FAULTS = {
-    "no events": (remove("H5_Files/Bunny/*"), "event.h5: there is no such event file"),
+    "no events": (remove("H5_Files/Bunny/*"), "event.h5: there is no such file"),
     "no poses": (remove("Render_info/Bunny/*.npz"), "Render_info/Bunny: it holds no .npz file"),
     "no intrinsics": (remove("Intrinsics/*"), "Intrinsics: it holds no .txt file"),
     "no camera": (

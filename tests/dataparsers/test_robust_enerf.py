@@ -70,7 +70,7 @@ CALIB, POSES, VIEWS = "camera_calibration.npz", "camera_poses.npz", "views/trans
 FAULTS = {
     "no calibration": (remove(CALIB), f"{CALIB}: there is no such file"),
     "no poses": (remove(POSES), f"{POSES}: there is no such file"),
-    "no events": (remove("raw_events.npz"), "raw_events.npz: there is no such event file"),
+    "no events": (remove("raw_events.npz"), "raw_events.npz: there is no such file"),
     "no intrinsics": (edit_npz(CALIB, intrinsics=None), f"{CALIB}: it has no array intrinsics"),
     "flat intrinsics": (edit_npz(CALIB, intrinsics=np.ones(9)), r"intrinsics has type float64 and shape \(9,\)"),
     "words as intrinsics": (edit_npz(CALIB, intrinsics=np.full((3, 3), "f")), "intrinsics has type <U1"),

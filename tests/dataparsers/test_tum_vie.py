@@ -116,7 +116,7 @@ def test_several_sequences_in_a_folder_are_told_apart(tmp_path: Path, tum_vie_ca
 CAMERAS, MOCAP = "camera-calibrationA.json", "mocap-imu-calibrationA.json"
 TRUTH = "mocap-desk2-vi_gt_data"
 FAULTS = {
-    "no events": (remove("*.h5"), "mocap-desk2-events_left.h5: there is no such event file"),
+    "no events": (remove("*.h5"), "mocap-desk2-events_left.h5: there is no such file"),
     "no poses": (remove(f"{TRUTH}/mocap_data.txt"), "mocap_data.txt: there is no such file"),
     "no calibration": (remove("camera-*"), f"{CAMERAS}: there is no such file; download the dataset's calibration"),
     "no hand-eye": (remove("mocap-imu*"), f"{MOCAP}: there is no such file"),

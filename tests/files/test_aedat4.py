@@ -52,11 +52,14 @@ def test_one_of_several_streams_of_aedat4(folder: Path) -> None:
 
 MALFORMED: dict[str, tuple[bytes, str]] = {
     "aedat of version 2": (b"#!AER-DAT2.0\r\n# events", "does not begin as an AEDAT4 file"),
-    "aedat4 with its magic alone": (b"#!AER-DAT4.0\r\n", "header"),
-    "aedat4 cut in its header": (aedat4_file(ROWS)[:100], "ends within its header"),
-    "aedat4 with a header of zeros": (b"#!AER-DAT4.0\r\n" + sized(bytes(64)), "header cannot be read"),
+    "aedat4 with its magic alone": (b"#!AER-DAT4.0\r\n", "not a readable AEDAT4 file"),
+    "aedat4 cut in its header": (aedat4_file(ROWS)[:100], "not a readable AEDAT4 file"),
+    "aedat4 with a header of zeros": (b"#!AER-DAT4.0\r\n" + sized(bytes(64)), "not a readable AEDAT4 file"),
     "aedat4 without events": (aedat4_file(ROWS, streams={0: "FRME"}), "no stream holds events"),
-    "aedat4 of no number": (aedat4_file(ROWS).replace(b'node name="0"', b'node name="?"'), "header cannot be read"),
+    "aedat4 of no number": (
+        aedat4_file(ROWS).replace(b'node name="0"', b'node name="?"'),
+        "not a readable AEDAT4 file",
+    ),
     "aedat4 of an unknown compression": (aedat4_file(ROWS, compression=9), "compression is number 9"),
     "aedat4 of another compression": (aedat4_file(ROWS, compression=1), ""),
     "aedat4 cut in a packet": (aedat4_file(ROWS)[:-20], "ends within the packet"),

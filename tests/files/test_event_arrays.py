@@ -53,7 +53,7 @@ def test_every_layout_gives_the_events_it_was_written_with(
     layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Several pieces.
-    monkeypatch.setattr(event_table, "_CHUNK", 128)
+    monkeypatch.setattr(event_table, "CHUNK", 128)
     name, write = LAYOUTS[layout]
     assert lengths_of_read_pieces(tmp_path / name, write, open_events) == [128, 128, 44]
 
@@ -73,8 +73,8 @@ def test_members_that_are_not_compressed_are_not_read_at_once(tmp_path: Path) ->
 
 
 FAULTS: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "no array file": ("e.npz", lambda path: None, "e.npz: there is no such event file"),
-    "no .npy file": ("e.npy", lambda path: None, "e.npy: there is no such event file"),
+    "no array file": ("e.npz", lambda path: None, "e.npz: there is no such file"),
+    "no .npy file": ("e.npy", lambda path: None, "e.npy: there is no such file"),
     "text as npz": ("e.npz", lambda path: path.write_text("x y"), "e.npz: not a readable .npz file"),
     "text as npy": ("e.npy", lambda path: path.write_text("x y"), "e.npy: not a readable .npy file"),
     "empty npy": ("e.npy", lambda path: path.write_bytes(b""), "e.npy: not a readable .npy file"),
@@ -89,12 +89,12 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object], str]] = {
             np.savez_compressed(path, **made_columns()),
             path.write_bytes(path.read_bytes()[:200] + b"?" * 100 + path.read_bytes()[300:]),
         ),
-        "e.npz: its array x cannot be read",
+        "e.npz: not a readable array x",
     ),
     "array of objects": (
         "e.npz",
         replaced("x", np.array([object] * N)),
-        "e.npz: its array x cannot be read .it holds Python objects",
+        "e.npz: not a readable array x .it holds Python objects",
     ),
     "no events in npz": ("e.npz", replaced("p", None), "e.npz: its arrays are t, x, y; it must hold x, y, t and p"),
     "empty stream": (

@@ -55,7 +55,7 @@ def test_every_layout_gives_the_events_it_was_written_with(
     layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Several pieces.
-    monkeypatch.setattr(event_table, "_CHUNK", 128)
+    monkeypatch.setattr(event_table, "CHUNK", 128)
     name, write = LAYOUTS[layout]
     assert lengths_of_read_pieces(tmp_path / name, write, open_events) == [128, 128, 44]
 
@@ -109,7 +109,7 @@ def set_offset(path: Path, value: object) -> None:
 
 
 FAULTS: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "no HDF5 file": ("e.h5", lambda path: None, "e.h5: there is no such event file"),
+    "no HDF5 file": ("e.h5", lambda path: None, "e.h5: there is no such file"),
     "text as HDF5": ("e.h5", lambda path: path.write_text("x y"), "e.h5: not a readable HDF5 file"),
     "no events in HDF5": ("e.h5", replaced("p", None), "e.h5: it holds t, x, y; events must be in"),
     "empty HDF5": ("e.h5", lambda path: h5py.File(path, "w").close(), "e.h5: it holds nothing"),

@@ -25,8 +25,7 @@ from hypothesis import strategies as st
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files import event_text
-from aenerf_ns.files.event_text import CsvEventFile, TextEventFile
-from aenerf_ns.files.number_lines import parse_lines
+from aenerf_ns.files.event_text import CsvEventFile, TextEventFile, parse_lines
 from aenerf_ns.files.open import open_event_file
 from aenerf_ns.files.text import TimeUnit
 
@@ -141,7 +140,7 @@ def test_numbers_are_exact(number: str, separator: bytes) -> None:
 
 
 FAULTS: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "no CSV": ("e.csv", lambda path: None, "e.csv: there is no such event file"),
+    "no CSV": ("e.csv", lambda path: None, "e.csv: there is no such file"),
     "empty CSV": ("e.csv", lambda path: path.write_text(""), "its first line is ''; it must name the columns"),
     "CSV without header": ("e.csv", lambda path: path.write_text("1,2,3,1\n"), "first line is '1,2,3,1'; it must name"),
     "CSV without events": ("e.csv", lambda path: path.write_text("x,y,t,p\n"), "e.csv: the file holds no events"),

@@ -37,7 +37,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files import aedat4, evt_words, prophesee_dat, prophesee_raw
+from aenerf_ns.files import event_reader, evt_words, prophesee
 from aenerf_ns.files.open import open_event_file
 
 # Microseconds in which times can be told apart from wrapped ones, less a margin.
@@ -83,9 +83,9 @@ def test_what_was_encoded_is_read_whatever_the_size_of_the_pieces(name: str, fol
         for is_small in (False, True):
             with pytest.MonkeyPatch.context() as patch:
                 if is_small:
-                    for module in (evt_words, prophesee_dat, aedat4):
-                        patch.setattr(module, "_CHUNK", chunk)
-                    patch.setattr(prophesee_raw, "_BLOCK", block)
+                    for module in (evt_words, prophesee, event_reader):
+                        patch.setattr(module, "CHUNK", chunk)
+                    patch.setattr(prophesee, "_BLOCK", block)
                 file = open_event_file(path)
                 assert (file.width, file.height) == (WIDTH, HEIGHT)
                 np.testing.assert_array_equal(read(file), expected)
@@ -146,9 +146,9 @@ def test_two_formats_of_one_recording_hold_the_same_events() -> None:
 def test_pieces_of_real_files_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     files = [open_event_file(vendor_file(name)) for name in ("evt3.raw", "gen4.dat", "davis346.aedat4")]
     whole = [read(file) for file in files]
-    for module in (evt_words, prophesee_dat, aedat4):
-        monkeypatch.setattr(module, "_CHUNK", 10_007)
-    monkeypatch.setattr(prophesee_raw, "_BLOCK", 9_973)
+    for module in (evt_words, prophesee, event_reader):
+        monkeypatch.setattr(module, "CHUNK", 10_007)
+    monkeypatch.setattr(prophesee, "_BLOCK", 9_973)
     for file, events in zip(files, whole, strict=True):
         assert max(map(len, file.chunks())) < 11_000
         np.testing.assert_array_equal(read(file), events)
@@ -185,9 +185,9 @@ def test_a_trained_run_opens_without_its_events(folder: Path) -> None:
     for suffix in ("raw", "dat", "aedat4", "bag", "h5", "npy", "txt"):
         file = open_event_file(folder / f"gone.{suffix}", WIDTH, HEIGHT)
         assert (file.width, file.height) == (WIDTH, HEIGHT)
-        with pytest.raises(DataError, match="there is no such event file"):
+        with pytest.raises(DataError, match="there is no such file"):
             file.time_span()
-        with pytest.raises(DataError, match="there is no such event file"):
+        with pytest.raises(DataError, match="there is no such file"):
             next(file.chunks())
 
 
@@ -199,7 +199,7 @@ def test_the_content_tells_the_format(folder: Path) -> None:
 
 
 def test_paths_that_are_no_files(folder: Path) -> None:
-    for path, message in ((folder, "it is a folder without"), (folder / "none.raw", "there is no such event file")):
+    for path, message in ((folder, "it is a folder without"), (folder / "none.raw", "there is no such file")):
         with pytest.raises(DataError, match=message):
             open_event_file(path)
 

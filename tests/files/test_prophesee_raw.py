@@ -21,7 +21,7 @@ from helpers.event_file_writers import (
     words,
 )
 
-from aenerf_ns.files import prophesee_raw
+from aenerf_ns.files import prophesee
 from aenerf_ns.files.open import open_event_file
 
 
@@ -47,7 +47,7 @@ def test_words_before_the_first_time_are_left_out(folder: Path) -> None:
 def test_the_upper_bits_of_a_time_take_effect_before_the_lower_ones_follow(
     block: int, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(prophesee_raw, "_BLOCK", block)
+    monkeypatch.setattr(prophesee, "_BLOCK", block)
     path = folder / "upper.raw"
     words = [0x8001, 0x6FFF, 0x0007, 0x2001, 0x8002, 0x2002, 0x8002, 0x6003, 0x8002, 0x2003]
     path.write_bytes(b"% evt 3.0\n% geometry 64x48\n" + np.array(words, "<u2").tobytes())
@@ -58,12 +58,12 @@ MALFORMED: dict[str, tuple[bytes, str]] = {
     "raw with a header alone": (HEADER3, "holds no events"),
     "raw with an endless header": (b"% evt 3.0\n% geometry 64x48", "does not end"),
     "raw with an endless line": (b"% evt 3.0\n% " + b"x" * 100_000, "does not end"),
-    "raw without an encoding": (b"% format \n% geometry 64x48\n" + words("<u2", 0x8001), "does not tell the encoding"),
+    "raw without an encoding": (b"% format \n% geometry 64x48\n" + words("<u2", 0x8001), "does not state the encoding"),
     "raw in another encoding": (b"% evt 2.1\n% geometry 64x48\n", "encoded as 2.1"),
-    "raw of histograms": (b"% format HISTO3D;width=64\n", "encoded as HISTO3D"),
+    "raw of histograms": (b"% format HISTO3D;width=64;height=48\n", "encoded as HISTO3D"),
     "raw in big endian": (b"% format EVT3;endianness=big;width=64;height=48\n", "encoded as EVT3;endianness=big"),
     "raw of no size": (b"% evt 3.0\n", "does not state the size"),
-    "raw of an absurd size": (b"% evt 3.0\n% geometry 999999x999999\n", "999999 x 999999 pixels cannot be"),
+    "raw of an absurd size": (b"% evt 3.0\n% geometry 999999x999999\n", "999999 x 999999 pixels is too large"),
     "raw of size zero": (b"% evt 3.0\n% geometry 0x48\n", "0 x 48 pixels cannot be"),
     "evt2 cut": (evt2(ROWS)[:-1], "ends within a word of 4 bytes"),
     "evt3 cut": (evt3(ROWS)[:-1], "ends within a word of 2 bytes"),

@@ -39,7 +39,7 @@ from helpers.event_file_writers import (
 )
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files import rosbag
+from aenerf_ns.files import event_reader
 from aenerf_ns.files.open import open_event_file
 
 
@@ -50,7 +50,7 @@ def test_arrays_of_events_in_a_bag(compress: str, folder: Path, monkeypatch: pyt
     assert (file.width, file.height) == (WIDTH, HEIGHT)
     np.testing.assert_array_equal(read(file), table(rows))
     assert file.time_span() == (rows[0][2] * 1000, rows[-1][2] * 1000)
-    monkeypatch.setattr(rosbag, "_CHUNK", 5)
+    monkeypatch.setattr(event_reader, "CHUNK", 5)
     assert len(list(file.chunks())) == 8
     np.testing.assert_array_equal(read(file), table(rows))
 

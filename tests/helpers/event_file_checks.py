@@ -60,7 +60,7 @@ def assert_rejected(path: Path, content: bytes, message: str) -> None:
     with pytest.raises(DataError) as caught:
         attempt(path)
     assert_one_line(caught.value, path)
-    assert message in str(caught.value)
+    assert message in str(caught.value), caught.value
 
 
 # Ways to damage a file, at places given as fractions of its length.

@@ -76,7 +76,7 @@ def parse(config: DataParserConfig, split: str = "train") -> DataparserOutputs:
 
 ECD_FAULTS = {
     "no folder": (lambda folder: shutil.rmtree(folder), "made: there is no such folder"),
-    "no events": (remove("events.txt"), "events.txt: there is no such event file"),
+    "no events": (remove("events.txt"), "events.txt: there is no such file"),
     "no poses": (remove("groundtruth.txt"), "groundtruth.txt: there is no such file"),
     "no calibration": (remove("calib.txt"), "calib.txt: there is no such file"),
     "missing image": (remove("images/1.png"), "images.txt: it names images/1.png, which does not exist"),
@@ -205,7 +205,7 @@ NATIVE_FAULTS = {
         edit_transforms(lambda m: [f.pop(k, None) for f in m["frames"] for k in ("transform_matrix", "timestamp")]),
         r"frames\[0\] has neither transform_matrix nor timestamp",
     ),
-    "no events": (remove("events.h5"), "events.h5: there is no such event file"),
+    "no events": (remove("events.h5"), "events.h5: there is no such file"),
     "not HDF5": (write_text("events.h5", "t x y p"), "events.h5: not a readable HDF5 file"),
     "no column": (replace_column("p", None), "there is no dataset /events/p"),
     "wrong dtype": (replace_column("t", np.zeros(200)), "/events/t has type float64 .*int64"),

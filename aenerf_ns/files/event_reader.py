@@ -1,0 +1,111 @@
+"""What the readers of event files have in common."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.limits import bounded, bounded_items
+
+CHUNK = 1 << 20
+"""Events that are read at once: 13 MB."""
+
+Columns = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArray[np.int8]]
+"""x, y, t in nanoseconds, and p = ±1, of equal length."""
+
+
+class EventReader(EventFile):
+    """An event file that is read within the limits of :mod:`aenerf_ns.files.limits`.
+
+    Formats implement :meth:`_chunks`, and :meth:`_time_span` and :meth:`_count` where the file tells them sooner.
+
+    Attributes:
+        kind: what the file is, for messages.
+        extra: the optional dependencies that reading it may need.
+    """
+
+    kind = "event file"
+    extra = ""
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        yield from bounded_items(self._chunks(), self.path, self.kind, self.extra)
+
+    def time_span(self) -> tuple[int, int]:
+        with bounded(self.path, self.kind, self.extra):
+            span = self._time_span()
+        if span is None:
+            raise self.empty_error()
+        return span
+
+    def count(self) -> int | None:
+        with bounded(self.path, self.kind, self.extra):
+            return self._count()
+
+    @abstractmethod
+    def _chunks(self) -> Iterator[EventStream]:
+        """Yield the events in pieces that fit in memory."""
+
+    def _time_span(self) -> tuple[int, int] | None:
+        """Return the times of the first and the last event in nanoseconds, or None without events."""
+        start = end = None
+        for chunk in self._chunks():
+            if len(chunk):
+                start = int(chunk.t[0]) if start is None else start
+                end = int(chunk.t[-1])
+        return None if start is None or end is None else (start, end)
+
+    def _count(self) -> int | None:
+        """Return the number of events, or None if the file must be read through to count them."""
+        return None
+
+    def _stream(self, columns: Columns) -> EventStream:
+        return EventStream(*columns, self.width, self.height, self.path)
+
+
+def resolve_sensor_size(
+    path: Path, stated: tuple[int, int] | None, width: int | None, height: int | None
+) -> tuple[int, int]:
+    """Return the width and height in pixels that a file states, or else the given ones.
+
+    Args:
+        path: the event file, for messages.
+        stated: width and height that the file states, or None.
+        width: the given width, or None.
+        height: the given height, or None.
+
+    Raises:
+        DataError: neither is known, the two differ, or no sensor has such a size.
+    """
+    given = (width, height)
+    width, height = (own if size is None else size for size, own in zip(given, stated or (None, None), strict=True))
+    if width is None or height is None:
+        raise DataError(path, "the file does not state the size of its sensor", "give its width and height in pixels")
+    if stated is not None and (width, height) != stated:
+        raise DataError(
+            path,
+            f"its sensor has {stated[0]} x {stated[1]} pixels, but {width} x {height} were given",
+            "give the calibration of this camera",
+        )
+    if width <= 0 or height <= 0:
+        raise DataError(path, f"a sensor of {width} x {height} pixels cannot be", "give its width and height in pixels")
+    return width, height
+
+
+def batches(arrays: Iterable[NDArray]) -> Iterator[NDArray]:
+    """Join arrays of events to batches of at least :data:`CHUNK` events, all but the last."""
+    waiting: list[NDArray] = []
+    count = 0
+    for array in arrays:
+        waiting.append(array)
+        count += len(array)
+        if count >= CHUNK:
+            yield np.concatenate(waiting)
+            waiting, count = [], 0
+    if count:
+        yield np.concatenate(waiting)

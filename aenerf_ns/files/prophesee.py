@@ -1,0 +1,234 @@
+"""RAW and DAT files of Prophesee's cameras, tools and datasets.
+
+https://docs.prophesee.ai/stable/data/file_formats/raw.html and dat.html
+
+The package faery was tried and is not used: where a camera pauses it loses laps of the times of EVT 3.0, and it reads
+files that are cut or damaged without a word.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import CHUNK, EventReader, resolve_sensor_size
+
+HEADER_BYTES = 1 << 16
+"""Far more bytes than any header has."""
+
+# Words of a RAW file that are read at once.
+_BLOCK = 1 << 20
+# The kind of word that holds the upper bits of a time, in the upper 4 bits of a word in both encodings. Cameras send
+# one at least every 5 ms, in which no camera sends this many words.
+_TIME_HIGH, _MAX_TIMELESS = 0x8, 1 << 20
+
+# A record of a DAT file: microseconds, then 14 bits of x, 14 of y and 4 of polarity.
+_RECORD = np.dtype([("time", "<u4"), ("address", "<u4")])
+# Records of Event2d and of EventCd have the same fields.
+_EVENT_TYPES = (0x00, 0x0C)
+_LAP = 1 << 32
+# Times that are read to count how often they wrapped. Two neighbours must be less than half a lap, 36 min, apart.
+_MAX_SAMPLES = 10_000
+
+
+@dataclass(frozen=True)
+class PropheseeHeader:
+    """The lines ``% keyword value`` at the beginning of a RAW or DAT file.
+
+    Attributes:
+        fields: values by keyword in lower case.
+        end: number of bytes before the events.
+    """
+
+    fields: dict[str, str]
+    end: int
+
+    @classmethod
+    def parse(cls, path: Path, beginning: bytes) -> PropheseeHeader:
+        """Parse the first :data:`HEADER_BYTES` of a file.
+
+        Raises:
+            DataError: a line does not end.
+        """
+        fields: dict[str, str] = {}
+        end = 0
+        # The keyword "end" is optional. Without it, the header ends at the first line that does not begin with "% ".
+        while beginning.startswith(b"% ", end):
+            line_end = beginning.find(b"\n", end) + 1
+            if line_end == 0:
+                raise DataError(path, f"line {len(fields) + 1} of its header does not end", "record or copy it again")
+            keyword, _, value = beginning[end + 2 : line_end].decode("ascii", "replace").strip().partition(" ")
+            end = line_end
+            if keyword.lower() == "end":
+                break
+            fields[keyword.lower()] = value.strip()
+        return cls(fields, end)
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether the header is that of a RAW file: only these name an encoding."""
+        return bool({"evt", "format"} & set(self.fields))
+
+    @property
+    def format_options(self) -> dict[str, str]:
+        """The options of ``% format NAME;option=value;…``, and its name in capitals as the option "name"."""
+        name, *options = self.fields.get("format", "").split(";")
+        pairs = (option.partition("=") for option in options)
+        return {"name": name.strip().upper(), **{key.strip().lower(): value.strip() for key, _, value in pairs}}
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of the sensor in pixels, or None where the header does not state them."""
+        geometry = re.fullmatch(r"(\d{1,9})\s*x\s*(\d{1,9})", self.fields.get("geometry", ""))
+        if geometry:
+            return int(geometry[1]), int(geometry[2])
+        for source in (self.format_options, self.fields):
+            sizes = [source.get(name, "") for name in ("width", "height")]
+            if all(re.fullmatch(r"\d{1,9}", size) for size in sizes):
+                return int(sizes[0]), int(sizes[1])
+        return None
+
+
+class PropheseeRawFile(EventReader):
+    """Read a RAW file: a header, then the words that the camera sent, in EVT 2.0 or EVT 3.0.
+
+    Args:
+        path: the file.
+        header: its header.
+        width: pixel columns of the sensor; needed where the header does not state them.
+        height: pixel rows of the sensor; needed where the header does not state them.
+
+    Raises:
+        DataError: the encoding is not one that is read, or a size is not known.
+    """
+
+    kind = "RAW file"
+
+    def __init__(
+        self, path: Path, header: PropheseeHeader, width: int | None = None, height: int | None = None
+    ) -> None:
+        super().__init__(path, *resolve_sensor_size(path, header.size, width, height))
+        self._encoding = _encoding_name(path, header)
+        self._begin = header.end
+
+    def _chunks(self) -> Iterator[EventStream]:
+        # Imported lazily: every command of every method imports this module, and numba is slow to import.
+        from aenerf_ns.files.evt_words import EVT2, EVT3, decode_words, initial_state
+
+        encoding = EVT2 if self._encoding == "EVT2" else EVT3
+        for columns in decode_words(self._blocks(encoding.dtype), encoding, initial_state(), self.path):
+            yield self._stream(columns)
+
+    def _blocks(self, dtype: np.dtype) -> Iterator[NDArray]:
+        if (self.path.stat().st_size - self._begin) % dtype.itemsize:
+            raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
+        with self.path.open("rb") as file:
+            file.seek(self._begin)
+            while len(block := np.fromfile(file, dtype, _BLOCK)):
+                if len(block) >= _MAX_TIMELESS and not (block >> 8 * dtype.itemsize - 4 == _TIME_HIGH).any():
+                    raise DataError(
+                        self.path,
+                        f"{len(block):,} words without the upper bits of a time end at byte {file.tell():,}",
+                        "copy it again",
+                    )
+                yield block
+
+
+def _encoding_name(path: Path, header: PropheseeHeader) -> str:
+    """Return EVT2 or EVT3."""
+    options = header.format_options
+    version = header.fields.get("evt", "")
+    name = options["name"] or {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}.get(version, version)
+    if not name:
+        raise DataError(
+            path,
+            "its header does not state the encoding of the events",
+            'add the line "% evt 2.0" or "% evt 3.0", or convert it with metavision_file_to_dat',
+        )
+    if name not in ("EVT2", "EVT3") or options.get("endianness", "little") != "little":
+        raise DataError(
+            path,
+            f"its events are encoded as {header.fields.get('format', version)}; EVT2 and EVT3, little-endian, are read",
+            "convert it with metavision_file_to_dat",
+        )
+    return name
+
+
+class PropheseeDatFile(EventReader):
+    """Read a DAT file of version 2: a header, the type and size of a record, then records of 8 bytes.
+
+    Args:
+        path: the file.
+        header: its header.
+        width: pixel columns of the sensor; needed where the header does not state them.
+        height: pixel rows of the sensor; needed where the header does not state them.
+
+    Raises:
+        DataError: the version or the records are not those that are read, or a size is not known.
+    """
+
+    kind = "DAT file"
+
+    def __init__(
+        self, path: Path, header: PropheseeHeader, width: int | None = None, height: int | None = None
+    ) -> None:
+        super().__init__(path, *resolve_sensor_size(path, header.size, width, height))
+        version = header.fields.get("version", "none")
+        if version != "2":
+            raise DataError(path, f"its version is {version}; version 2 is read", "convert it with Metavision")
+        with path.open("rb") as file:
+            file.seek(header.end)
+            kind = file.read(2)
+        if len(kind) < 2 or kind[0] not in _EVENT_TYPES or kind[1] != _RECORD.itemsize:
+            raise DataError(
+                path, f"its records are of type and size {kind.hex(' ') or 'none'}, not events", "record it again"
+            )
+        self._begin = header.end + len(kind)
+        self._num_events, rest = divmod(path.stat().st_size - self._begin, _RECORD.itemsize)
+        if rest:
+            raise DataError(path, f"it ends within a record of {_RECORD.itemsize} bytes", "copy it again")
+
+    def _count(self) -> int:
+        return self._num_events
+
+    def _chunks(self) -> Iterator[EventStream]:
+        previous = None
+        with self.path.open("rb") as file:
+            file.seek(self._begin)
+            while len(records := np.fromfile(file, _RECORD, CHUNK)):
+                time = _unwrap(records["time"], previous)
+                previous = int(time[-1])
+                address = records["address"]
+                x, y = ((address >> shift & 0x3FFF).astype(np.uint16) for shift in (0, 14))
+                yield self._stream((x, y, time * 1000, 2 * (address >> 28).astype(np.int8) - 1))
+
+    def _time_span(self) -> tuple[int, int] | None:
+        count = self._num_events
+        if count == 0:
+            return None
+        samples = []
+        with self.path.open("rb") as file:
+            for index in (*range(0, count, max(1, count // _MAX_SAMPLES)), count - 1):
+                file.seek(self._begin + index * _RECORD.itemsize)
+                samples.append(np.fromfile(file, _RECORD, 1)["time"])
+        time = _unwrap(np.concatenate(samples), None)
+        return int(time[0]) * 1000, int(time[-1]) * 1000
+
+
+def _unwrap(time: NDArray[np.uint32], previous: int | None) -> NDArray[np.int64]:
+    """Return the (N,) microseconds of times whose upper bits are cut off. Each time is the nearest to its predecessor.
+
+    Args:
+        time: (N,) lower 32 bits of times.
+        previous: the whole time before the first one, or None at the beginning.
+    """
+    begin = int(time[0]) if previous is None else previous
+    steps = np.diff(time.astype(np.int64), prepend=begin)
+    return begin + np.cumsum((steps + _LAP // 2) % _LAP - _LAP // 2)
