@@ -1,10 +1,10 @@
-"""The contrast of events that are warped to one view, which tells whether poses and intrinsics fit the events.
+"""The contrast of events that are warped to one view, which says whether poses and intrinsics fit the events.
 
 Warping moves each event to where the reference view sees the event's edge. The pose at the event's time and the depth
-of the edge give the place. With right poses and the right depth, the events of an edge then lie on one line. With wrong
-poses they are smeared at every depth.
+of the edge give the position. With right poses and the right depth, the events of an edge then lie on one line. With
+wrong poses they are smeared at every depth.
 
-Contrast maximisation is by Gallego et al. 2018, "A unifying contrast maximization framework"; planes of different depth
+Contrast maximization is by Gallego et al. 2018, "A unifying contrast maximization framework"; planes of different depth
 are by Rebecq et al. 2018, "EMVS".
 """
 
@@ -32,41 +32,57 @@ from aenerf_ns.checking.hypotheses import (
     clock_hypothesis,
 )
 from aenerf_ns.events.event_images import TILE, accumulate, best_of, image_size, tile_contrast
+from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.stream import EventStream
 
-# From one depth to the next, events at the ends of a slice move by this many pixels.
-_DEPTH_STEP = 1.5
-# Poses within a slice. From one to the next, nothing moves visibly.
-_POSES = 96
-# At most this many events of a slice are warped: more do not change the result.
-_MAX_EVENTS = 40_000
-# Numbers of events a pixel in a slice. They are tried in turn, until the image without warping is smeared.
-_DENSITIES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-# An image of less contrast is smeared.
-_SMEARED = 0.05
-_NUM_SLICES = 8
-# A slice is cut to the events that have a pose and a direction under both hypotheses. If a smaller share of the events
-# is left, the slice is not compared.
-_MIN_USABLE = 0.5
-# An alternative is first tried on a third of the slices. If its contrast is not above this share of the given contrast,
-# it is not tried on the others.
-_HOPELESS = 0.85
-# The columns of the events that are permuted together, and how often.
-_SHUFFLED, _NUM_SHUFFLES = (("p",), ("x", "y"), ("x", "y", "p")), 2
+# Permuted together, these columns lose their order within a slice.
+_SHUFFLED_COLUMNS = (("p",), ("x", "y"), ("x", "y", "p"))
+_PICTURE_HEIGHT = 480
+
+
+@dataclass(frozen=True)
+class WarpSettings:
+    """How a recording is cut into slices, and how finely a slice is warped."""
+
+    num_slices: int = 8
+    """Slices of a recording."""
+    densities: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+    """Events per pixel in a slice. They are tried in turn, until the image without warping is smeared."""
+    smeared_contrast: float = 0.05
+    """An image of less contrast is smeared."""
+    max_events: int = 40_000
+    """Events of a slice that are warped. More do not change the result."""
+    num_poses: int = 96
+    """Poses within a slice. From one to the next, nothing moves visibly."""
+    depth_step: float = 1.5
+    """Pixels that events at the ends of a slice move from one depth to the next."""
+    min_usable_share: float = 0.5
+    """A slice is cut to the events that have a pose and a direction under both hypotheses. If a smaller share of the
+    events is left, the slice is not compared."""
+    hopeless_share: float = 0.85
+    """An alternative is first tried on a third of the slices. If its contrast is not above this share of the given
+    contrast, it is not tried on the others."""
+    num_shuffles: int = 2
+    """How often the events are shuffled in each of three ways."""
+
+
+_SETTINGS = WarpSettings()
 
 
 @dataclass(frozen=True)
 class WarpedSlice:
     """The image of a slice of events, warped to the pose in the middle of the slice.
 
-    Each of the (R, C) tiles of the image is warped at the depth that gives the tile most contrast.
+    Each of the (R, C) tiles of the image is warped at the depth that gives the tile most contrast. The contrast of the
+    slice is the sum of ``energy`` by the sum of ``brightness``. It is 0 for noise in a tile at one depth. The best of
+    many depths gives noise a contrast of about 0.1.
 
     Attributes:
         energy: (R, C) squared contrast of the tiles, less the squared contrast of noise.
         brightness: (R, C) squared brightness of the tiles.
         depth: (R, C) depth of the tiles along the optical axis of the reference view, in the unit of the poses;
             infinite where the tile does not move when the camera is translated.
-        points: (R, C, 3) centres of the tiles in the world of the poses; not finite where the depth is infinite.
+        points: (R, C, 3) centers of the tiles in the world of the poses; not finite where the depth is infinite.
     """
 
     energy: NDArray[np.float64]
@@ -74,27 +90,40 @@ class WarpedSlice:
     depth: NDArray[np.float64]
     points: NDArray[np.float64]
 
-    @property
-    def contrast(self) -> float:
-        """Relative squared contrast of edges: energy by brightness.
 
-        It is 0 for noise in a tile at one depth. The best of many depths gives noise a contrast of about 0.1.
-        """
-        return _contrast([self])
+@dataclass(frozen=True)
+class _SliceGeometry:
+    """Where the events of a slice were seen, under a hypothesis.
 
-
-def num_slices(num_events: int, camera: CameraIntrinsics) -> int:
-    """Return how many runs of :func:`slice_size` events are taken from a recording.
-
-    A short recording is one run, with all its events.
+    Attributes:
+        points: (N, 2) directions of the events on the plane at depth 1.
+        pose_indices: (N,) the events' poses.
+        poses: (P, 3, 4) relative to the reference.
+        reference: (4, 4) the pose in the middle of the slice.
+        intrinsics: (4,) fx fy cx cy of the images.
     """
-    return 1 if num_events <= _NUM_SLICES * slice_size(camera) else _NUM_SLICES
+
+    points: NDArray[np.float64]
+    pose_indices: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+
+    def lines(self) -> NDArray[np.float32]:
+        """Return where the reference view sees the events, for :func:`accumulate`."""
+        return _lines(self.points, self.pose_indices, self.poses, self.intrinsics)
 
 
-def slice_size(camera: CameraIntrinsics) -> int:
-    """Return the largest number of events in a slice."""
+def choose_runs(num_events: int, camera: CameraIntrinsics) -> tuple[NDArray[np.int64], int]:
+    """Return where in a recording the runs of consecutive events begin that are looked at, and the length of a run.
+
+    Runs are as long as the longest slice. A short recording is one run with all its events.
+    """
     width, height, _ = image_size(camera.width, camera.height)
-    return int(_DENSITIES[-1] * width * height)
+    length = int(_SETTINGS.densities[-1] * width * height)
+    if num_events <= _SETTINGS.num_slices * length:
+        return np.zeros(1, np.int64), num_events
+    return np.linspace(0, num_events - length, _SETTINGS.num_slices).astype(np.int64), length
 
 
 class WarpedEvents:
@@ -103,7 +132,7 @@ class WarpedEvents:
     Args:
         runs: runs of consecutive events within the span of the poses, in the order of time.
         trajectory: given poses of the event camera, camera-to-world, OpenCV camera axes.
-        camera: lens of the event camera.
+        camera: intrinsics of the event camera.
         seed: seed of the choice of events in long slices, and of the position of each event within its pixel.
 
     Attributes:
@@ -121,31 +150,26 @@ class WarpedEvents:
         self._plane = directions[..., :2] * [1, -1] / depth
         self._seed = seed
         rng = np.random.default_rng(seed)
-        self._jitter = rng.uniform(-0.5, 0.5, (_MAX_EVENTS, 2)) / [camera.fx, camera.fy]
+        self._jitter = rng.uniform(-0.5, 0.5, (_SETTINGS.max_events, 2)) / [camera.fx, camera.fy]
         self._slices = self._cut(runs, rng)
         self.given = [self._warp(events, GIVEN) for events in self._slices]
 
     def _cut(self, runs: list[EventStream], rng: np.random.Generator) -> list[EventStream]:
-        """Return slices of the runs, so long that an image without warping is smeared."""
-        for density in _DENSITIES:
+        """Return slices of the runs, long enough that an image without warping is smeared."""
+        for density in _SETTINGS.densities:
             size = int(density * self._width * self._height)
             slices = []
             for run in runs:
-                count = min(max(len(run) // size, 1), _NUM_SLICES // len(runs))
+                count = min(max(len(run) // size, 1), _SETTINGS.num_slices // len(runs))
                 length = len(run) if len(run) < 2 * size else size
                 for begin in (np.arange(count) + 0.5) / count * (len(run) - length):
                     events = run[int(begin) : int(begin) + length]
-                    if len(events) > _MAX_EVENTS:
-                        events = events[np.sort(rng.choice(len(events), _MAX_EVENTS, replace=False))]
+                    if len(events) > _SETTINGS.max_events:
+                        events = events[np.sort(rng.choice(len(events), _SETTINGS.max_events, replace=False))]
                     slices.append(events)
-            if _contrast([self._warp(events, STILL) for events in slices]) < _SMEARED:
+            if contrast_of([self._warp(events, STILL) for events in slices]) < _SETTINGS.smeared_contrast:
                 break
         return slices
-
-    @property
-    def seconds(self) -> list[float]:
-        """Duration of each slice in seconds."""
-        return [float(events.t[-1] - events.t[0]) * 1e-9 for events in self._slices]
 
     @property
     def spans(self) -> list[tuple[int, int]]:
@@ -163,25 +187,25 @@ class WarpedEvents:
             The comparison, or None if too few events have a pose and a direction under the hypothesis.
         """
         covered = TimeWindow(self._trajectory.start, self._trajectory.end)
-        given, alternative, numbers = [], [], []
+        given, alternative, indices = [], [], []
         has_direction = np.isfinite(hypothesis.plane(self._plane) + self._plane).all(-1)
-        for number in range(len(self._slices))[slices]:
-            events, as_given = self._slices[number], self.given[number]
-            seen = has_direction[events.y, events.x]
-            usable = seen & covered.contains(events.t + hypothesis.clock_offset)
-            if usable.sum() < max(_MIN_USABLE * seen.sum(), 2):
+        for index in range(len(self._slices))[slices]:
+            events, as_given = self._slices[index], self.given[index]
+            visible = has_direction[events.y, events.x]
+            usable = visible & covered.contains(events.t + hypothesis.clock_offset)
+            if usable.sum() < max(_SETTINGS.min_usable_share * visible.sum(), 2):
                 continue
             part = events[usable]
             given.append(as_given if usable.all() else self._warp(part, GIVEN))
             alternative.append(self._warp(part, hypothesis))
-            numbers.append(number)
+            indices.append(index)
         if not given:
             return None
-        alone = [_compared(hypothesis, [one], [other]) for one, other in zip(given, alternative, strict=True)]
-        clear = [number for number, one in zip(numbers, alone, strict=True) if one.is_clearly_better]
-        return replace(_compared(hypothesis, given, alternative), clear_slices=frozenset(clear))
+        single = [_compare(hypothesis, [one], [other]) for one, other in zip(given, alternative, strict=True)]
+        in_favor = {index for index, found in zip(indices, single, strict=True) if found.is_clearly_better}
+        return replace(_compare(hypothesis, given, alternative), slices_in_favor=frozenset(in_favor))
 
-    def comparisons(self) -> list[Comparison]:
+    def compare_alternatives(self) -> list[Comparison]:
         """Compare all alternatives whose events the poses cover, and return the comparisons, the best first.
 
         An alternative that is much worse than what is given in a third of the slices is not tried on the others. The
@@ -191,7 +215,7 @@ class WarpedEvents:
         found = []
         for hypothesis in (*ALTERNATIVES, *map(clock_hypothesis, offsets)):
             comparison = self.compare(hypothesis, slice(None, None, 3))
-            if comparison is not None and comparison.contrast > _HOPELESS * comparison.given:
+            if comparison is not None and comparison.contrast > _SETTINGS.hopeless_share * comparison.given:
                 comparison = self.compare(hypothesis)
             if comparison is not None:
                 found.append(comparison)
@@ -202,60 +226,56 @@ class WarpedEvents:
             found += [comparison for comparison in between if comparison is not None]
         return sorted(found, key=lambda c: c.contrast - c.given, reverse=True)
 
-    def without_motion(self) -> Comparison:
+    def compare_without_motion(self) -> Comparison:
         """Compare the contrast without any warping with the given contrast."""
         comparison = self.compare(STILL)
         assert comparison is not None
         return comparison
 
-    def shuffled(self) -> NDArray[np.float64]:
+    def shuffled_contrasts(self) -> NDArray[np.float64]:
         """Return the contrasts of the same events under the given poses, after their order was lost.
 
-        Within each slice the polarities, the pixels, or both are permuted, which is to permute the times. What contrast
-        is left, noise has too.
+        Within each slice the polarities, the pixels, or both are permuted, which is to permute the times. Noise has the
+        contrast that is left.
         """
         rng = np.random.default_rng(self._seed)
         contrasts = []
-        for columns in _SHUFFLED * _NUM_SHUFFLES:
+        for columns in _SHUFFLED_COLUMNS * _SETTINGS.num_shuffles:
             permuted = []
             for events in self._slices:
                 order = rng.permutation(len(events))
                 permuted.append(replace(events, **{name: getattr(events, name)[order] for name in columns}))
-            contrasts.append(_contrast([self._warp(events, GIVEN) for events in permuted]))
+            contrasts.append(contrast_of([self._warp(events, GIVEN) for events in permuted]))
         return np.array(contrasts)
 
-    def _prepared(self, events: EventStream, hypothesis: Hypothesis) -> tuple:
-        """Return what :func:`_lines` and :func:`accumulate` need, for a slice under a hypothesis.
-
-        Returns:
-            (N, 2) directions of the events on the plane at depth 1, (N,) their polarities, (N,) the indices of their
-            poses, the (P, 3, 4) poses relative to the pose in the middle, (4,) fx fy cx cy of the images, and the
-            (4, 4) pose in the middle.
-        """
-        camera = self._camera
-        times = np.linspace(events.t[0], events.t[-1], _POSES).astype(np.int64)
+    def _geometry(self, events: EventStream, hypothesis: Hypothesis) -> _SliceGeometry:
+        camera, num_poses = self._camera, _SETTINGS.num_poses
+        times = np.linspace(events.t[0], events.t[-1], num_poses).astype(np.int64)
         if hypothesis.still:
-            poses = torch.eye(4, dtype=torch.float64).expand(_POSES, 4, 4)
+            poses = torch.eye(4, dtype=torch.float64).expand(num_poses, 4, 4)
         else:
             trajectory = self._trajectory.transform(hypothesis.poses)
             poses = homogeneous(trajectory.interpolate(times + hypothesis.clock_offset))
-        reference = poses[_POSES // 2]
-        relative = np.ascontiguousarray((torch.linalg.inv(reference) @ poses)[:, :3].numpy())
+        reference = poses[num_poses // 2]
         duration = max(int(events.t[-1] - events.t[0]), 1)
-        index = np.rint((events.t - events.t[0]) / duration * (_POSES - 1)).astype(np.int64)
-        points = hypothesis.plane(self._plane)[events.y, events.x] + self._jitter[: len(events)]
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy]) / self._binning
-        return points, events.p.astype(np.float32), index, relative, intrinsics, reference
+        return _SliceGeometry(
+            points=hypothesis.plane(self._plane)[events.y, events.x] + self._jitter[: len(events)],
+            pose_indices=np.rint((events.t - events.t[0]) / duration * (num_poses - 1)).astype(np.int64),
+            poses=np.ascontiguousarray((torch.linalg.inv(reference) @ poses)[:, :3].numpy()),
+            reference=reference.numpy(),
+            intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]) / self._binning,
+        )
 
     def _warp(self, events: EventStream, hypothesis: Hypothesis) -> WarpedSlice:
         """Warp a slice at every depth, and keep the depth of most contrast in each tile."""
-        points, polarity, index, relative, intrinsics, reference = self._prepared(events, hypothesis)
-        lines = _lines(points, index, relative, intrinsics)
-        baseline = float(np.linalg.norm(relative[:, :, 3], axis=1).max())
+        geometry = self._geometry(events, hypothesis)
+        lines, polarity = geometry.lines(), events.p.astype(np.float32)
+        fx, fy, cx, cy = geometry.intrinsics
+        baseline = float(np.linalg.norm(geometry.poses[:, :, 3], axis=1).max())
         inverse_depths = np.zeros(1)
         if baseline > 0:
-            steps = np.arange(0, self._width / _DEPTH_STEP + 1)
-            inverse_depths = steps * _DEPTH_STEP / (intrinsics[0] * baseline)
+            steps = np.arange(0, self._width / _SETTINGS.depth_step + 1)
+            inverse_depths = steps * _SETTINGS.depth_step / (fx * baseline)
         net, total = np.zeros((2, self._height, self._width), np.float32)
         measured = []
         for inverse_depth in inverse_depths:
@@ -263,55 +283,48 @@ class WarpedEvents:
             measured.append(tile_contrast(net, total))
         energy, brightness = map(np.array, zip(*measured, strict=True))
         best = best_of(energy, brightness)
-        with np.errstate(divide="ignore"):
-            depth = 1 / inverse_depths[best]
         rows, columns = (np.arange(n) * TILE + TILE / 2 for n in best.shape)
-        plane = np.stack(
-            np.broadcast_arrays(
-                ((columns - intrinsics[2]) / intrinsics[0])[None],
-                ((rows - intrinsics[3]) / intrinsics[1])[:, None],
-                1.0,
-            ),
-            -1,
-        )
-        with np.errstate(invalid="ignore"):
-            in_world = (plane * depth[..., None]) @ reference[:3, :3].numpy().T + reference[:3, 3].numpy()
+        x, y = np.meshgrid((columns - cx) / fx, (rows - cy) / fy)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = 1 / inverse_depths[best]
+            in_camera = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None]
+            points = in_camera @ geometry.reference[:3, :3].T + geometry.reference[:3, 3]
         return WarpedSlice(
             energy=np.take_along_axis(energy, best[None], 0)[0],
             brightness=np.take_along_axis(brightness, best[None], 0)[0],
             depth=depth,
-            points=in_world,
+            points=points,
         )
 
-    def picture(self) -> NDArray[np.float32]:
-        """Return the slice with the most contrast as it came and warped, side by side.
+    def picture(self) -> NDArray[np.uint8]:
+        """Draw the slice with the most contrast as it came and, to the right of it, warped to one view.
 
         Returns:
-            (height, 2 width) number of positive events less that of negative events. In the right half, each tile is
-            warped at its depth.
+            (height, width, 3) display values. Small sensors are enlarged by a whole factor, to at most 480 rows.
         """
-        best = max(range(len(self.given)), key=lambda i: self.given[i].contrast)
+        best = max(range(len(self.given)), key=lambda index: contrast_of([self.given[index]]))
         events, depth = self._slices[best], self.given[best].depth
-        points, polarity, index, relative, intrinsics, _ = self._prepared(events, GIVEN)
-        shape = (self._height, self._width)
-        net, total = np.zeros((2, *shape), np.float32)
-        depth_of_pixel = np.kron(depth, np.ones((TILE, TILE)))
-        still = np.tile(np.eye(3, 4), (_POSES, 1, 1))
-        accumulate(_lines(points, index, still, intrinsics), polarity, np.float32(0), net, total)
-        lines = _lines(points, index, relative, intrinsics)
-        unwarped, warped = net.copy(), np.zeros(shape, np.float32)
+        geometry, polarity = self._geometry(events, GIVEN), events.p.astype(np.float32)
+        unwarped, warped, net, total = np.zeros((4, self._height, self._width), np.float32)
+        still = replace(geometry, poses=np.tile(np.eye(3, 4), (_SETTINGS.num_poses, 1, 1)))
+        accumulate(still.lines(), polarity, np.float32(0), unwarped, total)
+        lines, depth_of_pixel = geometry.lines(), np.kron(depth, np.ones((TILE, TILE)))
         for value in np.unique(depth):
             accumulate(lines, polarity, np.float32(1 / value), net, total)
             warped[depth_of_pixel == value] = net[depth_of_pixel == value]
-        return np.concatenate([unwarped, warped], 1)
+        both = np.rint(np.concatenate([unwarped, warped], 1)).astype(np.int64)
+        rows, columns = np.nonzero(both)
+        picture = polarity_picture(columns, rows, both[rows, columns], both.shape[1], both.shape[0])
+        factor = max(_PICTURE_HEIGHT // self._height, 1)
+        return picture.repeat(factor, 0).repeat(factor, 1)
 
 
-def _contrast(slices: Sequence[WarpedSlice]) -> float:
+def contrast_of(slices: Sequence[WarpedSlice]) -> float:
     """Return the contrast of all tiles of the slices together."""
     return float(sum(s.energy.sum() for s in slices) / max(sum(s.brightness.sum() for s in slices), 1e-30))
 
 
-def _compared(hypothesis: Hypothesis, given: list[WarpedSlice], alternative: list[WarpedSlice]) -> Comparison:
+def _compare(hypothesis: Hypothesis, given: list[WarpedSlice], alternative: list[WarpedSlice]) -> Comparison:
     """Compare slices that are warped under a hypothesis with the same slices warped as given."""
     # The standard error of the difference of two ratios of sums, over the tiles.
     error = np.sqrt(
@@ -320,13 +333,13 @@ def _compared(hypothesis: Hypothesis, given: list[WarpedSlice], alternative: lis
             for one, other in zip(given, alternative, strict=True)
         )
     )
-    difference = (_contrast(alternative) - _contrast(given)) / max(float(error), 1e-12)
-    return Comparison(hypothesis, _contrast(alternative), _contrast(given), difference)
+    difference = (contrast_of(alternative) - contrast_of(given)) / max(float(error), 1e-12)
+    return Comparison(hypothesis, contrast_of(alternative), contrast_of(given), difference)
 
 
 def _residuals(one: WarpedSlice, slices: Sequence[WarpedSlice]) -> NDArray[np.float64]:
     """Return by how much each (R, C) tile of one slice raises the contrast of all slices, to first order."""
-    return (one.energy - _contrast(slices) * one.brightness) / max(sum(s.brightness.sum() for s in slices), 1e-30)
+    return (one.energy - contrast_of(slices) * one.brightness) / max(sum(s.brightness.sum() for s in slices), 1e-30)
 
 
 @numba.njit(cache=True)

@@ -18,10 +18,9 @@ from torch import Tensor
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import homogeneous
 
-# A contrast is clearly higher than another if it exceeds it by so many standard errors and by so large a factor. One of
-# the two pairs is enough.
+# (standard errors, factor): a contrast is clearly higher than another if either pair of limits is exceeded.
 _CLEAR = ((4.0, 1.03), (2.5, 1.15))
-# Two contrasts that differ by less than this cannot be told apart.
+# Two contrasts that differ by less than this cannot be told apart: standard errors, and factor.
 _SAME_ERRORS, _SAME_FACTOR = 2.0, 1.03
 
 CLOCK_OFFSETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
@@ -37,7 +36,7 @@ _MAX_LEARNED_OFFSET = 100_000_000
 Value = TypeVar("Value")
 
 
-def _same(value: Value) -> Value:
+def _identity(value: Value) -> Value:
     return value
 
 
@@ -56,24 +55,24 @@ class Hypothesis:
 
     name: str
     remedy: str = ""
-    poses: Callable[[Tensor], Tensor] = _same
-    plane: Callable[[NDArray[np.float64]], NDArray[np.float64]] = _same
+    poses: Callable[[Tensor], Tensor] = _identity
+    plane: Callable[[NDArray[np.float64]], NDArray[np.float64]] = _identity
     clock_offset: int = 0
     still: bool = False
 
 
-def _axes(*signs: float) -> Callable[[Tensor], Tensor]:
+def _flip_axes(*signs: float) -> Callable[[Tensor], Tensor]:
     matrix = torch.diag(torch.tensor([*signs, 1.0], dtype=torch.float64))
     return lambda poses: poses @ matrix
 
 
-def _quaternions_with_w_first(poses: Tensor) -> Tensor:
+def _move_w_last(poses: Tensor) -> Tensor:
     """Return the (N, 4, 4) poses that were meant if qw qx qy qz were read as qx qy qz qw."""
     quaternion = quaternion_from_rotation(poses[:, :3, :3]).roll(-1, -1)
     return homogeneous(torch.cat([rotation_from_quaternion(quaternion), poses[:, :3, 3:]], -1))
 
 
-def _transposed(plane: NDArray[np.float64]) -> NDArray[np.float64]:
+def _swap_rows_and_columns(plane: NDArray[np.float64]) -> NDArray[np.float64]:
     """Exchange rows and columns of the grid; directions of pixels that would leave the sensor are NaN."""
     side = min(plane.shape[:2])
     swapped = np.full_like(plane, np.nan)
@@ -91,28 +90,28 @@ ALTERNATIVES = (
     Hypothesis(
         "the poses have OpenGL camera axes (y up, z backward)",
         "multiply each camera-to-world matrix by diag(1, -1, -1, 1) from the right",
-        poses=_axes(1, -1, -1),
+        poses=_flip_axes(1, -1, -1),
     ),
     Hypothesis(
         "the camera axes x and y are flipped (a camera upside down)",
         "multiply each camera-to-world matrix by diag(-1, -1, 1, 1) from the right",
-        poses=_axes(-1, -1, 1),
+        poses=_flip_axes(-1, -1, 1),
     ),
     Hypothesis(
         "the camera axes x and z are flipped",
         "multiply each camera-to-world matrix by diag(-1, 1, -1, 1) from the right",
-        poses=_axes(-1, 1, -1),
+        poses=_flip_axes(-1, 1, -1),
     ),
     Hypothesis("the poses are world-to-camera", "invert each: rotation R^T, position -R^T t", poses=torch.linalg.inv),
     Hypothesis(
         "the poses are world-to-camera with OpenGL camera axes",
         "invert each and multiply it by diag(1, -1, -1, 1) from the right",
-        poses=lambda poses: _axes(1, -1, -1)(torch.linalg.inv(poses)),
+        poses=lambda poses: _flip_axes(1, -1, -1)(torch.linalg.inv(poses)),
     ),
-    Hypothesis("the quaternions have w first", "write them as qx qy qz qw", poses=_quaternions_with_w_first),
+    Hypothesis("the quaternions have w first", "write them as qx qy qz qw", poses=_move_w_last),
     Hypothesis("the pixels are mirrored in x", "write x as width - 1 - x", plane=lambda plane: plane[:, ::-1]),
     Hypothesis("the pixels are mirrored in y", "write y as height - 1 - y", plane=lambda plane: plane[::-1]),
-    Hypothesis("x and y of the events are swapped", "swap the two columns", plane=_transposed),
+    Hypothesis("x and y of the events are swapped", "swap the two columns", plane=_swap_rows_and_columns),
 )
 """The usual mistakes in poses and pixels."""
 
@@ -140,14 +139,14 @@ class Comparison:
         contrast: the contrast of the events warped under the hypothesis.
         given: the contrast of the events warped as given.
         difference: ``contrast`` less ``given``, in standard errors over the tiles.
-        clear_slices: the slices of the events that, each by itself, clearly fit the hypothesis better.
+        slices_in_favor: indices of the slices of the events that, each by itself, clearly fit the hypothesis better.
     """
 
     hypothesis: Hypothesis
     contrast: float
     given: float
     difference: float
-    clear_slices: frozenset[int] = frozenset()
+    slices_in_favor: frozenset[int] = frozenset()
 
     @property
     def is_clearly_better(self) -> bool:
@@ -160,7 +159,7 @@ class Comparison:
         return _is_clear(-self.difference, self.given, self.contrast)
 
     @property
-    def is_untold(self) -> bool:
+    def is_inconclusive(self) -> bool:
         """Whether the events fit the hypothesis about as well as what is given."""
         return abs(self.difference) < _SAME_ERRORS and _about_equal(self.contrast, self.given)
 

@@ -47,26 +47,28 @@ class Check(DatasetCommand):
     def _find_problems(self) -> list[str]:
         """Print the figures, write the picture and return the problems."""
         parser = self.open_dataset()
-        from aenerf_ns.checking.report import Report
+        from aenerf_ns.checking.report import check
         from aenerf_ns.recording.scene import SCENE_KEY
 
         # Training and evaluation will ask for all three splits.
         outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
-        report = Report(parser.recording, outputs[0].metadata[SCENE_KEY].window, outputs[0].dataparser_scale, _print)
+        result = check(parser.recording, outputs[0].metadata[SCENE_KEY].window, outputs[0].dataparser_scale)
+        for figure in result.figures:
+            _print(figure)
         format_words: list[str] = []
         if self.format != "auto" or self.format_options:
             format_words = [parser.guessed_format or self.format]
             for option in self.format_options:
                 format_words += f"--{option}".split("=", 1)
-        command = training_command(self.data, options=report.planes, format_words=format_words)
-        remark = " (near and far plane for a camera that stays that close)" if report.planes else ""
+        command = training_command(self.data, options=result.planes, format_words=format_words)
+        remark = " (near and far plane for a camera that stays that close)" if result.planes else ""
         _print(f"Train with{remark}: {command}")
         if self.picture is not None:
-            if report.warped is None:
+            if result.warped is None:
                 _print(f"{self.picture}: not written, because too few events have a pose")
             else:
-                _write_picture(self.picture, report.warped)
-        return report.problems
+                _write_picture(self.picture, result.warped)
+        return result.problems
 
 
 def _print(line: str) -> None:
@@ -76,8 +78,6 @@ def _print(line: str) -> None:
 def _write_picture(path: Path, warped: WarpedEvents) -> None:
     from PIL import Image
 
-    from aenerf_ns.checking.picture import warped_picture
-
     with creating(path, "--picture"):
-        Image.fromarray(warped_picture(warped)).save(path)
+        Image.fromarray(warped.picture()).save(path)
     _print(f"{path}: events as they came, and warped")

@@ -75,7 +75,7 @@ class ReportCommand:
             gc.collect()
         paired = paired_differences(reports, shared)
         left_out = views_left_out(reports, shared)
-        page = make_page(reports, paired, mixed, shared)
+        page = make_page(reports, paired, left_out, mixed, shared)
         with creating(self.output / "report.html"):
             (self.output / "report.html").write_text(page, "utf8")
             _write_views(self.output / "views.csv", reports)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +86,12 @@ class EventStream:
         """Return the events of a slice (as views) or of an array of indices or booleans (as copies)."""
         columns = {name: getattr(self, name)[index] for name in _COLUMNS}
         return EventStream(**columns, width=self.width, height=self.height, source=self.source)
+
+    @staticmethod
+    def concatenate(parts: Sequence[EventStream]) -> EventStream:
+        """Return the events of one or more streams of a sensor, one stream after the other, as a copy."""
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
+        return replace(parts[0], **columns)
 
     def between(self, start: int, end: int) -> EventStream:
         """Return the events with start <= t <= end, in nanoseconds."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sqlite3
 import statistics
 import time
 from collections.abc import Iterable, Iterator
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 from torch import Tensor
 
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
@@ -27,15 +26,10 @@ from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.images import read_image, require_8_bits
 
 # Each frame is matched with this number of frames after it, and with the frames 16, 32, ... 1024 after it.
-_NEIGHBOURS = 10
+_NUM_NEIGHBORS = 10
 # This number of frames, evenly spread, are matched with each other. Without them errors add up along the path, and a
 # loop stays open.
-_KEY_FRAMES = 100
-
-# COLMAP's own limits suit photographs of many megapixels. These suit frames of a fraction of a megapixel.
-_PEAK_THRESHOLD = 0.004
-_MIN_POSE_INLIERS = 15
-_MIN_INITIAL_INLIERS = 50
+_NUM_KEY_FRAMES = 100
 
 # Beyond these errors, a pose is not inaccurate but wrong: COLMAP put the camera elsewhere.
 _FLIP_DEGREES = 90.0
@@ -53,7 +47,7 @@ class EstimatedPoses:
         frame_times: (N,) times of all frames in nanoseconds.
         trajectory: poses of the frames that the largest model places, camera-to-world, OpenCV camera axes, in a world
             of arbitrary position, orientation and scale.
-        camera: the lens of the frames, as it was given or as COLMAP estimates it.
+        camera: intrinsics of the frames, as they were given or as COLMAP estimates them.
         model_sizes: numbers of frames that the models place, the largest first. More than one model means that the
             video fell apart into pieces whose relative poses are not known. COLMAP drops pieces of less than 10 frames.
         num_points: 3D points of the largest model.
@@ -81,7 +75,7 @@ class EstimatedPoses:
         ]
 
     def report(self) -> dict[str, Any]:
-        """Return the figures as values for JSON."""
+        """Return the figures as plain values for JSON."""
         registered, frames = len(self.trajectory), len(self.frame_times)
         return {
             "frames": frames,
@@ -120,17 +114,17 @@ def estimate_poses(
     source: str | Path,
     seed: int = 0,
 ) -> EstimatedPoses:
-    """Run COLMAP's incremental structure from motion on a video, on the CPU.
+    """Estimate the poses of a video by COLMAP's incremental structure from motion, on the CPU.
 
-    Intrinsics and distortion that are given stay as given. Every frame is matched with its neighbours, and a hundred
+    Intrinsics and distortion that are given stay as given. Every frame is matched with its neighbors, and a hundred
     frames with each other. COLMAP runs on one thread, because its results depend on the order in which threads end. So
     a seed gives the same poses again, to the last bit on one machine with one version of COLMAP.
 
     Args:
-        frames: (height, width) grey or (height, width, 3) RGB arrays, or files that hold such pictures, in the order of
+        frames: (height, width) gray or (height, width, 3) RGB arrays, or files that hold such pictures, in the order of
             time.
         times: (N,) times in nanoseconds, increasing.
-        camera: the lens of the frames. Or width and height of the frames in pixels: COLMAP then estimates one focal
+        camera: intrinsics of the frames. Or width and height of the frames in pixels: COLMAP then estimates one focal
             length and the radial distortion k1, and the principal point is the middle of the image.
         source: the file or folder of the frames, for messages.
         seed: of COLMAP's random samples.
@@ -146,14 +140,15 @@ def estimate_poses(
         index = int(np.argmax(np.diff(times) <= 0)) + 1
         raise DataError(source, f"frame {index} is not after the frame before it", "sort the frames by time")
     begin = time.perf_counter()
+    given = camera if isinstance(camera, CameraIntrinsics) else None
+    size = (camera.width, camera.height) if isinstance(camera, CameraIntrinsics) else camera
     with TemporaryDirectory() as folder, progress_bar() as progress:
         workspace = _Workspace(Path(folder), len(times), seed, progress)
-        size = (camera.width, camera.height) if isinstance(camera, CameraIntrinsics) else camera
         workspace.add_frames(frames, size, source)
-        workspace.find_features(camera if isinstance(camera, CameraIntrinsics) else None)
+        workspace.find_features(given)
         workspace.match()
-        models = workspace.reconstruct(refine_lens=not isinstance(camera, CameraIntrinsics))
-        features, pairs = workspace.num_features(), workspace.num_matched_pairs()
+        models = workspace.reconstruct(refine_intrinsics=given is None)
+        features, pairs = workspace.count_features_and_pairs()
     if not models:
         raise DataError(
             source,
@@ -167,15 +162,15 @@ def estimate_poses(
         for image in model.images.values()
         if image.has_pose
     }
-    if not isinstance(camera, CameraIntrinsics):
-        (lens,) = model.cameras.values()
-        focal_length, cx, cy, k1 = (float(value) for value in lens.params)
-        camera = CameraIntrinsics(*size, focal_length, focal_length, cx, cy, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
+    if given is None:
+        (found,) = model.cameras.values()
+        focal_length, cx, cy, k1 = (float(value) for value in found.params)
+        given = CameraIntrinsics(*size, focal_length, focal_length, cx, cy, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
     indices = sorted(poses)
     return EstimatedPoses(
         frame_times=times,
         trajectory=Trajectory(times[indices], torch.from_numpy(np.stack([poses[i] for i in indices])), source),
-        camera=camera,
+        camera=given,
         model_sizes=[model.num_reg_images() for model in models],
         num_points=model.num_points3D(),
         reprojection_error=model.compute_mean_reprojection_error(),
@@ -185,7 +180,7 @@ def estimate_poses(
 
 
 def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory, dict[str, float]]:
-    """Map estimated poses to the true world by one Sim(3), and measure their errors.
+    """Map estimated poses to the true world by one Sim(3), and compute their errors.
 
     Only position, orientation and scale of the whole world are taken from the truth. The similarity aligns positions
     and orientations (:func:`~aenerf_ns.camera.alignment.align`) of the frames that agree with most other frames. So a
@@ -204,7 +199,7 @@ def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory
     """
     poses, truth = estimated.camera_to_worlds, truth.double()
     extent = Trajectory(estimated.times, truth).extent
-    aligned = _majority(poses, truth)(poses)
+    aligned = _align_majority(poses, truth)(poses)
     degrees = torch.rad2deg(rotation_angle(aligned, truth))
     distances = (aligned - truth)[..., 3].norm(dim=-1)
     misplaced = (degrees > _MISPLACED_DEGREES) | (distances > _MISPLACED_EXTENTS * extent)
@@ -220,7 +215,7 @@ def compare_with_truth(estimated: Trajectory, truth: Tensor) -> tuple[Trajectory
     }
 
 
-def _majority(poses: Tensor, truth: Tensor) -> Similarity:
+def _align_majority(poses: Tensor, truth: Tensor) -> Similarity:
     """Align the frames that agree on the world's orientation if they are the majority, else all frames."""
     # Each frame alone gives an orientation of the world.
     turns = truth[..., :3] @ poses[..., :3].mT
@@ -235,10 +230,8 @@ class _Workspace:
     """COLMAP's database and images in a folder, and the steps of its work."""
 
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
-        self._images, self._database = folder / "images", folder / "database.db"
-        self._output, self._pairs = folder / "models", folder / "pairs.txt"
+        self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
         self._images.mkdir()
-        self._output.mkdir()
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
         self._seed = seed
         self._progress = progress
@@ -268,7 +261,9 @@ class _Workspace:
             reader.camera_model, parameters = camera.to_colmap()
             reader.camera_params = ", ".join(map(repr, parameters))
         extraction.use_gpu, extraction.num_threads = False, 1
-        extraction.sift.peak_threshold = _PEAK_THRESHOLD
+        # COLMAP's own limits suit photographs of many megapixels. This one, and those of the mapper below, suit frames
+        # of a fraction of a megapixel.
+        extraction.sift.peak_threshold = 0.004
         with self._step("Finding features"):
             pycolmap.extract_features(
                 self._database,
@@ -282,52 +277,49 @@ class _Workspace:
     def match(self) -> None:
         import pycolmap
 
-        pairs = [f"{self._names[i]} {self._names[j]}" for i, j in _pairs(len(self._names))]
-        self._pairs.write_text("\n".join(pairs), encoding="utf-8")
+        pairs = [f"{self._names[i]} {self._names[j]}" for i, j in _choose_pairs(len(self._names))]
         matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
         verification = pycolmap.TwoViewGeometryOptions()
         matching.use_gpu, matching.num_threads = False, 1
-        pairing.match_list_path = self._pairs
+        pairing.match_list_path = self._folder / "pairs.txt"
+        pairing.match_list_path.write_text("\n".join(pairs), encoding="utf-8")
         verification.ransac.random_seed = self._seed
         with self._step("Matching frames"):
             pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
 
-    def reconstruct(self, refine_lens: bool) -> list[Any]:
+    def reconstruct(self, refine_intrinsics: bool) -> list[Any]:
         """Return the models, in the order of the number of frames that they place, the largest first."""
         import pycolmap
 
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self._seed
         options.num_threads = options.mapper.num_threads = 1
-        options.ba_refine_focal_length = options.ba_refine_extra_params = refine_lens
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_lens
-        options.mapper.abs_pose_min_num_inliers = _MIN_POSE_INLIERS
-        options.mapper.init_min_num_inliers = _MIN_INITIAL_INLIERS
+        options.ba_refine_focal_length = options.ba_refine_extra_params = refine_intrinsics
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
+        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = 15, 50
         options.extract_colors = False
-        with self._step("Placing frames", len(self._names)) as placed:
+        output = self._folder / "models"
+        output.mkdir()
+        with self._step("Placing frames", len(self._names)) as task:
             models = pycolmap.incremental_mapping(
                 self._database,
                 self._images,
-                self._output,
+                output,
                 options,
-                next_image_callback=lambda: self._progress.advance(placed),
+                next_image_callback=lambda: self._progress.advance(task),
             )
         return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
-    def num_features(self) -> float:
-        """Return the median number of features in a frame."""
-        rows = [rows for (rows,) in self._query("SELECT rows FROM keypoints")]
-        return statistics.median(rows) if rows else 0.0
+    def count_features_and_pairs(self) -> tuple[float, int]:
+        """Return the median number of features in a frame, and the number of pairs of frames that match."""
+        import pycolmap
 
-    def num_matched_pairs(self) -> int:
-        return int(self._query("SELECT count(*) FROM two_view_geometries WHERE rows > 0")[0][0])
-
-    def _query(self, sql: str) -> list[tuple]:
-        with contextlib.closing(sqlite3.connect(self._database)) as database:
-            return database.execute(sql).fetchall()
+        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+            counts = [database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()]
+            return statistics.median(counts) if counts else 0.0, database.num_verified_image_pairs()
 
     @contextlib.contextmanager
-    def _step(self, description: str, total: int | None = None) -> Iterator[Any]:
+    def _step(self, description: str, total: int | None = None) -> Iterator[TaskID]:
         """Show the progress of a step, and keep COLMAP's log off the console."""
         import pycolmap
 
@@ -341,10 +333,10 @@ class _Workspace:
             self._progress.update(task, total=len(self._names), completed=len(self._names))
 
 
-def _pairs(num_frames: int) -> list[tuple[int, int]]:
-    """Return which frames of a video are matched: pairs of indices, the smaller index first."""
-    offsets = [*range(1, _NEIGHBOURS + 1), *(2**power for power in range(4, 11))]
+def _choose_pairs(num_frames: int) -> list[tuple[int, int]]:
+    """Return which frames of a video to match: pairs of indices, the smaller index first."""
+    offsets = [*range(1, _NUM_NEIGHBORS + 1), *(2**power for power in range(4, 11))]
     pairs = {(i, i + offset) for offset in offsets for i in range(num_frames - offset)}
-    keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _KEY_FRAMES))})
+    keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _NUM_KEY_FRAMES))})
     pairs |= {(i, j) for i in keys for j in keys if i < j}
     return sorted(pairs)

@@ -10,7 +10,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 
 CUTOFF = 0.06
-"""ω and ω_e of the authors' code. It calls them Hz and uses them as 1 / s."""
+"""ω and ω_e of the authors' code, which calls them Hz and uses them as 1 / s."""
 
 # Radiance of a pixel whose state is zero, as a share of display white: the photographers' middle grey.
 _MIDDLE_GREY = 0.18
@@ -19,7 +19,7 @@ _DISPLAY_POWER = 1 / 2.2
 
 
 class HighPassFilter:
-    """Adds up the log-intensity changes that events tell of, and forgets them with time.
+    """Add up the log-intensity changes that events stand for, and forget them with time.
 
     It is the complementary filter of Scheerlinck et al., "Continuous-time Intensity Estimation Using Event Cameras"
     (ACCV 2018), without frames. With C₊ or −C₋ for an event, its pixel's state s becomes
@@ -69,7 +69,7 @@ def _integrate(state, last, x, y, t, p, positive, negative, cutoff, cutoff_per_e
     for event in range(len(t)):
         row, column = y[event], x[event]
         elapsed = (t[event] - last[row, column]) * 1e-9
-        # No state is kept from before a pixel's first event, whose Δt has no meaning.
+        # A pixel's first event has no meaningful Δt, but the state before it is 0.
         kept = np.exp(-cutoff * elapsed - cutoff_per_event) * state[row, column]
         state[row, column] = kept + (positive if p[event] > 0 else -negative)
         last[row, column] = t[event]

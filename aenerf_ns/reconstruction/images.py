@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.reconstruction.batches import batches_of
-from aenerf_ns.reconstruction.color import demosaiced, with_lightness
 from aenerf_ns.reconstruction.high_pass import HighPassFilter
-from aenerf_ns.reconstruction.networks import NUM_BINS, ReconstructionNetwork
-from aenerf_ns.reconstruction.voxels import normalized, voxel_grid
+from aenerf_ns.reconstruction.networks import E2VID, NUM_BINS, FireNet
+from aenerf_ns.reconstruction.voxels import normalize, voxel_grid
 
 # The authors sharpen images: by this amount, with a blur of this standard deviation and size in pixels.
 _SHARPENING, _BLUR, _BLUR_SIZE = 0.3, 1.0, 5
@@ -29,7 +28,7 @@ class ImageSource(Protocol):
         """Take the next batch of the stream, and return the image at its last event.
 
         Returns:
-            (height, width, 3) RGB display values; grey for a monochrome sensor.
+            (height, width, 3) RGB display values; gray for a monochrome sensor.
         """
 
 
@@ -44,19 +43,19 @@ class FilteredImages:
 
     def __init__(self, width: int, height: int, sensor: SensorModel) -> None:
         self._filter = HighPassFilter(width, height, sensor)
-        self._is_colored = bool(sensor.bayer_pattern)
+        self._has_color = bool(sensor.bayer_pattern)
 
     def image(self, events: EventStream) -> NDArray[np.uint8]:
         """Return the next image; see :class:`ImageSource`."""
         values = self._filter.image(events)
-        return demosaiced(values) if self._is_colored else _grey(values)
+        return demosaic(values) if self._has_color else _gray_to_rgb(values)
 
 
 class NetworkImages:
-    """Images of a network, which sees a normalised voxel grid of each batch.
+    """Images of a network, which sees a normalized voxel grid of each batch.
 
-    The events of a colour sensor go through the network five times, each time with a state of its own: the four
-    half-resolution grids of its filters, whose images give the colours, and the whole grid, which gives the lightness.
+    The events of a color sensor go through the network five times, each time with a state of its own: the four
+    half-resolution grids of its filters, whose images give the colors, and the whole grid, which gives the lightness.
 
     Args:
         network: with its weights.
@@ -64,30 +63,30 @@ class NetworkImages:
         device: that the network runs on.
     """
 
-    def __init__(self, network: ReconstructionNetwork, sensor: SensorModel, device: torch.device | str) -> None:
+    def __init__(self, network: E2VID | FireNet, sensor: SensorModel, device: torch.device | str) -> None:
         self._network = network.to(device)
-        self._is_colored = bool(sensor.bayer_pattern)
+        self._has_color = bool(sensor.bayer_pattern)
         self._device = device
         self._states: dict[str, Any] = {}
 
     def image(self, events: EventStream) -> NDArray[np.uint8]:
         """Return the next image; see :class:`ImageSource`."""
-        voxels = normalized(voxel_grid(events, NUM_BINS))
-        grey = self._run("all", voxels)
-        if not self._is_colored:
-            return _grey(grey)
-        mosaic = np.empty_like(grey)
+        voxels = normalize(voxel_grid(events, NUM_BINS))
+        gray = self._run("all", voxels)
+        if not self._has_color:
+            return _gray_to_rgb(gray)
+        mosaic = np.empty_like(gray)
         for row in range(2):
             for column in range(2):
                 mosaic[row::2, column::2] = self._run(f"{row}{column}", voxels[:, row::2, column::2])
-        return with_lightness(demosaiced(mosaic), grey)
+        return _replace_lightness(demosaic(mosaic), gray)
 
     @torch.no_grad()
     def _run(self, name: str, voxels: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Return the (height, width) image of the (bins, height, width) voxels, after those before of that name."""
+        """Return the (height, width) image of (bins, height, width) voxels that follow those of the same name."""
         height, width = voxels.shape[1:]
         lacking = [-size % self._network.multiple for size in (height, width)]
-        # Of an odd number, the authors put the larger part in front.
+        # The authors put the larger part of an odd padding in front.
         padding = [(number - number // 2, number // 2) for number in lacking]
         padded = torch.from_numpy(np.pad(voxels, [(0, 0), *padding], mode="reflect"))[None].to(self._device)
         image, self._states[name] = self._network(padded, self._states.get(name))
@@ -114,5 +113,17 @@ def images_of(
         yield int(batch.t[-1]), source.image(batch)
 
 
-def _grey(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def demosaic(mosaic: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Interpolate the (height, width, 3) RGB picture of a (height, width) RGGB mosaic linearly."""
+    return np.asarray(cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB), np.uint8)
+
+
+def _replace_lightness(picture: NDArray[np.uint8], gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Give a (height, width, 3) RGB picture the lightness (CIELAB's L) of a (height, width) gray one."""
+    lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)
+    lab[..., 0] = cv2.cvtColor(_gray_to_rgb(gray), cv2.COLOR_RGB2LAB)[..., 0]
+    return np.asarray(cv2.cvtColor(lab, cv2.COLOR_LAB2RGB), np.uint8)
+
+
+def _gray_to_rgb(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.repeat(values[..., None], 3, -1)

@@ -13,15 +13,9 @@ from torch import Tensor, nn
 
 
 class ConvLayer(nn.Module):
-    """A convolution, batch normalisation if asked for, and ReLU if asked for.
+    """A convolution, then batch normalization in place of a bias if asked for, then ReLU if asked for.
 
-    Args:
-        num_inputs: channels.
-        num_outputs: channels.
-        size: of the kernel, odd. The input is padded by half of it.
-        stride: of the convolution.
-        normalize: whether batch normalisation takes the place of the convolution's bias.
-        activate: whether ReLU follows.
+    The input is padded by half of the kernel's odd size.
     """
 
     def __init__(
@@ -34,7 +28,7 @@ class ConvLayer(nn.Module):
         self._activate = activate
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return (N, num_outputs, height / stride, width / stride) features."""
+        """Compute (N, num_outputs, height / stride, width / stride) features."""
         features = self.conv2d(features)
         if self.norm_layer is not None:
             features = self.norm_layer(features)
@@ -42,7 +36,7 @@ class ConvLayer(nn.Module):
 
 
 class TransposedConvLayer(nn.Module):
-    """A transposed convolution that doubles height and width, batch normalisation, and ReLU."""
+    """A transposed convolution that doubles height and width, batch normalization, and ReLU."""
 
     def __init__(self, num_inputs: int, num_outputs: int) -> None:
         super().__init__()
@@ -50,7 +44,7 @@ class TransposedConvLayer(nn.Module):
         self.norm_layer = nn.BatchNorm2d(num_outputs)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return (N, num_outputs, 2 height, 2 width) features."""
+        """Compute (N, num_outputs, 2 height, 2 width) features."""
         return F.relu(self.norm_layer(self.transposed_conv2d(features)))
 
 
@@ -66,7 +60,7 @@ class ResidualBlock(nn.Module):
         self.bn2 = nn.BatchNorm2d(num_channels) if normalize else nn.Identity()
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return features of the same shape."""
+        """Compute features of the same shape."""
         return F.relu(features + self.bn2(self.conv2(F.relu(self.bn1(self.conv1(features))))))
 
 
@@ -78,7 +72,7 @@ class ConvLSTM(nn.Module):
         self.Gates = nn.Conv2d(2 * num_channels, 4 * num_channels, 3, padding=1)
 
     def forward(self, features: Tensor, state: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
-        """Return the new state (hidden, cell). The hidden state is the output. None begins with zeros."""
+        """Compute the new state (hidden, cell). The hidden state is the output. None begins with zeros."""
         hidden, cell = (torch.zeros_like(features),) * 2 if state is None else state
         take, keep, show, new = self.Gates(torch.cat([features, hidden], 1)).chunk(4, 1)
         cell = keep.sigmoid() * cell + take.sigmoid() * new.tanh()
@@ -95,7 +89,7 @@ class ConvGRU(nn.Module):
         self.out_gate = nn.Conv2d(2 * num_channels, num_channels, 3, padding=1)
 
     def forward(self, features: Tensor, state: Tensor | None) -> Tensor:
-        """Return the new state, which is the output too. No state means zeros."""
+        """Compute the new state, which is the output too. None begins with zeros."""
         state = torch.zeros_like(features) if state is None else state
         both = torch.cat([features, state], 1)
         update, reset = self.update_gate(both).sigmoid(), self.reset_gate(both).sigmoid()
@@ -112,5 +106,5 @@ class Recurrent(nn.Module):
         self.recurrent_block = recurrent_block
 
     def forward(self, features: Tensor, state: Any) -> Any:
-        """Return the recurrent layer's new state."""
+        """Compute the recurrent layer's new state."""
         return self.recurrent_block(self.conv(features), state)

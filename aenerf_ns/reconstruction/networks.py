@@ -1,9 +1,12 @@
-"""E2VID's and FireNet's networks, written anew from their descriptions and their weights files' names."""
+"""E2VID's and FireNet's networks, written anew from their descriptions and their weights files' names.
+
+Both map a voxel grid and the state after the grids before to an image and the next state. Attributes are named as in
+the authors' weights files.
+"""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -13,47 +16,20 @@ NUM_BINS = 5
 """Bins of time in the voxel grids that both networks were trained on."""
 
 
-class ReconstructionNetwork(nn.Module, ABC):
-    """Maps a voxel grid and the state after the grids before to an image and the next state.
-
-    Attributes:
-        multiple: height and width of the voxel grids must be multiples of this.
-    """
-
-    multiple: ClassVar[int]
-
-    @abstractmethod
-    def forward(self, voxels: Tensor, state: Any) -> tuple[Tensor, Any]:
-        """Return an image and the state after it.
-
-        Args:
-            voxels: (N, 5, height, width) normalised voxel grids.
-            state: after the grids before; None at the start.
-
-        Returns:
-            (N, 1, height, width) display values, in [0, 1] or about, and the state.
-        """
-
-
-class E2VID(ReconstructionNetwork):
+class E2VID(nn.Module):
     """The network of the weights file E2VID_lightweight.pth.tar (Rebecq et al., TPAMI 2021).
 
     A recurrent U-net: three encoders with a convolutional LSTM each, two residual blocks, and three decoders. Skip
     connections add features up.
+
+    Attributes:
+        name_in_file: under which the weights file has the network.
+        multiple: height and width of the voxel grids must be multiples of this.
     """
 
+    name_in_file = "unetrecurrent"
     multiple = 8
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.unetrecurrent = _RecurrentUNet()
-
-    def forward(self, voxels: Tensor, state: Any) -> tuple[Tensor, Any]:
-        """Return the image, in [0, 1], and the three encoders' states; see :class:`ReconstructionNetwork`."""
-        return self.unetrecurrent(voxels, state)
-
-
-class _RecurrentUNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         sizes = [(32, 64), (64, 128), (128, 256)]
@@ -66,6 +42,15 @@ class _RecurrentUNet(nn.Module):
         self.pred = ConvLayer(32, 1, 1, normalize=True, activate=False)
 
     def forward(self, voxels: Tensor, state: Any) -> tuple[Tensor, Any]:
+        """Reconstruct an image.
+
+        Args:
+            voxels: (N, 5, height, width) normalized voxel grids.
+            state: of the encoders after the grids before; None at the start.
+
+        Returns:
+            (N, 1, height, width) display values in [0, 1], and the state.
+        """
         features = self.head(voxels)
         skipped, states = [features], []
         for encoder, before in zip(self.encoders, state or [None] * len(self.encoders), strict=True):
@@ -79,25 +64,20 @@ class _RecurrentUNet(nn.Module):
         return self.pred(features + skipped.pop()).sigmoid(), states
 
 
-class FireNet(ReconstructionNetwork):
+class FireNet(nn.Module):
     """The network of the weights file firenet_1000.pth.tar (Scheerlinck et al., WACV 2020).
 
     A convolution and two residual blocks of 16 channels at full resolution. A convolutional GRU follows the convolution
     and the first block.
+
+    Attributes:
+        name_in_file: see :class:`E2VID`.
+        multiple: see :class:`E2VID`.
     """
 
+    name_in_file = "net"
     multiple = 1
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = _FireLayers()
-
-    def forward(self, voxels: Tensor, state: Any) -> tuple[Tensor, Any]:
-        """Return the image, about in [0, 1], and the two units' states; see :class:`ReconstructionNetwork`."""
-        return self.net(voxels, state)
-
-
-class _FireLayers(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.head = Recurrent(ConvLayer(NUM_BINS, 16, 3), ConvGRU(16))
@@ -107,6 +87,7 @@ class _FireLayers(nn.Module):
         self.pred = ConvLayer(16, 1, 1, activate=False)
 
     def forward(self, voxels: Tensor, state: Any) -> tuple[Tensor, Any]:
+        """Reconstruct an image, whose values are in [0, 1] or about; see :meth:`E2VID.forward`."""
         first, second = self.resblocks
         before = state or (None, None)
         features = self.head(voxels, before[0])

@@ -9,7 +9,7 @@ from aenerf_ns.events.stream import EventStream
 
 
 def voxel_grid(events: EventStream, num_bins: int) -> NDArray[np.float32]:
-    """Return the polarities of events, added up over pixels and over bins of time.
+    """Add up the polarities of events over pixels and over bins of time.
 
     The first event is at the first bin and the last event at the last bin. In between, each polarity is shared between
     the two nearest bins, linearly in time (Rebecq et al., "High Speed and High Dynamic Range Video with an Event
@@ -25,18 +25,18 @@ def voxel_grid(events: EventStream, num_bins: int) -> NDArray[np.float32]:
     grid = np.zeros((num_bins, events.height, events.width))
     elapsed = (events.t - events.t[0]).astype(np.float64)
     # Events that are all of one time are in the first bin.
-    place = (num_bins - 1) * elapsed / max(elapsed[-1], 1.0)
-    lower = np.minimum(place.astype(np.int64), num_bins - 2)
-    share = place - lower
+    position = (num_bins - 1) * elapsed / max(elapsed[-1], 1.0)
+    lower = np.minimum(position.astype(np.int64), num_bins - 2)
+    share = position - lower
     np.add.at(grid, (lower, events.y, events.x), events.p * (1 - share))
     np.add.at(grid, (lower + 1, events.y, events.x), events.p * share)
     return grid.astype(np.float32)
 
 
-def normalized(grid: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a voxel grid whose values other than zero have mean 0 and standard deviation 1; zeros stay zero.
+def normalize(grid: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Bring the values of a voxel grid other than zero to mean 0 and standard deviation 1; zeros stay zero.
 
-    If those values are all alike, which have no deviation, only the mean is taken from them.
+    Values that are all equal have no deviation: only the mean is subtracted from them.
     """
     active = grid != 0
     if not active.any():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from aenerf_ns.errors import DataError, reading
 
 if TYPE_CHECKING:
-    from aenerf_ns.reconstruction.networks import ReconstructionNetwork
+    from aenerf_ns.reconstruction.networks import E2VID, FireNet
 
 NetworkName = Literal["e2vid", "firenet"]
 
@@ -22,7 +22,7 @@ _WHERE = {
 
 
 def require_weights(name: NetworkName, weights: Path | None) -> Path:
-    """Return the weights file of a network, or raise a DataError if none is given or there is no such file."""
+    """Return the weights file of a network, and raise a DataError if none is given or there is no such file."""
     if weights is None:
         raise DataError(f"--method {name}", "no weights are given", _remedy(name))
     with reading(weights):
@@ -35,8 +35,8 @@ def _remedy(name: NetworkName) -> str:
     return f"{_WHERE[name]}, and give it with --weights"
 
 
-def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwork:
-    """Return a network with the weights of a file, ready for inference on the CPU.
+def load_network(name: NetworkName, weights: Path | None) -> E2VID | FireNet:
+    """Load a network with the weights of a file, ready for inference on the CPU.
 
     Nothing in the file is executed. Every parameter of the network must be in it, and no other.
 
@@ -52,7 +52,6 @@ def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwo
 
     from aenerf_ns.reconstruction.networks import E2VID, FireNet
 
-    networks: dict[NetworkName, type[ReconstructionNetwork]] = {"e2vid": E2VID, "firenet": FireNet}
     weights, remedy = require_weights(name, weights), _remedy(name)
     try:
         with warnings.catch_warnings():
@@ -65,9 +64,9 @@ def load_network(name: NetworkName, weights: Path | None) -> ReconstructionNetwo
     state = content.get("state_dict") if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
         raise DataError(weights, "it holds no state_dict", remedy)
-    network = networks[name]()
+    network = E2VID() if name == "e2vid" else FireNet()
     try:
-        network.load_state_dict(state, strict=True)
+        torch.nn.ModuleDict({network.name_in_file: network}).load_state_dict(state, strict=True)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines()]
         raise DataError(weights, f"its weights are not {name}'s ({' '.join(lines)})", remedy) from None

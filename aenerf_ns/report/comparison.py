@@ -13,7 +13,7 @@ from aenerf_ns.report.measuring import RunReport
 
 
 def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> list[dict[str, Any]]:
-    """Return how the metrics of each later run differ from the first run's on the same views.
+    """Compare the metrics of each later run with the first run's on the same views.
 
     Args:
         reports: of the runs.
@@ -53,13 +53,13 @@ def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> l
 
 
 def views_left_out(reports: Sequence[RunReport], shared: Sequence[str]) -> dict[str, list[str]]:
-    """Return the files of the views that are not in all runs, by the name of the run, where there are any."""
+    """Return the files of the views that are not in all runs, by the name of the run; runs with none are left out."""
     left_out = {report.name: [v["file"] for v in report.views if v["file"] not in set(shared)] for report in reports}
     return {name: files for name, files in left_out.items() if files}
 
 
 def confidence_interval(values: np.ndarray) -> tuple[float, float] | None:
-    """Return the 95 % confidence interval of the mean of (N,) values by Student's t, None with fewer than two.
+    """Compute the 95 % confidence interval of the mean of (N,) values by Student's t, None with fewer than two.
 
     Example:
         >>> low, high = confidence_interval(np.array([1.0, 2.0, 3.0]))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.supervision.event_pairs import PairSampler, PairSupervision
@@ -16,22 +18,43 @@ _LENGTHS = (1, 2, 4, 8, 16, 32, 64, 255)
 # Tiles along the longer side of the sensor, and bins of the histogram along each axis.
 _TILES, _BINS = 12, 60
 # Share of pairs that may lie beyond either end of the histogram.
-_BEYOND = 0.005
-# Fewer pairs say little of a tile or a class.
-_LEAST = 10
+_MAX_BEYOND = 0.005
+# Fewer pairs say little about a tile or a class.
+_MIN_PAIRS = 10
+
+
+@dataclass(frozen=True)
+class PairResiduals:
+    """Rendered changes of pairs of events beside the measured ones, in units of the mean contrast threshold.
+
+    Attributes:
+        num_pairs: pairs that were compared.
+        edges: of the histogram's bins, alike along both axes.
+        histogram: number of pairs by bin of the rendered change, then of the measured change.
+        correlation: of rendered and measured changes.
+        mean_residual: mean absolute difference.
+        by_length: ``mean_residual`` and ``num_pairs`` of classes of pairs by their number of ``events``.
+        by_tile: rows of the mean absolute differences in tiles of the sensor, None where there are too few pairs.
+    """
+
+    num_pairs: int
+    edges: list[float]
+    histogram: list[list[int]]
+    correlation: float
+    mean_residual: float
+    by_length: list[dict[str, Any]]
+    by_tile: list[list[float | None]]
 
 
 @torch.no_grad()
-def pair_residuals(run: TrainedRun) -> dict[str, Any] | None:
+def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
     """Render newly drawn pairs that end at events, the same in every call, and compare their changes.
 
     Args:
         run: in evaluation mode. Its events are there.
 
     Returns:
-        In units of the mean contrast threshold: a ``histogram`` of rendered against measured changes with its
-        ``edges``, their ``correlation``, the mean absolute residual ``by_length`` (events of a pair) and ``by_tile``,
-        None where there are too few pairs. None for a run whose batches are no pairs.
+        The comparison; None for a run whose batches are not pairs.
     """
     sampler, supervision = run.sampler, run.model.supervision
     if not isinstance(sampler, PairSampler) or not isinstance(supervision, PairSupervision):
@@ -55,42 +78,49 @@ def pair_residuals(run: TrainedRun) -> dict[str, Any] | None:
     pixel = batch["pixel"].cpu().numpy()[at_events]
     rendered, measured = rendered[at_events], measured[at_events]
     residual = np.abs(rendered - measured)
-    return {
-        "num_pairs": len(residual),
-        **_histogram(measured, rendered),
-        "correlation": float(np.corrcoef(measured, rendered)[0, 1]),
-        "mean_residual": float(residual.mean()),
-        "by_length": _by_length(length, residual),
-        "by_tile": _by_tile(pixel, residual, run.scene.event_camera),
-    }
+    edges, histogram = _histogram(measured, rendered)
+    camera = run.scene.event_camera
+    return PairResiduals(
+        num_pairs=len(residual),
+        edges=edges,
+        histogram=histogram,
+        correlation=float(np.corrcoef(measured, rendered)[0, 1]),
+        mean_residual=float(residual.mean()),
+        by_length=average_by_length(length, residual),
+        by_tile=average_by_tile(pixel, residual, camera.width, camera.height),
+    )
 
 
-def _histogram(measured: np.ndarray, rendered: np.ndarray) -> dict[str, Any]:
+def _histogram(measured: NDArray[np.float64], rendered: NDArray[np.float64]) -> tuple[list[float], list[list[int]]]:
     both = np.concatenate([measured, rendered])
-    end = float(np.abs(np.quantile(both, [_BEYOND, 1 - _BEYOND])).max())
+    end = float(np.abs(np.quantile(both, [_MAX_BEYOND, 1 - _MAX_BEYOND])).max())
     edges = np.linspace(-end, end, _BINS + 1)
     ends = [(-end, end), (-end, end)]
     counts, _, _ = np.histogram2d(np.clip(rendered, -end, end), np.clip(measured, -end, end), bins=_BINS, range=ends)
-    return {"edges": edges.tolist(), "histogram": counts.astype(int).tolist()}
+    return edges.tolist(), counts.astype(int).tolist()
 
 
-def _by_length(length: np.ndarray, residual: np.ndarray) -> list[dict[str, Any]]:
+def average_by_length(length: NDArray[np.floating], residual: NDArray[np.float64]) -> list[dict[str, Any]]:
+    """Average the (N,) residuals of pairs in classes by the (N,) numbers of their events."""
     classes, low = [], 1
     for high in _LENGTHS:
         chosen = residual[(length >= low) & (length <= high)]
-        if len(chosen) >= _LEAST:
+        if len(chosen) >= _MIN_PAIRS:
             name = str(low) if low == high else f"{low} to {high}"
             classes.append({"events": name, "num_pairs": len(chosen), "mean_residual": float(chosen.mean())})
         low = high + 1
     return classes
 
 
-def _by_tile(pixel: np.ndarray, residual: np.ndarray, camera: Any) -> list[list[float | None]]:
-    side = max(camera.width, camera.height) / _TILES
-    shape = (int(np.ceil(camera.height / side)), int(np.ceil(camera.width / side)))
-    rows, columns = np.divmod(pixel, camera.width)
+def average_by_tile(
+    pixel: NDArray[np.int64], residual: NDArray[np.float64], width: int, height: int
+) -> list[list[float | None]]:
+    """Average the (N,) residuals of pairs in tiles of the sensor by their (N,) pixels, counted row by row."""
+    side = max(width, height) / _TILES
+    shape = (int(np.ceil(height / side)), int(np.ceil(width / side)))
+    rows, columns = np.divmod(pixel, width)
     tile = (rows // side).astype(int) * shape[1] + (columns // side).astype(int)
     counts = np.bincount(tile, minlength=shape[0] * shape[1])
     sums = np.bincount(tile, residual, minlength=shape[0] * shape[1])
-    means = [float(total / count) if count >= _LEAST else None for total, count in zip(sums, counts, strict=True)]
+    means = [float(total / count) if count >= _MIN_PAIRS else None for total, count in zip(sums, counts, strict=True)]
     return [means[row * shape[1] : (row + 1) * shape[1]] for row in range(shape[0])]

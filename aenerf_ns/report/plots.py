@@ -9,13 +9,14 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from aenerf_ns.report.measuring import RunReport
+from aenerf_ns.report.measuring import DataReport, RunReport
+from aenerf_ns.report.pair_residuals import PairResiduals
 
-# One for each run, and dashes for what a run began with and what is true.
+# Colors of the runs and of true poses.
 _COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf")
 _TRUE = "#999999"
 # A loss that vanishes for some steps must not press the rest of its curve together.
-_MOST_DECADES = 5
+_MAX_DECADES = 5
 
 # Panels of the curves: the scalar's name, its title, and whether the axis is logarithmic.
 _CURVES = (
@@ -37,12 +38,12 @@ _CURVES = (
 
 
 def color(index: int) -> str:
-    """Return the colour of a run."""
+    """Return the color of a run."""
     return _COLORS[index % len(_COLORS)]
 
 
 def curves(reports: Sequence[RunReport]) -> go.Figure | None:
-    """Return the logged losses and figures over the steps, or None where no run kept any."""
+    """Plot the logged losses and figures over the steps; None where no run kept any."""
     kept = [report.scalars or {} for report in reports]
     panels = [panel for panel in _CURVES if any(panel[0] in scalars for scalars in kept)]
     if not panels:
@@ -69,7 +70,7 @@ def curves(reports: Sequence[RunReport]) -> go.Figure | None:
     last = max(steps[-1] for scalars in kept for steps, _ in scalars.values())
     figure.update_xaxes(range=[0, last])
     figure.update_xaxes(title_text="step", row=rows)
-    return _styled(figure, 210 * rows + 60)
+    return _style(figure, 210 * rows + 60)
 
 
 def _decades(values: Sequence[float]) -> list[float] | None:
@@ -77,25 +78,24 @@ def _decades(values: Sequence[float]) -> list[float] | None:
     if not values:
         return None
     low, high = np.log10([min(values), max(values)])
-    margin = 0.05 * (min(high - low, _MOST_DECADES) + 0.1)
-    return [max(low, high - _MOST_DECADES) - margin, high + margin]
+    margin = 0.05 * (min(high - low, _MAX_DECADES) + 0.1)
+    return [max(low, high - _MAX_DECADES) - margin, high + margin]
 
 
-def event_rate(report: RunReport) -> go.Figure:
-    """Return the rate of the events over time, with the gaps of the poses."""
-    data = report.data
-    start, end = data["start_ns"] * 1e-9, data["end_ns"] * 1e-9
-    rate = data["rate"]
+def event_rate(data: DataReport) -> go.Figure:
+    """Plot the rate of the events over time, with the gaps of the poses."""
+    assert data.events is not None
+    start, end, rate = data.events.start_ns * 1e-9, data.events.end_ns * 1e-9, data.events.rate
     times = np.linspace(start, end, len(rate), endpoint=False) + (end - start) / len(rate) / 2
     figure = go.Figure(go.Bar(x=times, y=rate, marker_color=color(0), width=(end - start) / len(rate)))
-    for first, last in data["pose_gaps_ns"]:
+    for first, last in data.pose_gaps_ns:
         figure.add_vrect(first * 1e-9, last * 1e-9, fillcolor="#d62728", opacity=0.2, line_width=0)
     figure.update_layout(xaxis_title="time (s), clock of the events", yaxis_title="events a second", bargap=0)
-    return _styled(figure, 260)
+    return _style(figure, 260)
 
 
 def trajectory(reports: Sequence[RunReport]) -> go.Figure:
-    """Return the trajectories from above and from the side, in units of the recording."""
+    """Plot the trajectories from above and from the side, in units of the recording."""
     figure = make_subplots(1, 2, subplot_titles=("from above", "from the side"))
     for column, (across, up) in enumerate(((0, 1), (0, 2)), start=1):
         for run, report in enumerate(reports):
@@ -108,11 +108,11 @@ def trajectory(reports: Sequence[RunReport]) -> go.Figure:
                 )  # fmt: skip
         figure.update_xaxes(title_text="x", row=1, col=column)
         figure.update_yaxes(title_text="xyz"[up], scaleanchor=f"x{column if column > 1 else ''}", row=1, col=column)
-    return _styled(figure, 460)
+    return _style(figure, 460)
 
 
 def _paths(report: RunReport, first: bool) -> list[tuple[str, Any]]:
-    positions = report.poses["positions"]
+    positions = report.poses.positions
     # All runs of a comparison may have the same true poses.
     shown = [(name, points) for name, points in positions.items() if first or name != "true"]
     # Below the others.
@@ -126,51 +126,49 @@ def _line(name: str, run: int) -> dict[str, Any]:
 
 
 def pose_errors(reports: Sequence[RunReport]) -> go.Figure | None:
-    """Return rotation and translation errors over time, or None where no true poses are known."""
-    known = [(run, report) for run, report in enumerate(reports) if report.poses["errors"]]
+    """Plot rotation and translation errors over time; None where no true poses are known."""
+    known = [(run, report) for run, report in enumerate(reports) if report.poses.errors]
     if not known:
         return None
     titles = {"rotation_degrees": "rotation error (degrees)", "translation": "translation error (recording units)"}
     figure = make_subplots(2, 1, subplot_titles=list(titles.values()), shared_xaxes=True, vertical_spacing=0.12)
     for row, kind in enumerate(titles, start=1):
         for run, report in known:
-            for name, errors in report.poses["errors"].items():
+            for name, errors in report.poses.errors.items():
                 figure.add_scatter(
-                    x=report.poses["seconds"], y=errors[kind], mode="lines", line=_line(name, run),
+                    x=report.poses.seconds, y=errors[kind], mode="lines", line=_line(name, run),
                     name=name if len(reports) == 1 else f"{name}, {report.name}", legendgroup=f"{report.name}{name}",
                     showlegend=row == 1, row=row, col=1,
                 )  # fmt: skip
     figure.update_xaxes(title_text="seconds since the start of the trajectory", row=2)
     figure.update_yaxes(rangemode="tozero")
-    return _styled(figure, 480)
+    return _style(figure, 480)
 
 
 def correction(reports: Sequence[RunReport]) -> go.Figure | None:
-    """Return the six components of the correction ψ over time, or None where no run corrects poses."""
-    known = [(run, report) for run, report in enumerate(reports) if report.poses["correction"]]
+    """Plot the six components of the correction ψ over time; None where no run corrects poses."""
+    known = [(run, report) for run, report in enumerate(reports) if report.poses.correction]
     if not known:
         return None
-    names = list(known[0][1].poses["correction"])
+    names = list(known[0][1].poses.correction)
     titles = [f"{name} ({'degrees' if 'rotation' in name else 'recording units'})" for name in names]
     figure = make_subplots(2, 3, subplot_titles=titles, shared_xaxes=True, vertical_spacing=0.14)
     for index, name in enumerate(names):
         for run, report in known:
             figure.add_scatter(
-                x=report.poses["seconds"], y=report.poses["correction"][name], mode="lines", line_color=color(run),
+                x=report.poses.seconds, y=report.poses.correction[name], mode="lines", line_color=color(run),
                 name=report.name, legendgroup=report.name, showlegend=len(known) > 1 and index == 0,
                 row=index // 3 + 1, col=index % 3 + 1,
             )  # fmt: skip
     figure.update_xaxes(title_text="seconds", row=2)
-    return _styled(figure, 440)
+    return _style(figure, 440)
 
 
-def changes(report: RunReport) -> go.Figure:
-    """Return the 2-D histogram of rendered against measured changes."""
-    pairs = report.pairs
-    assert pairs is not None
-    edges = np.array(pairs["edges"])
+def changes(pairs: PairResiduals) -> go.Figure:
+    """Plot the 2-D histogram of rendered against measured changes."""
+    edges = np.array(pairs.edges)
     middles = (edges[1:] + edges[:-1]) / 2
-    counts = np.array(pairs["histogram"])
+    counts = np.array(pairs.histogram)
     # Nothing is drawn where there are no pairs.
     shown = [[float(np.log10(count)) if count else None for count in row] for row in counts]
     figure = go.Figure(
@@ -186,15 +184,15 @@ def changes(report: RunReport) -> go.Figure:
     )
     figure.update_yaxes(scaleanchor="x", constrain="domain")
     figure.update_xaxes(constrain="domain")
-    return _styled(figure, 440)
+    return _style(figure, 440)
 
 
 def residual_by_length(reports: Sequence[RunReport]) -> go.Figure:
-    """Return the mean absolute residual by the number of events of a pair."""
+    """Plot the mean absolute residual by the number of events of a pair."""
     figure = go.Figure()
     for run, report in enumerate(reports):
         if report.pairs is not None:
-            rows = report.pairs["by_length"]
+            rows = report.pairs.by_length
             figure.add_bar(
                 x=[row["events"] for row in rows], y=[row["mean_residual"] for row in rows], name=report.name,
                 marker_color=color(run), customdata=[row["num_pairs"] for row in rows],
@@ -204,13 +202,12 @@ def residual_by_length(reports: Sequence[RunReport]) -> go.Figure:
         xaxis={"title": "events of a pair", "type": "category"}, yaxis_title="mean |rendered − measured| (thresholds)",
         showlegend=len(reports) > 1,
     )  # fmt: skip
-    return _styled(figure, 440)
+    return _style(figure, 440)
 
 
-def residual_by_tile(report: RunReport) -> go.Figure:
-    """Return the mean absolute residual by tile of the sensor."""
-    assert report.pairs is not None
-    tiles = report.pairs["by_tile"]
+def residual_by_tile(pairs: PairResiduals) -> go.Figure:
+    """Plot the mean absolute residual by tile of the sensor."""
+    tiles = pairs.by_tile
     highest = max((value for row in tiles for value in row if value is not None), default=1.0)
     figure = go.Figure(
         go.Heatmap(
@@ -220,10 +217,10 @@ def residual_by_tile(report: RunReport) -> go.Figure:
     )  # fmt: skip
     figure.update_yaxes(autorange="reversed", scaleanchor="x", constrain="domain", showticklabels=False)
     figure.update_xaxes(constrain="domain", showticklabels=False)
-    return _styled(figure, 440)
+    return _style(figure, 440)
 
 
-def _styled(figure: go.Figure, height: int) -> go.Figure:
+def _style(figure: go.Figure, height: int) -> go.Figure:
     top, bottom = 40, 70
     figure.update_layout(
         height=height, template="plotly_white", margin={"l": 60, "r": 20, "t": top, "b": bottom}, font={"size": 12},

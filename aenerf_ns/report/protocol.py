@@ -1,4 +1,4 @@
-"""How runs are measured, which is known before anything is measured, and which views all runs have."""
+"""How runs are measured, which is known before anything is measured; and which views all runs have."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Protocol:
     """How a run is measured.
 
     Attributes:
-        color_correction: how the colours of the renderings are corrected.
+        color_correction: how the colors of the renderings are corrected.
         test_poses: how the test cameras are placed.
         truths: a checksum of each test view's image, by the view's file.
     """

@@ -17,9 +17,9 @@ from aenerf_ns.progress import progress_bar
 
 ERROR_RANGE = 0.25
 """The mean absolute difference of display values in [0, 1] that an error picture shows brightest."""
-# Of a depth picture's range: the share of the pixels that may lie beyond either end.
-_BEYOND = 0.02
-_MOST_CHOSEN = 9
+# Share of the pixels of a depth picture that may lie beyond either end of its range.
+_MAX_BEYOND = 0.02
+_MAX_CHOSEN = 9
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class ViewPictures:
 
     Attributes:
         truth, rendering, error, depth: of one size. The error is black at 0 and brightest at :data:`ERROR_RANGE`.
-        depth_range: the nearest and the farthest distance that the colours of the depth tell apart, in units of the
+        depth_range: the nearest and the farthest distance that the colors of the depth tell apart, in units of the
             recording.
     """
 
@@ -39,21 +39,21 @@ class ViewPictures:
     depth_range: tuple[float, float]
 
 
-def chosen_views(psnr: Sequence[float]) -> dict[int, str]:
-    """Return the views to show and why, by index: the worst, the median and the best one, and every n-th.
+def choose_views(psnr: Sequence[float]) -> dict[int, str]:
+    """Choose the views to show, and say why, by index: the worst, the median and the best one, and every n-th.
 
     Args:
         psnr: of each view.
 
     Example:
-        >>> chosen_views([20.0, 22.0, 21.0])
+        >>> choose_views([20.0, 22.0, 21.0])
         {0: 'worst', 2: 'median', 1: 'best'}
     """
     order = np.argsort(psnr, kind="stable")
     chosen = {int(order[0]): "worst"}
     chosen.setdefault(int(order[len(order) // 2]), "median")
     chosen.setdefault(int(order[-1]), "best")
-    every = -(-len(order) // (_MOST_CHOSEN - len(chosen)))
+    every = -(-len(order) // (_MAX_CHOSEN - len(chosen)))
     ordinal = f"every {every}th" if every > 3 else {1: "all", 2: "every second", 3: "every third"}[every]
     for index in range(0, len(order), every):
         chosen.setdefault(index, ordinal)
@@ -70,7 +70,7 @@ def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPic
 
     Returns:
         The pictures of each view; and the contrast of each channel over all pixels of these views: the standard
-        deviation of the rendered log-radiance, before colour correction, as a share of that of the images.
+        deviation of the rendered log-radiance, before color correction, as a share of that of the images.
     """
     model, dataset = run.model, run.views
     scale = run.scene.scale
@@ -82,7 +82,7 @@ def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPic
             image = dataset.get_image_float32(index).to(run.device)
             pictures.append(_pictures(outputs, model.reference_display(image), scale))
             rendered.append(outputs["log_radiance"].flatten(0, 1).double())
-            # As the colour correction is fitted.
+            # The color correction is fitted to the same values.
             true.append(torch.log(model.reference_radiance(image).flatten(0, 1).double() + 1e-3))
             progress.advance(task)
     contrast = torch.cat(rendered).std(0) / torch.cat(true).std(0).clamp_min(1e-9)
@@ -93,7 +93,9 @@ def _pictures(outputs: dict[str, Any], truth: torch.Tensor, scale: float) -> Vie
     rendering, depth = outputs["rgb"], outputs["depth"] / scale
     error = (rendering - truth).abs().mean(-1, keepdim=True)
     seen = depth[outputs["accumulation"] > 0.5]
-    near, far = torch.quantile(seen, seen.new_tensor([_BEYOND, 1 - _BEYOND])).tolist() if len(seen) else (0.0, 1.0)
+    near, far = (
+        torch.quantile(seen, seen.new_tensor([_MAX_BEYOND, 1 - _MAX_BEYOND])).tolist() if len(seen) else (0.0, 1.0)
+    )
     return ViewPictures(
         to_image(truth),
         to_image(rendering),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -24,11 +25,17 @@ def make_frames(count: int) -> list[NDArray[np.uint8]]:
 
 
 def write_video(path: Path, frames: list[NDArray[np.uint8]], frame_rate: float = 30.0) -> Path:
-    """Writes a lossless video."""
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), frame_rate, (WIDTH, HEIGHT))
+    """Write a lossless video.
+
+    Not by OpenCV, whose ffmpeg prints errors for good if its first use in a process is not silent.
+    """
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (WIDTH, HEIGHT), fps=frame_rate, codec="ffv1", pix_fmt_out="bgr0", macro_block_size=1
+    )
+    writer.send(None)
     for frame in frames:
-        writer.write(frame[..., ::-1])
-    writer.release()
+        writer.send(np.ascontiguousarray(frame))
+    writer.close()
     return path
 
 

@@ -8,7 +8,7 @@ from helpers.streams import make_stream
 
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.reconstruction.batches import batches_of
-from aenerf_ns.reconstruction.voxels import normalized, voxel_grid
+from aenerf_ns.reconstruction.voxels import normalize, voxel_grid
 
 EPOCH = 1_600_000_000_000_000_000
 
@@ -19,7 +19,7 @@ def test_the_worked_case() -> None:
     grid = voxel_grid(events, 5)
     assert grid.shape == (5, 3, 4)
     np.testing.assert_allclose(grid[:, 1, 2], [1, -0.8, 0.8, 0, -1], atol=1e-6)
-    found = normalized(grid)
+    found = normalize(grid)
     np.testing.assert_allclose(found[:, 1, 2], [1.10432, -0.88345, 0.88345, 0, -1.10432], atol=5e-6)
     assert np.count_nonzero(grid) == np.count_nonzero(found) == 4
 
@@ -35,7 +35,7 @@ def test_a_grid_holds_all_polarities_of_its_pixels() -> None:
         expected[y, x] += p
     grid = voxel_grid(make_stream(rows), 5)
     np.testing.assert_allclose(grid.sum(0), expected, atol=1e-5)
-    active = normalized(grid)[grid != 0].astype(np.float64)
+    active = normalize(grid)[grid != 0].astype(np.float64)
     assert active.mean() == pytest.approx(0, abs=1e-6)
     assert active.std() == pytest.approx(1, abs=1e-6)
 
@@ -44,8 +44,8 @@ def test_events_of_one_time_and_alike_values_stay_finite() -> None:
     grid = voxel_grid(make_stream([(0, 0, EPOCH, 1), (1, 2, EPOCH, 1)]), 5)
     assert grid[0, 0, 0] == grid[0, 2, 1] == 1
     assert np.abs(grid).sum() == 2
-    np.testing.assert_array_equal(normalized(grid), np.zeros_like(grid))
-    np.testing.assert_array_equal(normalized(np.zeros_like(grid)), np.zeros_like(grid))
+    np.testing.assert_array_equal(normalize(grid), np.zeros_like(grid))
+    np.testing.assert_array_equal(normalize(np.zeros_like(grid)), np.zeros_like(grid))
 
 
 @pytest.mark.parametrize("lengths", [[23], [1] * 23, [5, 0, 11, 7], [7, 7, 7, 2]])

@@ -6,6 +6,7 @@ import csv
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -21,13 +22,13 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.report.comparison import confidence_interval, paired_differences, views_left_out
-from aenerf_ns.report.measuring import RunReport
-from aenerf_ns.report.pair_residuals import _by_length, _by_tile
-from aenerf_ns.report.poses import measure_poses
+from aenerf_ns.report.measuring import DataReport, RunReport
+from aenerf_ns.report.pair_residuals import average_by_length, average_by_tile
+from aenerf_ns.report.poses import RunPoses, measure_poses
 from aenerf_ns.report.protocol import Protocol, protocol_differences, shared_views
-from aenerf_ns.report.run_files import describe_state, read_record, read_scalars
-from aenerf_ns.report.trajectory_errors import as_evo_prints, correction_components
-from aenerf_ns.report.view_pictures import chosen_views
+from aenerf_ns.report.run_files import TrainingRecord, read_record, read_scalars
+from aenerf_ns.report.trajectory_errors import correction_components, evo_errors
+from aenerf_ns.report.view_pictures import choose_views
 
 SECOND = 10**9
 
@@ -40,7 +41,7 @@ def test_errors_are_those_that_evo_prints(random_poses: torch.Tensor) -> None:
     reference = Trajectory(times, Trajectory(SECOND * np.arange(8), random_poses).interpolate(times))
     poses = perturb(reference, rotation_degrees=3.0, translation=0.2, correlation_time=0.3, seed=1).camera_to_worlds
     poses[..., 3] *= 1.7
-    found = as_evo_prints(poses, reference.camera_to_worlds)
+    found = evo_errors(poses, reference.camera_to_worlds)
     paths = [
         PosePath3D(
             positions_xyz=p[..., 3].numpy(),
@@ -71,19 +72,16 @@ def test_a_correction_is_told_by_its_components(random_poses: torch.Tensor) -> N
 def test_residuals_are_grouped_by_length_and_tile() -> None:
     length = np.array([1] * 20 + [3] * 20 + [100] * 5)
     residual = np.arange(45.0)
-    rows = _by_length(length, residual)
+    rows = average_by_length(length, residual)
     # Five pairs say too little.
     assert rows == [
         {"events": "1", "num_pairs": 20, "mean_residual": 9.5},
         {"events": "3 to 4", "num_pairs": 20, "mean_residual": 29.5},
     ]
 
-    class Sensor:
-        width, height = 24, 12
-
     # Tiles of two pixels: the last one on the sensor, and one beside the first.
     pixel = np.array([24 * 12 - 1] * 10 + [2] * 10)
-    tiles = _by_tile(pixel, np.array([1.0] * 10 + [3.0] * 10), Sensor)
+    tiles = average_by_tile(pixel, np.array([1.0] * 10 + [3.0] * 10), 24, 12)
     assert (len(tiles), len(tiles[0])) == (6, 12)
     assert tiles[5][11] == 1.0
     assert tiles[0][1] == 3.0
@@ -91,12 +89,12 @@ def test_residuals_are_grouped_by_length_and_tile() -> None:
 
 
 def test_the_worst_the_median_and_the_best_view_are_shown() -> None:
-    chosen = chosen_views([20.0 + index % 7 for index in range(30)])
+    chosen = choose_views([20.0 + index % 7 for index in range(30)])
     assert [chosen[index] for index in (0, 27)] == ["worst", "best"]
     assert list(chosen.values()).count("median") == 1
     assert len(chosen) <= 9
     assert set(chosen.values()) == {"worst", "median", "best", "every 5th"}
-    assert chosen_views([20.0]) == {0: "worst"}
+    assert choose_views([20.0]) == {0: "worst"}
 
 
 def test_errors_are_those_of_evo_over_all_poses_of_the_files(random_poses: torch.Tensor, tmp_path: Path) -> None:
@@ -114,10 +112,8 @@ def test_errors_are_those_of_evo_over_all_poses_of_the_files(random_poses: torch
         writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 7 * SECOND, -1)], 6, 4))
         writer.add_trajectories(given, true)
     found = measure_poses(make_pipeline(tmp_path / "data", "test").trained_run())
-    assert found["num_poses"] == 2501
-    assert all(
-        len(found["errors"]["estimated"][kind]) == len(found["seconds"]) == 501 for kind in found["errors"]["estimated"]
-    )
+    assert found.num_poses == 2501
+    assert all(len(found.errors["estimated"][kind]) == len(found.seconds) == 501 for kind in found.errors["estimated"])
     paths = sync.associate_trajectories(
         *(
             read_tum_trajectory_file(tmp_path / "data" / f"trajectory_{name}.txt")
@@ -133,12 +129,13 @@ def test_errors_are_those_of_evo_over_all_poses_of_the_files(random_poses: torch
         metric.process_data(paths)
         expected = metric.get_all_statistics()
         # The scene's transform is of float32.
-        assert found["evo"]["estimated"][name] == pytest.approx(expected, rel=1e-4, abs=1e-5 * expected["max"]), name
+        assert found.evo["estimated"][name] == pytest.approx(expected, rel=1e-4, abs=1e-5 * expected["max"]), name
 
 
 def report_of(name: str, psnr: list[float]) -> RunReport:
     views = [{"file": f"{index}.png", "placed": {"psnr": value}} for index, value in enumerate(psnr)]
-    return RunReport(name, Path(name), {}, evaluation={"views": views})
+    poses = RunPoses(0, [], {}, [], [], None, None, None)
+    return RunReport(name, Path(name), {}, None, None, DataReport([]), poses, evaluation={"views": views})
 
 
 def test_differences_are_paired_by_the_views_files() -> None:
@@ -174,17 +171,19 @@ def test_protocols_that_differ_are_named() -> None:
 def test_what_a_run_wrote_is_read_back(tmp_path: Path) -> None:
     folder = train_small_model(tmp_path, "run", 3).base_dir
     record, scalars = read_record(folder), read_scalars(folder)
-    assert describe_state(record) == "finished: all 3 steps"
+    assert record is not None
+    assert record.describe_state() == "finished: all 3 steps"
     assert scalars is not None
     steps, values = scalars["Train Loss Dict/reconstruction_loss"]
     assert steps == [0]
     assert values[0] > 0
     # A run of an earlier version has neither.
     assert read_record(tmp_path) is read_scalars(tmp_path) is None
-    assert "earlier version" in describe_state(None)
+    written = json.loads((folder / "run.json").read_text())
+    assert msgspec.to_builtins(record) == written
     broken = {"run.json": ["[]", "{", "[" * 100_000, '{"steps": ' + "9" * 5000 + "}"]}
     values = {"state": "asleep", "steps": "many", "planned_steps": [1], "seconds": None, "started": 7, "machine": []}
-    broken["run.json"] += [json.dumps({**record, name: value}) for name, value in values.items()]
+    broken["run.json"] += [json.dumps({**written, name: value}) for name, value in values.items()]
     broken["scalars.csv"] = [f"step,name,value\n{line}\n" for line in ("1,loss", "a,loss,1", f"1,{'l' * 10**6},2")]
     for name, contents in broken.items():
         for number, content in enumerate(contents):
@@ -202,5 +201,9 @@ def test_what_a_run_wrote_is_read_back(tmp_path: Path) -> None:
     thinned = read_scalars(tmp_path)
     assert thinned is not None
     assert thinned["loss"][0][:2] == [0, 5]
-    killed = json.dumps({"state": "training", "steps": 0, "planned_steps": 2000, "first_step": 0})
-    assert "killed" in describe_state(json.loads(killed))
+    assert (
+        "killed"
+        in TrainingRecord(
+            state="training", first_step=0, planned_steps=2000, steps=0, started="now", seconds=0.0
+        ).describe_state()
+    )
