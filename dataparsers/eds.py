@@ -18,7 +18,7 @@ from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
+from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 
 # The sequences do not contain their calibration. This is the authors' ("03_calib" in uzh-rpg/bundles-eds).
 # Distortion: k1, k2, p1, p2.
@@ -59,20 +59,16 @@ class EdsDataParser(EventDataParser):
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)
         reference = read_tum_trajectory(folder / "stamped_groundtruth.txt")
-        trajectory, ground_truth = self.config.estimated(reference)
         event_camera, frame_camera, event_from_frame = self._calibration()
-        return Recording(
+        return self.config.make_recording(
+            reference,
+            SensorModel(),
             event_file=Hdf5TableFile(folder / "events.h5", event_camera.width, event_camera.height, COLUMNS_AT_TOP),
             event_camera=event_camera,
-            sensor=self.config.sensor(SensorModel()),
-            trajectory=trajectory,
-            ground_truth=ground_truth,
             frame_camera=frame_camera,
             reference_views=views_on_trajectory(
                 read_image_times(folder / "images", folder / "images_timestamps.txt", "us"), reference, event_from_frame
             ),
-            image_encoding="linear",
-            max_views=MAX_VIEWS,
         )
 
     def _calibration(self) -> tuple[CameraIntrinsics, CameraIntrinsics, Tensor]:

@@ -15,11 +15,12 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.event_arrays import XYTP_MATRIX, NpyEventFile, load_npy
+from aenerf_ns.files.limits import list_files, require_one
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
+from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 
 
 class EsimEventFolder(EventFile):
@@ -27,9 +28,8 @@ class EsimEventFolder(EventFile):
 
     def _files(self) -> list[NpyEventFile]:
         # By the numbers in the names, because these may lack leading zeros.
-        paths = sorted(self.path.glob("*.npy"), key=lambda path: [int(n) for n in re.findall(r"\d+", path.name)])
-        if not paths:
-            raise DataError(self.path, "it holds no .npy file", "copy the events of the dataset to it")
+        paths = list_files(self.path, "*.npy")
+        paths.sort(key=lambda path: [int(number) for number in re.findall(r"\d+", path.name)])
         return [NpyEventFile(path, self.width, self.height, XYTP_MATRIX, "ns") for path in paths]
 
     def require(self) -> None:
@@ -74,22 +74,17 @@ class ENeRFEsimDataParser(EventDataParser):
         folder = Path(self.config.data)
         camera = _read_camera(folder / "poses_bounds.npy")
         lists = sorted(folder.glob("*poses_all*.txt"))
-        if len(lists) != 1:
-            raise DataError(folder, f"it holds {len(lists)} files *poses_all*.txt", "there must be one")
-        reference = read_tum_trajectory(lists[0], "ns")
-        trajectory, ground_truth = self.config.estimated(reference)
-        return Recording(
+        poses = require_one(lists, folder, "files *poses_all*.txt", "leave the poses of the scene only")
+        reference = read_tum_trajectory(poses, "ns")
+        return self.config.make_recording(
+            reference,
+            SensorModel(),
             event_file=EsimEventFolder(folder / "events", camera.width, camera.height),
             event_camera=camera,
-            sensor=self.config.sensor(SensorModel()),
-            trajectory=trajectory,
-            ground_truth=ground_truth,
             frame_camera=camera,
             reference_views=views_on_trajectory(
                 read_image_times(folder / "images", folder / "images" / "image_stamps_ns.txt", "ns"), reference
             ),
-            image_encoding="linear",
-            max_views=MAX_VIEWS,
         )
 
 

@@ -19,12 +19,12 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
-from aenerf_ns.files.limits import read_text
+from aenerf_ns.files.limits import list_files, read_text, require_one
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import ObjectDataParserConfig
 from aenerf_ns.recording.recording import Recording, ReferenceView, Split
-from aenerf_ns.recording.views import MAX_VIEWS, image_files, image_files_of_poses, views_on_trajectory
+from aenerf_ns.recording.views import image_files, image_files_of_poses, views_on_trajectory
 
 # A DAVIS 346C.
 _WIDTH, _HEIGHT = 346, 260
@@ -57,13 +57,10 @@ class EvenPosesDataParserConfig(ObjectDataParserConfig):
             source: the file or folder of the poses, for messages.
             first: default time of the first pose in nanoseconds. None: the time of the first event.
         """
-        if self.last_pose_time_ns is None or (self.first_pose_time_ns is None and first is None):
-            start, end = event_file.time_span()
-            first = start if first is None else first
-            self.last_pose_time_ns = end if self.last_pose_time_ns is None else self.last_pose_time_ns
         if self.first_pose_time_ns is None:
-            self.first_pose_time_ns = first
-        assert self.first_pose_time_ns is not None
+            self.first_pose_time_ns = event_file.time_span()[0] if first is None else first
+        if self.last_pose_time_ns is None:
+            self.last_pose_time_ns = event_file.time_span()[1]
         duration, steps = self.last_pose_time_ns - self.first_pose_time_ns, max(len(poses) - 1, 1)
         times = [self.first_pose_time_ns + duration * index // steps for index in range(len(poses))]
         return Trajectory(times, poses, source)
@@ -94,39 +91,24 @@ class EventNeRFDataParser(EventDataParser):
     def read_recording(self) -> Recording:
         data = Path(self.config.data)
         splits = [split for split in _training_splits(data) if (split / "pose").is_dir()]
-        if not splits:
-            raise DataError(data, "there is no train/pose", "give the folder of a scene or of one of its splits")
-        if len(splits) > 1:
-            raise DataError(data, f"it holds {len(splits)} training splits", f"give one as --data, such as {splits[0]}")
-        split = splits[0]
+        split = require_one(splits, data, "training splits (train/pose)", "give the folder of one as --data")
         camera = read_intrinsics(split / "intrinsics", _WIDTH, _HEIGHT)
-        events = sorted((split / "events").glob("*.npz"))
-        if len(events) > 1:
-            raise DataError(split / "events", f"it holds {len(events)} .npz files", "there must be one")
-        event_file = NpzEventFile(
-            events[0] if events else split / "events" / "events.npz",
-            _WIDTH,
-            _HEIGHT,
-            XYTP_MEMBERS,
-            self.config.time_unit,
-        )
+        # A trained run is opened without its events.
+        events = sorted((split / "events").glob("*.npz")) or [split / "events" / "events.npz"]
+        file = require_one(events, split / "events", "files *.npz", "leave the events of the scene only")
+        event_file = NpzEventFile(file, _WIDTH, _HEIGHT, XYTP_MEMBERS, self.config.time_unit)
         poses = _read_poses(split)
         # Pose i of N is at i / (N - 1) of the time of the last event.
         reference = self.config.spread(poses, event_file, split / "pose", first=0)
-        trajectory, ground_truth = self.config.estimated(reference)
         # There may be no images.
         images = zip(reference.times.tolist(), image_files_of_poses(split / "rgb", len(poses)), strict=False)
-        views = views_on_trajectory(list(images), reference)
-        views.update(_held_out_views(split.parent))
-        return Recording(
+        return self.config.make_recording(
+            reference,
+            SensorModel(bayer_pattern="RGGB" if self.config.color else ""),
             event_file=event_file,
             event_camera=camera,
-            sensor=self.config.sensor(SensorModel(bayer_pattern="RGGB" if self.config.color else "")),
-            trajectory=trajectory,
-            ground_truth=ground_truth,
-            max_views=MAX_VIEWS,
             frame_camera=camera,
-            reference_views=views,
+            reference_views={**views_on_trajectory(list(images), reference), **_held_out_views(split.parent)},
             image_encoding="srgb",
             scene_box=self.config.scene_box(UNIT_SPHERE),
         )
@@ -144,19 +126,14 @@ def _held_out_views(scene: Path) -> dict[Split, list[ReferenceView]]:
             poses = _read_poses(scene / name)
             files = image_files_of_poses(scene / name / "rgb", len(poses))
             found.append([ReferenceView(file, pose, None) for file, pose in zip(files, poses, strict=True)])
-    if not found:
-        return {}
     if len(found) == 1:
-        return {"val": found[0][::2], "test": found[0][1::2]}
-    return {"val": found[0], "test": found[1]}
+        found = [found[0][::2], found[0][1::2]]
+    return dict(zip(("val", "test"), found, strict=False))
 
 
 def _read_poses(split: Path) -> Tensor:
     """Read the (N, 4, 4) float64 camera-to-world poses of a split, OpenCV camera axes."""
-    files = sorted((split / "pose").glob("*.txt"))
-    if not files:
-        raise DataError(split / "pose", "it holds no .txt file", "copy the poses of the dataset to it")
-    poses = torch.stack([torch.from_numpy(read_matrix(file, 4)) for file in files])
+    poses = torch.stack([torch.from_numpy(read_matrix(file, 4)) for file in list_files(split / "pose", "*.txt")])
     require_rigid(poses, split / "pose")
     return poses
 
@@ -194,12 +171,10 @@ def read_intrinsics(folder: Path, width: int, height: int) -> CameraIntrinsics:
     Raises:
         DataError: the folder holds no file, or the file is malformed.
     """
-    files = sorted(folder.glob("*.txt"))
-    if not files:
-        raise DataError(folder, "it holds no .txt file", "copy the intrinsics of the dataset to it")
-    matrix = read_matrix(files[0], 4, 5).tolist()
+    file = list_files(folder, "*.txt")[0]
+    matrix = read_matrix(file, 4, 5).tolist()
     k1, k2 = matrix[4][:2] if len(matrix) == 5 else (0.0, 0.0)
-    with value_errors_as_data_error(files[0], "it must hold the matrix of the intrinsics"):
+    with value_errors_as_data_error(file, "it must hold the matrix of the intrinsics"):
         # NeRF++ counts pixels from the edge of the image, as CameraIntrinsics does.
         return CameraIntrinsics(
             width,

@@ -16,6 +16,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.files.colmap import read_colmap_poses
+from aenerf_ns.files.limits import require_one
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
@@ -122,30 +123,16 @@ class OwnRecordingDataParser(EventDataParser):
         if self.config.calibration is not None:
             return self.config.calibration
         found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
-        if len(found) != 1:
-            raise DataError(
-                folder,
-                f"it holds {len(found)} of {' and '.join(_CALIBRATIONS)}",
-                "give the calibration as --calibration",
-            )
-        return found[0]
+        return require_one(found, folder, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
 
     def _event_file(self, folder: Path, camera: CameraIntrinsics) -> EventFile:
-        path = self.config.events
-        if path is None:
-            found = sorted(folder / f"events{suffix}" for suffix in SUFFIXES)
-            found = [file for file in found if file.is_file()]
-            if len(found) != 1:
-                raise DataError(
-                    folder,
-                    f"it holds {len(found)} files events{{{','.join(SUFFIXES)}}}",
-                    "give the file of events as --events",
-                )
-            path = found[0]
-        # Stored, so that opening a trained run needs no events.
-        self.config.events = path
         config = self.config
-        return open_event_file(path, camera.width, camera.height, config.event_topic, config.event_time_unit)
+        if config.events is None:
+            files = sorted(folder / f"events{suffix}" for suffix in SUFFIXES)
+            files = [file for file in files if file.is_file()]
+            # Stored, so that opening a trained run needs no events.
+            config.events = require_one(files, folder, f"files events{{{','.join(SUFFIXES)}}}", "give one as --events")
+        return open_event_file(config.events, camera.width, camera.height, config.event_topic, config.event_time_unit)
 
 
 def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:

@@ -63,22 +63,18 @@ class RobustENeRFDataParser(EventDataParser):
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)
         camera, stated = _read_calibration(folder / "camera_calibration.npz")
-        trajectory, ground_truth = self.config.estimated(_read_poses(folder / "camera_poses.npz"))
         frame_camera, views = _read_views(folder)
         # Only scenes simulated from Blender have this file.
         synthetic = (folder / "renderer_params.npz").is_file()
-        return Recording(
+        return self.config.make_recording(
+            _read_poses(folder / "camera_poses.npz"),
+            stated,
             event_file=NpzEventFile(
                 folder / "raw_events.npz", camera.width, camera.height, POSITION_TIMESTAMP_POLARITY
             ),
             event_camera=camera,
-            sensor=self.config.sensor(stated),
-            trajectory=trajectory,
-            ground_truth=ground_truth,
             frame_camera=camera if frame_camera is None else frame_camera,
             reference_views={"train": [], **views},
-            # The events were simulated from these values.
-            image_encoding="linear",
             scene_box=self.config.scene_box(_HALF_EXTENT if synthetic else 0.0),
             image_background=(1.0, 1.0, 1.0),
         )

@@ -18,11 +18,12 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
 from aenerf_ns.files.json_file import read_json
+from aenerf_ns.files.limits import require_one
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.recording.views import MAX_VIEWS, read_image_times, views_on_trajectory
+from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 
 _EVENT_FILE = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
 # Sequences recorded with calibration A. All others were recorded with calibration B.
@@ -125,13 +126,11 @@ class TumVieDataParser(EventDataParser):
         reference = markers.transform(lambda poses: poses @ marker_from_event)
         image_folder = ground_truth_folder / f"{side}_images"
         images = read_image_times(image_folder, image_folder / f"image_timestamps_{side}.txt", "us")
-        trajectory, ground_truth = self.config.estimated(reference)
-        return Recording(
+        return self.config.make_recording(
+            reference,
+            _SENSOR,
             event_file=Hdf5TableFile(events, event_camera.width, event_camera.height, COLUMNS_IN_GROUP),
             event_camera=event_camera,
-            sensor=self.config.sensor(_SENSOR),
-            trajectory=trajectory,
-            ground_truth=ground_truth,
             frame_camera=frame_camera,
             reference_views=views_on_trajectory(
                 images,
@@ -139,8 +138,6 @@ class TumVieDataParser(EventDataParser):
                 torch.linalg.inv(imu_from_event) @ imu_from_frame,
                 max_pose_gap=self.config.max_pose_gap_ns,
             ),
-            image_encoding="linear",
-            max_views=MAX_VIEWS,
             max_pose_gap=self.config.max_pose_gap_ns,
         )
 
@@ -157,16 +154,11 @@ def _event_files(data: Path) -> list[Path]:
 
 def _choose(data: Path) -> tuple[Path, str, str]:
     """Return the event file, its sequence and its side."""
-    files = _event_files(data)
-    if not files:
-        raise DataError(data, "there is no SEQUENCE-events_left.h5", "download a sequence to this folder")
-    if len(files) > 1:
-        raise DataError(
-            data, f"it holds {len(files)} sequences", f"give the event file of one as --data, such as {files[0]}"
-        )
-    match = _EVENT_FILE.fullmatch(files[0].name)
+    sequences = "sequences (SEQUENCE-events_left.h5)"
+    file = require_one(_event_files(data), data, sequences, "give the event file of one as --data")
+    match = _EVENT_FILE.fullmatch(file.name)
     assert match is not None
-    return files[0], match["sequence"], match["side"]
+    return file, match["sequence"], match["side"]
 
 
 def _find_calibration(folder: Path, name: str) -> Path:

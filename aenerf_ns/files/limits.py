@@ -150,6 +150,36 @@ def require_file(path: Path) -> None:
             raise DataError(path, "there is no such file", "check the path of the dataset")
 
 
+def list_files(folder: Path, pattern: str) -> list[Path]:
+    """List the files of a dataset's folder that match a pattern, in the order of their names.
+
+    Raises:
+        DataError: there is none.
+    """
+    files = sorted(folder.glob(pattern))
+    if not files:
+        raise DataError(folder, f"it holds no {pattern}", "copy all files of the dataset")
+    return files
+
+
+def require_one(paths: list[Path], source: Path, what: str, remedy: str) -> Path:
+    """Return the only one of the paths.
+
+    Args:
+        paths: what was found.
+        source: the folder that was searched.
+        what: names the paths, in the plural.
+        remedy: how to choose one of several.
+
+    Raises:
+        DataError: there is none, or there are several.
+    """
+    if len(paths) != 1:
+        example = f", such as {paths[0]}" if paths else ""
+        raise DataError(source, f"it holds {len(paths)} {what}", f"{remedy}{example}")
+    return paths[0]
+
+
 def read_text(path: Path, max_bytes: int) -> str:
     """Read a small file of text.
 

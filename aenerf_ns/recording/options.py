@@ -11,10 +11,12 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.views import MAX_VIEWS
 
 
 @dataclass
@@ -102,10 +104,8 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
         Raises:
             DataError: a value is impossible.
         """
-        try:
+        with value_errors_as_data_error(str(self.data), "correct it among the options"):
             return replace(stated, **self.given_sensor_values())
-        except ValueError as error:
-            raise DataError(str(self.data), str(error), "correct it among the options") from None
 
     def estimated(self, reference: Trajectory) -> tuple[Trajectory, Trajectory | None]:
         """Return the estimated and the true trajectory, given the dataset's own.
@@ -113,6 +113,22 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
         The dataset's own is the estimated one, and none is true, unless the options give another estimated one.
         """
         return (reference, None) if self.trajectory is None else (read_tum_trajectory(self.trajectory), reference)
+
+    def make_recording(self, reference: Trajectory, sensor: SensorModel, **content: Any) -> Recording:
+        """Make a recording, with what the options state in place of the dataset's own poses and sensor.
+
+        Args:
+            reference: the dataset's poses.
+            sensor: the dataset's sensor, or the one assumed.
+            content: further attributes of :class:`~aenerf_ns.recording.recording.Recording`. By default images are
+                linear, and as many of them are used as of other published formats.
+
+        Raises:
+            DataError: a value among the options is impossible.
+        """
+        trajectory, ground_truth = self.estimated(reference)
+        content = {"image_encoding": "linear", "max_views": MAX_VIEWS, **content}
+        return Recording(trajectory=trajectory, ground_truth=ground_truth, sensor=self.sensor(sensor), **content)
 
 
 @dataclass

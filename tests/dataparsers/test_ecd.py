@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.dataset_faults import assert_one_clear_line, replace_line
+from helpers.dataset_faults import replace_line
 from helpers.small_datasets import (
-    ECD_FAULTS,
     parse,
     write_ecd,
 )
@@ -104,9 +103,3 @@ def test_the_real_recording_reads(slider_depth: Path) -> None:
     poses = dataset.metadata[SCENE_KEY].trajectory.camera_to_worlds
     assert (poses[:, :, :3] - poses[:1, :, :3]).abs().max() < 1e-6
     assert torch.linalg.matrix_rank(poses[1:, :, 3] - poses[0, :, 3], atol=1e-4) == 1
-
-
-@pytest.mark.parametrize("fault", ECD_FAULTS)
-def test_malformed_ecd_text_is_one_clear_line(fault: str, tmp_path: Path) -> None:
-    change, message = ECD_FAULTS[fault]
-    assert_one_clear_line(change, message, EcdDataParserConfig(data=write_ecd(tmp_path / "made")))

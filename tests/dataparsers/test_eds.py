@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
-import pytest
 import yaml
-from helpers.dataset_faults import assert_one_clear_line, remove, write_text
 from helpers.published_datasets import (
     EPOCH,
     config_of,
@@ -49,20 +46,3 @@ def test_eds_views_are_those_of_the_frame_camera(tmp_path: Path) -> None:
     # Kalibr's matrix takes points from the frame camera to the event camera.
     expected = interpolated(truth, view.time) @ make_poses(3)[1]
     np.testing.assert_allclose(view.camera_to_world.numpy(), expected, rtol=0, atol=1e-9)
-
-
-FAULTS = {
-    "no poses": (remove("stamped*"), "stamped_groundtruth.txt: there is no such file"),
-    "no events": (remove("events.h5"), "events.h5: there is no such file"),
-    "no column": (lambda folder: h5py.File(folder / "events.h5", "a").pop("p"), "there is no dataset /p"),
-    "five images": (write_text("images_timestamps.txt", "1\n2\n3\n4\n5\n"), "it has 5 times for 3 images"),
-    "image time is a word": (write_text("images_timestamps.txt", "1\ntwo\n3\n"), "two is not a time in microseconds"),
-    "huge time": (write_text("images_timestamps.txt", "1\n2\n1e99999999\n"), "1e99999999 is not a time in micro"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_malformed_datasets_are_one_clear_line(fault: str, tmp_path: Path) -> None:
-    change, message = FAULTS[fault]
-    config = config_of("eds-data", write_eds(tmp_path / "made").data)
-    assert_one_clear_line(change, message, config)

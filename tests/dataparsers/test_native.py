@@ -9,11 +9,9 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from helpers.dataset_faults import assert_one_clear_line
 from helpers.small_datasets import (
     AS_RECORDED,
     CAMERA,
-    NATIVE_FAULTS,
     SENSOR,
     START,
     make_trajectory,
@@ -106,9 +104,3 @@ def test_events_are_written_in_order_only(tmp_path: Path) -> None:
         writer.append(make_stream([(0, 0, 5, 1)]))
         with pytest.raises(DataError, match="4 ns is before 5 ns"):
             writer.append(make_stream([(0, 0, 4, 1)]))
-
-
-@pytest.mark.parametrize("fault", NATIVE_FAULTS)
-def test_malformed_native_datasets_are_one_clear_line(fault: str, tmp_path: Path) -> None:
-    change, message = NATIVE_FAULTS[fault]
-    assert_one_clear_line(change, message, NativeDataParserConfig(data=write_native(tmp_path / "made")))

@@ -20,11 +20,10 @@ import yaml
 from helpers.bounded_reading import little_memory, read_whole, readable_folder, without_rights_of_root
 from helpers.dataset_faults import read_everything
 from helpers.malformed_inputs import FORMAT_WRITERS, camchain, npy_header
-from helpers.published_datasets import config_of
+from helpers.published_datasets import CAMCHAIN, config_of
 from helpers.vendor_recordings import RECORDINGS, config_of_recording
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_own_recording import CAMCHAIN
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError

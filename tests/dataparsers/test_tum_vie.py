@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.dataset_faults import assert_one_clear_line, edit_json, remove, replace_line
 from helpers.published_datasets import (
     EPOCH,
     assert_same_poses,
@@ -104,55 +103,8 @@ def test_events_in_a_gap_of_the_poses_are_left_out_also_after_conversion(
 def test_several_sequences_in_a_folder_are_told_apart(tmp_path: Path, tum_vie_calibration: Path) -> None:
     for sequence in ("mocap-desk2", "office-maze"):
         write_tum_vie(tmp_path / "made", tum_vie_calibration, sequence)
-    with pytest.raises(
-        DataError, match=r"it holds 2 sequences; give the event file of one .*/mocap-desk2-events_left.h5"
-    ):
+    with pytest.raises(DataError, match=r"it holds 2 sequences .*/mocap-desk2-events_left.h5"):
         recording_of(config_of("tum-vie-data", tmp_path / "made"))
     one = tmp_path / "made" / "office-maze-events_left.h5"
     assert recognize(one) == "tum-vie-data"
     assert recording_of(config_of("tum-vie-data", one)).event_file.path == one
-
-
-CAMERAS, MOCAP = "camera-calibrationA.json", "mocap-imu-calibrationA.json"
-TRUTH = "mocap-desk2-vi_gt_data"
-FAULTS = {
-    "no events": (remove("*.h5"), "mocap-desk2-events_left.h5: there is no such file"),
-    "no poses": (remove(f"{TRUTH}/mocap_data.txt"), "mocap_data.txt: there is no such file"),
-    "no calibration": (remove("camera-*"), f"{CAMERAS}: there is no such file; download the dataset's calibration"),
-    "no hand-eye": (remove("mocap-imu*"), f"{MOCAP}: there is no such file"),
-    "pinhole": (
-        edit_json(CAMERAS, lambda m: m["value0"]["intrinsics"][2].update(camera_type="ds")),
-        r"value0.intrinsics\[2\].camera_type: invalid enum value 'ds'",
-    ),
-    "one camera": (
-        edit_json(CAMERAS, lambda m: m["value0"].update(T_imu_cam=m["value0"]["T_imu_cam"][:1])),
-        "value0.T_imu_cam: expected `array` of length 4, got 1",
-    ),
-    "no k4": (
-        edit_json(CAMERAS, lambda m: m["value0"]["intrinsics"][2]["intrinsics"].pop("k4")),
-        r"value0.intrinsics\[2\].intrinsics: .* required field `k4`",
-    ),
-    "size is a word": (
-        edit_json(CAMERAS, lambda m: m["value0"].update(resolution=["big"] * 4)),
-        r"value0.resolution\[0\]: expected `array`",
-    ),
-    "long quaternion": (
-        edit_json(MOCAP, lambda m: m["value0"]["T_imu_marker"].update(qw=3.0)),
-        f"{MOCAP}: the quaternion of pose 0 has length 3",
-    ),
-    "no marker": (edit_json(MOCAP, lambda m: m["value0"].pop("T_imu_marker")), "required field `T_imu_marker`"),
-    "NaN pose": (replace_line(f"{TRUTH}/mocap_data.txt", 3, "1 nan 0 0 0 0 0 1"), "pose 2 holds nan"),
-    "seconds": (
-        replace_line(f"{TRUTH}/mocap_data.txt", 1, "early 0 0 0 0 0 0 1"),
-        "early is not a time in microseconds",
-    ),
-    "lost image": (remove(f"{TRUTH}/left_images/00001.jpg"), "it has 3 times for 2 images"),
-    "no image times": (remove(f"{TRUTH}/left_images/*.txt"), "image_timestamps_left.txt: there is no such file"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_malformed_datasets_are_one_clear_line(fault: str, tmp_path: Path, tum_vie_calibration: Path) -> None:
-    change, message = FAULTS[fault]
-    config = config_of("tum-vie-data", write_tum_vie(tmp_path / "made", tum_vie_calibration).data)
-    assert_one_clear_line(change, message, config)

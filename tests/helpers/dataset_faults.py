@@ -8,9 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.options import EventDataParserConfig
 
@@ -54,12 +52,3 @@ def replace_line(name: str, index: int, line: str) -> Callable[[Path], object]:
 def read_everything(config: EventDataParserConfig) -> None:
     config.setup().get_dataparser_outputs("val")
     assert len(EventDataset(config.setup().get_dataparser_outputs("train")).pairs)
-
-
-def assert_one_clear_line(change: Callable[[Path], object], message: str, config: EventDataParserConfig) -> None:
-    """Damage the dataset, read all of it, and expect a message of one line that names the dataset's folder."""
-    change(config.data)
-    with pytest.raises(DataError, match=message) as error:
-        read_everything(config)
-    assert "\n" not in str(error.value)
-    assert str(config.data) in str(error.value)

@@ -283,6 +283,40 @@ def write_own(folder: Path) -> Truth:
     return Truth(folder, times, poses, events, 60, 40, matrix, (-0.1, 0.0, 0.0, 0.01))
 
 
+CAMCHAIN = {
+    "cam0": {
+        "camera_model": "pinhole",
+        "distortion_model": "equidistant",
+        "intrinsics": [70.0, 71.0, 40.0, 30.0],
+        "resolution": [80, 60],
+        "distortion_coeffs": [0.01, 0.02, 0.03, 0.04],
+        "rostopic": "/frames",
+    },
+    "cam1": {
+        "camera_model": "pinhole",
+        "distortion_model": "radtan",
+        "intrinsics": [50.0, 51.0, 29.5, 20.0],
+        "resolution": [60, 40],
+        "distortion_coeffs": [-0.1, 0.0, 0.0, 0.01],
+        "T_cn_cnm1": make_poses(3)[2].tolist(),
+    },
+}
+
+
+def write_colmap(folder: Path, poses: NDArray[np.float64], names: list[str]) -> None:
+    """COLMAP's text model: world-to-camera, qw first."""
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text("1 PINHOLE 60 40 50 51 30 20.5\n")
+    lines = []
+    for index, (pose, name) in enumerate(zip(poses, names, strict=True), start=1):
+        inverse = np.linalg.inv(pose)
+        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat().tolist()
+        values = [w, x, y, z, *inverse[:3, 3].tolist()]
+        lines.append(f"{index} {' '.join(map(repr, values))} 1 {name}\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "points3D.txt").write_text("")
+
+
 WRITERS: dict[str, Callable[[Path], Truth]] = {
     "robust-enerf-data": write_robust_enerf,
     "eds-data": write_eds,

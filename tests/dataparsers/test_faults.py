@@ -1,0 +1,400 @@
+"""Faults in the datasets of every format: one clear line that names the file and what is wrong with it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from helpers.dataset_faults import edit_json, edit_npz, read_everything, remove, replace_line, write_text
+from helpers.published_datasets import (
+    CAMCHAIN,
+    N_EVENTS,
+    N_POSES,
+    WRITERS,
+    config_of,
+    make_poses,
+    write_colmap,
+    write_tum_vie,
+)
+from helpers.small_datasets import START, replace_column, resize_image, set_attribute, write_ecd, write_native
+
+from aenerf_ns.errors import DataError
+
+Change = Callable[[Path], object]
+# What is done to the dataset, a part of the error's source, and a part of its problem.
+Fault = tuple[Change, str, str]
+
+MIRRORED, SCALED = np.diag([1.0, 1, -1, 1]).tolist(), np.diag([2.0, 2, 2, 1]).tolist()
+
+
+def all_of(*changes: Change) -> Change:
+    return lambda folder: [change(folder) for change in changes]
+
+
+def native(edit: Callable[[dict], object]) -> Change:
+    return edit_json("transforms.json", edit)
+
+
+def event_camera(**values: object) -> Change:
+    return native(lambda meta: meta["event_camera"].update(values))
+
+
+def frame(**values: object) -> Change:
+    return native(lambda meta: meta["frames"][0].update(values))
+
+
+def no_events(folder: Path) -> None:
+    for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.int8)):
+        replace_column(name, np.zeros(0, dtype))(folder)
+
+
+NATIVE: dict[str, Fault] = {
+    "no transforms": (remove("transforms.json"), "transforms.json", "no such file"),
+    "no JSON": (write_text("transforms.json", "{"), "transforms.json", "not valid JSON"),
+    "a list": (write_text("transforms.json", "[]"), "transforms.json", "expected `object`"),
+    "no event camera": (native(lambda m: m.pop("event_camera")), "transforms.json", "`event_camera`"),
+    "no focal length": (native(lambda m: m["event_camera"].pop("fl_x")), "transforms.json", "event_camera: "),
+    "width is a word": (event_camera(width="wide"), "transforms.json", "event_camera.width"),
+    "no threshold": (event_camera(positive_contrast_threshold=None), "transforms.json", "positive_contrast"),
+    "negative threshold": (event_camera(negative_contrast_threshold=-1), "transforms.json", "negative_contrast"),
+    "unknown Bayer pattern": (event_camera(bayer_pattern="GRBG"), "transforms.json", '"GRBG"'),
+    "unknown lens": (event_camera(camera_model="KB4"), "transforms.json", "event_camera: the lens model is 'KB4'"),
+    "image of another size": (resize_image("images/val/00000.png"), "val/00000.png", "3 x 2 pixels"),
+    "mirrored pose": (frame(transform_matrix=MIRRORED), "frames[0].transform_matrix", "not a rigid motion"),
+    "scaled mount": (event_camera(T_frame_event=SCALED), "event_camera.T_frame_event", "not a rigid motion"),
+    "frame twice": (native(lambda m: m["frames"].append(m["frames"][0])), "transforms.json", "train/00000.png again"),
+    "unknown encoding": (native(lambda m: m.update(image_encoding="log")), "transforms.json", "image_encoding"),
+    "box inside out": (native(lambda m: m.update(scene_box=[[1] * 3, [0] * 3])), "transforms.json", "scene_box"),
+    "box is flat": (native(lambda m: m.update(scene_box=[[1] * 3])), "transforms.json", "scene_box"),
+    "no longest gap": (native(lambda m: m.update(max_pose_gap_ns=0)), "transforms.json", "max_pose_gap_ns"),
+    "missing image": (remove("images/val/00000.png"), "transforms.json", "val/00000.png, which does not exist"),
+    "unknown image": (native(lambda m: m.update(test_filenames=["x.png"])), "transforms.json", "test_filenames"),
+    "short matrix": (frame(transform_matrix=[[1]]), "transforms.json", "frames[0].transform_matrix"),
+    "no pose and time": (frame(transform_matrix=None, timestamp=None), "transforms.json", "frames[0] has neither"),
+    "no event file": (remove("events.h5"), "events.h5", "no such file"),
+    "no name of events": (event_camera(file=None), "transforms.json", "file"),
+    "not HDF5": (write_text("events.h5", "t x y p"), "events.h5", "HDF5"),
+    "no column": (replace_column("p", None), "events.h5", "/events/p"),
+    "wrong dtype": (replace_column("t", np.zeros(200)), "events.h5", "/events/t has type float64"),
+    "short column": (replace_column("x", np.zeros(3, np.uint16)), "events.h5", "lengths"),
+    "no events": (no_events, "events.h5", "no events"),
+    "fractional offset": (set_attribute("time_offset", 0.5), "events.h5", "time offset is 0.5"),
+    "offset is NaN": (set_attribute("time_offset", np.nan), "events.h5", "time offset is nan"),
+    "unknown unit": (set_attribute("time_unit", "fortnight"), "events.h5", "time unit is 'fortnight'"),
+    "polarity 0": (replace_column("p", np.zeros(200, np.int8)), "events.h5", "polarity 0"),
+    "pixel outside": (replace_column("x", np.full(200, 6, np.uint16)), "events.h5", "x = 6"),
+    "unsorted": (replace_column("t", START + 10**9 - np.arange(200)), "events.h5", "before"),
+    "no overlap": (replace_column("t", np.arange(200)), "trajectory_estimated.txt", "do not overlap"),
+    "no poses": (remove("trajectory_estimated.txt"), "trajectory_estimated.txt", "no such file"),
+}
+
+
+def event(line: str) -> Change:
+    return replace_line("events.txt", 2, line)
+
+
+def pose(line: str) -> Change:
+    return replace_line("groundtruth.txt", 2, line)
+
+
+ECD: dict[str, Fault] = {
+    "no folder": (shutil.rmtree, "made", "no such folder"),
+    "no event file": (remove("events.txt"), "events.txt", "no such file"),
+    "no poses": (remove("groundtruth.txt"), "groundtruth.txt", "no such file"),
+    "no calibration": (remove("calib.txt"), "calib.txt", "no such file"),
+    "missing image": (remove("images/1.png"), "images.txt", "images/1.png, which does not exist"),
+    "no events": (write_text("events.txt", ""), "events.txt", "no events"),
+    "five fields": (event("0.03 1 2 0 9"), "events.txt", "line 3 has 5 fields"),
+    "a word": (event("0.03 one 2 0"), "events.txt", "line 3 has x = one"),
+    "signed polarity": (event("0.03 1 2 -1"), "events.txt", "line 3 has p = -1"),
+    "pixel outside": (event("0.03 6 3 1"), "events.txt", "line 3 has x = 6"),
+    "negative pixel": (event("0.03 5 -1 1"), "events.txt", "line 3 has y = -1"),
+    "fractional pixel": (event("0.03 2.5 1 1"), "events.txt", "line 3 has x = 2.5"),
+    "time is NaN": (event("nan 2 1 1"), "events.txt", "line 3 has t = nan"),
+    "unsorted": (event("0.015 2 1 1"), "events.txt", "event 2 is at 15000000 ns, before"),
+    "NaN pose": (pose("0.2 nan 0 0 0 0 0 1"), "groundtruth.txt", "pose 2 holds nan"),
+    "long quaternion": (pose("0.2 0 0 0 0 0 1 1"), "groundtruth.txt", "pose 2 has length 1.414"),
+    "seven numbers": (pose("0.2 0 0 0 0 0 1"), "groundtruth.txt", "line 3 has 7 fields"),
+    "pose is a word": (pose("0.2 x 0 0 0 0 0 1"), "groundtruth.txt", "'x'"),
+    "pose time is a word": (pose("now 0 0 0 0 0 0 1"), "groundtruth.txt", "now is not a time in seconds"),
+    "unsorted poses": (pose("0.05 0 0 0 0 0 0 1"), "groundtruth.txt", "pose 2 is at 50000000 ns, not after"),
+    "one pose": (write_text("groundtruth.txt", "0 0 0 0 0 0 0 1\n"), "groundtruth.txt", "1 poses"),
+    "no pose": (write_text("groundtruth.txt", "# nothing\n"), "groundtruth.txt", "no poses"),
+    "no overlap": (
+        write_text("groundtruth.txt", "5 0 0 0 0 0 0 1\n6 1 0 0 0 0 0 1\n"),
+        "groundtruth.txt",
+        "do not overlap the events from 10000000 to 310000000 ns",
+    ),
+    "short calibration": (write_text("calib.txt", "5 5.5 2.5 1.5\n"), "calib.txt", "line 1 has 4 fields"),
+    "empty calibration": (write_text("calib.txt", ""), "calib.txt", "empty"),
+    "no focal length": (write_text("calib.txt", "0 5 2 1 0 0 0 0 0\n"), "calib.txt", "fx must be from 0.01"),
+}
+
+CALIBRATION, POSES, VIEWS = "camera_calibration.npz", "camera_poses.npz", "views/transforms_val.json"
+
+
+def views(edit: Callable[[dict], object]) -> Change:
+    return edit_json(VIEWS, edit)
+
+
+ROBUST: dict[str, Fault] = {
+    "no calibration": (remove(CALIBRATION), CALIBRATION, "no such file"),
+    "no poses": (remove(POSES), POSES, "no such file"),
+    "no events": (remove("raw_events.npz"), "raw_events.npz", "no such file"),
+    "no intrinsics": (edit_npz(CALIBRATION, intrinsics=None), CALIBRATION, "no array intrinsics"),
+    "flat intrinsics": (edit_npz(CALIBRATION, intrinsics=np.ones(9)), CALIBRATION, "intrinsics has type float64"),
+    "words": (edit_npz(CALIBRATION, intrinsics=np.full((3, 3), "f")), CALIBRATION, "intrinsics has type <U1"),
+    "unknown lens": (edit_npz(CALIBRATION, distortion_model="fov"), CALIBRATION, "the lens model is 'fov'"),
+    "six distortions": (edit_npz(CALIBRATION, distortion_params=np.zeros(6)), CALIBRATION, "takes 5 numbers, not 6"),
+    "no focal length": (edit_npz(CALIBRATION, intrinsics=np.zeros((3, 3))), CALIBRATION, "fx must be from 0.01"),
+    "NaN focal length": (edit_npz(CALIBRATION, intrinsics=np.full((3, 3), np.nan)), CALIBRATION, "fx must be"),
+    "NaN threshold": (edit_npz(CALIBRATION, pos_contrast_threshold=np.nan), CALIBRATION, "is not finite"),
+    "negative threshold": (edit_npz(CALIBRATION, neg_contrast_threshold=-1.0), CALIBRATION, "negative_contrast"),
+    "unknown pattern": (edit_npz(CALIBRATION, bayer_pattern="GRBG"), CALIBRATION, '"GRBG"'),
+    "pattern is a number": (edit_npz(CALIBRATION, bayer_pattern=3), CALIBRATION, "bayer_pattern has type int64"),
+    "NaN pose": (edit_npz(POSES, T_wc_position=np.full((N_POSES, 3), np.nan)), POSES, "pose 0 holds nan"),
+    "long quaternion": (edit_npz(POSES, T_wc_orientation=np.ones((N_POSES, 4))), POSES, "pose 0 has length 2"),
+    "decimal times": (edit_npz(POSES, T_wc_timestamp=np.zeros(N_POSES)), POSES, "T_wc_timestamp has type float64"),
+    "fewer times": (edit_npz(POSES, T_wc_timestamp=np.arange(3)), POSES, "3 times"),
+    "unsorted poses": (edit_npz(POSES, T_wc_timestamp=np.arange(N_POSES)[::-1]), POSES, "not after"),
+    "no overlap": (edit_npz(POSES, T_wc_timestamp=np.arange(N_POSES) + 10**15), POSES, "do not overlap"),
+    "views are no JSON": (write_text(VIEWS, "{"), VIEWS, "not valid JSON"),
+    "no frames": (write_text(VIEWS, "{}"), VIEWS, "`frames`"),
+    "frame is a number": (write_text(VIEWS, '{"frames": [3]}'), VIEWS, "frames[0]: expected `object`, got `int`"),
+    "no image": (remove("views/val/r_1.png"), VIEWS, "frames[1] names ./val/r_1"),
+    "scaled pose": (
+        views(lambda m: m["frames"][0].update(transform_matrix=SCALED)),
+        "frames[0].transform_matrix",
+        "not a rigid motion",
+    ),
+    "no pose": (views(lambda m: m["frames"][0].pop("transform_matrix")), VIEWS, "`transform_matrix`"),
+    "no angle": (views(lambda m: m.pop("camera_angle_x")), VIEWS, "neither camera_angle_x nor intrinsics"),
+    "angle is 0": (views(lambda m: m.update(camera_angle_x=0)), VIEWS, "camera_angle_x"),
+    "other angle": (views(lambda m: m.update(camera_angle_x=1)), "transforms_test.json", "that of the other split"),
+}
+
+CAMERAS, MOCAP, TRUTH = "camera-calibrationA.json", "mocap-imu-calibrationA.json", "mocap-desk2-vi_gt_data"
+
+
+def tum_cameras(edit: Callable[[dict], object]) -> Change:
+    return edit_json(CAMERAS, lambda meta: edit(meta["value0"]))
+
+
+TUM_VIE: dict[str, Fault] = {
+    "no events": (remove("*.h5"), "mocap-desk2-events_left.h5", "no such file"),
+    "no poses": (remove(f"{TRUTH}/mocap_data.txt"), "mocap_data.txt", "no such file"),
+    "no calibration": (remove("camera-*"), CAMERAS, "no such file"),
+    "no hand-eye": (remove("mocap-imu*"), MOCAP, "no such file"),
+    "pinhole": (tum_cameras(lambda m: m["intrinsics"][2].update(camera_type="ds")), CAMERAS, "[2].camera_type"),
+    "one camera": (tum_cameras(lambda m: m.update(T_imu_cam=m["T_imu_cam"][:1])), CAMERAS, "value0.T_imu_cam"),
+    "no k4": (tum_cameras(lambda m: m["intrinsics"][2]["intrinsics"].pop("k4")), CAMERAS, "`k4`"),
+    "size is a word": (tum_cameras(lambda m: m.update(resolution=["big"] * 4)), CAMERAS, "value0.resolution[0]"),
+    "long quaternion": (
+        edit_json(MOCAP, lambda m: m["value0"]["T_imu_marker"].update(qw=3.0)),
+        MOCAP,
+        "pose 0 has length 3",
+    ),
+    "no marker": (edit_json(MOCAP, lambda m: m["value0"].pop("T_imu_marker")), MOCAP, "`T_imu_marker`"),
+    "NaN pose": (replace_line(f"{TRUTH}/mocap_data.txt", 3, "1 nan 0 0 0 0 0 1"), "mocap_data.txt", "pose 2 holds nan"),
+    "a word": (replace_line(f"{TRUTH}/mocap_data.txt", 1, "early 0 0 0 0 0 0 1"), "mocap_data.txt", "in microseconds"),
+    "lost image": (remove(f"{TRUTH}/left_images/00001.jpg"), "image_timestamps_left.txt", "3 times for 2 images"),
+    "no image times": (remove(f"{TRUTH}/left_images/*.txt"), "image_timestamps_left.txt", "no such file"),
+}
+
+TIMES = "images_timestamps.txt"
+EDS: dict[str, Fault] = {
+    "no poses": (remove("stamped*"), "stamped_groundtruth.txt", "no such file"),
+    "no events": (remove("events.h5"), "events.h5", "no such file"),
+    "no column": (lambda folder: h5py.File(folder / "events.h5", "a").pop("p"), "events.h5", "no dataset /p"),
+    "five images": (write_text(TIMES, "1\n2\n3\n4\n5\n"), TIMES, "5 times for 3 images"),
+    "image time is a word": (write_text(TIMES, "1\ntwo\n3\n"), TIMES, "two is not a time in microseconds"),
+    "huge time": (write_text(TIMES, "1\n2\n1e99999999\n"), TIMES, "1e99999999 is not a time"),
+}
+
+
+def bounds(array: np.ndarray) -> Change:
+    return lambda folder: np.save(folder / "poses_bounds.npy", array)
+
+
+ESIM: dict[str, Fault] = {
+    "no events": (remove("events"), "events", "no such"),
+    "empty folder": (remove("events/*"), "events", "no *.npy"),
+    "no camera": (remove("poses_bounds.npy"), "poses_bounds.npy", "no such file"),
+    "two lists": (write_text("other_poses_all.txt", ""), "made", "2 files *poses_all*.txt"),
+    "small bounds": (bounds(np.zeros((12, 4))), "poses_bounds.npy", "shape (12, 4)"),
+    "empty bounds": (bounds(np.zeros((12, 17))), "poses_bounds.npy", "width must be a whole number from 1"),
+    "NaN bounds": (bounds(np.full((12, 17), np.nan)), "poses_bounds.npy", "width must be a whole number"),
+    "unsorted files": (lambda folder: (folder / "events/2.npy").rename(folder / "events/20.npy"), "events", "before"),
+    "text": (write_text("events/2.npy", "x y t p"), "2.npy", ".npy file"),
+}
+
+MATRIX = "train/pose/r_00003.txt"
+EVENTNERF: dict[str, Fault] = {
+    "no events": (remove("train/events"), "events.npz", "no such file"),
+    "two event files": (lambda folder: np.savez(folder / "train/events/b.npz"), "train/events", "2 files *.npz"),
+    "no poses": (remove("train/pose/*"), "train/pose", "no *.txt"),
+    "no split": (remove("train"), "made", "0 training splits"),
+    "no intrinsics": (remove("train/intrinsics/*"), "train/intrinsics", "no *.txt"),
+    "3 x 4": (write_text(MATRIX, "1 " * 12), MATRIX, "12 numbers"),
+    "a word": (write_text(MATRIX, "1 " * 15 + "one"), MATRIX, "not a number"),
+    "NaN pose": (write_text(MATRIX, "nan " * 16), MATRIX, "not finite"),
+    "mirrored": (write_text(MATRIX, "1 0 0 0  0 1 0 0  0 0 -1 0  0 0 0 1"), "train/pose", "pose 3 is not a rigid"),
+    "no focal length": (write_text("train/intrinsics/r_00000.txt", "0 " * 16), "r_00000.txt", "fx must be from 0.01"),
+    "lost image": (remove("train/rgb/00003.png"), "train/rgb", "20 images for 21 poses"),
+    "lost test image": (remove("test/rgb/00001.png"), "test/rgb", "1 images for 2 poses"),
+    "one event time": (
+        edit_npz("train/events/test_lego.npz", t=np.zeros(N_EVENTS, int)),
+        "train/pose",
+        "pose 1 is at 0 ns, not after",
+    ),
+}
+
+EVENT_FILE = "H5_Files/Bunny/event.h5"
+
+
+def objects(*values: dict) -> Change:
+    return lambda folder: np.savez(folder / "Render_info/Bunny/0002.npz", object_poses=list(values))
+
+
+def three_columns(folder: Path) -> None:
+    with h5py.File(folder / EVENT_FILE, "w") as file:
+        file["events"] = np.zeros((9, 3))
+
+
+PAEV3D: dict[str, Fault] = {
+    "no events": (remove(EVENT_FILE), "event.h5", "no such file"),
+    "no poses": (remove("Render_info/Bunny/*.npz"), "Render_info/Bunny", "no *.npz"),
+    "no intrinsics": (remove("Intrinsics/*"), "Intrinsics", "no *.txt"),
+    "no camera": (objects({"name": "Bunny"}), "0002.npz", "no 'Camera'"),
+    "no pose": (objects({"name": "Camera"}), "0002.npz", "no 'Camera' with a pose"),
+    "pose is a word": (objects({"name": "Camera", "pose": "up"}), "0002.npz", "no 'Camera' with a pose"),
+    "pose of words": (objects({"name": "Camera", "pose": np.full((4, 4), "1")}), "0002.npz", "no 'Camera' with a pose"),
+    "small pose": (objects({"name": "Camera", "pose": np.eye(3)}), "0002.npz", "no 'Camera' with a pose"),
+    "NaN pose": (objects({"name": "Camera", "pose": np.full((4, 4), np.nan)}), "0002.npz", "not a rigid motion"),
+    "no object_poses": (
+        lambda folder: np.savez(folder / "Render_info/Bunny/0002.npz", depth=np.zeros(3)),
+        "0002.npz",
+        "no array object_poses",
+    ),
+    "text": (write_text("Render_info/Bunny/0002.npz", "pose"), "0002.npz", ".npz file"),
+    "lost image": (remove("Render_info/Bunny/00003.png"), "Render_info/Bunny", "20 images for 21 poses"),
+    "columns": (three_columns, "event.h5", "3 columns"),
+}
+
+
+def calibration(edit: Callable[[dict], object]) -> Change:
+    return edit_json("calibration.json", edit)
+
+
+def camchain(text: str) -> Change:
+    return all_of(remove("calibration.json"), write_text("camchain.yaml", text))
+
+
+def colmap(make: Change) -> Change:
+    return all_of(remove("trajectory.txt"), lambda folder: (folder / "colmap").mkdir(), make)
+
+
+OWN: dict[str, Fault] = {
+    "no folder": (shutil.rmtree, "made", "no such folder"),
+    "no events": (remove("events.h5"), "made", "0 files events{.raw,"),
+    "two event files": (write_text("events.csv", ""), "made", "2 files events"),
+    "no calibration": (remove("calibration.json"), "made", "0 of calibration.json and camchain.yaml"),
+    "no poses": (remove("trajectory.txt"), "trajectory.txt", "no such file"),
+    "no JSON": (write_text("calibration.json", "fx"), "calibration.json", "not valid JSON"),
+    "no event camera": (write_text("calibration.json", "{}"), "calibration.json", "`event_camera`"),
+    "negative threshold": (
+        calibration(lambda m: m["event_camera"].update(positive_contrast_threshold=-1)),
+        "calibration.json",
+        "positive_contrast_threshold",
+    ),
+    "unknown lens": (
+        calibration(lambda m: m["event_camera"].update(camera_model="FOV")),
+        "calibration.json",
+        "event_camera: the lens model is 'FOV'",
+    ),
+    "unknown encoding": (calibration(lambda m: m.update(image_encoding="log")), "calibration.json", "image_encoding"),
+    "scaled mount": (
+        calibration(lambda m: m["event_camera"].update(T_frame_event=SCALED)),
+        "event_camera.T_frame_event",
+        "not a rigid motion",
+    ),
+    "missing image": (remove("images/00001.png"), "images.txt", "images/00001.png, which does not exist"),
+    "image without time": (write_text("images.txt", "00001.png\n"), "images.txt", "line 1 has 1 fields"),
+    "COLMAP without times": (all_of(remove("images.txt"), colmap(lambda _: None)), "images.txt", "no such list"),
+    "empty COLMAP": (colmap(lambda _: None), "colmap", "no COLMAP model"),
+    "COLMAP of other images": (
+        colmap(lambda folder: write_colmap(folder / "colmap/sparse/0", make_poses(2), ["00000.png", "other.png"])),
+        "images.txt",
+        "it lists other.png 0 times",
+    ),
+    "broken COLMAP": (
+        colmap(lambda folder: (folder / "colmap" / "images.bin").write_bytes(b"\1")),
+        "images.bin",
+        "not a COLMAP model",
+    ),
+    "unknown distortion": (
+        camchain(yaml.dump({"cam0": {**CAMCHAIN["cam0"], "distortion_model": "fov"}})),
+        "camchain.yaml",
+        "cam0: the lens model is 'fov'",
+    ),
+    "three distortions": (
+        camchain(yaml.dump({"cam0": {**CAMCHAIN["cam0"], "distortion_coeffs": [0.1, 0, 0]}})),
+        "camchain.yaml",
+        "cam0: it has 3 distortion_coeffs",
+    ),
+    "infinite mount": (
+        camchain(yaml.dump({**CAMCHAIN, "cam1": {**CAMCHAIN["cam1"], "T_cn_cnm1": np.full((4, 4), np.inf).tolist()}})),
+        "cam1.T_cn_cnm1",
+        "not a rigid motion",
+    ),
+    "camchain of numbers": (camchain("cam0: 3"), "camchain.yaml", "no camera"),
+    "no YAML": (camchain("{:"), "camchain.yaml", "not valid YAML"),
+}
+
+FAULTS = {
+    "aenerf-data": NATIVE,
+    "ecd-data": ECD,
+    "robust-enerf-data": ROBUST,
+    "tum-vie-data": TUM_VIE,
+    "eds-data": EDS,
+    "enerf-esim-data": ESIM,
+    "eventnerf-data": EVENTNERF,
+    "paev3d-data": PAEV3D,
+    "event-recording-data": OWN,
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Callable[[str], Path]:
+    """A dataset of each format, written when it is first asked for."""
+    root, written = tmp_path_factory.mktemp("whole"), {}
+
+    def folder(name: str) -> Path:
+        if name not in written:
+            written[name] = root / name
+            if name == "tum-vie-data":
+                write_tum_vie(root / name, request.getfixturevalue("tum_vie_calibration"))
+            else:
+                {"aenerf-data": write_native, "ecd-data": write_ecd, **WRITERS}[name](root / name)
+        return written[name]
+
+    return folder
+
+
+@pytest.mark.parametrize(("name", "fault"), [(name, fault) for name, faults in FAULTS.items() for fault in faults])
+def test_faults_are_one_clear_line(name: str, fault: str, whole: Callable[[str], Path], tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(whole(name), tmp_path / "made"))
+    change, source, problem = FAULTS[name][fault]
+    change(folder)
+    options = {"event_camera": "cam0"} if (folder / "camchain.yaml").exists() else {}
+    with pytest.raises(DataError) as error:
+        read_everything(config_of(name, folder, **options))
+    assert str(folder) in str(error.value.source)
+    assert str(error.value.source).endswith(source)
+    assert problem in error.value.problem
+    assert "\n" not in str(error.value)
