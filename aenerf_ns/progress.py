@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Collection, Iterable, Iterator, Sized
 from typing import TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+Item = TypeVar("Item")
 Chunk = TypeVar("Chunk", bound=Sized)
 
 
@@ -20,6 +21,12 @@ def progress_bar() -> Progress:
         TimeRemainingColumn(),
         transient=True,
     )
+
+
+def track(items: Collection[Item], description: str) -> Iterator[Item]:
+    """Yield items and show how many of them have been yielded and worked on."""
+    with progress_bar() as progress:
+        yield from progress.track(items, description=description)
 
 
 def tracked(chunks: Iterable[Chunk], description: str, total: int | None) -> Iterator[Chunk]:

@@ -87,12 +87,12 @@ class ExportCameras:
         _, run, _ = open_run(self.load_config, test_mode="inference")
         from aenerf_ns.export.camera_model_files import IMAGE_FOLDER
         from aenerf_ns.export.frames import write_cameras
-        from aenerf_ns.export.placing import placed_views
-        from aenerf_ns.export.rendering import points_seen
+        from aenerf_ns.export.placing import place_views
+        from aenerf_ns.export.rendering import observe_points
 
-        placed = placed_views(run)
+        placed = place_views(run)
         images = [image for image, _ in placed]
-        points = points_seen(run, images, self.num_points)
+        points = observe_points(run, images, self.num_points)
         with creating(self.output):
             for image, file in placed:
                 target = self.output / IMAGE_FOLDER / image.name
@@ -136,10 +136,10 @@ class ExportFrames:
             require_range("rate", self.rate, *RATES)
         _, run, _ = open_run(self.load_config, test_mode="inference")
         from aenerf_ns.export.frames import export_frames
-        from aenerf_ns.export.times import times_at_rate, times_of_seconds
+        from aenerf_ns.export.times import times_at_rate, times_from_seconds
 
         if self.times:
-            times = times_of_seconds(run.scene.window, self.times)
+            times = times_from_seconds(run.scene.window, self.times)
         else:
             times = times_at_rate(run.scene.window, 10.0 if self.rate is None else self.rate)
         with creating(self.output):
@@ -169,15 +169,12 @@ class ExportMesh:
         require_range("resolution", self.resolution, 8, 2048)
         require_range("num-views", self.num_views, 1, _MAX_VIEWS)
         _, run, _ = open_run(self.load_config, test_mode="inference")
-        import trimesh
-
         from aenerf_ns.export.mesh import extract_mesh
 
         mesh = extract_mesh(run, self.num_views, self.resolution)
-        written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
         with creating(self.output):
-            written.export(self.output)
-        sides = " x ".join(f"{side:.3g}" for side in written.extents)
+            mesh.export(self.output)
+        sides = " x ".join(f"{side:.3g}" for side in mesh.extents)
         CONSOLE.print(
             f"{self.output}: {len(mesh.faces)} triangles, {sides} units of the recording.",
             highlight=False,
@@ -209,13 +206,13 @@ class ExportVideo:
         _, run, _ = open_run(self.load_config, test_mode="inference")
         from aenerf_ns.cli.video_file import new_video
         from aenerf_ns.export.times import times_at_rate
-        from aenerf_ns.export.video import side_by_side
+        from aenerf_ns.export.video import render_panels
 
         run.scene.event_file.require()
         times = times_at_rate(run.scene.window, self.rate)
         if len(times) < 2:
             raise DataError("--rate", f"{self.rate:g} frames a second give no two frames", "give a higher one")
-        pictures = side_by_side(run, times)
+        pictures = render_panels(run, times)
         first = next(pictures)
         with (
             creating(self.output),

@@ -12,8 +12,8 @@ from aenerf_ns.events.stream import EventFile
 from aenerf_ns.progress import tracked
 
 
-def recorded_between(events: EventFile, times: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Yield the (height, width) sums of polarities between each two times, of the events from the first time on.
+def sum_recorded_events(events: EventFile, times: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Yield the (height, width) sums of polarities between each two consecutive times, the earlier one included.
 
     Args:
         events: read once, in pieces.
@@ -28,7 +28,7 @@ def recorded_between(events: EventFile, times: NDArray[np.int64]) -> Iterator[ND
             end = int(np.searchsorted(chunk.t, times[index]))
             np.add.at(net, (chunk.y[begin:end], chunk.x[begin:end]), chunk.p[begin:end])
             if end == len(chunk):
-                # Later pieces may go on with this interval.
+                # The next chunk may continue this interval.
                 break
             yield net
             net = np.zeros(shape, np.int64)
@@ -41,7 +41,7 @@ def recorded_between(events: EventFile, times: NDArray[np.int64]) -> Iterator[ND
 
 
 class RenderedEvents:
-    """Triggers events as the sensor's model does (paper, eq. 5), from renderings one after another.
+    """Trigger events as the sensor's model does (paper, eq. 5), from consecutive renderings.
 
     Args:
         sensor: its thresholds and its filters. Its refractory period plays no part.

@@ -21,15 +21,15 @@ from aenerf_ns.export.camera_model_files import (
     write_transforms,
 )
 from aenerf_ns.export.placing import corrected_poses
-from aenerf_ns.export.rendering import points_seen, render
+from aenerf_ns.export.rendering import observe_points, render
 from aenerf_ns.files.text import format_seconds
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 from aenerf_ns.recording.views import IMAGE_LIST
 
 DEPTH_FOLDER = "depth"
 DEPTH_UNIT = 1e-3
-"""Units of the recording that one step of a depth picture stands for: the framework's own default."""
-_DEEPEST = 2**16 - 1
+"""Depth per step of a depth picture, in units of the recording: the framework's own default."""
+_MAX_DEPTH = 2**16 - 1
 
 
 @torch.no_grad()
@@ -43,30 +43,27 @@ def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int)
         run: in evaluation mode.
         folder: to create.
         times: (N,) in nanoseconds.
-        num_points: points of the scene at most.
+        num_points: the most points of the scene.
     """
-    lens = run.recording.event_camera
-    directions, _ = lens.pixel_directions()
-    # Distances along the optical axis are distances along the ray times these. The axis looks along -z.
+    camera = run.recording.event_camera
+    directions, _ = camera.pixel_directions()
+    # Factors from distances along the ray to distances along the optical axis, which looks along -z.
     along_axis = torch.from_numpy(-directions[..., 2:])
     poses = homogeneous(corrected_poses(run, times))
     for name in (IMAGE_FOLDER, DEPTH_FOLDER):
         (folder / name).mkdir(parents=True)
     images, lines = [], []
-    with progress_bar() as progress:
-        task = progress.add_task("Rendering frames", total=len(times))
-        for index, (time, pose) in enumerate(zip(times.tolist(), poses, strict=True)):
-            outputs = render(run, lens, pose)
-            name = f"{index:06d}.png"
-            to_image(outputs["rgb"]).save(folder / IMAGE_FOLDER / name)
-            depth = (outputs["depth"].cpu() * along_axis / DEPTH_UNIT).round()[..., 0].numpy()
-            depth[depth > _DEEPEST] = 0
-            Image.fromarray(depth.astype(np.uint16)).save(folder / DEPTH_FOLDER / name)
-            images.append(PlacedImage(name, lens, pose.numpy(), depth=f"{DEPTH_FOLDER}/{name}"))
-            lines.append(f"{format_seconds(time)} {IMAGE_FOLDER}/{name}\n")
-            progress.advance(task)
+    for index, pose in enumerate(track(poses, "Rendering frames")):
+        outputs = render(run, camera, pose)
+        name = f"{index:06d}.png"
+        to_image(outputs["rgb"]).save(folder / IMAGE_FOLDER / name)
+        depth = (outputs["depth"].cpu() * along_axis / DEPTH_UNIT).round()[..., 0].numpy()
+        depth[depth > _MAX_DEPTH] = 0
+        Image.fromarray(depth.astype(np.uint16)).save(folder / DEPTH_FOLDER / name)
+        images.append(PlacedImage(name, camera, pose.numpy(), depth=f"{DEPTH_FOLDER}/{name}"))
+        lines.append(f"{format_seconds(int(times[index]))} {IMAGE_FOLDER}/{name}\n")
     (folder / IMAGE_LIST).write_text("".join(lines), "utf8")
-    write_cameras(folder, images, points_seen(run, images, num_points))
+    write_cameras(folder, images, observe_points(run, images, num_points))
 
 
 def write_cameras(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:

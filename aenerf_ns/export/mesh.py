@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
-from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import homogeneous
@@ -17,34 +15,19 @@ from aenerf_ns.export.placing import corrected_poses
 from aenerf_ns.export.rendering import render
 from aenerf_ns.export.times import spread_times
 from aenerf_ns.open3d_import import load_open3d
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 
-# Of an unbounded scene, the share of what the views see that lies beyond each end of the box, along each axis.
-_LEFT_OUT = 0.01
+# Share of what the views see of an unbounded scene that lies beyond each end of the box, along each axis.
+_MAX_BEYOND = 0.01
 # Voxels on either side of a surface in which its distance is kept.
 _TRUNCATION = 4.0
 # Voxels along a side of a block, and blocks that memory is taken for at first: 0.4 GB.
 _BLOCK, _NUM_BLOCKS = 8, 40_000
 # Views that must have seen a surface.
-_LEAST_VIEWS = 1.0
+_MIN_VIEWS = 1.0
 
 
-@dataclass(frozen=True)
-class ColoredMesh:
-    """A triangle mesh.
-
-    Attributes:
-        vertices: (V, 3) float64 in the recording's world and units.
-        faces: (F, 3) indices of vertices.
-        colors: (V, 3) uint8 display values.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    colors: NDArray[np.uint8]
-
-
-def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> ColoredMesh:
+def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Trimesh:
     """Fuse the depths of views along the corrected trajectory in a truncated signed distance field, and mesh it.
 
     The framework's own exporter takes the cameras as the dataset gives them, while its renderings are from the
@@ -56,21 +39,32 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> ColoredMes
         resolution: voxels along the longest side of the box that is meshed: the scene's own box where the dataset
             states one, else a box that holds nearly all that the views see.
 
+    Returns:
+        A mesh with vertex colors, in the recording's world and units.
+
     Raises:
         DataError: the views see no surface.
     """
     open3d = load_open3d()
+    no_surface = DataError(run.data, "the run renders no surface", "train it longer")
     given = run.recording.event_camera
-    lens = CameraIntrinsics(given.width, given.height, given.fx, given.fy, given.cx, given.cy)
+    camera = CameraIntrinsics(given.width, given.height, given.fx, given.fy, given.cx, given.cy)
     poses = homogeneous(corrected_poses(run, spread_times(run.scene.window, num_views)))
-    colors, depths = _views(run, lens, poses)
-    directions, _ = lens.pixel_directions()
+    colors, distances = [], []
+    for pose in track(poses, "Rendering views"):
+        outputs = render(run, camera, pose)
+        colors.append(outputs["rgb"].clamp(0, 1).float().cpu().numpy())
+        distances.append(outputs["depth"][..., 0].double().cpu())
+    depths = torch.stack(distances)
+    directions, _ = camera.pixel_directions()
     # From OpenGL's axes to OpenCV's.
     in_camera = torch.from_numpy(directions) * torch.tensor([1.0, -1.0, -1.0])
     points = poses[:, None, None, :3, 3] + depths[..., None] * torch.einsum(
         "nij,hwj->nhwi", poses[:, :3, :3], in_camera
     )
-    low, high = _box(run, points[depths > 0].numpy())
+    if not (depths > 0).any():
+        raise no_surface
+    low, high = _choose_box(run, points[depths > 0].numpy())
     depths[((points < torch.from_numpy(low)) | (points > torch.from_numpy(high))).any(-1)] = 0
     voxel = float((high - low).max()) / resolution
     core, image = open3d.core, open3d.t.geometry.Image
@@ -83,8 +77,8 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> ColoredMes
         block_resolution=_BLOCK,
         block_count=_NUM_BLOCKS,
     )
-    # Open3D counts pixels from the centre of the first one.
-    matrix = core.Tensor(np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]]))
+    # Open3D counts pixels from the center of the first one.
+    matrix = core.Tensor(np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]]))
     along_axis = (depths * in_camera[..., 2]).float().numpy()
     farthest = 2 * float(along_axis.max()) + 1
     for color, depth, pose in zip(colors, along_axis, poses.numpy(), strict=True):
@@ -93,46 +87,23 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> ColoredMes
         seen, shown, extrinsics = image(core.Tensor(depth)), image(core.Tensor(color)), core.Tensor(np.linalg.inv(pose))
         blocks = grid.compute_unique_block_coordinates(seen, matrix, extrinsics, 1.0, farthest, _TRUNCATION)
         grid.integrate(blocks, seen, shown, matrix, matrix, extrinsics, 1.0, farthest, _TRUNCATION)
-    mesh = grid.extract_triangle_mesh(weight_threshold=_LEAST_VIEWS)
+    mesh = grid.extract_triangle_mesh(weight_threshold=_MIN_VIEWS)
     if len(mesh.triangle.indices) == 0:
-        raise _no_surface(run)
-    return ColoredMesh(
+        raise no_surface
+    return trimesh.Trimesh(
         mesh.vertex.positions.numpy().astype(np.float64),
         mesh.triangle.indices.numpy().astype(np.int64),
-        np.rint(255 * mesh.vertex.colors.numpy().clip(0, 1)).astype(np.uint8),
+        vertex_colors=np.rint(255 * mesh.vertex.colors.numpy().clip(0, 1)).astype(np.uint8),
+        process=False,
     )
 
 
-def _views(run: TrainedRun, lens: CameraIntrinsics, poses: Tensor) -> tuple[NDArray[np.float32], Tensor]:
-    """Return display values (N, H, W, 3), and float64 distances (N, H, W) along the rays in units of the recording."""
-    colors, depths = [], []
-    with progress_bar() as progress:
-        task = progress.add_task("Rendering views", total=len(poses))
-        for pose in poses:
-            outputs = render(run, lens, pose)
-            colors.append(outputs["rgb"].clamp(0, 1).float().cpu().numpy())
-            depths.append(outputs["depth"][..., 0].double().cpu())
-            progress.advance(task)
-    return np.stack(colors), torch.stack(depths)
-
-
-def _box(run: TrainedRun, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and the highest corner (3,) of the box that is meshed, in the recording's world.
-
-    Args:
-        run: trained.
-        points: (N, 3) that the views see.
-    """
-    if len(points) == 0:
-        raise _no_surface(run)
+def _choose_box(run: TrainedRun, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and the highest corner (3,) of the box to mesh: the dataset's, else that of (N, 3) points."""
     stated = run.recording.scene_box
     if stated is not None:
         low, high = stated.double().numpy()
         return low, high
-    low, high = np.quantile(points, [_LEFT_OUT, 1 - _LEFT_OUT], axis=0)
-    margin = _LEFT_OUT * (high - low).max()
+    low, high = np.quantile(points, [_MAX_BEYOND, 1 - _MAX_BEYOND], axis=0)
+    margin = _MAX_BEYOND * (high - low).max()
     return low - margin, high + margin
-
-
-def _no_surface(run: TrainedRun) -> DataError:
-    return DataError(run.data, "the run renders no surface", "train it longer")

@@ -17,28 +17,30 @@ from aenerf_ns.recording.recording import SPLITS, ReferenceView, Split
 from aenerf_ns.recording.views import thinned, views_within
 
 
-def placed_views(run: TrainedRun) -> list[tuple[PlacedImage, Path]]:
-    """Return the images of a run's recording where the corrected poses put them, and their files.
+def place_views(run: TrainedRun) -> list[tuple[PlacedImage, Path]]:
+    """Place the images of a run's recording where the corrected poses put them.
 
-    An image with a time is at the corrected pose of that time, with the place on the rig that it has beside the
+    An image with a time is at the corrected pose of that time, with the offset on the rig that it has beside the
     dataset's own poses. Other images are carried over by the Sim(3) that best maps the dataset's trajectory, the true
     one where it is known, to the corrected one. An image that is in several splits is a test or validation image.
+
+    Returns:
+        The images and their files.
 
     Raises:
         DataError: the recording has no images, or their files are missing.
     """
     recording = run.recording
-    window = run.scene.window
     split_of: dict[Path, tuple[Split, ReferenceView]] = {}
     for split in SPLITS:
-        views = views_within(recording.reference_views[split], window)
+        views = views_within(recording.reference_views[split], run.scene.window)
         for view in views if split == "train" else thinned(views, recording.max_views):
             split_of[view.file] = (split, view)
     found = {file: entry for file, entry in split_of.items() if file.is_file()}
     if not found:
         problem = "its images are missing" if split_of else "it has no images"
         raise DataError(run.data, problem, "aenerf export-frames renders images along the trajectory")
-    poses = _carried_over(run, [view for _, view in found.values()])
+    poses = _place_poses(run, [view for _, view in found.values()])
     common = Path(os.path.commonpath([file.parent for file in found]))
     return [
         (PlacedImage(file.relative_to(common).as_posix(), recording.frame_camera, pose.numpy(), split), file)
@@ -46,13 +48,12 @@ def placed_views(run: TrainedRun) -> list[tuple[PlacedImage, Path]]:
     ]
 
 
-def _carried_over(run: TrainedRun, views: list[ReferenceView]) -> Tensor:
-    """Return the poses (N, 4, 4), OpenCV axes, of views in the frame of the corrected poses."""
+def _place_poses(run: TrainedRun, views: list[ReferenceView]) -> Tensor:
+    """Compute the poses (N, 4, 4), OpenCV axes, of views in the frame of the corrected poses."""
     correction = run.model.camera_optimizer
-    recording = run.recording
     _, corrected, reference = (run.scene.to_recording(poses) for poses in correction.compared_poses())
     alignment = align(corrected, reference).inverse()
-    given = recording.reference_trajectory
+    given = run.recording.reference_trajectory
     poses = []
     for view in views:
         if view.time is not None and given.start <= view.time <= given.end:
@@ -68,7 +69,7 @@ def _carried_over(run: TrainedRun, views: list[ReferenceView]) -> Tensor:
 
 @torch.no_grad()
 def corrected_poses(run: TrainedRun, times: Tensor) -> Tensor:
-    """Return the corrected poses (N, 3, 4) at (N,) times in nanoseconds: OpenCV axes, in the recording's world."""
+    """Compute the corrected poses (N, 3, 4) at (N,) times in nanoseconds: OpenCV axes, in the recording's world."""
     correction = run.model.camera_optimizer
     seconds = correction.trajectory.seconds(times.to(run.device))
     return run.scene.to_recording(correction.pose(seconds))

@@ -14,76 +14,62 @@ from torch import Tensor
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.export.camera_model_files import ObservedPoints, PlacedImage
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 
 # Less opaque pixels see no surface.
-OPAQUE = 0.5
+_MIN_OPACITY = 0.5
 
 
-def scene_camera(run: TrainedRun, lens: CameraIntrinsics, poses: Tensor) -> Cameras:
-    """Return cameras of the scene at poses (N, 4, 4) of the recording's world, OpenCV axes, on the run's device."""
-    return lens.cameras(run.scene.to_scene(poses)).to(run.device)
+def _make_cameras(run: TrainedRun, camera: CameraIntrinsics, poses: Tensor) -> Cameras:
+    """Make cameras of the scene at poses (N, 4, 4) of the recording's world, OpenCV axes, on the run's device."""
+    return camera.cameras(run.scene.to_scene(poses)).to(run.device)
 
 
 @torch.no_grad()
-def render(run: TrainedRun, lens: CameraIntrinsics, pose: Tensor) -> dict[str, Tensor]:
+def render(run: TrainedRun, camera: CameraIntrinsics, pose: Tensor) -> dict[str, Tensor]:
     """Render a view.
 
     Args:
         run: in evaluation mode.
-        lens: of the camera.
+        camera: its intrinsics.
         pose: (4, 4) or (3, 4) in the recording's world, OpenCV axes.
 
     Returns:
         The model's outputs (height, width, channels). ``depth`` is the distance along the ray in units of the
         recording, 0 where no surface is seen.
     """
-    outputs = run.model.get_outputs_for_camera(scene_camera(run, lens, pose[None]))
-    scale = run.scene.scale
-    depth = torch.where(outputs["accumulation"] > OPAQUE, outputs["depth"] / scale, 0.0)
+    outputs = run.model.get_outputs_for_camera(_make_cameras(run, camera, pose[None]))
+    depth = torch.where(outputs["accumulation"] > _MIN_OPACITY, outputs["depth"] / run.scene.scale, 0.0)
     return {**outputs, "depth": depth}
 
 
 @torch.no_grad()
-def points_seen(run: TrainedRun, images: Sequence[PlacedImage], most: int) -> ObservedPoints:
-    """Return points on the surfaces that images see, in the recording's world, at pixels spread over the images.
+def observe_points(run: TrainedRun, images: Sequence[PlacedImage], max_points: int) -> ObservedPoints:
+    """Render points on the surfaces that images see, in the recording's world, at pixels spread over the images.
 
     Args:
         run: in evaluation mode.
         images: with their poses.
-        most: number of points at most. Rays that see no surface give none.
+        max_points: rays that see no surface give no point.
     """
     to_recording = run.scene.frame.inverse()
     generator = torch.Generator().manual_seed(0)
     parts: list[tuple[NDArray, ...]] = []
-    per_image = -(-most // len(images))
+    per_image = -(-max_points // len(images))
     chunk = run.model.config.eval_num_rays_per_chunk
-    with progress_bar() as progress:
-        task = progress.add_task("Rendering points", total=len(images))
-        for index, image in enumerate(images):
-            lens = image.camera
-            size = torch.tensor([lens.height, lens.width])
-            coordinates = (torch.rand(per_image, 2, generator=generator) * size).floor() + 0.5
-            camera = scene_camera(run, lens, torch.from_numpy(image.camera_to_world)[None])
-            rays = camera.generate_rays(
-                torch.zeros(per_image, 1, dtype=torch.long, device=run.device),
-                coords=coordinates.to(run.device),
-            )
-            for begin in range(0, per_image, chunk):
-                part = rays[begin : begin + chunk]
-                outputs = run.model(replace(part))
-                seen = (outputs["accumulation"] > OPAQUE)[:, 0]
-                positions = (part.origins + part.directions * outputs["depth"])[seen]
-                colors = (255 * outputs["rgb"][seen].clamp(0, 1)).round().byte()
-                pixels = coordinates[begin : begin + chunk].flip(-1)[seen.cpu()]
-                parts.append(
-                    (
-                        to_recording.map_points(positions.cpu().double()).numpy(),
-                        colors.cpu().numpy(),
-                        np.full(len(pixels), index),
-                        pixels.double().numpy(),
-                    )
-                )
-            progress.advance(task)
-    columns = (np.concatenate(column)[:most] for column in zip(*parts, strict=True))
-    return ObservedPoints(*columns)
+    for index, image in enumerate(track(images, "Rendering points")):
+        size = torch.tensor([image.camera.height, image.camera.width])
+        coordinates = (torch.rand(per_image, 2, generator=generator) * size).floor() + 0.5
+        rays = _make_cameras(run, image.camera, torch.from_numpy(image.camera_to_world)[None]).generate_rays(
+            torch.zeros(per_image, 1, dtype=torch.long, device=run.device), coords=coordinates.to(run.device)
+        )
+        for begin in range(0, per_image, chunk):
+            part = rays[begin : begin + chunk]
+            outputs = run.model(replace(part))
+            seen = (outputs["accumulation"] > _MIN_OPACITY)[:, 0]
+            positions = (part.origins + part.directions * outputs["depth"])[seen].cpu().double()
+            colors = (255 * outputs["rgb"][seen].clamp(0, 1)).round().byte().cpu()
+            pixels = coordinates[begin : begin + chunk].flip(-1)[seen.cpu()].double()
+            found = np.full(len(pixels), index)
+            parts.append((to_recording.map_points(positions).numpy(), colors.numpy(), found, pixels.numpy()))
+    return ObservedPoints(*(np.concatenate(column)[:max_points] for column in zip(*parts, strict=True)))

@@ -14,19 +14,19 @@ from aenerf_ns.files.limits import MAX_ROWS
 
 
 def spread_times(window: TimeWindow, count: int) -> Tensor:
-    """Return (count,) times in nanoseconds, evenly spread over a time window, its gaps left out."""
+    """Spread (count,) times in nanoseconds evenly over a time window, its gaps left out."""
     if count < 1:
         raise DataError("aenerf", f"{count} views", "give one or more")
     starts, ends = torch.tensor(window.pieces()).T
-    passed = (ends - starts).cumsum(0)
-    # In the middles of equal parts.
-    places = ((torch.arange(count) + 0.5) * (int(passed[-1]) / count)).long()
-    piece = torch.searchsorted(passed, places, right=True)
-    return ends[piece] - (passed[piece] - places)
+    elapsed = (ends - starts).cumsum(0)
+    # The times are in the middles of equal parts.
+    middles = ((torch.arange(count) + 0.5) * (int(elapsed[-1]) / count)).long()
+    piece = torch.searchsorted(elapsed, middles, right=True)
+    return ends[piece] - (elapsed[piece] - middles)
 
 
 def regular_times(start: int, end: int, rate: float) -> Tensor:
-    """Return times in nanoseconds from a start to an end, so many a second.
+    """Return times in nanoseconds from a start to an end, at a rate per second.
 
     Raises:
         DataError: the rate is not positive, or gives more times than a reader of trajectories takes.
@@ -42,7 +42,7 @@ def regular_times(start: int, end: int, rate: float) -> Tensor:
 
 
 def times_at_rate(window: TimeWindow, rate: float) -> Tensor:
-    """Return times in nanoseconds, so many a second, in a time window but not in its gaps.
+    """Return times in nanoseconds, at a rate per second, in a time window but not in its gaps.
 
     Raises:
         DataError: the rate is not positive, or too high for the run.
@@ -51,18 +51,19 @@ def times_at_rate(window: TimeWindow, rate: float) -> Tensor:
     return times[torch.from_numpy(window.contains(times))]
 
 
-def times_of_seconds(window: TimeWindow, seconds: Sequence[float]) -> Tensor:
-    """Return times in nanoseconds for times in seconds on the clock of the events.
+def times_from_seconds(window: TimeWindow, seconds: Sequence[float]) -> Tensor:
+    """Convert times in seconds on the clock of the events to nanoseconds.
 
     Raises:
         DataError: a time is not in the time window of the run.
     """
-    times = [round(one * 1e9) if math.isfinite(one * 1e9) else window.start - 1 for one in seconds]
-    for one, time in zip(seconds, times, strict=True):
-        if not window.contains(time):
+    times = []
+    for value in seconds:
+        times.append(round(value * 1e9) if math.isfinite(value * 1e9) else window.start - 1)
+        if not window.contains(times[-1]):
             raise DataError(
                 "--times",
-                f"{one:g} s is not in the run's time, {window.start * 1e-9:g} to {window.end * 1e-9:g} s",
+                f"{value:g} s is not in the run's time, {window.start * 1e-9:g} to {window.end * 1e-9:g} s",
                 "give times on the clock of the events, in which poses are known",
             )
     return torch.tensor(times)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import to_image
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 
 ERROR_RANGE = 0.25
 """The mean absolute difference of display values in [0, 1] that an error picture shows brightest."""
@@ -75,16 +75,13 @@ def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPic
     model, dataset = run.model, run.views
     scale = run.scene.scale
     pictures, rendered, true = [], [], []
-    with progress_bar() as progress:
-        task = progress.add_task("Rendering views", total=len(indices))
-        for index in indices:
-            outputs = model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(run.device))
-            image = dataset.get_image_float32(index).to(run.device)
-            pictures.append(_pictures(outputs, model.reference_display(image), scale))
-            rendered.append(outputs["log_radiance"].flatten(0, 1).double())
-            # The color correction is fitted to the same values.
-            true.append(torch.log(model.reference_radiance(image).flatten(0, 1).double() + 1e-3))
-            progress.advance(task)
+    for index in track(indices, "Rendering views"):
+        outputs = model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(run.device))
+        image = dataset.get_image_float32(index).to(run.device)
+        pictures.append(_pictures(outputs, model.reference_display(image), scale))
+        rendered.append(outputs["log_radiance"].flatten(0, 1).double())
+        # The color correction is fitted to the same values.
+        true.append(torch.log(model.reference_radiance(image).flatten(0, 1).double() + 1e-3))
     contrast = torch.cat(rendered).std(0) / torch.cat(true).std(0).clamp_min(1e-9)
     return pictures, contrast.tolist()
 

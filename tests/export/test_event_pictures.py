@@ -10,7 +10,7 @@ import pytest
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.export.event_pictures import RenderedEvents, recorded_between
+from aenerf_ns.export.event_pictures import RenderedEvents, sum_recorded_events
 
 
 class Pieces(EventFile):
@@ -44,7 +44,7 @@ def test_recorded_events_are_those_between_two_times(size: int) -> None:
     )
     # Before the first event, between events, at an event, and beyond the last.
     times = np.array([-50, 100, 101, int(events.t[120]), 900, 2000, 3000])
-    pictures = list(recorded_between(Pieces(events, size), times))
+    pictures = list(sum_recorded_events(Pieces(events, size), times))
     assert len(pictures) == len(times) - 1
     for picture, first, last in zip(pictures, times[:-1], times[1:], strict=True):
         expected = np.zeros((4, 5), np.int64)

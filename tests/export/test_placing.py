@@ -18,9 +18,9 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.export import mesh
 from aenerf_ns.export.camera_model_files import PlacedImage
-from aenerf_ns.export.placing import corrected_poses, placed_views
-from aenerf_ns.export.rendering import points_seen
-from aenerf_ns.export.times import spread_times, times_at_rate, times_of_seconds
+from aenerf_ns.export.placing import corrected_poses, place_views
+from aenerf_ns.export.rendering import observe_points
+from aenerf_ns.export.times import spread_times, times_at_rate, times_from_seconds
 
 SECOND = 10**9
 
@@ -39,7 +39,7 @@ def run(tmp_path: Path) -> TrainedRun:
 
 
 def test_images_are_at_the_corrected_poses(run: TrainedRun) -> None:
-    placed = placed_views(run)
+    placed = place_views(run)
     assert [(image.name, image.split) for image, _ in placed] == [
         ("val/00000.png", "val"), ("val/00001.png", "val"),
         ("test/00000.png", "test"), ("test/00001.png", "test"), ("test/00002.png", "test"),
@@ -68,8 +68,8 @@ def test_images_are_at_the_corrected_poses(run: TrainedRun) -> None:
 
 def test_points_lie_on_the_rays_of_their_pixels(run: TrainedRun) -> None:
     run.model.field.average_init_density = 1e3
-    images = [image for image, _ in placed_views(run)]
-    points = points_seen(run, images, 40)
+    images = [image for image, _ in place_views(run)]
+    points = observe_points(run, images, 40)
     assert 20 < len(points.positions) <= 40
     for position, index, (column, row) in zip(points.positions, points.images, points.pixels, strict=True):
         image: PlacedImage = images[index]
@@ -82,7 +82,7 @@ def test_points_lie_on_the_rays_of_their_pixels(run: TrainedRun) -> None:
 def test_a_recording_without_images_has_no_cameras_to_export(tmp_path: Path) -> None:
     run = make_pipeline(tmp_path / "made", "test", num_views=-1, true_world=lambda poses: poses).trained_run()
     with pytest.raises(DataError, match="it has no images; aenerf export-frames renders"):
-        placed_views(run)
+        place_views(run)
 
 
 def test_times_leave_gaps_out() -> None:
@@ -93,10 +93,10 @@ def test_times_leave_gaps_out() -> None:
     assert int((times <= SECOND // 10).sum()) == 10
     assert (np.diff(times)[np.diff(times) < SECOND // 10] - SECOND // 100 <= 1).all()
     assert times_at_rate(window, 20).tolist() == [0, 5 * 10**7, 10**8, *range(SECOND // 2, SECOND + 1, 5 * 10**7)]
-    assert times_of_seconds(window, [0.05, 0.75]).tolist() == [5 * 10**7, 75 * 10**7]
+    assert times_from_seconds(window, [0.05, 0.75]).tolist() == [5 * 10**7, 75 * 10**7]
     for seconds in (0.2, 1.5, float("nan"), float("inf")):
         with pytest.raises(DataError, match="is not in the run's time, 0 to 1 s"):
-            times_of_seconds(window, [seconds])
+            times_from_seconds(window, [seconds])
     with pytest.raises(DataError, match="a rate of 0"):
         times_at_rate(window, 0)
     with pytest.raises(DataError, match="a rate of 1e\\+09 gives 1e\\+09 times"):
@@ -127,4 +127,4 @@ def test_a_mesh_is_in_the_units_of_the_recording(run: TrainedRun, monkeypatch: p
     # To a voxel and a pixel: the visible cap is less than a metre wide.
     assert np.abs(distance - radius).mean() < 0.01
     assert np.quantile(np.abs(distance - radius), 0.95) < 0.03
-    assert (made.colors[distance < radius + 0.01] == [255, 128, 0]).mean() > 0.9
+    assert (made.visual.vertex_colors[distance < radius + 0.01] == [255, 128, 0, 255]).mean() > 0.9
