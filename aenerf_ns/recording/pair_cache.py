@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import math
 import os
-import sys
 import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -28,8 +28,6 @@ _VERSION = 1
 # The end of the file: length of the description as JSON in front of it, and this word.
 _WORD = b"aenerf-pairs"
 _NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "int")
-
-Shown = TypeVar("Shown")
 
 
 class PairFile:
@@ -48,34 +46,33 @@ class PairFile:
         self.path = events.path.with_name(events.path.name + ".pairs")
         options = {name: repr(value) for name, value in vars(events).items() if name != "path"}
         stated = {"version": _VERSION, "files": _stamps(events.path), "reader": options, **made_from}
-        # As it will be read again.
+        # JSON turns tuples into lists: compare what reading the file gives.
         self._made_from = json.loads(json.dumps(stated))
         self._new: BinaryIO | None = None
         self._is_kept = False
-        self._said: set[str] = set()
+        self._printed: set[str] = set()
 
     def find(self) -> tuple[EventPairs, NDArray[np.int16]] | None:
-        """Return the pairs and the pictures, or None if they are to be made. Says so if there is a file of no use."""
+        """Find the pairs and the pictures of an earlier run. None, and a line why, if they must be made."""
         if not self.path.is_file():
             return None
         try:
             with self.path.open("rb") as file:
                 found = self._read(file)
         except (OSError, ValueError, KeyError, TypeError) as error:
-            self._say(f"{self.path} is not whole ({error}): it is made again.")
+            self._print_once(f"{self.path} is not whole ({error}): it is made again.")
             return None
         if found is None:
-            self._say(f"{self.path} is of other events or options: it is made again.")
+            self._print_once(f"{self.path} is of other events or options: it is made again.")
         return found
 
-    def _say(self, line: str) -> None:
-        """Print a line, once."""
-        if line not in self._said:
+    def _print_once(self, line: str) -> None:
+        if line not in self._printed:
             CONSOLE.print(f"[yellow]{line}")
-        self._said.add(line)
+        self._printed.add(line)
 
     def _read(self, file: BinaryIO) -> tuple[EventPairs, NDArray[np.int16]] | None:
-        """Return the pairs and the pictures, or None if they are of other events or options.
+        """Read the pairs and the pictures, None if they are of other events or options.
 
         Raises:
             ValueError, KeyError or TypeError: the file is broken.
@@ -107,11 +104,9 @@ class PairFile:
         return pairs, pictures
 
     def open(self) -> tuple[BinaryIO, Path]:
-        """Open a new file to write the rows to. Returns it with a folder for temporary files."""
+        """Open a new file for the rows. Return it with a folder for temporary files."""
         try:
             folder = self.path.parent
-            if sys.platform == "win32":
-                raise OSError(errno.EACCES, "Windows renames no file that is mapped")
             self._new = self._part.open("w+b")
             self._is_kept = True
         except OSError as error:
@@ -183,13 +178,10 @@ class PairFile:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold a folder's lock, where there are such locks: not on Windows nor in some network folders."""
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
+    """Hold a folder's lock. Some network folders have none.
 
-    # The folder's, because HDF5 locks its files itself.
+    The events' own lock is HDF5's, and a lock file would stay behind in the dataset.
+    """
     lock = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):
@@ -200,7 +192,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _stamps(path: Path) -> list[tuple[str, int, int]]:
-    """Return name, size and time of change of a file, or of all files in a folder."""
+    """List name, size and time of change of a file, or of all files in a folder."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     stats = [(file, file.stat()) for file in files if file.is_file()]
     return [(str(file.relative_to(path.parent)), stat.st_size, stat.st_mtime_ns) for file, stat in stats]

@@ -20,9 +20,9 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class ReferenceView:
-    """An image with its pose. Reference images serve evaluation, colour correction and the viewer.
+    """An image with its pose, for evaluation, color correction and the viewer.
 
-    Only ``e2vid-nerf`` trains on images, those of the train split, which ``aenerf reconstruct`` makes of the events.
+    Only ``e2vid-nerf`` trains on images: those of the train split, which ``aenerf reconstruct`` makes of the events.
 
     Attributes:
         file: the image.
@@ -61,9 +61,10 @@ class Capture:
         ground_truth: Trajectory | None = None,
         max_views: int | None = None,
     ) -> Recording:
-        """Return the recording of this capture with poses. The arguments are the attributes of :class:`Recording`."""
+        """Make the recording of this capture with poses. The arguments are the attributes of :class:`Recording`."""
+        known = {field.name: getattr(self, field.name) for field in fields(Capture)}
         return Recording(
-            **{field.name: getattr(self, field.name) for field in fields(Capture)},
+            **known,
             trajectory=trajectory,
             reference_views=reference_views,
             ground_truth=ground_truth,

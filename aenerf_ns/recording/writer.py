@@ -52,7 +52,7 @@ class _FolderWriter(ABC):
         lock = OutputLock(folder) if isinstance(folder, Path) else folder
         self._own_lock = lock if isinstance(folder, Path) else None
         self._folder, self._partial = lock.output, lock.partial
-        # Of a process that was killed, because the lock is held.
+        # A process that was killed may have left it. Nobody else writes it, because the lock is held.
         shutil.rmtree(self._partial, ignore_errors=True)
         try:
             self._partial.mkdir()
@@ -91,11 +91,7 @@ class _FolderWriter(ABC):
 
 
 class NativeDatasetWriter(_FolderWriter):
-    """Write a dataset folder, completely or not at all. Use it as a context manager.
-
-    The folder gets its name when the last file is complete. If anything fails, nothing is left behind. An OSError
-    within the context, such as on a full disk, becomes a DataError. As long as the writer lives, no other process can
-    write the folder.
+    """Write a dataset folder, completely or not at all, as a context manager (see :class:`_FolderWriter`).
 
     Args:
         folder: the dataset folder to create, or the lock on it that the caller holds.
@@ -107,12 +103,6 @@ class NativeDatasetWriter(_FolderWriter):
             known everywhere.
         frame_camera: the lens of the camera that took the images; by default the event camera's.
         auto_scale_poses: whether training scales the poses by default.
-
-    Raises:
-        DataError: the folder exists, cannot be created, or is being written by another process.
-
-    Attributes:
-        events: its method ``append`` takes the events, piece by piece in the order of time.
     """
 
     def __init__(
@@ -226,17 +216,15 @@ class NativeDatasetWriter(_FolderWriter):
             self._meta[f"{split}_filenames"].append(self._files[file]["file_path"])
             return
         with Image.open(file) as image:
-            opaque = background is None or image.mode != "RGBA"
-            if opaque:
-                self._files[file] = self._add_frame(split, file.suffix, camera_to_world, time)
-                shutil.copyfile(file, self._partial / self._files[file]["file_path"])
-                return
-            values = np.asarray(image, np.float64) / 255
+            values = None if background is None or image.mode != "RGBA" else np.asarray(image, np.float64) / 255
+        frame = self._add_frame(split, file.suffix if values is None else ".png", camera_to_world, time)
+        self._files[file] = frame
+        if values is None:
+            shutil.copyfile(file, self._partial / frame["file_path"])
+            return
         alpha = values[..., 3:]
         composed = values[..., :3] * alpha + np.array(background) * (1 - alpha)
-        self._files[file] = self._add_frame(split, ".png", camera_to_world, time)
-        picture = Image.fromarray(np.rint(composed * 255).astype(np.uint8))
-        picture.save(self._partial / self._files[file]["file_path"])
+        Image.fromarray(np.rint(composed * 255).astype(np.uint8)).save(self._partial / frame["file_path"])
 
     def _add_frame(self, split: Split, suffix: str, camera_to_world: Tensor, time: int | None) -> dict[str, Any]:
         names = self._meta[f"{split}_filenames"]
@@ -254,22 +242,15 @@ class NativeDatasetWriter(_FolderWriter):
 
 
 class PoselessRecordingWriter(_FolderWriter):
-    """Write a folder of events and images whose poses are not known, completely or not at all.
+    """Write a folder of events and images without poses, completely or not at all, as a context manager.
 
-    Use it as a context manager. With a trajectory.txt beside them, the files are a recording of the format
-    ``event-recording-data`` (docs/datasets/own_recording.md).
+    With a trajectory.txt beside them, the files are a recording of the format ``event-recording-data``.
 
     Args:
         folder: the folder to create, or the lock on it that the caller holds.
         camera: the lens of the sensor that took events and images, or None where it is not known. The folder then has
             no calibration.json.
         sensor: its contrast thresholds, refractory period and Bayer pattern.
-
-    Raises:
-        DataError: the folder exists, cannot be created, or is being written by another process.
-
-    Attributes:
-        events: its method ``append`` takes the events, piece by piece in the order of time.
     """
 
     def __init__(self, folder: Path | OutputLock, camera: CameraIntrinsics | None, sensor: SensorModel) -> None:
