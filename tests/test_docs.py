@@ -29,7 +29,7 @@ def _name(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
 
-def test_the_table_of_options_is_up_to_date() -> None:
+def test_options_page_is_current() -> None:
     page = runpy.run_path(str(ROOT / "scripts" / "write_options.py"))["options_page"]()
     written = (ROOT / "docs" / "options.md").read_text(encoding="utf-8")
     assert written == page, "options have changed: run `python scripts/write_options.py`"
@@ -44,22 +44,14 @@ def flags() -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_every_option_of_ns_train_that_a_page_names_exists(page: Path, flags: set[str]) -> None:
+def test_page_names_what_exists(page: Path, flags: set[str]) -> None:
+    """Options of ns-train, paths of the repository and linked files."""
     text = page.read_text(encoding="utf-8")
     # Not the beginnings of flags, as in `--pipeline.model.field.*`.
     named = re.findall(r"--(?:pipeline|optimizers|gradient)[\w.-]*(?<![.-])(?![\w.*-])", text)
     assert set(named) <= flags
-
-
-@pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_every_path_of_the_repository_that_a_page_names_exists(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
     for path in re.findall(rf"`((?:{FOLDERS})/[\w./-]*)`", text):
         assert (ROOT / path).exists(), path
-
-
-@pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_every_file_that_a_page_links_to_exists(page: Path) -> None:
     # The site's build checks the headings too; this one also holds where mkdocs is not installed.
-    for target in re.findall(r"\]\(([^)#\s:]+)(?:#[^)\s]*)?\)", page.read_text(encoding="utf-8")):
+    for target in re.findall(r"\]\(([^)#\s:]+)(?:#[^)\s]*)?\)", text):
         assert (page.parent / target).exists(), target

