@@ -30,7 +30,12 @@ from aenerf_ns.events.pairing import EVENTS_IN_MEMORY, pair_events
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.scene import SceneRecording
-from aenerf_ns.supervision.event_pairs import PairSampler, PairSamplerConfig, PairSupervisionConfig
+from aenerf_ns.supervision.event_pairs import (
+    PairLossCoefficients,
+    PairSampler,
+    PairSamplerConfig,
+    PairSupervisionConfig,
+)
 from benchmarks.common import in_own_process, peak_mib, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
@@ -85,7 +90,7 @@ def sampler(pairs: EventPairs) -> PairSampler:
     )
     return PairSamplerConfig().setup(
         dataset=SimpleNamespace(scene=scene, pairs=pairs),
-        supervision=PairSupervisionConfig().setup(sensor=sensor, loss_coefficients={}),
+        supervision=PairSupervisionConfig().setup(sensor=sensor, loss_coefficients=PairLossCoefficients()),
         device="cpu",
     )
 

@@ -18,7 +18,7 @@ import torch
 import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
-from aenerf_ns.supervision.event_pairs import PairSampler
+from aenerf_ns.supervision.event_pairs import PairSamplerConfig
 from aenerf_ns.training.pipeline import AENeRFPipeline
 from benchmarks.common import write_result
 
@@ -65,9 +65,8 @@ class RealRecording:
                 name = views.image_filenames[index].name
                 # A rendering without any structure has no correlation.
                 correlations[name] = torch.corrcoef(stacked)[0, 1].nan_to_num().item()
-        sampler = pipeline.datamanager.train_pixel_sampler
-        assert isinstance(sampler, PairSampler)
-        sampler.max_events_per_pair, sampler.share_to_moments = 1, 0.0
+        pipeline.datamanager.config.sampler = PairSamplerConfig(max_events_per_pair=1, silent_pair_share=0.0)
+        pipeline.datamanager.supervise(model.supervision)
         torch.manual_seed(1)
         losses = []
         for _ in range(_NUM_BATCHES):

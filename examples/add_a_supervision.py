@@ -17,8 +17,8 @@ from typing import Any
 from nerfstudio.scripts.train import main as train
 from torch import Tensor
 
-from aenerf_ns.method_configs.aenerf_small import aenerf_small
-from aenerf_ns.supervision.event_pairs import PairSupervision, PairSupervisionConfig
+from aenerf_ns.method_configs.aenerf import aenerf_small
+from aenerf_ns.supervision.event_pairs import PairBatch, PairSupervision, PairSupervisionConfig
 
 
 @dataclass
@@ -31,10 +31,10 @@ class AbsoluteErrorConfig(PairSupervisionConfig):
 class AbsoluteError(PairSupervision):
     """Compares the rendered change of a pair with the events' by the absolute difference, in thresholds."""
 
-    def losses(self, outputs: Mapping[str, Any], batch: Any) -> dict[str, Tensor]:
+    def losses(self, outputs: Mapping[str, Any], batch: PairBatch) -> dict[str, Tensor]:
         """Return the loss of a batch."""
         predicted, change = self.changes(outputs, batch)
-        return {"reconstruction_loss": ((predicted - change) / self.unit(outputs)).abs().mean()}
+        return {"reconstruction_loss": ((predicted - change) / self.loss_unit(outputs)).abs().mean()}
 
 
 def main(data: Path, output: Path, steps: int = 2000) -> None:
@@ -43,7 +43,7 @@ def main(data: Path, output: Path, steps: int = 2000) -> None:
     config.method_name = "absolute-error"
     config.pipeline.model.supervision = AbsoluteErrorConfig()
     # Changes of silent pixels are known up to a threshold only, which this loss does not handle.
-    config.pipeline.datamanager.sampler.share_to_moments = 0.0
+    config.pipeline.datamanager.sampler.silent_pair_share = 0.0
     config.data, config.output_dir, config.max_num_iterations, config.vis = data, output, steps, "tensorboard"
     config.machine.device_type = "cpu"
     train(config)

@@ -1,1 +1,1 @@
-"""The registered methods, one file each."""
+"""The registered methods: AE-NeRF, AE-NeRF with the paper's networks, and other papers' methods."""

@@ -1,13 +1,17 @@
-"""``ns-train aenerf``: AE-NeRF on hash grids, for a GPU."""
+"""``ns-train aenerf`` and ``ns-train aenerf-small``: AE-NeRF on hash grids, for a GPU and for minutes on a CPU."""
 
 from __future__ import annotations
 
-from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, ViewerConfig
+from copy import deepcopy
+
+import torch
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.writer import EventName
 
 from aenerf_ns.dataparsers.formats import AutomaticDataParserConfig
 from aenerf_ns.method.model import AENeRFModelConfig
+from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.training.console import ConsoleWriter
 from aenerf_ns.training.datamanager import EventDataManagerConfig
@@ -26,6 +30,7 @@ aenerf = MethodSpecification(
         steps_per_save=2000,
         steps_per_eval_batch=500,
         steps_per_eval_image=500,
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         pipeline=AENeRFPipelineConfig(
             datamanager=EventDataManagerConfig(dataparser=AutomaticDataParserConfig()),
             model=AENeRFModelConfig(camera_optimizer=PoseCorrectionConfig(mode="spline")),
@@ -59,8 +64,36 @@ aenerf = MethodSpecification(
                 stats_to_track=(EventName.ITER_TRAIN_TIME, EventName.ETA),
             )
         ),
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 13, websocket_host="127.0.0.1"),
         vis="viewer",
     ),
     description="AE-NeRF: event camera to radiance field, on hash grids.",
+)
+
+
+def small(config: AENeRFTrainerConfig) -> AENeRFTrainerConfig:
+    """Return a method with fewer steps, fewer rays and smaller networks. Its name ends with "-small"."""
+    config = deepcopy(config)
+    config.method_name += "-small"
+    config.max_num_iterations = 2000
+    config.steps_per_save = 1000
+    config.pipeline.datamanager.train_num_rays_per_batch = 1024
+    config.pipeline.datamanager.eval_num_rays_per_batch = 1024
+    config.pipeline.model.field = FieldConfig(
+        num_samples_per_ray=24, num_levels=8, max_resolution=256, log2_hashmap_size=15, hidden_dim=32
+    )
+    config.pipeline.model.proposal = ProposalConfig(
+        num_samples_per_ray=(48,),
+        max_resolutions=(64,),
+        num_levels=4,
+        log2_hashmap_size=14,
+        weights_anneal_iterations=200,
+    )
+    # On a CPU twice as fast as 8192, because the memory of a piece stays small.
+    config.pipeline.model.eval_num_rays_per_chunk = 1 << 10
+    return config
+
+
+aenerf_small = MethodSpecification(
+    config=small(aenerf.config), description="AE-NeRF, small: for a CPU and for a first look."
 )

@@ -16,19 +16,20 @@ import tyro
 from tyro._docstrings import get_field_docstring
 
 from aenerf_ns.dataparsers.formats import FORMATS
-from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
-from aenerf_ns.method_configs.aenerf_small import aenerf_small
-from aenerf_ns.method_configs.e2vid_nerf import e2vid_nerf
-from aenerf_ns.method_configs.e2vid_nerf_small import e2vid_nerf_small
-from aenerf_ns.method_configs.eventnerf import eventnerf
-from aenerf_ns.method_configs.eventnerf_small import eventnerf_small
-from aenerf_ns.method_configs.evnerf import evnerf
-from aenerf_ns.method_configs.evnerf_small import evnerf_small
-from aenerf_ns.method_configs.paev3d import paev3d
-from aenerf_ns.method_configs.paev3d_small import paev3d_small
-from aenerf_ns.method_configs.robust_enerf import robust_enerf
-from aenerf_ns.method_configs.robust_enerf_small import robust_enerf_small
+from aenerf_ns.method_configs.peers import (
+    e2vid_nerf,
+    e2vid_nerf_small,
+    eventnerf,
+    eventnerf_small,
+    evnerf,
+    evnerf_small,
+    paev3d,
+    paev3d_small,
+    robust_enerf,
+    robust_enerf_small,
+)
 
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 
@@ -52,6 +53,8 @@ PEERS = {
 
 # Nerfstudio's options are listed where a method changes their default. These are listed because many runs set them.
 OFTEN_SET = {"--machine.seed", "--machine.device-type", "--machine.num-devices", "--mixed-precision", "--load-dir"}
+# Defaults that depend on the machine.
+DEFAULTS_IN_WORDS = {"--machine.device-type": "cuda, or cpu without a GPU"}
 # These differ from Nerfstudio's default, but they are no choice of the user.
 NO_CHOICE = {"--method-name", "--logging.local-writer.enable"}
 
@@ -167,7 +170,7 @@ def _options(config: Any, prefix: str = "--") -> Iterator[tuple[str, Any, bool, 
         if is_dataclass(value) or (isinstance(value, dict) and value):
             nested.append((value, flag, is_listed, meaning))
         else:
-            yield flag, value, is_listed, meaning
+            yield flag, DEFAULTS_IN_WORDS.get(flag, value), is_listed, meaning
     for value, flag, is_listed, meaning in nested:
         if isinstance(value, dict):
             yield from _entries(value, flag, is_listed, meaning)

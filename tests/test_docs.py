@@ -11,9 +11,7 @@ import tyro
 
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
-from aenerf_ns.method_configs.eventnerf import eventnerf
-from aenerf_ns.method_configs.evnerf import evnerf
-from aenerf_ns.method_configs.paev3d import paev3d
+from aenerf_ns.method_configs.peers import eventnerf, evnerf, paev3d
 
 ROOT = Path(__file__).parents[1]
 PAGES = [

@@ -58,7 +58,7 @@ def evaluate(run: TrainedRun, output: Path | None = None, with_deviations: bool 
     if placed and run.refine_test_poses:
         refined = measure_reference_views(run, refine=True)
         metrics["refined_test_poses"] = _describe_refined(run, refined, with_deviations)
-    metrics |= supervision.learned()
+    metrics |= supervision.learned_values()
     if model.image_metrics.lpips_absent is not None:
         metrics["lpips"] = None
         metrics["lpips_absent"] = model.image_metrics.lpips_absent

@@ -17,7 +17,6 @@ from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import PoseCorrection
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import Sampler
-from aenerf_ns.supervision.event_pairs import PairSampler
 
 if TYPE_CHECKING:
     from aenerf_ns.checking.hypotheses import Comparison
@@ -178,16 +177,14 @@ def _stretches(model: AENeRFModel, sampler: Sampler | None) -> list[dict[str, An
 
     The list is empty where batches are not of pairs.
     """
-    if not isinstance(sampler, PairSampler):
+    num_rays = 2 * _DRAWN * _NUM_STRETCHES * _PAIRS_PER_STRETCH
+    drawn = None if sampler is None else sampler.residual_batch(num_rays)
+    if drawn is None:
         return []
-    # The same pairs every time, without the random numbers that training would draw next.
-    devices = [model.device] if model.device.type == "cuda" else []
-    with torch.random.fork_rng(devices):
-        torch.manual_seed(0)
-        rays, batch = sampler.sample(2 * _DRAWN * _NUM_STRETCHES * _PAIRS_PER_STRETCH, training=False)
+    rays, batch = drawn
     assert rays.times is not None
-    num_pairs = len(batch["channel"])
-    duration = sampler.trajectory.duration
+    num_pairs = len(batch)
+    duration = model.camera_optimizer.trajectory.duration
     middle = rays.times[:, 0].unflatten(0, (2, num_pairs)).mean(0)
     stretch = (middle * (_NUM_STRETCHES / duration)).long().clamp(0, _NUM_STRETCHES - 1)
     model.eval()
@@ -196,11 +193,10 @@ def _stretches(model: AENeRFModel, sampler: Sampler | None) -> list[dict[str, An
         chosen = (stretch == index).nonzero()[:_PAIRS_PER_STRETCH, 0]
         losses: list[float | None] = [None, None]
         if len(chosen) >= _LEAST_PAIRS:
-            part = {name: value[chosen] for name, value in batch.items()}
             outputs = model(rays[torch.cat([chosen, chosen + num_pairs])])
             constant = outputs | {"log_radiance": torch.zeros_like(outputs["log_radiance"])}
             losses = [
-                float(model.supervision.losses(rendered, part)["reconstruction_loss"])
+                float(model.supervision.losses(rendered, batch[chosen])["reconstruction_loss"])
                 for rendered in (outputs, constant)
             ]
         found.append(

@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
-from nerfstudio.configs.config_utils import to_immutable_dict
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
@@ -41,8 +40,8 @@ from aenerf_ns.method.ray_losses import distortion_loss
 from aenerf_ns.method.ray_samplers import EvenSampler, EvenThenDisparitySampler, ProposalSampler
 from aenerf_ns.method.temporal import log_radiance_rate
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
-from aenerf_ns.supervision.base import Supervision, SupervisionConfig
-from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
+from aenerf_ns.supervision.base import Batch, LossCoefficients, Supervision, SupervisionConfig
+from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervisionConfig
 
 # ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
@@ -83,11 +82,8 @@ class AENeRFModelConfig(ModelConfig):
     average_init_density: float = 10.0
     """Density of field and proposal networks before training, per scene unit. A scene that starts nearly transparent
     sits in a fog for hundreds of steps, until matter grows out of it."""
-    loss_coefficients: dict[str, float] = to_immutable_dict(
-        {"reconstruction_loss": 1.0, "temporal_loss": 0.0, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
-    )
-    """Weights of the losses (paper, eq. 14: alpha, beta, gamma, eta). A weight of 0 turns a loss off. The paper's beta
-    is 0.001. On hash grids the temporal loss has not been seen to help."""
+    loss_coefficients: LossCoefficients = dataclasses.field(default_factory=PairLossCoefficients)  # type: ignore[assignment]
+    """Weights of the losses (paper, eq. 14)."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=PairSupervisionConfig)
     """How renderings are compared with the sensor's record. The datamanager's sampler draws the batches."""
     camera_optimizer: PoseCorrectionConfig = dataclasses.field(default_factory=PoseCorrectionConfig)
@@ -231,7 +227,7 @@ class AENeRFModel(Model):
         """Render rays. Rays of a batch of the supervision's sampler are rendered from the corrected poses."""
         if not _is_of_batch(ray_bundle):
             return super().forward(ray_bundle)
-        learned = self.supervision.place(ray_bundle)
+        learned = self.supervision.shift_ray_times(ray_bundle)
         self.camera_optimizer.apply_to_raybundle(ray_bundle)
         return super().forward(ray_bundle) | learned
 
@@ -301,22 +297,22 @@ class AENeRFModel(Model):
         return torch.log(radiance + _RADIANCE_EPSILON), weights
 
     def get_loss_dict(
-        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
+        self, outputs: dict[str, Any], batch: Batch, metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
         """Return the weighted terms of the paper's total loss (eq. 14) on a batch of the supervision's sampler."""
         losses = self.supervision.losses(outputs, batch)
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
-            losses["interlevel_loss"] = interlevel_loss(weights, samples) / self.supervision.unit(outputs) ** 2
+            losses["interlevel_loss"] = interlevel_loss(weights, samples) / self.supervision.loss_unit(outputs) ** 2
             losses["distortion_loss"] = distortion_loss(weights[-1], samples[-1])
             self.camera_optimizer.get_loss_dict(losses)
-        return scale_dict(losses, self.config.loss_coefficients)
+        return scale_dict(losses, vars(self.config.loss_coefficients))
 
-    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: Batch) -> dict[str, Any]:
         """Return the supervision's figures, the size of the pose corrections, and what is learned of the sensor."""
         metrics = self.supervision.metrics(outputs, batch)
         self.camera_optimizer.get_metrics_dict(metrics)
-        return metrics | self.supervision.learned()
+        return metrics | self.supervision.learned_values()
 
     def new_color_correction(self, protocol: ColorCorrectionProtocol) -> ColorCorrection:
         """Return a colour correction for this model's pictures, not yet fitted."""

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from aenerf_ns.evaluation.run import TrainedRun
-from aenerf_ns.supervision.event_pairs import PairSampler, PairSupervision
+from aenerf_ns.supervision.event_pairs import PairSupervision
 
 _NUM_PAIRS = 20_000
 # Upper ends of the classes of pairs by their number of events.
@@ -56,26 +56,24 @@ def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
     Returns:
         The comparison; None for a run whose batches are not pairs.
     """
-    sampler, supervision = run.sampler, run.model.supervision
-    if not isinstance(sampler, PairSampler) or not isinstance(supervision, PairSupervision):
+    drawn = None if run.sampler is None else run.sampler.residual_batch(2 * _NUM_PAIRS)
+    if drawn is None:
         return None
-    devices = [run.device] if run.device.type == "cuda" else []
-    with torch.random.fork_rng(devices):
-        torch.manual_seed(0)
-        rays, batch = sampler.sample(2 * _NUM_PAIRS, training=False)
-    num_pairs = len(batch["channel"])
+    rays, batch = drawn
+    supervision = run.model.supervision
+    assert isinstance(supervision, PairSupervision)
+    num_pairs = len(batch)
     pieces = []
     chunk = run.model.config.eval_num_rays_per_chunk // 2
     for begin in range(0, num_pairs, chunk):
         chosen = torch.arange(begin, min(begin + chunk, num_pairs), device=run.device)
         outputs = run.model(rays[torch.cat([chosen, chosen + num_pairs])])
-        part = {name: values[chosen] for name, values in batch.items()}
-        unit = supervision.unit(outputs)
-        pieces.append(torch.stack([one / unit for one in supervision.changes(outputs, part)]))
+        unit = supervision.loss_unit(outputs)
+        pieces.append(torch.stack([change / unit for change in supervision.changes(outputs, batch[chosen])]))
     rendered, measured = torch.cat(pieces, -1).double().cpu().numpy()
-    at_events = ~batch["ends_between_events"].cpu().numpy()
-    length = (batch["num_positive"] + batch["num_negative"]).cpu().numpy()[at_events]
-    pixel = batch["pixel"].cpu().numpy()[at_events]
+    at_events = ~batch.ends_between_events.cpu().numpy()
+    length = (batch.num_positive + batch.num_negative).cpu().numpy()[at_events]
+    pixel = batch.pixel.cpu().numpy()[at_events]
     rendered, measured = rendered[at_events], measured[at_events]
     residual = np.abs(rendered - measured)
     edges, histogram = _histogram(measured, rendered)

@@ -1,6 +1,6 @@
 """The seam between events and the field: how a batch is drawn, and what its renderings are compared with.
 
-A sampler and a supervision belong together: they share one kind of batch. The sampler draws rays and tells what the
+A sampler and a supervision belong together: they share one type of batch. The sampler draws rays and says what the
 sensor recorded of them; the supervision compares the rendered log-radiance with that. Everything else, the field, the
 poses, the compositing and the evaluation, knows neither.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import torch
@@ -20,6 +20,47 @@ from torch import Tensor, nn
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.supervision.losses import log_radiance_change
+
+
+@dataclass
+class Batch:
+    """What the sensor recorded of a batch's rays. Every field is a tensor with one row for each item of the batch."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def __getitem__(self, index: Tensor | slice) -> Any:
+        """Return some of the items, as a batch of the same type."""
+        return type(self)(**{entry.name: getattr(self, entry.name)[index] for entry in fields(self)})
+
+
+@dataclass
+class ChangeBatch(Batch):
+    """The events of N pixels, each between two times. The rays at the first times come first, then those at the second.
+
+    Attributes:
+        num_positive: (N,) float, positive events after the first time up to the second.
+        num_negative: (N,) float, negative events in the same time.
+        channel: (N,) index of the radiance channel that the pixel sees.
+    """
+
+    num_positive: Tensor
+    num_negative: Tensor
+    channel: Tensor
+
+
+@dataclass
+class LossCoefficients:
+    """Weights of the losses (paper, eq. 14), by their names. Losses that are not named have the weight 1."""
+
+    reconstruction_loss: float = 1.0
+    """Weight of the supervision's main loss (paper: alpha)."""
+    interlevel_loss: float = 2.5e-3
+    """Weight of the loss that trains the proposal networks (paper: gamma). It is divided by the squared mean contrast
+    threshold."""
+    distortion_loss: float = 1e-3
+    """Weight of the loss that draws matter together along a ray (paper: eta)."""
 
 
 @dataclass
@@ -37,15 +78,15 @@ class Supervision(nn.Module, ABC):
     Args:
         config: the options of the supervision.
         sensor: the dataset's contrast thresholds, refractory period and Bayer pattern.
-        loss_coefficients: weights of all losses by their names; a loss that is not named has the weight 1.
+        loss_coefficients: weights of the losses.
 
     Attributes:
-        batch: the kind of batch that is understood.
+        batch_type: the batches that are understood.
     """
 
-    batch: ClassVar[str]
+    batch_type: ClassVar[type[Batch]]
 
-    def __init__(self, config: SupervisionConfig, sensor: SensorModel, loss_coefficients: Mapping[str, float]) -> None:
+    def __init__(self, config: SupervisionConfig, sensor: SensorModel, loss_coefficients: LossCoefficients) -> None:
         super().__init__()
         self.config = config
         self.sensor = sensor
@@ -58,10 +99,10 @@ class Supervision(nn.Module, ABC):
             DataError: the data cannot be used.
         """
 
-    def place(self, rays: RayBundle) -> dict[str, Tensor]:
+    def shift_ray_times(self, rays: RayBundle) -> dict[str, Tensor]:
         """Move the rays of a batch in time, before pose correction moves them in space.
 
-        Called in the model's ``forward``: DistributedDataParallel synchronises the gradients of parameters that
+        Called in the model's ``forward``: DistributedDataParallel synchronizes the gradients of parameters that
         ``forward`` used, and of no others.
 
         Args:
@@ -77,26 +118,51 @@ class Supervision(nn.Module, ABC):
         return 0
 
     @abstractmethod
-    def unit(self, outputs: Mapping[str, Any]) -> Tensor | float:
+    def loss_unit(self, outputs: Mapping[str, Any]) -> Tensor | float:
         """Return the change of log-radiance that counts as one: the mean contrast threshold."""
 
     @abstractmethod
-    def losses(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Tensor]:
+    def losses(self, outputs: Mapping[str, Any], batch: Any) -> dict[str, Tensor]:
         """Return the losses of a batch, without their weights.
 
         Args:
             outputs: of the model: ``log_radiance`` (rays, channels), while training ``log_radiance_rate``
-                (rate rays, channels) per second if any were asked for, and what :meth:`place` returned.
-            batch: as the sampler drew it.
+                (rate rays, channels) per second if any were asked for, and what :meth:`shift_ray_times` returned.
+            batch: as the sampler drew it, of type ``batch_type``.
         """
 
-    def metrics(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
+    def metrics(self, outputs: Mapping[str, Any], batch: Any) -> dict[str, Any]:
         """Return figures for the log that are no losses."""
         return {}
 
-    def learned(self) -> dict[str, float]:
+    def learned_values(self) -> dict[str, float]:
         """Return the values that are learned of the sensor, for logs and evaluations."""
         return {}
+
+
+class ChangeSupervision(Supervision):
+    """Compares rendered changes of log-radiance with the events of a pixel between two times."""
+
+    @abstractmethod
+    def thresholds(self, outputs: Mapping[str, Any]) -> tuple[Tensor | float, Tensor | float]:
+        """Return the changes of log-radiance that a positive and a negative event stand for, both positive."""
+
+    def changes(self, outputs: Mapping[str, Any], batch: ChangeBatch) -> tuple[Tensor, Tensor]:
+        """Return the (N,) changes between the two times: as rendered in the pixel's channel, and as the events say."""
+        first, second = outputs["log_radiance"].split(len(batch))[:2]
+        rendered = (second - first).gather(1, batch.channel[:, None])[:, 0]
+        return rendered, log_radiance_change(batch.num_positive, batch.num_negative, *self.thresholds(outputs))
+
+    def has_sign(self, change: Tensor, batch: Any) -> Tensor:
+        """Return whether the signs of (N,) changes are known. Polarities that cancel have none."""
+        return change != 0
+
+    def metrics(self, outputs: Mapping[str, Any], batch: ChangeBatch) -> dict[str, Any]:
+        """Return the share of the pixels whose rendered change has the sign of their events."""
+        rendered, change = self.changes(outputs, batch)
+        signed = self.has_sign(change, batch)
+        agreeing = (rendered.detach() * change > 0) & signed
+        return {"polarity_agreement": agreeing.sum() / signed.sum().clamp_min(1)}
 
 
 @dataclass
@@ -116,21 +182,22 @@ class Sampler(ABC):
         device: of the batches.
 
     Raises:
-        DataError: the supervision needs another kind of batch.
+        DataError: the supervision needs batches of another type.
 
     Attributes:
-        batch: the kind of batch that is drawn.
+        batch_type: the batches that are drawn.
     """
 
-    batch: ClassVar[str]
+    batch_type: ClassVar[type[Batch]]
 
     def __init__(
         self, config: SamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
     ) -> None:
-        if self.batch != supervision.batch:
+        if self.batch_type is not supervision.batch_type:
             raise DataError(
                 "the method's configuration",
-                f"its sampler draws {self.batch} and its supervision compares {supervision.batch}",
+                f"its sampler draws a {self.batch_type.__name__}, and its supervision compares a "
+                f"{supervision.batch_type.__name__}",
                 "give it a sampler and a supervision that belong together",
             )
         self.config = config
@@ -146,7 +213,7 @@ class Sampler(ABC):
         """
 
     @abstractmethod
-    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
+    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, Batch]:
         """Draw a batch.
 
         Args:
@@ -158,3 +225,11 @@ class Sampler(ABC):
             them to the world by their ``times`` (N, 1), in float64 seconds since the trajectory's start, and the
             :data:`~aenerf_ns.camera.metadata_keys.CAMERA_DIRECTIONS` among their metadata.
         """
+
+    def residual_batch(self, num_rays: int) -> tuple[RayBundle, Any] | None:
+        """Draw pairs of events to compare with renderings, the same in every call.
+
+        Returns:
+            As :meth:`sample` does, of pairs; None where batches are not of pairs.
+        """
+        return None

@@ -9,12 +9,10 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
@@ -30,7 +28,14 @@ from aenerf_ns.events.pair_store import (
 )
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision, SupervisionConfig
+from aenerf_ns.supervision.base import (
+    ChangeBatch,
+    ChangeSupervision,
+    LossCoefficients,
+    Sampler,
+    SamplerConfig,
+    SupervisionConfig,
+)
 from aenerf_ns.supervision.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
 from aenerf_ns.supervision.pixel_rays import PixelRays
 from aenerf_ns.supervision.sensor_parameters import SensorParameters
@@ -45,6 +50,37 @@ _WITHIN_MASS = math.erf(_WITHIN_MEAN / (_WITHIN_DEVIATION * math.sqrt(2)))
 
 
 @dataclass
+class PairBatch(ChangeBatch):
+    """Pairs of events of a pixel, each of which may span several events.
+
+    Rays at the starts of the intervals come first, then rays at their ends, then, if rates are needed, rays at t_sam: a
+    random time between the last two events of the pair, because over more events the mean rate says little of a moment.
+
+    Attributes:
+        ends_between_events: (N,) whether a pair ends at a random moment before its last event, which is not counted.
+        last_num_positive: (N,) float, positive events at the time of the last event.
+        last_num_negative: (N,) float, negative events at the time of the last event.
+        last_interval: (N,) float, seconds from the event before to the last event.
+        pixel: (N,) pixels, counted row by row.
+    """
+
+    ends_between_events: Tensor
+    last_num_positive: Tensor
+    last_num_negative: Tensor
+    last_interval: Tensor
+    pixel: Tensor
+
+
+@dataclass
+class PairLossCoefficients(LossCoefficients):
+    """Weights of the losses on pairs of events (paper, eq. 14)."""
+
+    temporal_loss: float = 0.0
+    """Weight of the loss on rates of log-radiance (paper: beta, 0.001). 0 turns it off. On hash grids it has not been
+    seen to help."""
+
+
+@dataclass
 class PairSupervisionConfig(SupervisionConfig):
     """Pairs of events of a pixel."""
 
@@ -56,20 +92,21 @@ class PairSupervisionConfig(SupervisionConfig):
     shortest interval between two events of a pixel. All pairs are then of consecutive events."""
 
 
-class PairSupervision(Supervision):
+class PairSupervision(ChangeSupervision):
     """Compares the rendered change of log-radiance between the two times of a pair with the events between them.
 
     Args:
         config: what is learned of the sensor.
         sensor: see :class:`Supervision`.
-        loss_coefficients: see :class:`Supervision`. Rates are rendered where ``temporal_loss`` has a weight above 0.
+        loss_coefficients: weights of the losses. Rates are rendered where ``temporal_loss`` is above 0.
     """
 
-    batch = "pairs"
+    batch_type = PairBatch
     config: PairSupervisionConfig
+    loss_coefficients: PairLossCoefficients
 
     def __init__(
-        self, config: PairSupervisionConfig, sensor: SensorModel, loss_coefficients: Mapping[str, float]
+        self, config: PairSupervisionConfig, sensor: SensorModel, loss_coefficients: PairLossCoefficients
     ) -> None:
         super().__init__(config, sensor, loss_coefficients)
         self.sensor_parameters = SensorParameters(
@@ -79,14 +116,14 @@ class PairSupervision(Supervision):
     @property
     def needs_rates(self) -> bool:
         """Whether training batches hold a third ray for each pair, for the temporal loss."""
-        return self.loss_coefficients.get("temporal_loss", 0) > 0
+        return self.loss_coefficients.temporal_loss > 0
 
     def prepare(self, dataset: EventDataset) -> None:
         """Bound the refractory period, where it is learned, by the shortest interval between events of a pixel."""
         if self.config.learn_refractory_period:
             self.sensor_parameters.bound_refractory_period(dataset.pairs.shortest_interval)
 
-    def place(self, rays: RayBundle) -> dict[str, Tensor]:
+    def shift_ray_times(self, rays: RayBundle) -> dict[str, Tensor]:
         """Move the starts of the intervals to the end of the learned refractory period, and return what is learned.
 
         Returns:
@@ -102,7 +139,7 @@ class PairSupervision(Supervision):
             assert rays.times is not None
             learned["interval_change"] = change = self.sensor.refractory_period * 1e-9 - period
             start, end, *within = rays.times.chunk(3 if self.training and self.needs_rates else 2)
-            # t_sam keeps its place in the interval.
+            # t_sam keeps its relative position in the interval.
             within = [end - (end - t) * (1 + change / (end - start)) for t in within]
             rays.times = torch.cat([start - change, end, *within])
         return learned
@@ -111,52 +148,38 @@ class PairSupervision(Supervision):
         """Return the number of third rays: one for each pair."""
         return num_rays // 3 if self.needs_rates else 0
 
-    def unit(self, outputs: Mapping[str, Any]) -> Tensor | float:
-        """Return C̄, the mean of the two contrast thresholds."""
-        return (self._positive_threshold(outputs) + self.sensor.negative_contrast_threshold) / 2
+    def thresholds(self, outputs: Mapping[str, Any]) -> tuple[Tensor | float, float]:
+        """Return C+, learned or given, and C−."""
+        positive = outputs.get("positive_contrast_threshold", self.sensor.positive_contrast_threshold)
+        return positive, self.sensor.negative_contrast_threshold
 
-    def losses(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Tensor]:
+    def loss_unit(self, outputs: Mapping[str, Any]) -> Tensor | float:
+        """Return C̄, the mean of the two contrast thresholds."""
+        positive, negative = self.thresholds(outputs)
+        return (positive + negative) / 2
+
+    def losses(self, outputs: Mapping[str, Any], batch: PairBatch) -> dict[str, Tensor]:
         """Return the reconstruction loss (eq. 11), and while training the temporal loss (eq. 12) where it is on."""
-        predicted, change = self.changes(outputs, batch)
-        silent = silent_change(
-            predicted, change, self._positive_threshold(outputs), self.sensor.negative_contrast_threshold
-        )
-        target = torch.where(batch["ends_between_events"], silent, change)
-        losses = {"reconstruction_loss": reconstruction_loss(predicted, target, self.unit(outputs))}
+        rendered, change = self.changes(outputs, batch)
+        silent = silent_change(rendered, change, *self.thresholds(outputs))
+        target = torch.where(batch.ends_between_events, silent, change)
+        losses = {"reconstruction_loss": reconstruction_loss(rendered, target, self.loss_unit(outputs))}
         if self.training and "log_radiance_rate" in outputs:
-            rate = outputs["log_radiance_rate"].gather(1, batch["channel"][:, None])[:, 0]
-            interval = batch["last_interval"] + outputs.get("interval_change", 0.0)
-            last_change = self._change(outputs, batch["last_num_positive"], batch["last_num_negative"])
+            rate = outputs["log_radiance_rate"].gather(1, batch.channel[:, None])[:, 0]
+            interval = batch.last_interval + outputs.get("interval_change", 0.0)
+            last_change = log_radiance_change(
+                batch.last_num_positive, batch.last_num_negative, *self.thresholds(outputs)
+            )
             losses["temporal_loss"] = temporal_loss(rate, last_change, interval)
         return losses
 
-    def metrics(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the share of the pairs whose rendered change has the sign of the events."""
-        predicted, target = self.changes(outputs, batch)
-        # Polarities that cancel have no sign. A change that is known to a threshold only may have either.
-        signed = (target != 0) & ~batch["ends_between_events"]
-        agreeing = (predicted.detach() * target > 0) & signed
-        return {"polarity_agreement": agreeing.sum() / signed.sum().clamp_min(1)}
+    def has_sign(self, change: Tensor, batch: PairBatch) -> Tensor:
+        """Return whether the signs of (N,) changes are known. A change known to a threshold only may have either."""
+        return super().has_sign(change, batch) & ~batch.ends_between_events
 
-    def learned(self) -> dict[str, float]:
+    def learned_values(self) -> dict[str, float]:
         """Return C+ / C- and the refractory period in nanoseconds, each where it is learned."""
-        return self.sensor_parameters.learned()
-
-    def changes(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """Return the (N,) changes over a batch's intervals: as rendered in the pixel's channel, and as events tell."""
-        start, end = outputs["log_radiance"].split(len(batch["channel"]))[:2]
-        predicted = (end - start).gather(1, batch["channel"][:, None])[:, 0]
-        return predicted, self._change(outputs, batch["num_positive"], batch["num_negative"])
-
-    def _change(self, outputs: Mapping[str, Any], num_positive: Tensor, num_negative: Tensor) -> Tensor:
-        """Return the (N,) changes of log-radiance that counts of events tell of."""
-        return log_radiance_change(
-            num_positive, num_negative, self._positive_threshold(outputs), self.sensor.negative_contrast_threshold
-        )
-
-    def _positive_threshold(self, outputs: Mapping[str, Any]) -> Tensor | float:
-        """Return C+, learned or given."""
-        return outputs.get("positive_contrast_threshold", self.sensor.positive_contrast_threshold)
+        return self.sensor_parameters.learned_values()
 
 
 @dataclass
@@ -167,7 +190,7 @@ class PairSamplerConfig(SamplerConfig):
     max_events_per_pair: int = 64
     """The most events of its pixel that a pair spans, up to 255. 1: consecutive events, as in the paper. Pairs are of
     consecutive events wherever the refractory period is more than a twentieth of the interval between two events."""
-    share_to_moments: float = 0.25
+    silent_pair_share: float = 0.25
     """Share of the pairs of a batch that end at a random moment at a random pixel, between two events. The others end
     at a random event. 0: all of them, as in the paper."""
 
@@ -203,12 +226,10 @@ class PairSampler(Sampler):
         DataError: an option is out of range.
 
     Attributes:
-        max_events_per_pair: the most events that a pair spans.
-        share_to_moments: share of the pairs of a batch that end at a moment.
         trajectory: the estimated trajectory, which times count from; on the device of the batches.
     """
 
-    batch = "pairs"
+    batch_type = PairBatch
 
     def __init__(
         self,
@@ -224,15 +245,15 @@ class PairSampler(Sampler):
                 f"max-events-per-pair is {config.max_events_per_pair}",
                 f"give a number from 1 to {MAX_SPAN}",
             )
-        if not 0 <= config.share_to_moments <= 1:
+        if not 0 <= config.silent_pair_share <= 1:
             raise DataError(
-                "the sampler", f"share-to-moments is {config.share_to_moments}", "give a number from 0 to 1"
+                "the sampler", f"silent-pair-share is {config.silent_pair_share}", "give a number from 0 to 1"
             )
         consecutive = supervision.config.learn_refractory_period
-        self.max_events_per_pair = 1 if consecutive else config.max_events_per_pair
-        self.share_to_moments = 0.0 if consecutive else config.share_to_moments
+        self._max_events_per_pair = 1 if consecutive else config.max_events_per_pair
+        self._silent_pair_share = 0.0 if consecutive else config.silent_pair_share
         self._needs_rates = supervision.needs_rates
-        self.sensor = dataset.scene.sensor
+        self._refractory_period = dataset.scene.sensor.refractory_period
         self._pixel_rays = PixelRays(dataset.scene, device)
         self.trajectory = self._pixel_rays.trajectory
 
@@ -248,7 +269,7 @@ class PairSampler(Sampler):
     def _table(self) -> _PairTable:
         return _PairTable(self.dataset.pairs, self.device)
 
-    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
+    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, PairBatch]:
         """Draw a batch of pairs.
 
         Args:
@@ -256,27 +277,20 @@ class PairSampler(Sampler):
             training: see :class:`Sampler`.
 
         Returns:
-            The rays at the starts of the N intervals, then the rays at their ends, then those at t_sam if there are
-            any: at a random time between the last two events of the pair, because over more events the mean rate tells
-            little of a moment's. And for each pair: ``num_positive`` and ``num_negative`` (N,) counts of events after
-            its earlier one up to its end, whether it ``ends_between_events`` (N,), its ``pixel`` (N,), counted row by
-            row, and the ``channel`` (N,) of the pixel's filter. And of the event that it ends at, or that follows its
-            end: ``last_num_positive`` and ``last_num_negative`` (N,) at its time and the ``last_interval`` (N,) in
-            seconds from the event before.
+            See :class:`PairBatch`.
         """
         with_time_within = training and self._needs_rates
-        rays_per_pair = 3 if with_time_within else 2
-        num_pairs = max(num_rays // rays_per_pair, 1)
+        num_pairs = max(num_rays // (3 if with_time_within else 2), 1)
         device = self._pixel_rays.channels.device
-        num_to_moments = round(self.share_to_moments * num_pairs)
-        rows = self._table.draw(num_to_moments, num_pairs - num_to_moments, self.max_events_per_pair)
-        times, numbers = rows.permute(2, 1, 0)
+        num_silent = round(self._silent_pair_share * num_pairs)
+        rows = self._table.draw(num_silent, num_pairs - num_silent, self._max_events_per_pair)
+        times, packed = rows.permute(2, 1, 0)
         end = self.trajectory.seconds(times[0])
-        last_start, start = self.trajectory.seconds(times[1:] + self.sensor.refractory_period)
+        last_start, start = self.trajectory.seconds(times[1:] + self._refractory_period)
         last_interval = end - last_start
         # Given the interval that it lies in, a uniform moment is uniform there.
-        part = torch.rand(num_to_moments, dtype=torch.float64, device=device)
-        end[:num_to_moments] = last_start[:num_to_moments] + part * last_interval[:num_to_moments]
+        part = torch.rand(num_silent, dtype=torch.float64, device=device)
+        end[:num_silent] = last_start[:num_silent] + part * last_interval[:num_silent]
         seconds = [start, end]
         if with_time_within:
             # From the distribution's inverse, because torch's own function waits for a GPU.
@@ -284,22 +298,27 @@ class PairSampler(Sampler):
             within.erfinv_().mul_(_WITHIN_DEVIATION * math.sqrt(2)).add_(_WITHIN_MEAN)
             seconds.append(last_start + within * last_interval)
         # From the pair's last event but one, and from its first event.
-        last_count, count = torch.stack(event_counts(numbers[:1], numbers[1:])).float().unbind(1)
+        last_count, count = torch.stack(event_counts(packed[:1], packed[1:])).float().unbind(1)
         # A pair that ends at a moment has not seen its last event.
-        count[:, :num_to_moments] -= last_count[:, :num_to_moments]
-        pixel = pixel_index(numbers[0])
-        rays = self._pixel_rays.rays(pixel, seconds)
-        batch = {
-            "num_positive": count[0],
-            "num_negative": count[1],
-            "ends_between_events": torch.arange(num_pairs, device=device) < num_to_moments,
-            "last_num_positive": last_count[0],
-            "last_num_negative": last_count[1],
-            "last_interval": last_interval.float(),
-            "pixel": pixel,
-            "channel": self._pixel_rays.channels.index_select(0, pixel),
-        }
-        return rays, batch
+        count[:, :num_silent] -= last_count[:, :num_silent]
+        pixel = pixel_index(packed[0])
+        batch = PairBatch(
+            num_positive=count[0],
+            num_negative=count[1],
+            channel=self._pixel_rays.channels.index_select(0, pixel),
+            ends_between_events=torch.arange(num_pairs, device=device) < num_silent,
+            last_num_positive=last_count[0],
+            last_num_negative=last_count[1],
+            last_interval=last_interval.float(),
+            pixel=pixel,
+        )
+        return self._pixel_rays.rays(pixel, seconds), batch
+
+    def residual_batch(self, num_rays: int) -> tuple[RayBundle, PairBatch]:
+        """Draw a batch to look at, the same in every call, without the random numbers that training would draw next."""
+        with torch.random.fork_rng([self.device] if torch.device(self.device).type == "cuda" else []):
+            torch.manual_seed(0)
+            return self.sample(num_rays, training=False)
 
 
 class _PairTable:
@@ -324,7 +343,10 @@ class _PairTable:
         self._duration = int(pairs.block_ends[-1])
         self._find_rows: Callable[[Tensor, Tensor, Tensor], Tensor]
         if self._device.type == "cpu":
-            self._find_rows = _CpuTable(*arrays).find_rows
+            # Imported lazily: every ns-* command imports this module, and numba is slow to import.
+            from aenerf_ns.events import pairing
+
+            self._find_rows = partial(_find_rows_on_cpu, pairing.find_rows, (*arrays, *pairing.near_blocks(arrays[2])))
         else:
             with warnings.catch_warnings():
                 # Torch warns of rows that are mapped read-only. They are only copied.
@@ -357,24 +379,13 @@ class _PairTable:
         return rows
 
 
-class _CpuTable:
-    """Find rows as :func:`find_rows` does, in less time on a CPU.
-
-    Args:
-        arrays: the first three arguments of :func:`find_rows`.
-    """
-
-    def __init__(self, *arrays: NDArray[np.int64]) -> None:
-        # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-        from aenerf_ns.events import pairing
-
-        self._find = pairing.find_rows
-        self._table = (*arrays, *pairing.near_blocks(arrays[2]))
-
-    def find_rows(self, moments: Tensor, events: Tensor, spans: Tensor) -> Tensor:
-        found = torch.empty((len(spans), 3, 2), dtype=torch.int64)
-        self._find(*self._table, *(array.numpy() for array in (moments, events, spans, found)))
-        return found
+def _find_rows_on_cpu(
+    compiled: Callable[..., None], table: tuple[Any, ...], moments: Tensor, events: Tensor, spans: Tensor
+) -> Tensor:
+    """Find rows as :func:`find_rows` does, in less time on a CPU."""
+    found = torch.empty((len(spans), 3, 2), dtype=torch.int64)
+    compiled(*table, *(tensor.numpy() for tensor in (moments, events, spans, found)))
+    return found
 
 
 def find_rows(
@@ -388,7 +399,7 @@ def find_rows(
         block_ends: see there.
         moments: (M,) int64 nanoseconds along the intervals of all pairs, laid end to end. Each finds its pair.
         events: (N - M,) int64 numbers below the number of pairs. Each finds a pair of its own.
-        spans: (N,) int64, how many consecutive pairs to join that end with the found one, if so many may be joined.
+        spans: (N,) int64, how many consecutive pairs to join that end with the found one, if that many may be joined.
 
     Returns:
         (N, 3, 2) int64 rows: of the event that the pair ends with, of the event of its pixel before, and of the event
@@ -408,5 +419,5 @@ def find_rows(
 
 
 def _fits(size: int, device: torch.device) -> bool:
-    """Return whether a table of so many bytes has a place on a device."""
+    """Return whether a table of ``size`` bytes fits on a device beside the model."""
     return device.type == "cpu" or size <= _SHARE_OF_FREE_MEMORY * torch.cuda.mem_get_info(device)[0]

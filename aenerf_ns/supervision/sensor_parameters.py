@@ -54,7 +54,7 @@ class SensorParameters(nn.Module):
             return None
         return self._longest_refractory_period * torch.sigmoid(self.raw_refractory_period.double())
 
-    def learned(self) -> dict[str, float]:
+    def learned_values(self) -> dict[str, float]:
         """Return the values that are learned, by their names, for logs and evaluations."""
         values = {}
         if self.contrast_threshold_ratio is not None:

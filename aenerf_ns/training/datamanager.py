@@ -13,7 +13,7 @@ from torch import Tensor
 
 from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision
+from aenerf_ns.supervision.base import Batch, Sampler, SamplerConfig, Supervision
 from aenerf_ns.supervision.event_pairs import PairSamplerConfig
 
 
@@ -109,7 +109,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """Give the training cameras, which are only shown, the poses (N, 3, 4), camera-to-world in the scene."""
         _place(self.train_dataset, poses)
 
-    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+    def next_train(self, step: int) -> tuple[RayBundle, Batch]:
         """Draw a batch to train on; see :meth:`Sampler.sample`."""
         self.train_count += 1
         # An exporter asks a trained run for batches too: its events are read only then.
@@ -119,12 +119,12 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """Return the most rays of a training batch."""
         return self.config.train_num_rays_per_batch
 
-    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+    def next_eval(self, step: int) -> tuple[RayBundle, Batch]:
         """Draw a batch to log the loss on."""
         self.eval_count += 1
         return self._sample(self.config.eval_num_rays_per_batch, training=False)
 
-    def _sample(self, num_rays: int, training: bool) -> tuple[RayBundle, dict[str, Any]]:
+    def _sample(self, num_rays: int, training: bool) -> tuple[RayBundle, Batch]:
         assert self.train_pixel_sampler is not None
         with errors_as_one_line():
             return self.train_pixel_sampler.sample(num_rays, training)

@@ -25,6 +25,7 @@ from aenerf_ns.evaluation.poses import compare_with_ground_truth
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import average_metrics
 from aenerf_ns.method.model import AENeRFModel
+from aenerf_ns.supervision.base import Batch, ChangeBatch
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.device import require_device
 from aenerf_ns.training.ffmpeg import provide_ffmpeg
@@ -122,13 +123,13 @@ class AENeRFPipeline(VanillaPipeline):
         self._unchecked_losses = losses
         return outputs, losses, metrics
 
-    def _rate(self, batch: Mapping[str, Any]) -> dict[str, float]:
+    def _rate(self, batch: Batch) -> dict[str, float]:
         """Return ``pairs_per_second`` at the framework's mean time of a step, where a batch holds pairs of times."""
         # The framework has no mean before the first step, and none outside a training.
         times = GLOBAL_BUFFER.get("events", {}).get(EventName.ITER_TRAIN_TIME.value)
-        if times is None or "num_positive" not in batch:
+        if times is None or not isinstance(batch, ChangeBatch):
             return {}
-        return {"pairs_per_second": comms.get_world_size() * len(batch["num_positive"]) / times["avg"]}
+        return {"pairs_per_second": comms.get_world_size() * len(batch) / times["avg"]}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

@@ -180,7 +180,7 @@ class RecordingView:
         return f"**Poses**: the true ones are not known. {words}."
 
     def _threshold_figures(self) -> str:
-        sensor, learned = self._model.sensor, self._model.supervision.learned()
+        sensor, learned = self._model.sensor, self._model.supervision.learned_values()
         positive, negative = sensor.positive_contrast_threshold, sensor.negative_contrast_threshold
         ratio = learned.get("contrast_threshold_ratio")
         if ratio is not None:

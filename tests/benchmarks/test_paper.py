@@ -27,8 +27,7 @@ from PIL import Image
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.image_metrics import ImageMetrics
-from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.method_configs.aenerf_small import aenerf_small
+from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
 from benchmarks.paper import tables
 from benchmarks.paper.figures import draw, error_map
 from benchmarks.paper.plan import (

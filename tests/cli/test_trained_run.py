@@ -19,14 +19,9 @@ from aenerf_ns.cli.report import ReportCommand
 from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.errors import DataError
-from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
-from aenerf_ns.method_configs.aenerf_small import aenerf_small
-from aenerf_ns.method_configs.e2vid_nerf import e2vid_nerf
-from aenerf_ns.method_configs.eventnerf import eventnerf
-from aenerf_ns.method_configs.evnerf import evnerf
-from aenerf_ns.method_configs.paev3d import paev3d
-from aenerf_ns.method_configs.robust_enerf import robust_enerf
+from aenerf_ns.method_configs.peers import e2vid_nerf, eventnerf, evnerf, paev3d, robust_enerf
 
 METHODS = (aenerf, aenerf_mlp, aenerf_small, e2vid_nerf, eventnerf, evnerf, paev3d, robust_enerf)
 

@@ -17,7 +17,6 @@ from functools import cache
 from typing import Any
 
 import torch
-from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor, nn
 from torch._guards import active_fake_mode
 from torch._subclasses.fake_tensor import FakeTensor
@@ -161,7 +160,7 @@ class SimulatedCuda(TorchDispatchMode):
 
 
 def to_device(value: Any) -> Any:
-    """Return what a value holds on the device, uncounted: a tensor, or a dictionary or ray bundle of tensors.
+    """Return what a value holds on the device, uncounted: a tensor, or or a dictionary or dataclass of tensors.
 
     A module is moved in place. Within a ``FakeTensorMode`` the tensors lose their values.
     """
@@ -174,7 +173,7 @@ def to_device(value: Any) -> Any:
                 if buffer is not None:
                     part._buffers[name] = to_device(buffer)
         return value
-    if isinstance(value, RayBundle):
+    if dataclasses.is_dataclass(value):
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         return replace(value, **{name: to_device(part) for name, part in fields.items()})
     if isinstance(value, dict):

@@ -25,13 +25,20 @@ from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
-from aenerf_ns.supervision.event_pairs import PairSampler, PairSamplerConfig, PairSupervisionConfig
+from aenerf_ns.supervision.base import LossCoefficients, SupervisionConfig
+from aenerf_ns.supervision.event_pairs import (
+    PairBatch,
+    PairLossCoefficients,
+    PairSampler,
+    PairSamplerConfig,
+    PairSupervisionConfig,
+)
 from helpers.streams import make_stream
 
 CAMERA = CameraIntrinsics(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
 
 
-ALL_LOSSES = {"reconstruction_loss": 1.0, "temporal_loss": 1e-3, "interlevel_loss": 2.5e-3, "distortion_loss": 1e-3}
+ALL_LOSSES = PairLossCoefficients(temporal_loss=1e-3)
 
 
 EPOCH = 1_600_000_000_000_000_000
@@ -65,6 +72,11 @@ class NoEvents(EventFile):
         raise AssertionError("no test reads it")
 
 
+def make_supervision(config: SupervisionConfig, sensor: SensorModel | None = None) -> Any:
+    """Another paper's supervision, with the usual weights."""
+    return config.setup(sensor=sensor or SensorModel(), loss_coefficients=LossCoefficients())
+
+
 @dataclass
 class FivePairs:
     """A training dataset of five events at two pixels."""
@@ -87,10 +99,10 @@ def make_sampler(
     _, usable = camera.pixel_directions()
     pairs = pair_events([stream], refractory_period=sensor.refractory_period, usable=usable)
     trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
-    return PairSamplerConfig(max_events_per_pair=max_events_per_pair, share_to_moments=share).setup(
+    return PairSamplerConfig(max_events_per_pair=max_events_per_pair, silent_pair_share=share).setup(
         dataset=FivePairs(make_scene(sensor, trajectory, camera), pairs),
         supervision=PairSupervisionConfig(learn_refractory_period=learn_refractory_period).setup(
-            sensor=sensor, loss_coefficients={"temporal_loss": float(temporal)}
+            sensor=sensor, loss_coefficients=PairLossCoefficients(temporal_loss=float(temporal))
         ),
         device="cpu",
     )
@@ -140,14 +152,16 @@ def make_rays(count: int = 10, away: bool = False, with_times: bool = False) -> 
     )
 
 
-def make_batch(num_pairs: int) -> dict[str, torch.Tensor]:
-    positive = (torch.arange(num_pairs) % 2).float()
-    return {
-        "num_positive": positive,
-        "num_negative": 1 - positive,
-        "last_num_positive": positive,
-        "last_num_negative": 1 - positive,
-        "last_interval": torch.full((num_pairs,), 1e-3),
-        "channel": torch.zeros(num_pairs, dtype=torch.long),
-        "ends_between_events": torch.zeros(num_pairs, dtype=torch.bool),
-    }
+def make_batch(num_pairs: int, device: torch.device | str = "cpu") -> PairBatch:
+    positive = (torch.arange(num_pairs, device=device) % 2).float()
+    zeros = torch.zeros_like(positive).long()
+    return PairBatch(
+        num_positive=positive,
+        num_negative=1 - positive,
+        channel=zeros,
+        ends_between_events=zeros.bool(),
+        last_num_positive=positive,
+        last_num_negative=1 - positive,
+        last_interval=torch.full_like(positive, 1e-3),
+        pixel=zeros,
+    )

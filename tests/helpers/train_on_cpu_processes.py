@@ -41,10 +41,10 @@ def share_batches(trainer: Trainer) -> None:
         torch.manual_seed(step)
         num_rays = trainer.world_size * datamanager.config.train_num_rays_per_batch
         rays, batch = datamanager.train_pixel_sampler.sample(num_rays)
-        num_pairs = len(batch["channel"])
+        num_pairs = len(batch)
         part = torch.arange(num_pairs).chunk(trainer.world_size)[trainer.local_rank]
         of_part = torch.arange(len(rays)).unflatten(0, (-1, num_pairs))[:, part].flatten()
-        return rays[of_part], {name: value[part] for name, value in batch.items()}
+        return rays[of_part], batch[part]
 
     datamanager.next_train = next_train
 

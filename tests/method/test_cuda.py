@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +28,7 @@ from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.supervision.base import SupervisionConfig
 from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
-from aenerf_ns.supervision.peers.paev3d import PAEv3DSupervisionConfig
+from aenerf_ns.supervision.peers.paev3d import PAEv3DSupervisionConfig, PatchBatch
 from aenerf_ns.supervision.peers.windows import EventNeRFSupervisionConfig, EvNeRFSupervisionConfig
 
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -71,8 +72,10 @@ def test_a_step_on_windows_computes_on_the_device_alone(supervision: Supervision
     model = make_model(camera_optimizer=PoseCorrectionConfig(mode="spline"), supervision=supervision)
     with SimulatedCuda() as gpu:
         to_device(model)
-        of_patches = {"displacement": torch.ones(4, 2), "window": torch.zeros(4, dtype=torch.long)}
-        rays, batch = to_device(make_rays(8, with_times=True)), to_device(make_batch(4) | of_patches)
+        one, zero = torch.ones(4), torch.zeros(4, dtype=torch.long)
+        parts = {"window": zero, "displacement": torch.ones(4, 2)} if model.supervision.batch_type is PatchBatch else {}
+        rays = to_device(make_rays(8, with_times=True))
+        batch = to_device(model.supervision.batch_type(one, one, zero, **parts))
         outputs = model(rays)
         torch.stack(list(model.get_loss_dict(outputs, batch).values())).sum().backward()
         assert model.supervision.metrics(outputs, batch)["polarity_agreement"].device == device()
@@ -111,7 +114,7 @@ def make_trainer(folder: Path, narrow: bool, temporal: bool) -> Trainer:
     config = deepcopy(aenerf.config)
     config.pipeline.datamanager.dataparser = make_pipeline_config(folder).datamanager.dataparser
     model = config.pipeline.model
-    model.loss_coefficients = {**model.loss_coefficients, "temporal_loss": 1e-3 * temporal}
+    model.loss_coefficients = replace(model.loss_coefficients, temporal_loss=1e-3 * temporal)
     if narrow:
         config.pipeline.datamanager.train_num_rays_per_batch = 60
         model.field.log2_hashmap_size, model.field.num_samples_per_ray = 10, 6

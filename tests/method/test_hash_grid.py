@@ -243,7 +243,7 @@ def training_step(implementation: str) -> dict[str, Tensor]:
         assert is_fast(encoding(torch.ones(1, 3, device=model.device))) == (implementation != "torch")
     torch.manual_seed(0)
     rays = make_rays(15, with_times=True).to(model.device)
-    losses = model.get_loss_dict(model(rays), {name: value.to(model.device) for name, value in make_batch(5).items()})
+    losses = model.get_loss_dict(model(rays), make_batch(5, model.device))
     sum(losses.values()).backward()  # type: ignore[union-attr]
     gradients = {
         f"gradient of {name}": value.grad for name, value in model.named_parameters() if value.grad is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from nerfstudio.viewer.utils import CameraState, get_camera
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+from aenerf_ns.supervision.event_pairs import PairLossCoefficients
 
 
 @pytest.mark.parametrize("backbone", ["hash", "mlp"])
@@ -33,7 +35,7 @@ def test_outputs_have_their_shapes_and_ranges(backbone: str, contraction: str, b
 
 
 def test_proposal_loss_is_normalised_by_the_mean_threshold() -> None:
-    model = make_model(loss_coefficients={"interlevel_loss": 3.0})
+    model = make_model(loss_coefficients=PairLossCoefficients(interlevel_loss=3.0, distortion_loss=1.0))
     model.field.average_init_density = 5.0
     outputs = model(make_rays())
     losses = model.get_loss_dict(outputs, make_batch(5))
@@ -43,12 +45,12 @@ def test_proposal_loss_is_normalised_by_the_mean_threshold() -> None:
 
 
 def test_between_events_changes_within_the_thresholds_are_right() -> None:
-    model = make_model(loss_coefficients={"reconstruction_loss": 1.0, "interlevel_loss": 0.0, "distortion_loss": 0.0})
+    model = make_model(loss_coefficients=PairLossCoefficients(interlevel_loss=0.0, distortion_loss=0.0))
     # Events tell of -0.3, 0.2, -0.3, 0.2, -0.3; the thresholds are 0.2 and 0.3.
     log_radiance = torch.zeros(10, 1)
     log_radiance[5:, 0] = torch.tensor([-0.61, 0.38, -0.05, -0.08, -0.3])
     outputs = model(make_rays()) | {"log_radiance": log_radiance.requires_grad_()}
-    batch = make_batch(5) | {"ends_between_events": torch.tensor([True, True, True, True, False])}
+    batch = replace(make_batch(5), ends_between_events=torch.tensor([True, True, True, True, False]))
     loss = model.get_loss_dict(outputs, batch)["reconstruction_loss"]
     errors = torch.tensor([-0.01, 0.0, 0.05, 0.0, 0.0])
     torch.testing.assert_close(loss, (errors**2).mean() / 0.25**2)
@@ -59,7 +61,7 @@ def test_between_events_changes_within_the_thresholds_are_right() -> None:
 
 
 def test_losses_are_those_of_the_rendered_changes() -> None:
-    model = make_model(loss_coefficients={"reconstruction_loss": 2.0, "interlevel_loss": 0.0, "distortion_loss": 0.0})
+    model = make_model(loss_coefficients=PairLossCoefficients(2.0, 0.0, 0.0))
     outputs, batch = model(make_rays()), make_batch(5)
     losses = model.get_loss_dict(outputs, batch)
     change = outputs["log_radiance"][5:, 0] - outputs["log_radiance"][:5, 0]

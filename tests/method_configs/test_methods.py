@@ -19,18 +19,19 @@ from nerfstudio.engine.trainer import TrainerConfig
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
-from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.method_configs.aenerf_small import aenerf_small
-from aenerf_ns.method_configs.e2vid_nerf import e2vid_nerf
-from aenerf_ns.method_configs.e2vid_nerf_small import e2vid_nerf_small
-from aenerf_ns.method_configs.eventnerf import eventnerf
-from aenerf_ns.method_configs.eventnerf_small import eventnerf_small
-from aenerf_ns.method_configs.evnerf import evnerf
-from aenerf_ns.method_configs.evnerf_small import evnerf_small
-from aenerf_ns.method_configs.paev3d import paev3d
-from aenerf_ns.method_configs.paev3d_small import paev3d_small
-from aenerf_ns.method_configs.robust_enerf import robust_enerf
-from aenerf_ns.method_configs.robust_enerf_small import robust_enerf_small
+from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
+from aenerf_ns.method_configs.peers import (
+    e2vid_nerf,
+    e2vid_nerf_small,
+    eventnerf,
+    eventnerf_small,
+    evnerf,
+    evnerf_small,
+    paev3d,
+    paev3d_small,
+    robust_enerf,
+    robust_enerf_small,
+)
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
 SMALL = [robust_enerf_small, eventnerf_small, evnerf_small, paev3d_small, e2vid_nerf_small]
@@ -96,7 +97,7 @@ def same(first: Any, second: Any) -> bool:
 
 AS_ROBUST = (
     "--pipeline.datamanager.sampler.max-events-per-pair", "1",
-    "--pipeline.datamanager.sampler.share-to-moments", "0",
+    "--pipeline.datamanager.sampler.silent-pair-share", "0",
     "--pipeline.model.camera-optimizer.mode", "off",
 )  # fmt: skip
 

@@ -19,7 +19,7 @@ from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.supervision.event_pairs import PairSamplerConfig, PairSupervisionConfig
+from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSamplerConfig, PairSupervisionConfig
 
 KEPT = "events.h5.pairs"
 
@@ -84,7 +84,7 @@ def test_pairs_in_a_file_are_those_in_memory_and_are_found_again(
         sampler = PairSamplerConfig().setup(
             dataset=dataset,
             supervision=PairSupervisionConfig().setup(
-                sensor=dataset.scene.sensor, loss_coefficients={"temporal_loss": 1.0}
+                sensor=dataset.scene.sensor, loss_coefficients=PairLossCoefficients(temporal_loss=1.0)
             ),
             device="cpu",
         )
@@ -93,7 +93,7 @@ def test_pairs_in_a_file_are_those_in_memory_and_are_found_again(
     (rays, batch), (mapped_rays, mapped_batch) = batches
     assert torch.equal(rays.times, mapped_rays.times)
     assert torch.equal(rays.directions, mapped_rays.directions)
-    assert all(torch.equal(batch[name], mapped_batch[name]) for name in batch)
+    assert all(torch.equal(value, vars(mapped_batch)[name]) for name, value in vars(batch).items())
 
 
 def test_pairs_are_made_again_when_events_or_options_change(

@@ -14,7 +14,19 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor, nn
 
 from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
-from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision, SupervisionConfig
+from aenerf_ns.supervision.base import Batch, LossCoefficients, Sampler, SamplerConfig, Supervision, SupervisionConfig
+
+
+@dataclass
+class Moments(Batch):
+    """Rays at random moments."""
+
+    offset: Tensor
+
+
+@dataclass
+class GreyCoefficients(LossCoefficients):
+    grey_loss: float = 2.0
 
 
 @dataclass
@@ -25,22 +37,22 @@ class GreyConfig(SupervisionConfig):
 
 
 class Grey(Supervision):
-    batch = "moments"
+    batch_type = Moments
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.level = nn.Parameter(torch.tensor(-1.0))
 
-    def place(self, rays: RayBundle) -> dict[str, Tensor]:
+    def shift_ray_times(self, rays: RayBundle) -> dict[str, Tensor]:
         return {"level": self.level * 1.0}
 
-    def unit(self, outputs: Mapping[str, Any]) -> float:
+    def loss_unit(self, outputs: Mapping[str, Any]) -> float:
         return self.sensor.negative_contrast_threshold
 
-    def losses(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Tensor]:
-        return {"grey_loss": (outputs["log_radiance"] - outputs["level"] - batch["offset"]).square().mean()}
+    def losses(self, outputs: Mapping[str, Any], batch: Moments) -> dict[str, Tensor]:
+        return {"grey_loss": (outputs["log_radiance"] - outputs["level"] - batch.offset).square().mean()}
 
-    def learned(self) -> dict[str, float]:
+    def learned_values(self) -> dict[str, float]:
         return {"level": self.level.item()}
 
 
@@ -52,12 +64,12 @@ class MomentSamplerConfig(SamplerConfig):
 
 
 class MomentSampler(Sampler):
-    batch = "moments"
+    batch_type = Moments
 
     def prepare(self) -> None:
         self.duration = (self.dataset.scene.trajectory.end - self.dataset.scene.trajectory.start) * 1e-9
 
-    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
+    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, Moments]:
         ahead = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(num_rays, 3)
         rays = RayBundle(
             origins=torch.zeros(num_rays, 3),
@@ -67,12 +79,12 @@ class MomentSampler(Sampler):
             times=self.duration * torch.rand(num_rays, 1, dtype=torch.float64),
             metadata={CAMERA_DIRECTIONS: ahead},
         )
-        return rays, {"offset": 0.5}
+        return rays, Moments(torch.full((num_rays, 1), 0.5))
 
 
 def test_another_supervision_is_trained_and_what_it_learns_is_logged(tmp_path: Path) -> None:
     config = make_pipeline_config(tmp_path / "data", pose_correction="spline")
-    config.model = replace(config.model, supervision=GreyConfig(), loss_coefficients={"grey_loss": 2.0})
+    config.model = replace(config.model, supervision=GreyConfig(), loss_coefficients=GreyCoefficients())
     config.datamanager = replace(config.datamanager, sampler=MomentSamplerConfig(), train_num_rays_per_batch=30)
     pipeline = config.setup(device="cpu", test_mode="val")
     groups = pipeline.get_param_groups()
@@ -94,5 +106,7 @@ def test_another_supervision_is_trained_and_what_it_learns_is_logged(tmp_path: P
 def test_a_sampler_for_another_supervision_is_refused(tmp_path: Path) -> None:
     config = make_pipeline_config(tmp_path / "data")
     config.datamanager = replace(config.datamanager, sampler=MomentSamplerConfig())
-    with pytest.raises(SystemExit, match="its sampler draws moments and its supervision compares pairs; give it"):
+    with pytest.raises(
+        SystemExit, match="its sampler draws a Moments, and its supervision compares a PairBatch; give it"
+    ):
         config.setup(device="cpu", test_mode="val")

@@ -35,7 +35,7 @@ def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> N
     for i, interval in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
         (x, y), polarity = known[interval]
         seen.add(interval)
-        assert batch["num_positive"][i] - batch["num_negative"][i] == polarity
+        assert batch.num_positive[i] - batch.num_negative[i] == polarity
         for ray, time in ((i, interval[0]), (i + 20, interval[1])):
             pose = sampler.trajectory.interpolate(time)
             torch.testing.assert_close(rays.origins[ray], pose[:, 3].float())
@@ -52,10 +52,10 @@ def test_a_pair_spans_several_events(random_poses: torch.Tensor) -> None:
     counts = zip(
         starts.tolist(),
         ends.tolist(),
-        batch["num_positive"].tolist(),
-        batch["num_negative"].tolist(),
-        batch["last_num_negative"].tolist(),
-        [round(seconds, 6) for seconds in batch["last_interval"].tolist()],
+        batch.num_positive.tolist(),
+        batch.num_negative.tolist(),
+        batch.last_num_negative.tolist(),
+        [round(seconds, 6) for seconds in batch.last_interval.tolist()],
         strict=True,
     )
     # All that end with an event of their pixel, never beyond its first.
@@ -80,7 +80,7 @@ def test_pairs_span_events_beside_which_the_refractory_period_is_short(
     sampler = make_sampler(random_poses, sensor, max_events_per_pair=3)
     rays, batch = sampler.sample(400)
     assert rays.times is not None
-    longer = batch["num_positive"] + batch["num_negative"] > 1
+    longer = batch.num_positive + batch.num_negative > 1
     assert longer.any() == (refractory_period == 12_000_000)
     starts, ends = torch.round(rays.times[:, 0] * 1e9).long().chunk(2)
     assert (starts[longer] == 5_000 + refractory_period).all()
@@ -95,11 +95,11 @@ def test_a_third_ray_lies_between_the_last_two_events(random_poses: torch.Tensor
     rays, batch = sampler.sample(6000)
     assert rays.times is not None
     start, end, within = rays.times[:, 0].chunk(3)
-    assert ((batch["num_positive"] + batch["num_negative"]).max() > 1) == (max_events_per_pair > 1)
-    single = batch["num_positive"] + batch["num_negative"] == 1
-    torch.testing.assert_close(batch["last_interval"][single], (end - start)[single].float())
-    assert (batch["last_num_positive"] + batch["last_num_negative"] == 1).all()
-    part = 1 - (end - within) / batch["last_interval"]
+    assert ((batch.num_positive + batch.num_negative).max() > 1) == (max_events_per_pair > 1)
+    single = batch.num_positive + batch.num_negative == 1
+    torch.testing.assert_close(batch.last_interval[single], (end - start)[single].float())
+    assert (batch.last_num_positive + batch.last_num_negative == 1).all()
+    part = 1 - (end - within) / batch.last_interval
     assert part.min() >= 0
     assert part.max() <= 1
     # A normal distribution of mean 0.5 and deviation 0.25, cut at two deviations, has the deviation 0.22.
@@ -114,9 +114,9 @@ def test_a_share_of_the_pairs_ends_at_uniform_moments(random_poses: torch.Tensor
     rays, batch = sampler.sample(40_000)
     assert rays.times is not None
     starts, ends = rays.times[:, 0].chunk(2)
-    between = batch["ends_between_events"]
+    between = batch.ends_between_events
     assert between.sum() == 15_000
-    count = batch["num_positive"] + batch["num_negative"]
+    count = batch.num_positive + batch.num_negative
     # Nothing has happened since the pair's start, or since an event that is counted: the pixel's middle one.
     assert set(count[between].tolist()) == {0, 1}
     assert set(count[~between].tolist()) == {1, 2}
@@ -124,7 +124,7 @@ def test_a_share_of_the_pairs_ends_at_uniform_moments(random_poses: torch.Tensor
     intervals = [(0.000_101, 0.6), (0.000_006, 0.25), (0.250_001, 1.0)]
     total = sum(end - start for start, end in intervals)
     for index, (start, end) in enumerate(intervals):
-        inside = between & (batch["last_interval"] - (end - start)).abs().lt(1e-6)
+        inside = between & (batch.last_interval - (end - start)).abs().lt(1e-6)
         assert inside.sum() / 15_000 == pytest.approx((end - start) / total, abs=0.02)
         assert ends[inside].min() == pytest.approx(start, abs=0.005)
         assert ends[inside].max() == pytest.approx(end, abs=0.005)
@@ -155,7 +155,7 @@ def test_an_impossible_number_of_events_is_refused(number: int, random_poses: to
 def test_the_colour_filter_is_that_of_the_raw_pixel(random_poses: torch.Tensor) -> None:
     _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB")).sample(40)
     # Pixel (3, 1) is blue and pixel (0, 2) red.
-    assert set(batch["channel"].tolist()) == {0, 2}
+    assert set(batch.channel.tolist()) == {0, 2}
 
 
 def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) -> None:
@@ -169,4 +169,4 @@ def test_pixels_without_a_direction_are_not_sampled(random_poses: torch.Tensor) 
     assert folded.pixel_directions()[1][1, 3]
     for share in (0.0, 1.0):
         _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB"), folded, share=share).sample(40)
-        assert set(batch["channel"].tolist()) == {2}
+        assert set(batch.channel.tolist()) == {2}

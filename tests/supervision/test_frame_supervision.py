@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.small_datasets import AS_RECORDED, END, START, parse, write_native
-from helpers.small_models import CAMERA, EPOCH, make_scene
+from helpers.small_models import CAMERA, EPOCH, make_scene, make_supervision
 from PIL import Image
 
 from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
@@ -19,8 +19,9 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
-from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
+from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervisionConfig
 from aenerf_ns.supervision.peers.frames import (
+    FrameBatch,
     FrameSampler,
     FrameSamplerConfig,
     FrameSupervision,
@@ -48,7 +49,7 @@ def make_sampler(folder: Path, poses: torch.Tensor, pattern: BayerPattern = "", 
     trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), poses)
     scene = make_scene(SensorModel(bayer_pattern=pattern), trajectory)
     scene = SceneRecording(**{**vars(scene), "frames": tuple(frames)})
-    supervision = FrameSupervisionConfig().setup(sensor=scene.sensor, loss_coefficients={})
+    supervision = make_supervision(FrameSupervisionConfig(), scene.sensor)
     return FrameSamplerConfig().setup(dataset=Dataset(scene), supervision=supervision, device="cpu")
 
 
@@ -58,7 +59,7 @@ def test_a_pixel_has_the_value_of_its_image_and_the_ray_of_its_time(
 ) -> None:
     rays, batch = make_sampler(tmp_path, random_poses, pattern, grey).sample(600)
     assert rays.origins.shape == (600, 3)
-    values = torch.round(batch["values"] * 255).long()
+    values = torch.round(batch.values * 255).long()
     assert values.shape == (600, 3 if pattern else 1)
     if pattern:
         assert (values - values[:, :1] == (torch.zeros(3).long() if grey else torch.arange(3))).all()
@@ -73,11 +74,11 @@ def test_a_pixel_has_the_value_of_its_image_and_the_ray_of_its_time(
 
 
 def test_the_loss_is_the_squared_error_of_display_values() -> None:
-    supervision = FrameSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={})
+    supervision = make_supervision(FrameSupervisionConfig(), SensorModel())
     assert isinstance(supervision, FrameSupervision)
     values = torch.tensor([[0.2], [0.5], [0.0]])
     log_radiance = torch.tensor([[0.3], [0.5], [0.1]]).log().requires_grad_()
-    loss = supervision.losses({"log_radiance": log_radiance}, {"values": values})["reconstruction_loss"]
+    loss = supervision.losses({"log_radiance": log_radiance}, FrameBatch(values))["reconstruction_loss"]
     assert loss.item() == pytest.approx((0.01 + 0 + 0.01) / 3)
     loss.backward()
     assert log_radiance.grad is not None
@@ -86,8 +87,8 @@ def test_the_loss_is_the_squared_error_of_display_values() -> None:
 
 def test_pairs_and_images_do_not_mix(random_poses: torch.Tensor, tmp_path: Path) -> None:
     scene = make_sampler(tmp_path, random_poses).dataset.scene
-    supervision = PairSupervisionConfig().setup(sensor=scene.sensor, loss_coefficients={})
-    with pytest.raises(DataError, match="its sampler draws frames and its supervision compares pairs"):
+    supervision = PairSupervisionConfig().setup(sensor=scene.sensor, loss_coefficients=PairLossCoefficients())
+    with pytest.raises(DataError, match="its sampler draws a FrameBatch, and its supervision compares a PairBatch"):
         FrameSamplerConfig().setup(dataset=Dataset(scene), supervision=supervision, device="cpu")
 
 
@@ -97,7 +98,7 @@ def test_images_that_cannot_be_trained_on_end_with_one_line(random_poses: torch.
     with pytest.raises(DataError, match=r"1.png: the image has 5 x 3 pixels, its camera 4 x 3"):
         sampler.prepare()
     none = Dataset(SceneRecording(**{**vars(sampler.dataset.scene), "frames": ()}))
-    supervision = FrameSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={})
+    supervision = make_supervision(FrameSupervisionConfig(), SensorModel())
     with pytest.raises(DataError, match=r"no training images .*; make some with aenerf reconstruct"):
         FrameSamplerConfig().setup(dataset=none, supervision=supervision, device="cpu").prepare()
 

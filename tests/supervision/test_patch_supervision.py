@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.small_models import EPOCH, make_scene
+from helpers.small_models import EPOCH, make_scene, make_supervision
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
@@ -23,6 +23,7 @@ from aenerf_ns.supervision.peers.paev3d import (
     FlowPatchSampler,
     FlowPatchSamplerConfig,
     PAEv3DSupervisionConfig,
+    PatchBatch,
     change_by_flow,
     depth_loss,
     mask_loss,
@@ -85,7 +86,7 @@ class Samples:
 def losses_of(
     predicted: torch.Tensor, net: list[float], threshold: float, training: bool = False, **batch: torch.Tensor
 ) -> dict[str, torch.Tensor]:
-    supervision = PAEv3DSupervisionConfig().setup(sensor=SensorModel(threshold, threshold), loss_coefficients={})
+    supervision = make_supervision(PAEv3DSupervisionConfig(), SensorModel(threshold, threshold))
     supervision.train(training)
     count = len(predicted)
     weights = batch.pop("weights", torch.full((count, 1), 0.5))
@@ -96,9 +97,9 @@ def losses_of(
         "ray_samples_list": [Samples(torch.ones(2 * count, weights.shape[1]) * torch.arange(1, weights.shape[1] + 1))],
     }
     counts = torch.tensor(net)
-    batch["num_positive"], batch["num_negative"] = counts.clamp_min(0), (-counts).clamp_min(0)
-    batch["channel"] = torch.zeros(count, dtype=torch.long)
-    return supervision.losses(outputs, batch)
+    channel = torch.zeros(count, dtype=torch.long)
+    parts = {"window": channel, "displacement": torch.zeros(count, 2)} | batch
+    return supervision.losses(outputs, PatchBatch(counts.clamp_min(0), (-counts).clamp_min(0), channel, **parts))
 
 
 def test_changes_are_compared_by_their_absolute_error_and_cut_at_five_events() -> None:
@@ -170,7 +171,7 @@ def make_sampler(
     windows = sort_events([events or make_events()], window=window, usable=camera.pixel_directions()[1])
     return FlowPatchSamplerConfig(**{"longest_window": 0.0, **options}).setup(
         dataset=Windows(scene, windows),
-        supervision=PAEv3DSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={}),
+        supervision=make_supervision(PAEv3DSupervisionConfig(), SensorModel()),
         device="cpu",
     )
 
@@ -192,10 +193,10 @@ def test_patches_are_drawn_by_their_number_of_active_pixels(random_poses: torch.
     assert (patches - corner[:, None] == [[0, 0], [0, 1], [1, 0], [1, 1]]).all()
     # All of the image but its last row and column, which make no patch.
     assert len(np.unique(corner, axis=0)) == (HEIGHT // 2) * (WIDTH // 2)
-    active = (batch["num_positive"] != batch["num_negative"]).reshape(-1, 4).sum(1)
+    active = (batch.num_positive != batch.num_negative).reshape(-1, 4).sum(1)
     assert active.bincount().tolist() == [20, 100, 100, 100, 704]
     # Four windows of as many patches each.
-    assert batch["window"].bincount().tolist() == [1024] * 4
+    assert batch.window.bincount().tolist() == [1024] * 4
     assert len(sampler.sample(1)[0]) == 8
     assert len(sampler.sample(75)[0]) == 72
 
@@ -204,7 +205,7 @@ def test_patches_of_any_number_take_the_place_of_those_that_no_window_has(random
     silent = make_events()
     sampler = make_sampler(random_poses, events=silent[silent.t <= KNOTS[0] + 10])
     _, batch = sampler.sample(8 * 64)
-    assert len(batch["num_positive"]) == 256
+    assert len(batch) == 256
 
 
 def test_displacements_are_those_of_the_flow_and_are_zero_where_nothing_happens(
@@ -229,18 +230,18 @@ def test_displacements_are_those_of_the_flow_and_are_zero_where_nothing_happens(
         at = int(np.searchsorted(part.t, KNOTS[starts[index]]))
         begin = max(min(at // size * size, len(part) - size), 0)
         velocities, side = told_apart(part[begin : begin + size])
-        silent = batch["num_positive"][index] + batch["num_negative"][index] == 0
+        silent = batch.num_positive[index] + batch.num_negative[index] == 0
         expected = 0.2 * (ends - starts)[index].item() * velocities[row // side, column // side] * (not silent)
-        assert batch["displacement"][index].numpy() == pytest.approx(expected, rel=1e-5), index
+        assert batch.displacement[index].numpy() == pytest.approx(expected, rel=1e-5), index
 
 
 def test_a_batch_of_another_kind_is_refused(random_poses: torch.Tensor) -> None:
     from aenerf_ns.supervision.peers.windows import EventNeRFSupervisionConfig
 
-    with pytest.raises(DataError, match="its sampler draws patches and its supervision compares windows"):
+    with pytest.raises(DataError, match="its sampler draws a PatchBatch, and its supervision compares a WindowBatch"):
         FlowPatchSamplerConfig().setup(
             dataset=make_sampler(random_poses).dataset,
-            supervision=EventNeRFSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients={}),
+            supervision=make_supervision(EventNeRFSupervisionConfig(), SensorModel()),
             device="cpu",
         )
     blind = CameraIntrinsics(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (-9.0, 0.0, 0.0, 0.0, 0.0))

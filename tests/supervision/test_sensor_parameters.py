@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
 from aenerf_ns.method.networks import FieldConfig
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
+from aenerf_ns.supervision.event_pairs import PairBatch, PairSupervisionConfig
 from aenerf_ns.supervision.sensor_parameters import SensorParameters
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipelineConfig
@@ -60,7 +61,8 @@ def test_their_gradients_are_those_of_finite_differences() -> None:
     sampler = UniformSampler(num_samples=24).eval()
     model.proposal_sampler.forward = lambda rays, density_fns: (sampler(rays), [], [])  # type: ignore[method-assign]
     # A scalar in float64 does not make a float32 batch one.
-    batch = {name: value.double() if value.is_floating_point() else value for name, value in make_batch(5).items()}
+    values = vars(make_batch(5)).items()
+    batch = PairBatch(**{name: value.double() if value.is_floating_point() else value for name, value in values})
 
     def loss() -> torch.Tensor:
         rays = make_rays(10, with_times=True)
@@ -94,10 +96,10 @@ def test_the_starts_of_the_intervals_move_and_what_lies_within_keeps_its_place()
     torch.testing.assert_close(places[0], places[1], rtol=1e-9, atol=1e-9)
     # Later starts make shorter intervals.
     assert outputs["interval_change"].item() == pytest.approx(0.02 - period, rel=1e-9)
-    losses = model.get_loss_dict(outputs, make_batch(5) | {"last_interval": torch.full((5,), 0.1)})
+    losses = model.get_loss_dict(outputs, replace(make_batch(5), last_interval=torch.full((5,), 0.1)))
     shorter = model.get_loss_dict(
         {k: v for k, v in outputs.items() if k != "interval_change"},
-        make_batch(5) | {"last_interval": torch.full((5,), 0.1 + 0.02 - period)},
+        replace(make_batch(5), last_interval=torch.full((5,), 0.1 + 0.02 - period)),
     )
     torch.testing.assert_close(losses["temporal_loss"], shorter["temporal_loss"])
 
@@ -128,4 +130,4 @@ def test_pairs_are_of_consecutive_events_where_the_refractory_period_is_learned(
         ),
     ).setup(device="cpu", test_mode="val")
     _, batch = pipeline.datamanager.next_train(0)
-    assert (batch["num_positive"] == 1).all() == learned
+    assert (batch.num_positive == 1).all() == learned

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.simulated_cuda import Counts, SimulatedCuda, device
-from helpers.small_models import CAMERA, EPOCH, make_rays, make_scene
+from helpers.small_models import CAMERA, EPOCH, make_rays, make_scene, make_supervision
 from helpers.streams import make_stream
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -26,6 +26,7 @@ from aenerf_ns.supervision.base import SupervisionConfig
 from aenerf_ns.supervision.peers.windows import (
     EventNeRFSupervisionConfig,
     EvNeRFSupervisionConfig,
+    WindowBatch,
     WindowSampler,
     WindowSamplerConfig,
     WindowSupervision,
@@ -64,7 +65,7 @@ def make_sampler(
     events = sort_events([EVENTS], window=window, usable=camera.pixel_directions()[1])
     return WindowSamplerConfig(**options).setup(
         dataset=Windows(scene, events),
-        supervision=EventNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={}),
+        supervision=make_supervision(EventNeRFSupervisionConfig(), sensor),
         device="cpu",
     )
 
@@ -89,9 +90,9 @@ def test_a_pixel_has_the_events_of_its_window_and_rays_at_both_ends(random_poses
         y, x = divmod(pixel, 4)
         inside = (EVENTS.x == x) & (EVENTS.y == y) & (start < EVENTS.t) & (EVENTS.t <= end)
         inside &= (EVENTS.t <= GAP[0]) | (EVENTS.t >= GAP[1])
-        assert batch["num_positive"][index] == (EVENTS.p[inside] > 0).sum()
-        assert batch["num_negative"][index] == (EVENTS.p[inside] < 0).sum()
-        assert batch["channel"][index] == [[0, 1], [1, 2]][y % 2][x % 2]
+        assert batch.num_positive[index] == (EVENTS.p[inside] > 0).sum()
+        assert batch.num_negative[index] == (EVENTS.p[inside] < 0).sum()
+        assert batch.channel[index] == [[0, 1], [1, 2]][y % 2][x % 2]
 
 
 def test_windows_end_at_poses_cross_no_gap_and_have_all_lengths_alike(random_poses: torch.Tensor) -> None:
@@ -131,7 +132,7 @@ def test_most_pixels_are_active_and_the_others_any_that_the_lens_sees(random_pos
         rays, batch = sampler.sample(800)
         ((start, end),) = set(windows_of(rays))
         seen.add((start, end))
-        sums = batch["num_positive"] - batch["num_negative"]
+        sums = batch.num_positive - batch.num_negative
         directions = rays.metadata[CAMERA_DIRECTIONS][:400]
         # Two events that cancel make no pixel active, and an event at the start is not in the window.
         if (start, end) in ((0, 4), (16, 20)):
@@ -161,10 +162,10 @@ def test_a_batch_goes_to_the_device_in_one_copy(random_poses: torch.Tensor) -> N
     sampler = make_sampler(random_poses, pixels_per_window=5)
     with SimulatedCuda() as gpu:
         sampler.device = device()
-        sampler._pixel_rays = PixelRays(sampler.dataset.scene, device())
+        sampler.pixel_rays = PixelRays(sampler.dataset.scene, device())
         gpu.counts = Counts()
         rays, batch = sampler.sample(40)
-    assert {value.device for value in (rays.times, rays.directions, *batch.values())} == {device()}
+    assert {value.device for value in (rays.times, rays.directions, *vars(batch).values())} == {device()}
     assert (gpu.counts.uploads, gpu.counts.downloads, gpu.counts.waits) == (1, 0, 0)
 
 
@@ -206,13 +207,9 @@ def compare(
 ) -> dict[str, torch.Tensor]:
     """The losses for rendered changes of a grey sensor's pixels."""
     outputs = {"log_radiance": torch.cat([torch.zeros_like(predicted), predicted])[:, None]}
-    outputs |= supervision.place(make_rays(2 * len(predicted), with_times=True))
-    batch = {
-        "num_positive": torch.tensor(positive),
-        "num_negative": torch.tensor(negative),
-        "channel": torch.zeros(len(predicted), dtype=torch.long),
-    }
-    return supervision.losses(outputs, batch)
+    outputs |= supervision.shift_ray_times(make_rays(2 * len(predicted), with_times=True))
+    channel = torch.zeros(len(predicted), dtype=torch.long)
+    return supervision.losses(outputs, WindowBatch(torch.tensor(positive), torch.tensor(negative), channel))
 
 
 def log_change(start: list[float], end: list[float], epsilon: float) -> torch.Tensor:
@@ -233,7 +230,7 @@ def log_change(start: list[float], end: list[float], epsilon: float) -> torch.Te
 def test_the_loss_of_eventnerf_is_the_releases_in_units_of_the_threshold(
     start: list[float], end: list[float], net: list[float], epsilon: float, expected: float
 ) -> None:
-    supervision = EventNeRFSupervisionConfig().setup(sensor=SensorModel(0.25, 0.25), loss_coefficients={})
+    supervision = make_supervision(EventNeRFSupervisionConfig(), SensorModel(0.25, 0.25))
     counts = [max(n, 0.0) for n in net], [max(-n, 0.0) for n in net]
     (loss,) = compare(supervision, log_change(start, end, epsilon), *counts).values()
     assert loss.item() == pytest.approx(expected / 0.25**2, rel=1e-5)
@@ -249,7 +246,7 @@ def test_the_loss_of_eventnerf_is_the_releases_in_units_of_the_threshold(
 def test_the_loss_of_evnerf_by_hand(
     predicted: list[float], positive: list[float], negative: list[float], excess: list[float]
 ) -> None:
-    supervision = EvNeRFSupervisionConfig().setup(sensor=SensorModel(0.3, 0.25), loss_coefficients={})
+    supervision = make_supervision(EvNeRFSupervisionConfig(), SensorModel(0.3, 0.25))
     losses = compare(supervision, torch.tensor(predicted), positive, negative)
     assert losses["reconstruction_loss"].item() == pytest.approx(np.mean(excess) / 0.275, rel=1e-5)
     assert losses["threshold_bound_loss"].item() == pytest.approx(0, abs=1e-6)
@@ -257,18 +254,20 @@ def test_the_loss_of_evnerf_by_hand(
 
 @pytest.mark.parametrize(("learned", "expected"), [((0.2, 0.25), 0.15), ((0.35, 0.4), 0.0)])
 def test_the_bound_holds_thresholds_at_the_sensors(learned: tuple[float, float], expected: float) -> None:
-    supervision = EvNeRFSupervisionConfig().setup(sensor=SensorModel(0.3, 0.3), loss_coefficients={})
+    supervision = make_supervision(EvNeRFSupervisionConfig(), SensorModel(0.3, 0.3))
     factors = torch.tensor(learned) / 0.3
     supervision.raw_factors.data = factors.expm1().log()
-    assert supervision.learned() == pytest.approx({"positive_threshold": learned[0], "negative_threshold": learned[1]})
+    assert supervision.learned_values() == pytest.approx(
+        {"positive_threshold": learned[0], "negative_threshold": learned[1]}
+    )
     losses = compare(supervision, torch.zeros(1), [0.0], [0.0])
     assert losses["threshold_bound_loss"].item() == pytest.approx(expected / 0.3, rel=1e-5)
     # The unit stays the sensor's.
-    assert supervision.unit({}) == pytest.approx(0.3)
+    assert supervision.loss_unit({}) == pytest.approx(0.3)
 
 
 def test_learned_thresholds_have_gradients_from_both_losses() -> None:
-    supervision = EvNeRFSupervisionConfig().setup(sensor=SensorModel(0.3, 0.25), loss_coefficients={})
+    supervision = make_supervision(EvNeRFSupervisionConfig(), SensorModel(0.3, 0.25))
     supervision.raw_factors.data -= 0.1
     # Outside at the upper edge with two positive events, outside at the lower edge with three negative ones.
     losses = compare(supervision, torch.tensor([1.5, -0.2]), [2.0, 0.0], [0.0, 3.0])
@@ -279,7 +278,7 @@ def test_learned_thresholds_have_gradients_from_both_losses() -> None:
 
 @pytest.mark.parametrize("config", [EventNeRFSupervisionConfig(), EvNeRFSupervisionConfig()])
 def test_gradients_are_finite_where_events_cancel_or_come_in_crowds(config: SupervisionConfig) -> None:
-    supervision = config.setup(sensor=SensorModel(0.3, 0.25), loss_coefficients={})
+    supervision = make_supervision(config, SensorModel(0.3, 0.25))
     predicted = torch.tensor([0.0, 0.0, 40.0, -0.25], requires_grad=True)
     losses = compare(supervision, predicted, [0.0, 3.0, 1000.0, 0.0], [0.0, 3.0, 0.0, 1.0])
     inputs = [predicted, *supervision.parameters()]
@@ -315,8 +314,8 @@ def test_the_events_of_a_window_tell_the_true_change_to_within_a_threshold_at_ei
     sensor = SensorModel(0.2, 0.15)
     stream = ideal_events(sensor)
     events = sort_events([stream], window=TimeWindow(0, 1_200_000_000), usable=np.ones((3, 4), bool))
-    eventnerf = EventNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={})
-    evnerf = EvNeRFSupervisionConfig().setup(sensor=sensor, loss_coefficients={})
+    eventnerf = make_supervision(EventNeRFSupervisionConfig(), sensor)
+    evnerf = make_supervision(EvNeRFSupervisionConfig(), sensor)
     rng = np.random.default_rng(0)
     for _ in range(50):
         start, end = np.sort(rng.integers(0, 1_200_000_001, 2))

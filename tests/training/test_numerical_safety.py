@@ -18,6 +18,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method.temporal import log_radiance_rate
+from aenerf_ns.supervision.event_pairs import PairBatch, PairLossCoefficients
 from aenerf_ns.training.pipeline import AENeRFPipeline
 from aenerf_ns.training.training_state import TrainingState
 
@@ -55,16 +56,16 @@ def turned_away(rays: RayBundle) -> RayBundle:
     return replace(rays, directions=-rays.directions, metadata={"camera_directions": camera_directions})
 
 
-def counts(positive: float, negative: float) -> Callable[[dict], dict]:
-    return lambda batch: {
-        **batch,
-        "num_positive": torch.full_like(batch["num_positive"], positive),
-        "num_negative": torch.full_like(batch["num_negative"], negative),
-    }
+def counts(positive: float, negative: float) -> Callable[[PairBatch], PairBatch]:
+    return lambda batch: replace(
+        batch,
+        num_positive=torch.full_like(batch.num_positive, positive),
+        num_negative=torch.full_like(batch.num_negative, negative),
+    )
 
 
-def interval(seconds: float) -> Callable[[dict], dict]:
-    return lambda batch: {**batch, "last_interval": torch.full_like(batch["last_interval"], seconds)}
+def interval(seconds: float) -> Callable[[PairBatch], PairBatch]:
+    return lambda batch: replace(batch, last_interval=torch.full_like(batch.last_interval, seconds))
 
 
 CASES: dict[str, dict[str, Any]] = {
@@ -108,7 +109,7 @@ def test_losses_and_gradients_are_finite(case: str, bounded: bool, backbone: str
         bounded=bounded,
         backbone=backbone,
         camera_optimizer=PoseCorrectionConfig(mode=mode),
-        loss_coefficients={**ALL_LOSSES, "temporal_loss": 1e-3 * temporal},
+        loss_coefficients=PairLossCoefficients(temporal_loss=1e-3 * temporal),
     )
     options.get("model", lambda model: None)(model)
     rays = make_rays((3 if temporal else 2) * pairs, with_times=True)

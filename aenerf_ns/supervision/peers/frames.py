@@ -18,8 +18,19 @@ from torch import Tensor
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.images import check_image
-from aenerf_ns.supervision.base import Sampler, SamplerConfig, Supervision, SupervisionConfig
+from aenerf_ns.supervision.base import Batch, Sampler, SamplerConfig, Supervision, SupervisionConfig
 from aenerf_ns.supervision.pixel_rays import PixelRays
+
+
+@dataclass
+class FrameBatch(Batch):
+    """Pixels of images.
+
+    Attributes:
+        values: (N, channels) display values in [0, 1].
+    """
+
+    values: Tensor
 
 
 @dataclass
@@ -33,18 +44,18 @@ class FrameSupervision(Supervision):
     """Compares rendered radiance with the display values of images.
 
     A network that reconstructs images knows neither their exposure nor their gamma. So the field learns display values
-    as they are. The colour correction, which is affine in the logarithm, takes up the exposure and the gamma.
+    as they are. The color correction, which is affine in the logarithm, takes up the exposure and the gamma.
     """
 
-    batch = "frames"
+    batch_type = FrameBatch
 
-    def unit(self, outputs: Mapping[str, Any]) -> float:
+    def loss_unit(self, outputs: Mapping[str, Any]) -> float:
         """Return 1, because the loss has the unit of display values and not of log-radiance."""
         return 1.0
 
-    def losses(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Tensor]:
+    def losses(self, outputs: Mapping[str, Any], batch: FrameBatch) -> dict[str, Tensor]:
         """Return the mean squared error of radiance."""
-        return {"reconstruction_loss": F.mse_loss(outputs["log_radiance"].exp(), batch["values"])}
+        return {"reconstruction_loss": F.mse_loss(outputs["log_radiance"].exp(), batch.values)}
 
 
 @dataclass
@@ -57,7 +68,7 @@ class FrameSamplerConfig(SamplerConfig):
 class FrameSampler(Sampler):
     """Draws pixels of the dataset's timed training images, at the poses of the trajectory at their times."""
 
-    batch = "frames"
+    batch_type = FrameBatch
 
     def __init__(
         self, config: FrameSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
@@ -94,7 +105,7 @@ class FrameSampler(Sampler):
         times = torch.tensor([time for time, _ in scene.frames], device=self.device)
         return self._pixel_rays.trajectory.seconds(times), torch.from_numpy(np.stack(values)).to(self.device)
 
-    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
+    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, FrameBatch]:
         """Draw a batch of pixels.
 
         Args:
@@ -102,9 +113,9 @@ class FrameSampler(Sampler):
             training: has no effect.
 
         Returns:
-            The rays of the N pixels, and their display ``values`` (N, channels) in [0, 1].
+            The rays of the N pixels, and their display values.
         """
         seconds, values = self._frames
         frame = torch.randint(len(seconds), (num_rays,), device=self.device)
         pixel = self._usable[torch.randint(len(self._usable), (num_rays,), device=self.device)]
-        return self._pixel_rays.rays(pixel, [seconds[frame]]), {"values": values[frame, pixel] / 255}
+        return self._pixel_rays.rays(pixel, [seconds[frame]]), FrameBatch(values[frame, pixel] / 255)

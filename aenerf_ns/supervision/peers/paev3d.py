@@ -36,15 +36,24 @@ from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRen
 from numpy.typing import NDArray
 from torch import Tensor
 
-from aenerf_ns.supervision.base import SupervisionConfig
-from aenerf_ns.supervision.peers.windows import DrawnWindow, PatchSampler, WindowSamplerConfig, WindowSupervision
+from aenerf_ns.errors import DataError
+from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.supervision.base import LossCoefficients, Supervision, SupervisionConfig
+from aenerf_ns.supervision.peers.windows import (
+    DrawnWindow,
+    WindowBatch,
+    WindowSampler,
+    WindowSamplerConfig,
+    WindowSupervision,
+    draw,
+)
 
-# A change is cut at that of so many events.
-_MOST_EVENTS = 5
+# Changes are cut at that of this many events.
+_MAX_EVENTS = 5
 # Rays of less opacity have no priors.
-_LEAST_OPACITY = 0.25
-# The mask loss of a ray of less opacity is constant.
-_LEAST_LOG_OPACITY = 1e-3
+_MIN_OPACITY = 0.25
+# Shares of the patches with 0, 1, 2, 3 and 4 active pixels.
+_PATCH_SHARES = np.array([5, 25, 25, 25, 176]) / 256
 # Events from which a flow is computed, as a share of the sensor's pixels. With half as many, edges of the benchmark's
 # scenes move by three pixels only.
 _FLOW_DENSITY = 2.0
@@ -57,7 +66,7 @@ def mask_loss(opacity: Tensor, has_flow: Tensor) -> Tensor:
         opacity: (N,) of the rays.
         has_flow: (N,) whether the ray's pixel has optical flow.
     """
-    return _mean(-opacity.clamp_min(_LEAST_LOG_OPACITY).log(), has_flow & (opacity >= _LEAST_OPACITY))
+    return _mean(-opacity.clamp_min(1e-3).log(), has_flow & (opacity >= _MIN_OPACITY))
 
 
 def depth_loss(depth: Tensor, opacity: Tensor, speed: Tensor, window: Tensor) -> Tensor:
@@ -72,7 +81,7 @@ def depth_loss(depth: Tensor, opacity: Tensor, speed: Tensor, window: Tensor) ->
         speed: (N,) length of the optical flow, 0 where there is none.
         window: (N,) number of the ray's window, below N.
     """
-    counts = (speed > 0) & (opacity >= _LEAST_OPACITY)
+    counts = (speed > 0) & (opacity >= _MIN_OPACITY)
     relative = []
     for values in (1 / depth, speed):
         largest = torch.zeros_like(values).scatter_reduce(0, window, values * counts, "amax")
@@ -99,6 +108,32 @@ def _mean(values: Tensor, counts: Tensor) -> Tensor:
 
 
 @dataclass
+class PatchBatch(WindowBatch):
+    """Patches of 2 x 2 pixels in windows of time: the four pixels of a patch one after another, row by row.
+
+    Attributes:
+        window: (N,) index of the pixel's window in the batch.
+        displacement: (N, 2) float, displacement over the window by the optical flow, in pixels along x and y; 0 where
+            the pixel has no events.
+    """
+
+    window: Tensor
+    displacement: Tensor
+
+
+@dataclass
+class PAEv3DLossCoefficients(LossCoefficients):
+    """Weights of PAEv3D's losses."""
+
+    mask_loss: float = 1e-3
+    """Weight of the prior that a moving edge is opaque."""
+    flow_loss: float = 1e-2
+    """Weight of the prior that the image's gradient and the flow give the change."""
+    depth_loss: float = 1e-3
+    """Weight of the prior that what is near moves fast."""
+
+
+@dataclass
 class PAEv3DSupervisionConfig(SupervisionConfig):
     """PAEv3D's losses on patches in windows."""
 
@@ -108,25 +143,24 @@ class PAEv3DSupervisionConfig(SupervisionConfig):
 class PAEv3DSupervision(WindowSupervision):
     """Compares changes by their mean absolute error, and opacity, depth and gradients with the optical flow."""
 
-    batch = "patches"
+    batch_type = PatchBatch
 
-    def losses(self, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Tensor]:
+    def losses(self, outputs: Mapping[str, Any], batch: PatchBatch) -> dict[str, Tensor]:
         """Return the absolute error of the changes, and while training the three priors, in units of C̄."""
-        predicted, change = self._changes(outputs, batch)
-        positive, negative = (_MOST_EVENTS * threshold for threshold in self.sensor_thresholds)
-        losses = {"reconstruction_loss": F.l1_loss(predicted, change.clamp(-negative, positive))}
+        rendered, change = self.changes(outputs, batch)
+        positive, negative = (_MAX_EVENTS * threshold for threshold in self.sensor_thresholds)
+        losses = {"reconstruction_loss": F.l1_loss(rendered, change.clamp(-negative, positive))}
         if self.training:
-            displacement = batch["displacement"]
             # The first half of the rays are the starts of the windows.
-            weights = outputs["weights_list"][-1][: len(change)]
-            depth = DepthRenderer("expected")(weights, outputs["ray_samples_list"][-1][: len(change)])[:, 0]
-            opacity, speed = AccumulationRenderer()(weights)[:, 0], displacement.norm(dim=-1)
-            start = outputs["log_radiance"][: len(change)].unflatten(0, (-1, 2, 2))
-            by_flow = change_by_flow(start, displacement.unflatten(0, (-1, 2, 2))).flatten(0, 2)
+            weights = outputs["weights_list"][-1][: len(batch)]
+            depth = DepthRenderer("expected")(weights, outputs["ray_samples_list"][-1][: len(batch)])[:, 0]
+            opacity, speed = AccumulationRenderer()(weights)[:, 0], batch.displacement.norm(dim=-1)
+            start = outputs["log_radiance"][: len(batch)].unflatten(0, (-1, 2, 2))
+            by_flow = change_by_flow(start, batch.displacement.unflatten(0, (-1, 2, 2))).flatten(0, 2)
             losses["mask_loss"] = mask_loss(opacity, speed > 0)
-            losses["depth_loss"] = depth_loss(depth, opacity, speed, batch["window"])
-            losses["flow_loss"] = F.l1_loss(by_flow.gather(1, batch["channel"][:, None])[:, 0], change)
-        return {name: loss / self.unit(outputs) for name, loss in losses.items()}
+            losses["depth_loss"] = depth_loss(depth, opacity, speed, batch.window)
+            losses["flow_loss"] = F.l1_loss(by_flow.gather(1, batch.channel[:, None])[:, 0], change)
+        return {name: loss / self.loss_unit(outputs) for name, loss in losses.items()}
 
 
 @dataclass
@@ -137,20 +171,56 @@ class FlowPatchSamplerConfig(WindowSamplerConfig):
     longest_window: float = 0.01
 
 
-class FlowPatchSampler(PatchSampler):
-    """Samples patches in windows of time, with the optical flow of the events.
+class FlowPatchSampler(WindowSampler):
+    """Samples windows of time, and in each of them patches of 2 x 2 pixels by the number of their active pixels.
 
-    The flow is computed when a window first begins in a stretch of events, and kept.
+    The image is divided into patches that do not overlap. A pixel is active if its polarities do not add up to zero in
+    the window. If no patch has some number of active pixels, patches of any number take its share.
+
+    The optical flow of the events is computed when a window first begins in a stretch of events, and kept.
+
+    Args:
+        config: the options. ``share_of_all_pixels`` has no effect.
+        dataset: the training data.
+        supervision: a :class:`PAEv3DSupervision`.
+        device: of the batches.
+
+    Raises:
+        DataError: an option is out of range, or no patch can be used.
     """
 
-    batch = "patches"
+    batch_type = PatchBatch
+    pixels_per_draw = 4
+
+    def __init__(
+        self, config: WindowSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
+    ) -> None:
+        super().__init__(config, dataset, supervision, device)
+        usable = self.pixel_rays.usable
+        height, width = usable.shape
+        pixels = np.arange(height * width).reshape(height, width)[: height // 2 * 2, : width // 2 * 2]
+        patches = pixels.reshape(height // 2, 2, width // 2, 2).swapaxes(1, 2).reshape(-1, 4)
+        self._patches = patches[usable.ravel()[patches].all(1)]
+        if len(self._patches) == 0:
+            raise DataError("the lens model", "it gives no patch of 2 x 2 pixels a direction", "check its parameters")
+
+    def draw_pixels(self, counts: NDArray[np.int64], num_draws: int) -> NDArray[np.int64]:
+        """Return the (N,) pixels of ``num_draws`` patches, given the events (2, pixels) of a window."""
+        num_active = (counts[0] != counts[1])[self._patches].sum(1)
+        # Whole patches for every number of active pixels, which add up to all.
+        ends = np.rint(np.cumsum(_PATCH_SHARES) * num_draws).astype(int)
+        drawn = []
+        for number, share in enumerate(np.diff(ends, prepend=0)):
+            candidates = np.flatnonzero(num_active == number)
+            drawn.append(draw(candidates if len(candidates) else np.arange(len(self._patches)), share))
+        return self._patches[np.concatenate(drawn)].ravel()
 
     @cached_property
     def _flows(self) -> dict[int, tuple[NDArray[np.float64], int]]:
-        """Velocities of the tiles and side of a tile, by the number of the first event of a stretch."""
+        """Velocities of the tiles and side of a tile, by the index of the first event of a stretch."""
         return {}
 
-    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, dict[str, Any]]:
+    def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, PatchBatch]:
         """Draw a batch of patches in windows.
 
         Args:
@@ -158,23 +228,19 @@ class FlowPatchSampler(PatchSampler):
             training: has no effect.
 
         Returns:
-            As :class:`~aenerf_ns.supervision.peers.windows.WindowSampler` does, with the four pixels of a patch one
-            after another, row by row. And for each pixel: the number (N,) of its ``window`` in the batch, and its
-            ``displacement`` (N, 2) over the window by the optical flow, in pixels along x and y, 0 where the pixel has
-            no events.
+            The rays of the N pixels at the starts of their windows, then those at the ends, and the events between.
         """
-        drawn = self._draw(num_rays // 2)
-        rays, batch = self._batch(drawn)
-        window = np.repeat(np.arange(len(drawn)), [len(one.pixels) for one in drawn])
-        displacement = np.concatenate([self._displacement(one) for one in drawn])
-        batch["window"] = torch.from_numpy(window).to(self.device)
-        batch["displacement"] = torch.from_numpy(displacement).to(self.device)
-        return rays, batch
+        drawn = self.draw_windows(num_rays // 2)
+        rays, batch = self.rays_and_batch(drawn)
+        window = np.repeat(np.arange(len(drawn)), [len(part.pixels) for part in drawn])
+        displacement = np.concatenate([self._displacement(part) for part in drawn])
+        to_device = (torch.from_numpy(array).to(self.device) for array in (window, displacement))
+        return rays, PatchBatch(*vars(batch).values(), *to_device)
 
     def _displacement(self, drawn: DrawnWindow) -> NDArray[np.float32]:
         """Return the displacements (N, 2) of the pixels of a window."""
         velocities, side = self._flow(drawn.start)
-        rows, columns = np.divmod(drawn.pixels, self._pixel_rays.usable.shape[1])
+        rows, columns = np.divmod(drawn.pixels, self.pixel_rays.usable.shape[1])
         moved = velocities[rows // side, columns // side] * ((drawn.end - drawn.start) * 1e-9)
         return (moved * drawn.counts.any(0)[:, None]).astype(np.float32)
 
@@ -183,7 +249,7 @@ class FlowPatchSampler(PatchSampler):
         # Imported lazily: every ns-* command imports this module, and numba is slow to import.
         from aenerf_ns.events.optical_flow import optical_flow
 
-        windows, (height, width) = self.dataset.windows, self._pixel_rays.usable.shape
+        windows, (height, width) = self.dataset.windows, self.pixel_rays.usable.shape
         piece = next((first, last) for first, last in windows.pieces if first <= time <= last)
         first, at = np.searchsorted(windows.times, [piece[0], time])
         last = np.searchsorted(windows.times, piece[1], side="right")
