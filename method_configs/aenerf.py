@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 
 import torch
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
@@ -37,7 +38,7 @@ aenerf = MethodSpecification(
         ),
         optimizers={
             "encodings": {
-                # A field that learns slowly holds on to wrong poses (docs/experiments.md).
+                # A field that learns slowly holds on to wrong poses (docs/defaults.md).
                 "optimizer": FusedAdamOptimizerConfig(lr=8e-2, eps=1e-15),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
@@ -55,7 +56,7 @@ aenerf = MethodSpecification(
             },
         },
         # A batch has few rays for each knot of the spline. If poses follow every single batch, the field stays blurred,
-        # at lower rates and in longer runs too (docs/experiments.md).
+        # at lower rates and in longer runs too (docs/defaults.md).
         gradient_accumulation_steps={"camera_opt": 8},
         logging=LoggingConfig(
             local_writer=LocalWriterConfig(
@@ -74,9 +75,6 @@ aenerf = MethodSpecification(
 def small(config: AENeRFTrainerConfig) -> AENeRFTrainerConfig:
     """Return a method with fewer steps, fewer rays and smaller networks. Its name ends with "-small"."""
     config = deepcopy(config)
-    config.method_name += "-small"
-    config.max_num_iterations = 2000
-    config.steps_per_save = 1000
     config.pipeline.datamanager.train_num_rays_per_batch = 1024
     config.pipeline.datamanager.eval_num_rays_per_batch = 1024
     config.pipeline.model.field = FieldConfig(
@@ -91,7 +89,8 @@ def small(config: AENeRFTrainerConfig) -> AENeRFTrainerConfig:
     )
     # On a CPU twice as fast as 8192, because the memory of a piece stays small.
     config.pipeline.model.eval_num_rays_per_chunk = 1 << 10
-    return config
+    # A new configuration, because the schedules follow the number of steps when it is made.
+    return replace(config, method_name=f"{config.method_name}-small", max_num_iterations=2000, steps_per_save=1000)
 
 
 aenerf_small = MethodSpecification(
