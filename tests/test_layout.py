@@ -16,6 +16,7 @@ PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 # The floors, bottom up, and what each stands on. A folder may also use itself.
 MAY_USE = {
     "errors": set(),
+    "atomic_write": set(),
     "progress": set(),
     "open3d_import": {"errors"},
     "camera": {"errors"},
@@ -33,7 +34,7 @@ MAY_USE = {
     "evaluation": {"errors", "progress", "camera", "recording", "supervision", "method", "checking"},
     # What the viewer shows of a run. It only looks: the pipeline hands it what it needs.
     "viewer": {"errors", "events", "camera", "files", "recording", "method", "evaluation"},
-    "training": {"errors", "recording", "supervision", "method", "evaluation", "viewer"},
+    "training": {"errors", "atomic_write", "recording", "supervision", "method", "evaluation", "viewer"},
     # What training and checking left behind, measured and shown.
     "report": {"errors", "progress", "camera", "files", "supervision", "evaluation", "training", "checking"},
     # Stands beside the method: only commands and benchmarks use it.

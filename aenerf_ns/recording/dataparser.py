@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -104,7 +105,7 @@ class EventDataParser(DataParser):
 
     def _generate_dataparser_outputs(self, split: Split = "train", **kwargs: object) -> DataparserOutputs:
         recording = self.recording
-        window = self._time_window(recording, say=split == "train")
+        window = self.time_window
         refractory = recording.sensor.refractory_period
         if refractory >= window.end - window.start:
             raise DataError(
@@ -173,9 +174,14 @@ class EventDataParser(DataParser):
             },
         )
 
-    def _time_window(self, recording: Recording, say: bool) -> TimeWindow:
-        """Find the time window and store it in the configuration, so that opening a trained run needs no events."""
-        config = self.config
+    @cached_property
+    def time_window(self) -> TimeWindow:
+        """The time that is used: what both events and poses cover, without the gaps of the poses.
+
+        Raises:
+            DataError: events and poses do not overlap.
+        """
+        recording, config = self.recording, self.config
         start, end = config.start_time_ns, config.end_time_ns
         if start is None or end is None:
             first, last = recording.event_file.ordered_time_span()
@@ -188,19 +194,19 @@ class EventDataParser(DataParser):
                 "widen the time window (--start-time-ns, --end-time-ns)",
             )
         covered = recording.trajectory.crop(start, end)
-        config.start_time_ns, config.end_time_ns = max(start, covered.start), min(end, covered.end)
-        return TimeWindow(
-            config.start_time_ns,
-            config.end_time_ns,
-            self._pose_gaps(recording, config.start_time_ns, config.end_time_ns, say),
-        )
+        start, end = max(start, covered.start), min(end, covered.end)
+        return TimeWindow(start, end, self._pose_gaps(recording, start, end))
 
-    def _pose_gaps(self, recording: Recording, start: int, end: int, say: bool) -> tuple[tuple[int, int], ...]:
+    def resolved_config(self) -> EventDataParserConfig:
+        """Return the configuration with the time window that is used, so that opening a trained run needs no events."""
+        return replace(self.config, start_time_ns=self.time_window.start, end_time_ns=self.time_window.end)
+
+    def _pose_gaps(self, recording: Recording, start: int, end: int) -> tuple[tuple[int, int], ...]:
         """Return where within the time window the poses are too far apart for interpolation."""
         longest = self.config.max_pose_gap_ns
         longest = recording.max_pose_gap if longest is None else longest
         gaps = [gap for gap in recording.trajectory.known_time(longest).gaps if gap[0] < end and gap[1] > start]
-        if longest is not None and gaps and say:
+        if longest is not None and gaps:
             seconds = sum(last - first for first, last in gaps) * 1e-9
             first, last = max(gaps, key=lambda gap: gap[1] - gap[0])
             CONSOLE.print(

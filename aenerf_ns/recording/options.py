@@ -54,15 +54,14 @@ class EventDataParserConfig(DataParserConfig):
         Raises:
             DataError: a whole number among the options is beyond all times.
         """
-        for option in fields(self):
-            value = getattr(self, option.name)
-            if isinstance(value, Path):
-                # A run's saved configuration is also read in other working directories.
-                setattr(self, option.name, value.absolute())
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        for option, value in values.items():
             if isinstance(value, int) and abs(value) > MAX_TIME:
-                name = f"--{option.name.replace('_', '-')}"
+                name = f"--{option.replace('_', '-')}"
                 raise DataError(str(self.data), f"{name} is {value}", "give nanoseconds, which have 19 digits at most")
-        return super().setup(**kwargs)
+        # A run's saved configuration is also read in other working directories.
+        paths = {option: value.absolute() for option, value in values.items() if isinstance(value, Path)}
+        return super(EventDataParserConfig, replace(self, **paths)).setup(**kwargs)
 
 
 @dataclass

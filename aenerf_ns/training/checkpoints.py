@@ -1,8 +1,7 @@
-"""Checkpoint files: which of them can be loaded, and how they are written whole or not at all."""
+"""Checkpoint files: which of them can be loaded."""
 
 from __future__ import annotations
 
-import os
 import warnings
 import zipfile
 from pathlib import Path
@@ -12,7 +11,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import DataError
 
-# What a checkpoint of the framework's trainer holds at least.
+# What a checkpoint of Nerfstudio's trainer holds at least.
 _ENTRIES = {"step", "pipeline", "optimizers", "schedulers", "scalers"}
 
 
@@ -94,29 +93,3 @@ def _fault(path: Path) -> str | None:
     if not isinstance(entries["step"], int) or entries["step"] < 0 or not isinstance(entries["pipeline"], dict):
         return "its step or its weights are of the wrong kind"
     return None
-
-
-def move_whole(source: Path, destination: Path) -> None:
-    """Give a complete file its final name, which is there after a crash of the machine only if the contents are.
-
-    Args:
-        source: the complete file.
-        destination: its final name, on the same file system.
-
-    Raises:
-        OSError: the disk is full or fails.
-    """
-    _sync(source, os.O_RDWR)
-    source.replace(destination)
-    # Windows opens no folder.
-    if os.name == "posix":
-        _sync(destination.parent, os.O_RDONLY)
-
-
-def _sync(path: Path, access: int) -> None:
-    # Windows writes back only files that are open for writing.
-    descriptor = os.open(path, access)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -12,6 +12,7 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from torch import Tensor
 
 from aenerf_ns.errors import errors_as_one_line
+from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import Batch, Sampler, SamplerConfig, Supervision
 from aenerf_ns.supervision.event_pairs import PairSamplerConfig
@@ -40,6 +41,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     """
 
     config: EventDataManagerConfig
+    dataparser: EventDataParser
     train_pixel_sampler: Sampler | None
     has_reference_views: bool
 
@@ -52,9 +54,11 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     ) -> None:
         with errors_as_one_line():
             super().__init__(config, device=device, test_mode=test_mode, **kwargs)
-        # A run is opened with the options that the dataparser resolved, such as the format it recognised.
-        config.dataparser = self.dataparser.config
-        config.data = config.dataparser.data
+
+    def resolved_config(self) -> EventDataManagerConfig:
+        """Return the configuration with what the dataparser resolved: its format, its paths and its time window."""
+        dataparser = self.dataparser.resolved_config()
+        return replace(self.config, dataparser=dataparser, data=dataparser.data)
 
     def create_eval_dataset(self) -> EventDataset | None:
         """Return the reference views.

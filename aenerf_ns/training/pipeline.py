@@ -14,7 +14,6 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils import comms
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
-from nerfstudio.utils.writer import GLOBAL_BUFFER, EventName
 from torch import Tensor
 
 from aenerf_ns.errors import errors_as_one_line
@@ -27,8 +26,8 @@ from aenerf_ns.evaluation.view_metrics import average_metrics
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.supervision.base import Batch, ChangeBatch
 from aenerf_ns.training.datamanager import EventDataManager
-from aenerf_ns.training.device import require_device
-from aenerf_ns.training.ffmpeg import provide_ffmpeg
+from aenerf_ns.training.framework import mean_step_seconds, steps_of
+from aenerf_ns.training.preflight import provide_ffmpeg
 from aenerf_ns.training.training_state import TrainingState
 from aenerf_ns.viewer.panel import RecordingPanel
 from aenerf_ns.viewer.recording_view import RecordingView
@@ -64,7 +63,6 @@ class AENeRFPipeline(VanillaPipeline):
         test_mode: Literal["test", "val", "inference"] = "val",
         **kwargs: Any,
     ) -> None:
-        require_device(device)
         if test_mode != "val":
             # Once the pipeline is made, ns-render asks for a program that pip cannot install.
             provide_ffmpeg()
@@ -124,12 +122,11 @@ class AENeRFPipeline(VanillaPipeline):
         return outputs, losses, metrics
 
     def _rate(self, batch: Batch) -> dict[str, float]:
-        """Return ``pairs_per_second`` at the framework's mean time of a step, where a batch holds pairs of times."""
-        # The framework has no mean before the first step, and none outside a training.
-        times = GLOBAL_BUFFER.get("events", {}).get(EventName.ITER_TRAIN_TIME.value)
-        if times is None or not isinstance(batch, ChangeBatch):
+        """Return ``pairs_per_second`` at the mean time of a step, where a batch holds pairs of times."""
+        seconds = mean_step_seconds()
+        if seconds is None or not isinstance(batch, ChangeBatch):
             return {}
-        return {"pairs_per_second": comms.get_world_size() * len(batch) / times["avg"]}
+        return {"pairs_per_second": comms.get_world_size() * len(batch) / seconds}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -137,13 +134,8 @@ class AENeRFPipeline(VanillaPipeline):
         """Return all callbacks, with the colour correction's and the diagnosis', and let optimizers check gradients."""
         trainer = training_callback_attributes.trainer
         assert trainer is not None
-        # Saved again, because the dataparser has resolved the time window by now: opening the run must give the same
-        # cameras without reading the events.
-        if trainer.local_rank == 0:
-            trainer.config.save_config()
-        num_steps = trainer.config.max_num_iterations
-        last_step = trainer._start_step + num_steps - 1
-        self.training_state.go_on(trainer, self.model.proposal_sampler)
+        steps = steps_of(trainer)
+        self.training_state.resume(trainer, self.model.proposal_sampler)
         # A run that goes on from a checkpoint is diagnosed anew at its own end.
         self._pose_diagnosis = None
         earlier_poses: list[Tensor] = []
@@ -151,9 +143,9 @@ class AENeRFPipeline(VanillaPipeline):
         def diagnose_poses(step: int) -> None:
             if not self.model.camera_optimizer.is_learned or not comms.is_main_process():
                 return
-            if step == max(last_step - max(round(LAST_PART * num_steps), 1), trainer._start_step):
+            if step == max(steps[-1] - max(round(LAST_PART * len(steps)), 1), steps.start):
                 earlier_poses.append(self.model.camera_optimizer.compared_poses()[1])
-            if step == last_step:
+            if step == steps[-1]:
                 sampler = self.datamanager.train_pixel_sampler
                 self._pose_diagnosis = diagnose(self.model, self.datamanager.train_dataset, sampler, *earlier_poses)
                 CONSOLE.print(self._pose_diagnosis["summary"], soft_wrap=True)
@@ -162,7 +154,7 @@ class AENeRFPipeline(VanillaPipeline):
             # The main process writes the checkpoints, and DistributedDataParallel copies its buffers to the others.
             if not comms.is_main_process():
                 return
-            if step == last_step or step_check(step, trainer.config.steps_per_save):
+            if step == steps[-1] or step_check(step, trainer.config.steps_per_save):
                 self.color_fit.fit()
             elif step_check(step, _ROUGH_FIT_INTERVAL, run_at_zero=True):
                 self.color_fit.fit(_ROUGH_FIT_SHARE)

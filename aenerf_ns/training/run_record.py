@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import resource
-import sys
 import time
 from collections.abc import Mapping
 from datetime import datetime, timezone
@@ -17,16 +16,15 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread, decorate_all
 from torch import Tensor
 
-from aenerf_ns.training.checkpoints import move_whole
+from aenerf_ns.atomic_write import atomic_write
+from aenerf_ns.training.framework import is_logged
 from aenerf_ns.training.provenance import environment
 
 RUN_FILE, SCALARS_FILE = "run.json", "scalars.csv"
 """The files' names in the folder of a run."""
 
-# Figures of the framework that come with every step and tell of the machine alone.
-_OF_EVERY_STEP = {name.value for name in writer.EventName} - {writer.EventName.CURR_TEST_PSNR.value}
-# ru_maxrss counts in KiB, and on macOS in bytes.
-_RESIDENT_UNIT = 1 if sys.platform == "darwin" else 1024
+# Figures of Nerfstudio that come with every step and describe the machine alone.
+_TIMING_NAMES = {name.value for name in writer.EventName} - {writer.EventName.CURR_TEST_PSNR.value}
 
 
 class RunRecord:
@@ -38,19 +36,18 @@ class RunRecord:
     Args:
         folder: of the run. It exists.
         seed: of the run.
-        first_step: the step that the training begins with; above 0 in a run that goes on from a checkpoint.
-        num_steps: steps that the training is meant to take.
+        steps: that the training is meant to take; they begin above 0 in a run that resumes.
     """
 
-    def __init__(self, folder: Path, seed: int, first_step: int, num_steps: int) -> None:
+    def __init__(self, folder: Path, seed: int, steps: range) -> None:
         self._path = folder / RUN_FILE
         self._began = time.monotonic()
         self._record: dict[str, Any] = {
             **environment(),
             "seed": seed,
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            "first_step": first_step,
-            "planned_steps": num_steps,
+            "first_step": steps.start,
+            "planned_steps": len(steps),
         }
         self.write("training", 0)
 
@@ -62,7 +59,7 @@ class RunRecord:
             num_steps: steps that were made.
         """
         memory: dict[str, int | None] = {
-            "host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _RESIDENT_UNIT,
+            "host": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
             "gpu": torch.cuda.max_memory_allocated() if torch.cuda.is_available() else None,
         }
         self._record |= {
@@ -71,9 +68,8 @@ class RunRecord:
             "seconds": time.monotonic() - self._began,
             "peak_memory_bytes": memory,
         }
-        partial = self._path.with_name(f"{RUN_FILE}.partial")
-        partial.write_text(json.dumps(self._record, indent=2) + "\n", "utf8")
-        move_whole(partial, self._path)
+        with atomic_write(self._path) as partial:
+            partial.write_text(json.dumps(self._record, indent=2) + "\n", "utf8")
 
 
 @decorate_all([check_main_thread])
@@ -92,9 +88,9 @@ class ScalarWriter(writer.Writer):
 
     def write_scalar(self, name: str, scalar: float | Tensor, step: int) -> None:
         """Write one scalar, unless it is a time, or a rate at a step that is not logged otherwise."""
-        if name.startswith("learning_rate/") and step % writer.GLOBAL_BUFFER["steps_per_log"]:
+        if name.startswith("learning_rate/") and not is_logged(step):
             return
-        if name not in _OF_EVERY_STEP:
+        if name not in _TIMING_NAMES:
             self._rows.writerow((step, name, f"{float(scalar):.6g}"))
 
     def write_image(self, name: str, image: Tensor, step: int) -> None:

@@ -1,17 +1,15 @@
-"""The state of a training beyond weights, optimizers and schedules, which the framework's checkpoints lack."""
+"""The state of a training beyond weights, optimizers and schedules, which Nerfstudio's checkpoints lack."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 from torch import nn
 
 from aenerf_ns.method.ray_samplers import ProposalSampler
-
-if TYPE_CHECKING:
-    from aenerf_ns.training.trainer import AENeRFTrainer
 
 
 class TrainingState(nn.Module):
@@ -24,7 +22,7 @@ class TrainingState(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self._training: tuple[AENeRFTrainer, ProposalSampler] | None = None
+        self._training: tuple[Trainer, ProposalSampler] | None = None
         self._loaded: dict[str, Any] | None = None
 
     def get_extra_state(self) -> dict[str, Any] | None:
@@ -47,14 +45,14 @@ class TrainingState(nn.Module):
         }
 
     def set_extra_state(self, state: dict[str, Any] | None) -> None:
-        """Take a checkpoint's state. It has an effect when :meth:`go_on` is called, because evaluations load it too."""
+        """Take a checkpoint's state, for :meth:`resume`: evaluations load it too, and it must not affect them."""
         self._loaded = state
 
-    def go_on(self, trainer: AENeRFTrainer, sampler: ProposalSampler) -> None:
-        """Follow a training from now on, which goes on from the loaded state if there is one.
+    def resume(self, trainer: Trainer, sampler: ProposalSampler) -> None:
+        """Attach to a trainer, and restore the loaded state if there is one.
 
         Args:
-            trainer: that is set up and has loaded its checkpoint.
+            trainer: of an :class:`~aenerf_ns.training.trainer.AENeRFTrainerConfig`, with its checkpoint loaded.
             sampler: of the model that is trained.
         """
         self._training = (trainer, sampler)
@@ -75,5 +73,5 @@ class TrainingState(nn.Module):
             torch.manual_seed(int(torch.randint(1 << 62, ())) + comms.get_rank())
 
 
-def _is_on_gpu(trainer: AENeRFTrainer) -> bool:
+def _is_on_gpu(trainer: Trainer) -> bool:
     return torch.device(trainer.device).type == "cuda"

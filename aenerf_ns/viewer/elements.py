@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerElement
+from nerfstudio.viewer.viewer_elements import ViewerElement
 from viser import ClientHandle, GuiMarkdownHandle, ViserServer
 
 
@@ -39,7 +39,7 @@ class ViewerMarkdown(ViewerElement[str]):
             self._handle.content = content
 
 
-class DownloadButton(ViewerButton):
+class DownloadButton(ViewerElement[bool]):
     """A button that sends a file to the browser in which it was clicked.
 
     Args:
@@ -53,10 +53,9 @@ class DownloadButton(ViewerButton):
 
     def install(self, viser_server: ViserServer) -> None:
         """Add the element to the viewer."""
-        self._create_gui_handle(viser_server)
-
+        button = self.gui_handle = viser_server.gui.add_button(self.name)
         # Nerfstudio wraps the hook so that it waits until no training step runs, and passes its argument on.
-        self.gui_handle.on_click(lambda event: self.cb_hook(event.client))
+        button.on_click(lambda event: self.cb_hook(event.client))
 
     def _send(self, client: ClientHandle) -> None:
         client.send_file_download(*self._make(client))

@@ -36,7 +36,6 @@ def train_small_model(folder: Path, name: str, num_steps: int, seed: int = 42, *
     config.optimizers["camera_opt"]["scheduler"].delay = 2
     torch.manual_seed(seed)
     try:
-        config.save_config()
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.train()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import signal
 import subprocess
@@ -13,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from helpers.small_datasets import CAMERA, SENSOR, write_native
 
 from aenerf_ns.errors import DataError
@@ -41,7 +41,7 @@ def another_owner(output: Path) -> Iterator[subprocess.Popen]:
         owner.kill()
 
 
-def test_the_second_is_refused_while_the_first_lives(tmp_path: Path) -> None:
+def test_second_is_refused_while_the_first_lives(tmp_path: Path) -> None:
     output = tmp_path / "made"
     in_use = tmp_path / ".made.partial" / "events.h5"
     in_use.parent.mkdir()
@@ -61,7 +61,7 @@ def test_the_second_is_refused_while_the_first_lives(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [output]
 
 
-def test_the_owner_is_named(tmp_path: Path) -> None:
+def test_owner_is_named(tmp_path: Path) -> None:
     with OutputLock(tmp_path / "a" / "made"):
         (file,) = (tmp_path / "a").iterdir()
         assert file.read_text().startswith(f"process {os.getpid()} on ")
@@ -73,7 +73,7 @@ def test_the_owner_is_named(tmp_path: Path) -> None:
         pass
 
 
-def test_a_writer_uses_the_lock_of_its_caller(tmp_path: Path) -> None:
+def test_writer_uses_the_lock_of_its_caller(tmp_path: Path) -> None:
     with OutputLock(tmp_path / "made") as lock:
         with pytest.raises(RuntimeError), NativeDatasetWriter(lock, CAMERA, SENSOR, "srgb"):
             raise RuntimeError
@@ -83,50 +83,32 @@ def test_a_writer_uses_the_lock_of_its_caller(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_lock_whose_file_was_removed_meanwhile_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first owner ends between the second's opening of the file and its locking."""
-    first = OutputLock(tmp_path / "made")
-    flock, third = fcntl.flock, []
+def test_output_finished_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    acquire = FileLock.acquire
 
-    def late(descriptor: int, operation: int) -> None:
-        monkeypatch.setattr(fcntl, "flock", flock)
-        first.release()
-        third.append(OutputLock(tmp_path / "made"))
-        flock(descriptor, operation)
-
-    monkeypatch.setattr(fcntl, "flock", late)
-    with pytest.raises(DataError, match="another command is writing it"):
-        OutputLock(tmp_path / "made")
-    third[0].release()
-    assert not list(tmp_path.iterdir())
-
-
-def test_an_output_that_was_finished_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flock = fcntl.flock
-
-    def late(descriptor: int, operation: int) -> None:
+    def late(lock: FileLock, **options: bool) -> object:
         (tmp_path / "made").mkdir()
-        flock(descriptor, operation)
+        return acquire(lock, **options)
 
-    monkeypatch.setattr(fcntl, "flock", late)
+    monkeypatch.setattr(FileLock, "acquire", late)
     with pytest.raises(DataError, match="the folder exists already"):
         OutputLock(tmp_path / "made")
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
 
-def test_a_file_system_without_locks_is_named_and_used(
+def test_file_system_without_locks_is_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def none(*_: int) -> None:
+    def none(*_: object, **__: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(fcntl, "flock", none)
+    monkeypatch.setattr(FileLock, "acquire", none)
     write_native(tmp_path / "made")
     assert "its file system has no locks (No locks available): start no second command" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == [tmp_path / "made"]
 
 
-def test_an_output_that_output_error_is_one_line(tmp_path: Path) -> None:
+def test_uncreatable_output_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match=r"it cannot be created \(.*\); choose another --output"):
         OutputLock(tmp_path / "file" / "made")
@@ -136,7 +118,7 @@ def test_an_output_that_output_error_is_one_line(tmp_path: Path) -> None:
         OutputLock(tmp_path / ("a" * 300))
 
 
-def test_what_a_signal_interrupts_before_its_context_is_removed_with_the_lock(tmp_path: Path) -> None:
+def test_interrupted_writer_is_removed_with_the_lock(tmp_path: Path) -> None:
     output = tmp_path / "made"
     with OutputLock(output) as lock:
         # Made, and never entered.

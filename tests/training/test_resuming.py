@@ -1,18 +1,25 @@
-"""Trainings that go on from a checkpoint."""
+"""Trainings that resume from a checkpoint."""
 
 from __future__ import annotations
 
+import inspect
+import json
+import re
+import textwrap
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from helpers.small_trainings import train_small_model
+from nerfstudio.engine import trainer as framework_trainer
+from nerfstudio.engine.trainer import Trainer
 
 from aenerf_ns.training.trainer import AENeRFTrainer
 
 NUM_STEPS = 60
 # Not a multiple of the 8 steps over which gradients of the poses are accumulated. Odd, because the proposal networks
-# are trained at every other step. And in the part of the run in which the field's space counts rays.
+# are trained at every other step. And in the part of the run in which the field's warp counts rays.
 NUM_FIRST = 13
 
 
@@ -30,15 +37,15 @@ def assert_equal(first: Any, second: Any, name: str = "checkpoint") -> None:
             assert_equal(first[key], second[key], f"{name}.{key}")
     elif isinstance(first, (list, tuple)):
         assert len(first) == len(second), name
-        for index, (one, other) in enumerate(zip(first, second, strict=True)):
-            assert_equal(one, other, f"{name}.{index}")
+        for index, pair in enumerate(zip(first, second, strict=True)):
+            assert_equal(*pair, f"{name}.{index}")
     elif isinstance(first, torch.Tensor):
         assert torch.equal(first, second), name
     else:
         assert first == second, name
 
 
-def test_a_run_in_two_pieces_is_the_run_in_one(tmp_path: Path) -> None:
+def test_run_in_two_pieces_equals_one(tmp_path: Path) -> None:
     whole = checkpoint(train_small_model(tmp_path, "whole", NUM_STEPS))
     first = train_small_model(tmp_path, "first", NUM_FIRST, schedule_length=NUM_STEPS)
     # The second piece is another process, whose generators are elsewhere.
@@ -48,6 +55,36 @@ def test_a_run_in_two_pieces_is_the_run_in_one(tmp_path: Path) -> None:
     # The diagnosis compares with poses at nine tenths of each run.
     del whole["pipeline"]["_extra_state"], resumed["pipeline"]["_extra_state"]
     assert_equal(whole, resumed)
-    moved = whole["pipeline"]["_model.camera_optimizer.twists.control_twists"]
-    assert moved.any()
+    assert whole["pipeline"]["_model.camera_optimizer.twists.control_twists"].any()
     assert checkpoint(first)["pipeline"]["training_state._extra_state"]["gradients"]["camera_opt"][0].any()
+
+
+@pytest.mark.parametrize("counts_earlier_steps", [False, True])
+def test_resumed_run_reaches_its_last_step(
+    counts_earlier_steps: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The installed Nerfstudio and its main branch count the steps of a resumed run differently."""
+    first = train_small_model(tmp_path, "first", 10)
+    if counts_earlier_steps:
+        number = "num_iterations = self.config.max_num_iterations\n"
+        source = textwrap.dedent(inspect.getsource(Trainer.train))
+        assert source.count(number) == 1
+        file = tmp_path / "train.py"
+        file.write_text(source.replace(number, f"{number.strip()} - self._start_step\n"))
+        namespace = dict(vars(framework_trainer))
+        exec(compile(file.read_text(), file, "exec"), namespace)
+        monkeypatch.setattr(Trainer, "train", namespace["train"])
+    capsys.readouterr()
+    count = 25 if counts_earlier_steps else 15
+    resumed = train_small_model(tmp_path, "second", count, load_checkpoint=first.checkpoint_dir / "step-000000009.ckpt")
+    shown = re.findall(r"^(\d+) \((\d+)\.00%\)", capsys.readouterr().out, re.MULTILINE)
+    assert shown == [("10", "40"), ("20", "80")]
+    (path,) = resumed.checkpoint_dir.iterdir()
+    assert path.name == "step-000000024.ckpt"
+    # What is made at the last step.
+    assert checkpoint(resumed)["pipeline"]["_extra_state"]["summary"]
+    record = json.loads((resumed.base_dir / "run.json").read_text())
+    assert [record[name] for name in ("state", "first_step", "steps", "planned_steps")] == ["finished", 10, 15, 15]
+    if counts_earlier_steps:
+        with pytest.raises(SystemExit, match=r"^Error: ns-train: the checkpoint is of step 24; "):
+            train_small_model(tmp_path, "third", 25, load_dir=resumed.checkpoint_dir)
