@@ -25,10 +25,10 @@ from torch import Tensor
 from aenerf_ns.camera.alignment import rotation_angle
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.simulator.paths import SpeedProfile, object_path, room_path
+from aenerf_ns.simulator.paths import ObjectPath, RoomPath, SpeedProfile
 from benchmarks.common import write_result
 
-_PATHS = {"object": object_path, "room": room_path}
+_PATHS = {"object": ObjectPath(), "room": RoomPath()}
 _DURATION = 4.0
 _FINE_STEP = 1e-3
 

@@ -77,7 +77,7 @@ def small_work() -> Iterator[None]:
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mesh_repair, "_POINTS", 2000)
+        patch.setattr(mesh_repair, "NUM_CORNERS", 2000)
         yield
     numba.set_num_threads(threads)
 
@@ -85,17 +85,17 @@ def small_work() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def room() -> SimulationScene:
     """The built-in room."""
-    from aenerf_ns.simulator.open_scene import built_in_scene
+    from aenerf_ns.simulator.scene import open_scene
 
-    return built_in_scene("room")
+    return open_scene("room")
 
 
 @pytest.fixture(scope="session")
 def toy() -> SimulationScene:
     """The built-in object."""
-    from aenerf_ns.simulator.open_scene import built_in_scene
+    from aenerf_ns.simulator.scene import open_scene
 
-    return built_in_scene("object")
+    return open_scene("object")
 
 
 @pytest.fixture

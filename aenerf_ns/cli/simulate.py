@@ -92,7 +92,7 @@ class Simulate(SimulationCommand):
         from aenerf_ns.camera.trajectory import homogeneous
         from aenerf_ns.recording.recording import Split
         from aenerf_ns.recording.writer import NativeDatasetWriter
-        from aenerf_ns.simulator.open_scene import open_scene
+        from aenerf_ns.simulator.scene import open_scene
         from aenerf_ns.simulator.simulation import Simulation
 
         scene = open_scene(self.scene, self.seed)
@@ -101,8 +101,8 @@ class Simulate(SimulationCommand):
         for note in scene.notes:
             CONSOLE.print(note, highlight=False, markup=False)
         held_out: dict[Split, torch.Tensor] = {
-            "val": torch.from_numpy(scene.validation_views(self.validation_views)),
-            "test": torch.from_numpy(scene.test_views(self.test_views, self.seed)),
+            "val": torch.from_numpy(scene.path.validation_views(self.validation_views)),
+            "test": torch.from_numpy(scene.path.test_views(self.test_views, self.seed)),
         }
         with value_error_as_data_error("simulate"):
             camera = CameraIntrinsics(self.width, self.height, *scene.intrinsics(self.width, self.height))

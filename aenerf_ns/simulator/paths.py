@@ -6,8 +6,9 @@ The world's z axis points up. Lengths are in meters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,12 +17,15 @@ from scipy.special import i0, iv
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.arrays import Array
+from aenerf_ns.simulator.free_space import FreeSpace
+from aenerf_ns.simulator.rendering.embree import RayCaster
 
 HARD_SPEED_RATIO = 8.0
 HARD_MEAN_SPEED = float(i0(np.log(HARD_SPEED_RATIO)))
 """Mean of 8 ** sin(2 pi t) over a period: 2.411."""
 
-_TRIES = 200
+ORIGIN = (0.0, 0.0, 0.0)
+_MAX_TRIES = 200
 _FINE = np.linspace(0, 1, 2001)
 
 
@@ -42,35 +46,17 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), 
     return pose
 
 
-def room_path(s: float) -> Array:
-    """Return the pose (4, 4) on a closed loop around the middle of the room.
+class CameraPath(Protocol):
+    """A camera's path through a scene, and the held-out views beside it."""
 
-    The camera looks across the room, high and low, with a slight roll.
-    """
-    return _room_pose(2 * np.pi * s, 0.0, 0.0, 0.0)
+    def __call__(self, s: float) -> Array:
+        """Return the pose (4, 4) at a parameter in [0, 1]."""
 
+    def validation_views(self, count: int) -> Array:
+        """Return views (count, 4, 4) spread evenly around the path."""
 
-def room_validation_views(count: int) -> Array:
-    """Return views (count, 4, 4) spread evenly along the room's path, by turns inside, outside, above and below it."""
-    return _stack(
-        [
-            _room_pose(2 * np.pi * (k + 0.5) / count, 0.12 * np.cos(2.4 * k), 0.12 * np.sin(2.4 * k), 0.0)
-            for k in range(count)
-        ]
-    )
-
-
-def room_test_views(count: int, seed: int) -> Array:
-    """Return random views (count, 4, 4) near the room's path, with random gazes."""
-    rng = np.random.default_rng(seed)
-    return _stack(
-        [
-            _room_pose(
-                rng.uniform(0, 2 * np.pi), rng.uniform(-0.15, 0.15), rng.uniform(-0.15, 0.15), rng.uniform(-0.5, 0.5)
-            )
-            for _ in range(count)
-        ]
-    )
+    def test_views(self, count: int, seed: int) -> Array:
+        """Return random views (count, 4, 4) around the path."""
 
 
 def _stack(poses: Sequence[Array]) -> Array:
@@ -78,82 +64,105 @@ def _stack(poses: Sequence[Array]) -> Array:
     return np.array(poses).reshape(-1, 4, 4)
 
 
-def _room_pose(angle: float, outwards: float, upwards: float, gaze: float) -> Array:
-    """Return the pose at an angle of the room's loop, displaced in meters, its gaze turned by ``gaze`` radians."""
-    radius = 1.15 + 0.10 * np.sin(2 * angle) + outwards
-    height = 1.40 + 0.15 * np.sin(3 * angle + 0.7) + upwards
-    opposite = angle + np.pi + 0.35 * np.sin(2 * angle + 0.4) + gaze
-    target = (np.cos(opposite), np.sin(opposite), 0.95 + 0.5 * np.sin(3 * angle - 0.6) - 0.3 * gaze)
-    eye = (radius * np.cos(angle), radius * np.sin(angle), height)
-    return look_at(eye, target, roll=0.08 * np.sin(2 * angle + 1.0))
+class RoomPath:
+    """A closed loop around the middle of the room. The camera looks across the room, high and low, slightly rolled."""
+
+    def __call__(self, s: float) -> Array:
+        return self._pose(2 * np.pi * s, 0.0, 0.0, 0.0)
+
+    def validation_views(self, count: int) -> Array:
+        """Return views (count, 4, 4) spread evenly along the path, by turns inside, outside, above and below it."""
+        return _stack(
+            [
+                self._pose(2 * np.pi * (k + 0.5) / count, 0.12 * np.cos(2.4 * k), 0.12 * np.sin(2.4 * k), 0.0)
+                for k in range(count)
+            ]
+        )
+
+    def test_views(self, count: int, seed: int) -> Array:
+        """Return random views (count, 4, 4) near the path, with random gazes."""
+        low, high = [0, -0.15, -0.15, -0.5], [2 * np.pi, 0.15, 0.15, 0.5]
+        return _stack([self._pose(*draw) for draw in np.random.default_rng(seed).uniform(low, high, (count, 4))])
+
+    @staticmethod
+    def _pose(angle: float, outwards: float, upwards: float, gaze: float) -> Array:
+        """Return the pose at an angle of the loop, displaced in meters, its gaze turned by ``gaze`` radians."""
+        radius = 1.15 + 0.10 * np.sin(2 * angle) + outwards
+        height = 1.40 + 0.15 * np.sin(3 * angle + 0.7) + upwards
+        opposite = angle + np.pi + 0.35 * np.sin(2 * angle + 0.4) + gaze
+        target = (np.cos(opposite), np.sin(opposite), 0.95 + 0.5 * np.sin(3 * angle - 0.6) - 0.3 * gaze)
+        eye = (radius * np.cos(angle), radius * np.sin(angle), height)
+        return look_at(eye, target, roll=0.08 * np.sin(2 * angle + 1.0))
 
 
-ORIGIN = (0.0, 0.0, 0.0)
-
-
-def _anywhere(eye: Array) -> bool:
-    return True
-
-
-def object_path(s: float, turns: float = 4.0, radius: float = 4.0, center: ArrayLike = ORIGIN) -> Array:
-    """Return the pose (4, 4) on a spiral from the equator to the pole of a hemisphere, as in Robust e-NeRF's scenes."""
-    return _hemisphere_pose(2 * np.pi * turns * s, 0.5 * np.pi * s, radius, ORIGIN, center)
-
-
-def object_validation_views(
-    count: int, radius: float = 4.0, center: ArrayLike = ORIGIN, is_free: Callable[[Array], bool] = _anywhere
-) -> Array:
-    """Return views (count, 4, 4) all over the hemisphere, on a golden-angle spiral.
+class ObjectPath:
+    """A spiral from the equator to the pole of a hemisphere, as in Robust e-NeRF's scenes.
 
     Args:
-        count: number of views.
+        turns: of the spiral.
         radius, center: radius and center (3,) of the hemisphere, in meters.
-        is_free: tells whether a camera may be at a place (3,). A view is turned about the vertical until it may.
+        caster: casts rays against the mesh that cameras must not come near to; None if there is no such mesh.
 
     Raises:
-        DataError: a view cannot be placed.
+        ValueError: the path comes too near to the mesh.
     """
 
-    def candidates(k: int, z: float) -> Iterator[Array]:
-        for i in range(_TRIES):
-            yield _hemisphere_pose(2.399963 * k + 0.1 * i, np.arcsin(z), radius, ORIGIN, center)
+    def __init__(
+        self, turns: float = 4.0, radius: float = 4.0, center: ArrayLike = ORIGIN, caster: RayCaster | None = None
+    ) -> None:
+        self._turns, self._radius, self._center = turns, radius, np.asarray(center, np.float64)
+        self._space = None if caster is None else FreeSpace(caster, radius)
+        if self._space is not None:
+            self._space.check_path(self)
 
-    heights = (np.arange(count) + 0.5) / count
-    return _stack([_first_free(candidates(k, z), is_free) for k, z in enumerate(heights)])
+    def __call__(self, s: float) -> Array:
+        return self._pose(2 * np.pi * self._turns * s, 0.5 * np.pi * s, self._radius, ORIGIN)
 
+    def validation_views(self, count: int) -> Array:
+        """Return views (count, 4, 4) all over the hemisphere, on a golden-angle spiral.
 
-def object_test_views(
-    count: int,
-    seed: int,
-    radius: float = 4.0,
-    center: ArrayLike = ORIGIN,
-    is_free: Callable[[Array], bool] = _anywhere,
-) -> Array:
-    """Return random views (count, 4, 4) over the hemisphere, at other distances and off-center, where `is_free`.
+        A view is turned about the vertical until its camera is clear of the mesh.
 
-    Raises:
-        DataError: a view cannot be placed.
-    """
-    rng = np.random.default_rng(seed)
+        Raises:
+            DataError: there is no such turn.
+        """
 
-    def candidates() -> Iterator[Array]:
-        for _ in range(_TRIES):
-            yield _hemisphere_pose(
-                rng.uniform(0, 2 * np.pi),
-                np.arcsin(rng.uniform(0, 1)),
-                radius / 4.0 * rng.uniform(3.6, 4.4),
-                radius / 4.0 * rng.uniform(-0.15, 0.15, 3),
-                center,
-            )
+        def candidates(k: int, z: float) -> Iterator[Array]:
+            for i in range(_MAX_TRIES):
+                yield self._pose(2.399963 * k + 0.1 * i, np.arcsin(z), self._radius, ORIGIN)
 
-    return _stack([_first_free(candidates(), is_free) for _ in range(count)])
+        heights = (np.arange(count) + 0.5) / count
+        return _stack([self._first_free(candidates(k, z)) for k, z in enumerate(heights)])
 
+    def test_views(self, count: int, seed: int) -> Array:
+        """Return random views (count, 4, 4) over the hemisphere, at other distances and off-center, clear of the mesh.
 
-def _first_free(candidates: Iterator[Array], is_free: Callable[[Array], bool]) -> Array:
-    for pose in candidates:
-        if is_free(pose[:3, 3]):
-            return pose
-    raise DataError("views around the scene", "no place is free of the mesh", "give its path a larger radius")
+        Raises:
+            DataError: no place is clear of the mesh.
+        """
+        rng = np.random.default_rng(seed)
+
+        def candidates() -> Iterator[Array]:
+            for _ in range(_MAX_TRIES):
+                azimuth, elevation = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(0, 1))
+                distance, target = rng.uniform(3.6, 4.4), rng.uniform(-0.15, 0.15, 3)
+                yield self._pose(azimuth, elevation, self._radius / 4.0 * distance, self._radius / 4.0 * target)
+
+        return _stack([self._first_free(candidates()) for _ in range(count)])
+
+    def _first_free(self, candidates: Iterator[Array]) -> Array:
+        for pose in candidates:
+            if self._space is None or self._space.is_free(pose[:3, 3]):
+                return pose
+        raise DataError("views around the scene", "no place is free of the mesh", "give its path a larger radius")
+
+    def _pose(self, azimuth: float, elevation: float, radius: float, target: ArrayLike) -> Array:
+        """Return a pose on a hemisphere that looks at ``target``, which is relative to the center."""
+        outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        eye = radius * (np.cos(elevation) * outward + np.sin(elevation) * np.array([0.0, 0.0, 1.0]))
+        # The direction of growing elevation is a vertical that stays defined at the pole.
+        up = np.cos(elevation) * np.array([0.0, 0.0, 1.0]) - np.sin(elevation) * outward
+        return look_at(eye + self._center, np.add(target, self._center), up)
 
 
 class WalkPath:
@@ -165,12 +174,14 @@ class WalkPath:
     Args:
         positions: (N, 3) that the camera passes, N at least 4. The camera returns to the first.
         targets: (N, 3) that the camera looks at from the positions.
+        caster: see `ObjectPath`.
 
     Raises:
-        ValueError: too few points, neighbors in one place, or a gaze that is vertical or has no direction.
+        ValueError: there are too few points, neighbors in one place, or a gaze that is vertical or has no direction, or
+            the path comes too near to the mesh.
     """
 
-    def __init__(self, positions: ArrayLike, targets: ArrayLike) -> None:
+    def __init__(self, positions: ArrayLike, targets: ArrayLike, caster: RayCaster | None = None) -> None:
         eyes, looked_at = np.asarray(positions, np.float64), np.asarray(targets, np.float64)
         if eyes.ndim != 2 or eyes.shape[1] != 3 or len(eyes) < 4 or eyes.shape != looked_at.shape:
             raise ValueError(f"positions {eyes.shape} and targets {looked_at.shape} must both be (N, 3), N at least 4")
@@ -181,80 +192,56 @@ class WalkPath:
         knots = np.append(0, np.cumsum(lengths)) / lengths.sum()
         self._eye = CubicSpline(knots, closed, bc_type="periodic")
         self._target = CubicSpline(knots, np.concatenate([looked_at, looked_at[:1]]), bc_type="periodic")
-        self.size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
-        """Root mean square distance of the positions from their mean, in meters."""
         gaze = self._target(_FINE) - self._eye(_FINE)
         if (np.linalg.norm(gaze[:, :2], axis=1) < 0.02 * np.linalg.norm(gaze, axis=1) + 1e-9).any():
             raise ValueError("the camera looks straight up or down, or at the place it is in; move the targets")
+        # Root mean square distance of the positions from their mean.
+        size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        # In proportion to the built-in room's.
+        self._spread = min(0.13 * size, 0.5)
+        self._space = None if caster is None else FreeSpace(caster, size)
+        if self._space is not None:
+            self._space.check_path(self)
 
     def __call__(self, s: float) -> Array:
-        """Return the pose (4, 4) at a parameter in [0, 1]."""
         return self._pose(s, np.zeros(3), 0.0)
 
-    def _pose(self, s: float, shift: ArrayLike, gaze: float) -> Array:
+    def validation_views(self, count: int) -> Array:
+        """Return views (count, 4, 4) spread along the walk, beside, above and below it.
+
+        A view moves towards the path until its camera is clear of the mesh and on the same side of all walls.
+        """
+        shifts = [np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) * (0.8 * self._spread) for k in range(count)]
+        return _stack([self._free_pose((k + 0.5) / count, shift, 0.0) for k, shift in enumerate(shifts)])
+
+    def test_views(self, count: int, seed: int) -> Array:
+        """Return random views (count, 4, 4) around the walk with random gazes, clear as in `validation_views`."""
+        rng, spread = np.random.default_rng(seed), self._spread
+        return _stack(
+            [
+                self._free_pose(rng.uniform(), rng.uniform(-spread, spread, 3), rng.uniform(-0.5, 0.5))
+                for _ in range(count)
+            ]
+        )
+
+    def _free_pose(self, s: float, shift: Array, gaze: float) -> Array:
+        for part in np.linspace(1, 0, 11):
+            pose = self._pose(s, part * shift, gaze)
+            if self._space is None or self._space.is_reached(pose[:3, 3], self._eye(s % 1.0)):
+                break
+        return pose  # at last on the path itself, which is free
+
+    def _pose(self, s: float, shift: Array, gaze: float) -> Array:
         """Return the pose displaced by ``shift`` meters (right, up, level forward), turned by ``gaze`` radians."""
         eye, target = self._eye(s % 1.0), self._target(s % 1.0)
         forward = (target - eye) * [1.0, 1.0, 0.0]
         forward /= np.linalg.norm(forward)
         right = np.array([forward[1], -forward[0], 0.0])
-        across, up, along = np.asarray(shift, np.float64)
+        across, up, along = shift
         eye = eye + across * right + along * forward + [0.0, 0.0, up]
         cos, sin = np.cos(gaze), np.sin(gaze)
         x, y, z = target - eye
         return look_at(eye, eye + np.array([cos * x - sin * y, sin * x + cos * y, z]))
-
-    def validation_views(self, count: int, is_free: Callable[[Array, Array], bool]) -> Array:
-        """Return views (count, 4, 4) spread along the walk, beside, above and below it.
-
-        ``is_free`` tells whether a camera may be at a place (3,), given the nearest place (3,) on the path. A view
-        moves towards the path until it may.
-        """
-        return _stack(
-            [
-                self._place(
-                    ((k + 0.5) / count, np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) * (0.8 * self._spread), 0.0),
-                    is_free,
-                )
-                for k in range(count)
-            ]
-        )
-
-    def test_views(self, count: int, seed: int, is_free: Callable[[Array, Array], bool]) -> Array:
-        """Return random views (count, 4, 4) around the walk with random gazes; ``is_free`` as in `validation_views`."""
-        rng = np.random.default_rng(seed)
-        return _stack(
-            [
-                self._place(
-                    (rng.uniform(), rng.uniform(-self._spread, self._spread, 3), rng.uniform(-0.5, 0.5)), is_free
-                )
-                for _ in range(count)
-            ]
-        )
-
-    @property
-    def _spread(self) -> float:
-        # In proportion to the built-in room's.
-        return min(0.13 * self.size, 0.5)
-
-    def _place(self, view: tuple[float, Array, float], is_free: Callable[[Array, Array], bool]) -> Array:
-        s, shift, gaze = view
-        home = self._eye(s % 1.0)
-        for part in np.linspace(1, 0, 11):
-            pose = self._pose(s, part * shift, gaze)
-            if is_free(pose[:3, 3], home):
-                return pose
-        return pose  # on the path itself, which is free
-
-
-def _hemisphere_pose(
-    azimuth: float, elevation: float, radius: float, target: ArrayLike, center: ArrayLike = ORIGIN
-) -> Array:
-    """Return a pose on the hemisphere that looks at ``target``, which is relative to the center."""
-    outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    eye = radius * (np.cos(elevation) * outward + np.sin(elevation) * np.array([0.0, 0.0, 1.0]))
-    # The direction of growing elevation is a vertical that stays defined at the pole.
-    up = np.cos(elevation) * np.array([0.0, 0.0, 1.0]) - np.sin(elevation) * outward
-    return look_at(eye + np.asarray(center), np.add(target, center), up)
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,15 @@
-"""A scene of the simulator: the lit mesh, the camera's path and the held-out views."""
+"""Scenes of the simulator: the lit mesh and the camera's path, and how they are opened by their names."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
 
 from aenerf_ns.simulator.arrays import Array
+from aenerf_ns.simulator.options import BUILT_IN
+from aenerf_ns.simulator.paths import CameraPath, ObjectPath, RoomPath
 from aenerf_ns.simulator.rendering.renderer import Renderer
 
 
@@ -16,24 +20,20 @@ class SimulationScene:
     Attributes:
         name: name of a built-in scene or of a file.
         renderer: renders the scene.
-        path: returns the pose (4, 4) at a parameter in [0, 1].
+        path: the camera's path, and the held-out views beside it.
         focal_ratio: focal length divided by image width. Pixels are square, and the principal point is the middle.
         aabb: (2, 3) corners of the box around the scene, or None if the scene surrounds the camera.
         background: (3,) linear RGB behind the scene, or None if every ray hits something or sees an environment.
-        validation_views: returns poses (n, 4, 4) around the path, given n.
-        test_views: returns random poses (n, 4, 4), given n and a seed.
         duration: seconds that the path takes at constant speed.
         notes: assumptions that the user should know, a line each.
     """
 
     name: str
     renderer: Renderer
-    path: Callable[[float], Array]
+    path: CameraPath
     focal_ratio: float
     aabb: Array | None
     background: Array | None
-    validation_views: Callable[[int], Array]
-    test_views: Callable[[int, int], Array]
     duration: float = 4.0
     notes: tuple[str, ...] = ()
 
@@ -41,3 +41,23 @@ class SimulationScene:
         """Return (fx, fy, cx, cy) in pixels, pixel centers at +0.5."""
         focal = self.focal_ratio * width
         return focal, focal, width / 2, height / 2
+
+
+def open_scene(name: str, seed: int = 0) -> SimulationScene:
+    """Open a built-in scene by its name, or a mesh or scene.json by its file name. Its light takes seconds.
+
+    Raises:
+        DataError: there is no such scene, or the file cannot be used.
+    """
+    if name not in BUILT_IN:
+        from aenerf_ns.simulator.scene_file import load_scene
+
+        return load_scene(Path(name), seed)
+    if name == "room":
+        from aenerf_ns.simulator.room import room_scene
+
+        return SimulationScene(name, room_scene(seed), RoomPath(), focal_ratio=0.62, aabb=None, background=None)
+    from aenerf_ns.simulator.locomotive import BACKGROUND, locomotive_scene
+
+    renderer, box = locomotive_scene(seed, shiny=name == "shiny_object"), np.array([[-1.2] * 3, [1.2] * 3])
+    return SimulationScene(name, renderer, ObjectPath(), focal_ratio=1.2, aabb=box, background=np.array(BACKGROUND))

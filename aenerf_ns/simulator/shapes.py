@@ -16,7 +16,7 @@ from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment
 from aenerf_ns.simulator.rendering.lighting import AreaLight, light_mesh
 from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh, scaled
-from aenerf_ns.simulator.rendering.mesh_repair import prepared
+from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.renderer import Renderer
 
 _SAGITTA = 5e-4
@@ -108,7 +108,7 @@ def lit(
         environment, lamps, background, ambient, seed: see `light_mesh`.
         gloss: coats by the names of textures, see `mesh_of`.
     """
-    mesh, _ = prepared(mesh_of(shapes, textures, spacing, gloss), math.inf)
+    mesh, _ = repair(mesh_of(shapes, textures, spacing, gloss), math.inf)
     caster = RayCaster(mesh.vertices, mesh.faces)
     return light_mesh(mesh, caster, environment, lamps, background, ambient=ambient, seed=seed)
 

@@ -27,7 +27,7 @@ def run(command: Convert | Simulate) -> None:
     """Run a command, with light at few points where it simulates."""
     from aenerf_ns.simulator.rendering import mesh_repair
 
-    mesh_repair._POINTS = 2000
+    mesh_repair.NUM_CORNERS = 2000
     command.main()
 
 

@@ -9,8 +9,7 @@ from helpers.small_meshes import (
     ray_directions,
 )
 
-from aenerf_ns.simulator.open_scene import built_in_scene
-from aenerf_ns.simulator.scene import SimulationScene
+from aenerf_ns.simulator.scene import SimulationScene, open_scene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
@@ -18,7 +17,11 @@ pytestmark = pytest.mark.usefixtures("small_work")
 def test_room_is_closed_and_well_exposed(room: SimulationScene) -> None:
     width, height = 64, 48
     pictures = []
-    for pose in [*(room.path(k / 12) for k in range(12)), *room.validation_views(12), *room.test_views(40, 3)]:
+    for pose in [
+        *(room.path(k / 12) for k in range(12)),
+        *room.path.validation_views(12),
+        *room.path.test_views(40, 3),
+    ]:
         radiance, depth, alpha = room.renderer.render(pose, room.intrinsics(width, height), width, height, 4)
         assert alpha.min() == 1
         assert depth.min() > 0.2  # nowhere inside the furniture or right in front of it
@@ -62,7 +65,7 @@ def test_object_stays_in_its_box(toy: SimulationScene) -> None:
     assert toy.background is not None
     width, height = 60, 45
     intrinsics = toy.intrinsics(width, height)
-    for pose in [*(toy.path(k / 7) for k in range(8)), *toy.validation_views(6), *toy.test_views(6, 1)]:
+    for pose in [*(toy.path(k / 7) for k in range(8)), *toy.path.validation_views(6), *toy.path.test_views(6, 1)]:
         radiance, depth, _ = toy.renderer.render(pose, intrinsics, width, height, 1)
         hit = np.isfinite(depth)
         assert 0.1 < hit.mean() < 0.6
@@ -75,10 +78,10 @@ def test_object_stays_in_its_box(toy: SimulationScene) -> None:
 
 def test_held_out_views_are_off_the_path_and_seeded(room: SimulationScene, toy: SimulationScene) -> None:
     for scene in (room, toy):
-        validation, test = scene.validation_views(30), scene.test_views(30, 5)
+        validation, test = scene.path.validation_views(30), scene.path.test_views(30, 5)
         assert validation.shape == test.shape == (30, 4, 4)
-        np.testing.assert_array_equal(test, scene.test_views(30, 5))
-        assert not np.array_equal(test, scene.test_views(30, 6))
+        np.testing.assert_array_equal(test, scene.path.test_views(30, 5))
+        assert not np.array_equal(test, scene.path.test_views(30, 6))
         on_path = np.stack([scene.path(s) for s in np.linspace(0, 1, 4000)])[:, :3]
         for pose in [*validation, *test]:
             assert np.abs(on_path - pose[:3]).max((1, 2)).min() > 1e-3
@@ -86,15 +89,10 @@ def test_held_out_views_are_off_the_path_and_seeded(room: SimulationScene, toy: 
 
 def test_pictures_do_not_depend_on_the_run_or_the_threads(toy: SimulationScene) -> None:
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    again = built_in_scene("object")
+    again = open_scene("object")
     pictures = [
         scene.renderer.render(scene.path(0.3), scene.intrinsics(40, 30), 40, 30, 4)[0] for scene in (toy, again)
     ]
     numba.set_num_threads(1)
     assert pictures[0].tobytes() == pictures[1].tobytes()
     np.testing.assert_array_equal(toy.renderer.light, again.renderer.light)
-
-
-def test_unknown_scene() -> None:
-    with pytest.raises(ValueError, match="got 'pool'"):
-        built_in_scene("pool")

@@ -14,10 +14,9 @@ from helpers.small_meshes import (
     scene_file,
 )
 
-from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.frames import frame_displacement, frame_parameters
-from aenerf_ns.simulator.open_scene import open_scene
-from aenerf_ns.simulator.scene import SimulationScene
+from aenerf_ns.simulator.paths import ObjectPath
+from aenerf_ns.simulator.scene import SimulationScene, open_scene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
@@ -45,10 +44,7 @@ def test_frame_displacement_of_a_turn_and_of_a_shift() -> None:
 def test_frame_parameters_bound_the_motion(toy: SimulationScene) -> None:
     width, height = 40, 30
     intrinsics = toy.intrinsics(width, height)
-
-    def path(s: float) -> np.ndarray:
-        return paths.object_path(s, turns=3.0)
-
+    path = ObjectPath(turns=3.0)
     scene = dataclasses.replace(toy, path=path)
     parameters = frame_parameters(scene, intrinsics, width, height, 1.0)
     assert parameters[0] == 0

@@ -24,20 +24,20 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight, light_points
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
-from aenerf_ns.simulator.rendering.mesh_repair import prepared
+from aenerf_ns.simulator.rendering.mesh_repair import repair
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
 
 def test_an_even_sky_lights_a_convex_body_evenly() -> None:
-    mesh, _ = prepared(mesh_of(trimesh.creation.icosphere(2)), 1.0)
+    mesh, _ = repair(mesh_of(trimesh.creation.icosphere(2)), 1.0)
     scene = light_mesh(mesh, sky((1, 2, 3), (1, 2, 3)), [], BLACK)
     np.testing.assert_allclose(scene.light[0], np.tile([1, 2, 3], (len(scene.light[0]), 1)), rtol=1e-4)
     assert scene.light[1].max() == 0
 
 
 def test_a_linear_sky_has_its_cosine_weighted_mean() -> None:
-    scene = light_mesh(prepared(plate(1.0), 0.2)[0], sky(BLACK, (1, 2, 0.5)), [], BLACK)
+    scene = light_mesh(repair(plate(1.0), 0.2)[0], sky(BLACK, (1, 2, 0.5)), [], BLACK)
     # The mean of (1 + cos) / 2 over cosine-weighted directions is 5 / 6 above, 1 / 6 below.
     np.testing.assert_allclose(scene.light[0].mean(0), 5 / 6 * np.array([1, 2, 0.5]), rtol=2e-3)
     np.testing.assert_allclose(scene.light[1].mean(0), 1 / 6 * np.array([1, 2, 0.5]), rtol=1e-2)
@@ -46,7 +46,7 @@ def test_a_linear_sky_has_its_cosine_weighted_mean() -> None:
 def test_direct_light_is_the_form_factor() -> None:
     """A small lamp above a plate, against radiance x area x cos x cos / (pi d^2). It shines to one side only."""
     lamp = AreaLight((0.5, 0, 2.0), (0.01, 0, 0), (0, -0.01, 0), (100.0, 200.0, 300.0))
-    scene = light_mesh(prepared(plate(2.0), 0.1)[0], NIGHT, [lamp], BLACK)
+    scene = light_mesh(repair(plate(2.0), 0.1)[0], NIGHT, [lamp], BLACK)
     radiance = scene.render(OVERHEAD, (6.0, 6.0, 4.0, 4.0), 8, 8, 1)[0]
     x, y = ray_directions((6.0, 6.0, 4.0, 4.0), 8, 8)[..., :2].transpose(2, 0, 1) * 3.0
     square = (x - 0.5) ** 2 + y**2 + 4.0
@@ -62,7 +62,7 @@ def test_shadow() -> None:
     lamp = AreaLight((1.0, 0, 2.0), (0.01, 0, 0), (0, -0.01, 0), (1.0,) * 3)
     sight = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.4], [0, 0, 0, 1]])
     clear_sky, shaded = (
-        light_mesh(prepared(mesh, 0.05)[0], NIGHT, [lamp], BLACK).render(sight, (10.0, 10.0, 20.0, 1.0), 80, 2, 1)[0]
+        light_mesh(repair(mesh, 0.05)[0], NIGHT, [lamp], BLACK).render(sight, (10.0, 10.0, 20.0, 1.0), 80, 2, 1)[0]
         for mesh in (ground, joined(ground, roof))
     )
     x = (np.arange(80) + 0.5 - 20.0) / 10.0 * 0.4
@@ -82,7 +82,7 @@ def test_ambient_light_bounces_and_emission_lights_nothing() -> None:
     box.invert()
     mesh = mesh_of(box, (0.5, 0.5, 0.5))
     glow = np.where(normals_and_areas(mesh)[0][:, 2] > 0.9, 3.0, 0.0)  # the floor
-    mesh, _ = prepared(dataclasses.replace(mesh, emission=glow), 0.5)
+    mesh, _ = repair(dataclasses.replace(mesh, emission=glow), 0.5)
     scene = light_mesh(mesh, NIGHT, [], BLACK, ambient=0.1)
     light = scene.light[0][scene.surface.light_point]
     expected = 0.1 * (1 - 0.5**13) / 0.5 + mesh.emission
@@ -98,7 +98,7 @@ def test_a_small_sun_is_no_noise() -> None:
     edges = np.cos(np.pi * np.array([row, row + 1]) / rows)
     direct = 5e4 * 2 * np.pi / columns * (edges[0] - edges[1]) * np.cos(np.pi * (row + 0.5) / rows) / np.pi
     ground, blind = plate(1.0), mesh_of(trimesh.creation.box((0.02, 2, 0.5)).apply_translation((0.5, 0, 0.3)))
-    scene = light_mesh(prepared(joined(ground, blind), 0.05)[0], Environment(picture), [], BLACK)
+    scene = light_mesh(repair(joined(ground, blind), 0.05)[0], Environment(picture), [], BLACK)
     radiance = scene.render(OVERHEAD, (30.0, 30.0, 30.0, 1.0), 40, 2, 1)[0][0, :, 1]
     x = (np.arange(40) + 0.5 - 30) / 30 * 3.0
     # The blind, from 0.05 to 0.55 m above the ground, throws a shadow as long.
@@ -137,7 +137,7 @@ def test_a_closed_box_balances_its_energy() -> None:
     box = trimesh.creation.box((2.0, 2.0, 2.0))
     box.invert()
     albedo = np.array([0.2, 0.5, 0.8])
-    mesh, _ = prepared(mesh_of(box, albedo), 0.25)
+    mesh, _ = repair(mesh_of(box, albedo), 0.25)
     lamp = AreaLight((0, 0, 0.3), (0.2, 0, 0), (0, -0.2, 0), (10.0,) * 3)
     scene = light_mesh(mesh, NIGHT, [lamp], BLACK)
     area = normals_and_areas(mesh)[1]
@@ -154,7 +154,7 @@ def test_both_sides_are_lit_by_what_they_face() -> None:
         AreaLight((0, 0, 2.0), (0.1, 0, 0), (0, -0.1, 0), (50.0, 0, 0)),
         AreaLight((0, 0, -2.0), (0.1, 0, 0), (0, 0.1, 0), (0, 50.0, 0)),
     ]
-    scene = light_mesh(prepared(plate(0.5), 0.2)[0], NIGHT, lamps, BLACK)
+    scene = light_mesh(repair(plate(0.5), 0.2)[0], NIGHT, lamps, BLACK)
     below = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3], [0, 0, 0, 1]])
     for pose, lit, dark in ((OVERHEAD, 0, 1), (below, 1, 0)):
         radiance = scene.render(pose, (20.0, 20.0, 2.0, 2.0), 4, 4, 1)[0]

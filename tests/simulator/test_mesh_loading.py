@@ -17,9 +17,9 @@ from helpers.small_meshes import (
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import paths
-from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas, scaled
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
+from aenerf_ns.simulator.scene import open_scene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
@@ -96,32 +96,49 @@ def test_an_obj_with_a_concave_polygon_and_two_materials(tmp_path: Path) -> None
     np.testing.assert_allclose(mesh.color[mesh.faces[-1]], [[0.1, 0.6, 0.1]] * 3)
 
 
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+# A warning of a library would print a second line.
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
-    ("name", "content", "told"),
+    ("name", "content", "problem"),
     [
         ("a.json", "{", "not valid JSON"),
-        ("a.json", "[]", "not a JSON object; see docs/simulator.md"),
-        ("a.json", "{}", "mesh is missing; see docs/simulator.md"),
+        ("a.json", "[]", "expected `object`"),
+        ("a.json", "{}", "missing required field `mesh`"),
         ("a.stl", "", "an unknown scene"),
+        ("a.glb", "", "not a binary glTF file"),
         ("a.glb", "glTF", "not a binary glTF file"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "a.ply"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7\n", "a.obj"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "there is no surface in it"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no face has an area"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "not finite"),
-        ("a.obj", "mtllib b.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "b.mtl: the materials do not exist"),
-        ("a.obj", "mtllib c.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "c.png: the texture does not exist"),
-        ("a.obj", "mtllib d.mtl\nusemtl c\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no material 'c'"),
-        ("a.obj", "mtllib e.mtl\nusemtl e\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "e.png: not a picture"),
+        ("a.ply", "ply\n", "a.ply: "),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "a.ply: "),
+        ("a.obj", TRIANGLE.replace("3\n", "99\n"), "a.obj: "),
+        ("a.obj", TRIANGLE[:-8], "there is no surface in it"),
+        ("a.obj", TRIANGLE.replace("0 1 0", "2 0 0"), "no face has an area"),
+        ("a.obj", TRIANGLE.replace("0 1 0", "0 nan 0"), "not finite"),
+        ("a.obj", TRIANGLE.replace("v 1", "v inf"), "not finite"),
+        ("a.obj", f"mtllib \n{TRIANGLE}", "a.obj: "),
+        ("a.obj", f"mtllib .\n{TRIANGLE}", "a.obj: "),
+        ("a.obj", f"mtllib {'m' * 5000}\n{TRIANGLE}", "cannot be read"),
+        ("a.obj", f"mtllib b.mtl\n{TRIANGLE}", "b.mtl: the file does not exist"),
+        ("a.obj", f"mtllib c.mtl\n{TRIANGLE}", "c.png: the file does not exist"),
+        ("a.obj", f"mtllib d.mtl\nmtllib d.mtl\n{TRIANGLE}", "2 material files"),
+        ("a.obj", f"mtllib d.mtl\nusemtl c\n{TRIANGLE}", "no material 'c'"),
+        ("a.obj", f"mtllib d.mtl\nusemtl \n{TRIANGLE}", "no material ''"),
+        ("a.obj", f"mtllib e.mtl\nusemtl e\n{TRIANGLE}", "e.png: not a picture"),
+        ("a.obj", f"mtllib f.mtl\nusemtl f\n{TRIANGLE}", "options of a texture"),
+        ("a.obj", f"mtllib g.mtl\nusemtl g\n{TRIANGLE}", "outside the folder"),
     ],
 )  # fmt: skip
-def test_bad_meshes_end_in_one_line(tmp_path: Path, name: str, content: str, told: str) -> None:
+def test_refuse_mesh(tmp_path: Path, name: str, content: str, problem: str) -> None:
     (tmp_path / "c.mtl").write_text("newmtl c\nmap_Kd c.png\n")
     (tmp_path / "d.mtl").write_text("newmtl d\nKd 1 1 1\n")
     (tmp_path / "e.mtl").write_text("newmtl e\nmap_Kd e.png\n")
     (tmp_path / "e.png").write_text("no")
+    (tmp_path / "f.mtl").write_text("newmtl f\nmap_Kd -s 2 2 2 e.png\n")
+    (tmp_path / "g.mtl").write_text("newmtl g\nmap_Kd ../e.png\n")
     (tmp_path / name).write_text(content)
     with pytest.raises(DataError) as raised:
         open_scene(str(tmp_path / name))
-    assert told in str(raised.value)
+    assert problem in str(raised.value)
     assert "\n" not in str(raised.value)

@@ -17,8 +17,8 @@ from helpers.small_meshes import (
 
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
-from aenerf_ns.simulator.rendering.mesh_repair import prepared, subdivided
-from aenerf_ns.simulator.rendering.polygons import ear_clipping
+from aenerf_ns.simulator.rendering.mesh_repair import repair, subdivided
+from aenerf_ns.simulator.rendering.polygons import clip_ears
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
@@ -38,7 +38,7 @@ def test_coincident_faces_show_the_first_from_everywhere() -> None:
     red, green = (mesh_of(trimesh.creation.box((1, 1, 0.2)), color) for color in ((0.8, 0, 0), (0, 0.8, 0)))
     smaller = mesh_of(trimesh.creation.box((0.6, 0.6, 0.2)), (0, 0, 0.8))
     for second, count in ((green, 12), (smaller, 4)):
-        both, coincident = prepared(joined(red, second))
+        both, coincident = repair(joined(red, second))
         assert coincident == count
         scene = baked_mesh(both, BLACK)
         rng = np.random.default_rng(0)
@@ -52,17 +52,17 @@ def test_degenerate_faces_are_dropped() -> None:
     square = plate(1.0)
     faces = np.concatenate([square.faces, [[0, 0, 1], [0, 2, 2]]])
     rest = {"texture": np.full(4, -1), "emission": np.zeros(4), "gloss": np.zeros((4, 2))}
-    mesh, _ = prepared(dataclasses.replace(square, faces=faces, **rest), 10.0)
+    mesh, _ = repair(dataclasses.replace(square, faces=faces, **rest), 10.0)
     assert len(mesh.faces) == 2
     with pytest.raises(ValueError, match="no face has an area"):
-        prepared(dataclasses.replace(square, faces=faces[2:]), 10.0)
+        repair(dataclasses.replace(square, faces=faces[2:]), 10.0)
 
 
 def test_concave_polygons() -> None:
     arrow = np.array([[0, 0], [2, 1], [0, 2], [0.7, 1.0]], np.float64) @ np.array([[1, 0, 0.2], [0, 1, -0.4]])
     for shift in range(4):
         corners = np.roll(arrow, shift, axis=0)[:: 1 if shift % 2 else -1]
-        triangles = np.array([corners[list(t)] for t in ear_clipping(corners)])
+        triangles = np.array([corners[list(t)] for t in clip_ears(corners)])
         cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         newell = np.cross(corners, np.roll(corners, -1, axis=0)).sum(0)
         assert (cross @ newell > 0).all()
@@ -82,7 +82,7 @@ def test_concave_polygons() -> None:
 )
 def test_holes_and_needless_corners_of_polygons(outline: list[tuple[float, float]]) -> None:
     corners = np.column_stack([outline, 1e-6 * np.random.default_rng(0).normal(size=len(outline))])
-    a, b, c = np.moveaxis(corners[ear_clipping(corners)], 1, 0)
+    a, b, c = np.moveaxis(corners[clip_ears(corners)], 1, 0)
     cross = np.cross(b - a, c - a)
     assert (cross[:, 2] >= 0).all()
     np.testing.assert_allclose(

@@ -23,9 +23,9 @@ def test_look_at() -> None:
     np.testing.assert_allclose(rolled[:3, 0], [np.cos(0.3), 0, -np.sin(0.3)], atol=1e-12)
 
 
-@pytest.mark.parametrize("path", [paths.room_path, paths.object_path], ids=["room", "object"])
-def test_paths_are_smooth(path: object) -> None:
-    poses = np.stack([path(s) for s in np.linspace(0, 1, 8001)])  # type: ignore[operator]
+@pytest.mark.parametrize("path", [paths.RoomPath(), paths.ObjectPath()], ids=["room", "object"])
+def test_paths_are_smooth(path: paths.CameraPath) -> None:
+    poses = np.stack([path(s) for s in np.linspace(0, 1, 8001)])
     np.testing.assert_allclose(
         poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (8001, 1, 1)), atol=1e-12
     )
@@ -36,17 +36,18 @@ def test_paths_are_smooth(path: object) -> None:
 
 
 def test_room_path_is_a_loop_that_turns_about_every_axis() -> None:
-    np.testing.assert_allclose(paths.room_path(0.0), paths.room_path(1.0), atol=1e-12)
+    path = paths.RoomPath()
+    np.testing.assert_allclose(path(0.0), path(1.0), atol=1e-12)
     step = 1e-5
     rates = []
     for s in np.linspace(0, 1, 200):
-        relative = paths.room_path(s)[:3, :3].T @ paths.room_path(s + step)[:3, :3]
+        relative = path(s)[:3, :3].T @ path(s + step)[:3, :3]
         rates.append(np.array([relative[2, 1], relative[0, 2], relative[1, 0]]) / step)
     assert (np.abs(rates).max(0) > 0.5).all()
 
 
 def test_object_path_is_a_hemisphere_spiral() -> None:
-    poses = np.stack([paths.object_path(s, turns=3.0) for s in np.linspace(0, 1, 3001)])
+    poses = np.stack([paths.ObjectPath(turns=3.0)(s) for s in np.linspace(0, 1, 3001)])
     positions = poses[:, :3, 3]
     np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 4.0, rtol=1e-12)
     np.testing.assert_allclose(positions[[0, -1], 2], [0, 4.0], atol=1e-12)
@@ -90,7 +91,7 @@ def test_a_walk_is_closed_and_smooth() -> None:
 
 
 def test_a_path_through_a_hair_of_space_is_refused() -> None:
-    space = FreeSpace(RayCaster(plate(1.0).vertices, plate(1.0).faces), 0.1)
+    space = FreeSpace(RayCaster(plate(1.0).vertices, plate(1.0).faces), 0.1 / 0.13)
     assert space.is_free((0, 0, 0.11))
     assert not space.is_free((0, 0, -0.09))
     assert space.is_reached((0, 0, 0.5), (0.5, 0, 0.5))

@@ -11,14 +11,13 @@ import trimesh
 from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, baked_mesh, joined, light_mesh, mesh_of, plate, ray_directions
 
 from aenerf_ns.simulator import paths
-from aenerf_ns.simulator.open_scene import built_in_scene
 from aenerf_ns.simulator.rendering import lighting
 from aenerf_ns.simulator.rendering.environment import sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight
 from aenerf_ns.simulator.rendering.mesh import Mesh
-from aenerf_ns.simulator.rendering.mesh_repair import prepared
+from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.renderer import Renderer
-from aenerf_ns.simulator.scene import SimulationScene
+from aenerf_ns.simulator.scene import SimulationScene, open_scene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
@@ -36,7 +35,7 @@ def red(scene: Renderer, pose: np.ndarray = OVERHEAD) -> np.ndarray:
 
 def test_without_specular_every_byte_is_that_of_a_diffuse_surface() -> None:
     lamp = AreaLight((0.5, 0, 2.0), (0.3, 0, 0), (0, -0.3, 0), (5.0, 5.0, 5.0))
-    mesh, _ = prepared(plate(1.0), 0.3)
+    mesh, _ = repair(plate(1.0), 0.3)
     other = mesh_of(trimesh.creation.icosphere(2, 0.2).apply_translation((0, 0, 0.5)))
     diffuse, rough, beside_gloss = (
         light_mesh(joined(mesh, ball), sky(BLACK, (1, 1, 1)), [lamp], BLACK)
@@ -58,7 +57,7 @@ def test_without_specular_every_byte_is_that_of_a_diffuse_surface() -> None:
 
 @pytest.mark.parametrize("roughness", [0.0, 0.5])
 def test_under_an_even_sky_reflectance_is_schlicks_and_no_light_is_lost_or_made(roughness: float) -> None:
-    ball, _ = prepared(mesh_of(trimesh.creation.icosphere(4)), 1.0)
+    ball, _ = repair(mesh_of(trimesh.creation.icosphere(4)), 1.0)
     even = sky((2, 2, 2), (2, 2, 2))
     white, black = (light_mesh(coated(ball, 0.04, roughness, albedo), even, [], BLACK) for albedo in (1.0, 0.0))
     pose = paths.look_at((4, 0, 0), (0, 0, 0))
@@ -129,7 +128,7 @@ def test_small_bodies_reflect_as_widely_as_their_pixels_curve() -> None:
     """A mirror ball of a few pixels: its highlight does not come and go as the ball moves through the pixels."""
     lamp = AreaLight((3, 3, 4.0), (1.0, 0, 0), (0, -1.0, 0), (50.0, 50.0, 50.0))
     ball = mesh_of(trimesh.creation.icosphere(4, 0.06))
-    scene = light_mesh(coated(prepared(ball, 1.0)[0], 0.5, 0.0, 0.0), NIGHT, [lamp], BLACK)
+    scene = light_mesh(coated(repair(ball, 1.0)[0], 0.5, 0.0, 0.0), NIGHT, [lamp], BLACK)
     totals = [
         scene.render(OVERHEAD, (60.0, 60.0, 8.0 + shift, 8.0), 16, 16, 4)[0].sum() for shift in np.linspace(0, 1, 9)
     ]
@@ -139,7 +138,7 @@ def test_small_bodies_reflect_as_widely_as_their_pixels_curve() -> None:
 def test_the_shiny_object_is_the_object_with_coats(toy: SimulationScene, monkeypatch: pytest.MonkeyPatch) -> None:
     # Light takes seconds, and the coats do not change it.
     monkeypatch.setattr(lighting, "compute_light", lambda *args: toy.renderer.light.copy())
-    shiny = built_in_scene("shiny_object")
+    shiny = open_scene("shiny_object")
     for one, same in zip(toy.renderer.surface, shiny.renderer.surface, strict=True):
         np.testing.assert_array_equal(one, same)
     np.testing.assert_array_equal(toy.path(0.3), shiny.path(0.3))

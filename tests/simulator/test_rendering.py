@@ -26,7 +26,7 @@ from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import Environment, sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight
-from aenerf_ns.simulator.rendering.mesh_repair import prepared
+from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.mip_maps import mip_maps
 from aenerf_ns.simulator.rendering.renderer import sample_offsets
 
@@ -124,7 +124,7 @@ def test_edge_is_blurred_by_the_point_spread() -> None:
 
 
 def test_pictures_do_not_depend_on_the_run_or_the_threads() -> None:
-    mesh, _ = prepared(mesh_of(trimesh.creation.icosphere(3)), 0.2)
+    mesh, _ = repair(mesh_of(trimesh.creation.icosphere(3)), 0.2)
     lamp = AreaLight((0.5, 0, 2.0), (0.3, 0, 0), (0, -0.3, 0), (1.0, 2.0, 3.0))
     pose = paths.look_at((3, 1, 1), (0, 0, 0))
     pictures = []

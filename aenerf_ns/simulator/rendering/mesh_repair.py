@@ -15,11 +15,11 @@ _RESOLUTION = 4e-6
 """Distance below which the ray caster's float32 cannot order two surfaces, as a fraction of the largest coordinate."""
 _SEPARATION = 8.0
 """How far coincident surfaces are moved apart, in units of that distance."""
-_POINTS = 60_000
+NUM_CORNERS = 60_000
 """Approximate number of corners that large faces are subdivided into."""
 
 
-def prepared(mesh: Mesh, spacing: float | None = None) -> tuple[Mesh, int]:
+def repair(mesh: Mesh, spacing: float | None = None) -> tuple[Mesh, int]:
     """Remove degenerate faces, separate coincident faces and subdivide large faces.
 
     Args:
@@ -37,7 +37,7 @@ def prepared(mesh: Mesh, spacing: float | None = None) -> tuple[Mesh, int]:
         raise ValueError("no face has an area")
     if spacing is None:
         # Halving leaves edges of about 0.7 of that length; an equilateral mesh has two triangles per corner.
-        spacing = math.sqrt(2.3 * float(normals_and_areas(mesh)[1].sum()) / _POINTS)
+        spacing = math.sqrt(2.3 * float(normals_and_areas(mesh)[1].sum()) / NUM_CORNERS)
     small, source = subdivided(mesh, spacing)
     apart, moved = with_coincident_faces_apart(small, source)
     return apart, dropped + len(np.unique(source[moved]))

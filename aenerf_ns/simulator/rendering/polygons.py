@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aenerf_ns.simulator.arrays import Array
 
 
-def ear_clipping(corners: Array) -> NDArray[np.int64]:
+def clip_ears(corners: Array) -> NDArray[np.int64]:
     """Cut a simple polygon with corners (N, 3) into triangles that keep its orientation.
 
     Returns:
@@ -25,7 +25,7 @@ def ear_clipping(corners: Array) -> NDArray[np.int64]:
     return triangles.reshape(-1, 3).astype(np.int64)
 
 
-def triangulated_obj(text: str) -> str:
+def triangulate_obj(text: str) -> str:
     """Return the text of an .obj file with its concave polygons cut into triangles."""
     if not re.search(r"^f(?:[ \t]+\S+){4}", text, re.MULTILINE):
         return text
@@ -49,6 +49,6 @@ def triangulated_obj(text: str) -> str:
         for i in np.flatnonzero(concave):
             number = rows[i][0]
             names = lines[number].split()[1:]
-            triangles = [" ".join(names[k] for k in triangle) for triangle in ear_clipping(corners[i])]
+            triangles = [" ".join(names[k] for k in triangle) for triangle in clip_ears(corners[i])]
             lines[number] = "\n".join(f"f {triangle}" for triangle in triangles)
     return "\n".join(lines)
