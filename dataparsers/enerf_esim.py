@@ -48,7 +48,7 @@ class EsimEventFolder(EventFile):
         return files[0].time_span()[0], files[-1].time_span()[1]
 
     def count(self) -> int:
-        return sum(file.count() for file in self._files())
+        return sum(file.count() or 0 for file in self._files())
 
 
 @dataclass

@@ -148,20 +148,20 @@ def _read_poses(path: Path) -> Trajectory:
 def _read_views(folder: Path) -> tuple[CameraIntrinsics | None, dict[Split, list[ReferenceView]]]:
     """Read the lens of the views, or None where there are no views, and the views of the val and the test split."""
     root = next((place for place in (folder / "views", folder.parent / "views") if place.is_dir()), None)
-    camera, splits = None, {}
-    for split in ("val", "test"):
-        splits[split] = []
+    camera: CameraIntrinsics | None = None
+    splits: dict[Split, list[ReferenceView]] = {"val": [], "test": []}
+    for split, views in splits.items():
         path = folder if root is None else root / f"transforms_{split}.json"
         if not path.is_file():
             continue
         meta = read_json(path, _Views)
-        splits[split] = [_read_view(path, f"frames[{index}]", view) for index, view in enumerate(meta.frames)]
-        if splits[split]:
-            own = _view_camera(path, meta, splits[split][0].file)
+        views += [_read_view(path, f"frames[{index}]", view) for index, view in enumerate(meta.frames)]
+        if views:
+            own = _view_camera(path, meta, views[0].file)
             if camera not in (None, own):
                 raise DataError(path, "its camera is not that of the other split", "give both splits one camera")
             camera = own
-    return camera, splits  # type: ignore[return-value]
+    return camera, splits
 
 
 def _read_view(path: Path, key: str, view: _View) -> ReferenceView:
