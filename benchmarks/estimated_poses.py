@@ -19,7 +19,8 @@ import tyro
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.simulator.scene import SimulationScene, open_scene
+from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.scene import SimulationScene
 from aenerf_ns.simulator.simulated_poses import poses_from_frames
 from aenerf_ns.simulator.simulation import Simulation
 from benchmarks.common import write_result

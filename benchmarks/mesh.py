@@ -27,8 +27,8 @@ import tyro
 from aenerf_ns.camera.alignment import align
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.rendering.embree import RayCaster
-from aenerf_ns.simulator.scene import open_scene
 from benchmarks.common import run_script, write_result
 
 _NUM_POINTS = 100_000

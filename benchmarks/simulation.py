@@ -26,7 +26,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.frames import frame_parameters
-from aenerf_ns.simulator.scene import open_scene
+from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.simulation import RAYS_PER_PIXEL
 from benchmarks.common import write_result
 from benchmarks.paper.plan import scene_name

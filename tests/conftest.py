@@ -85,7 +85,7 @@ def small_work() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def room() -> SimulationScene:
     """The built-in room."""
-    from aenerf_ns.simulator.scene import open_scene
+    from aenerf_ns.simulator.open_scene import open_scene
 
     return open_scene("room")
 
@@ -93,7 +93,7 @@ def room() -> SimulationScene:
 @pytest.fixture(scope="session")
 def toy() -> SimulationScene:
     """The built-in object."""
-    from aenerf_ns.simulator.scene import open_scene
+    from aenerf_ns.simulator.open_scene import open_scene
 
     return open_scene("object")
 

@@ -92,7 +92,7 @@ class Simulate(SimulationCommand):
         from aenerf_ns.camera.trajectory import homogeneous
         from aenerf_ns.recording.recording import Split
         from aenerf_ns.recording.writer import NativeDatasetWriter
-        from aenerf_ns.simulator.scene import open_scene
+        from aenerf_ns.simulator.open_scene import open_scene
         from aenerf_ns.simulator.simulation import Simulation
 
         scene = open_scene(self.scene, self.seed)

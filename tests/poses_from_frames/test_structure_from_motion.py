@@ -28,8 +28,9 @@ from aenerf_ns.poses_from_frames.structure_from_motion import (
     estimate_poses,
 )
 from aenerf_ns.recording.scene import SCENE_KEY
+from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.paths import RoomPath
-from aenerf_ns.simulator.scene import SimulationScene, open_scene
+from aenerf_ns.simulator.scene import SimulationScene
 from aenerf_ns.simulator.simulation import Simulation
 
 FRAME = 40_000_000
@@ -52,7 +53,7 @@ def dataset(room: SimulationScene, tmp_path_factory: pytest.TempPathFactory) -> 
     """A dataset whose poses COLMAP estimated from 14 frames, and what the command printed."""
     folder = tmp_path_factory.mktemp("colmap") / "scene"
     with pytest.MonkeyPatch.context() as patch, command.CONSOLE.capture() as output:
-        patch.setattr("aenerf_ns.simulator.scene.open_scene", lambda *_: room)
+        patch.setattr("aenerf_ns.simulator.open_scene.open_scene", lambda *_: room)
         Simulate(
             folder, poses="colmap", width=160, height=120, duration=14 / 25 - 0.03, max_displacement=2.0,
             train_images=3, validation_views=1, test_views=1,
@@ -244,7 +245,7 @@ def test_a_frame_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 def test_pose_noise_and_colmap_exclude_each_other(room: SimulationScene, tmp_path: Path) -> None:
     options = Simulate(tmp_path / "scene", poses="colmap", pose_noise_degrees=1.0, width=16, height=12, duration=0.5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("aenerf_ns.simulator.scene.open_scene", lambda *_: room)
+        patch.setattr("aenerf_ns.simulator.open_scene.open_scene", lambda *_: room)
         with pytest.raises(DataError, match="COLMAP makes errors of its own"):
             options.main()
     assert not (tmp_path / "scene").exists()

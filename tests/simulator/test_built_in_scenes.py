@@ -9,7 +9,8 @@ from helpers.small_meshes import (
     ray_directions,
 )
 
-from aenerf_ns.simulator.scene import SimulationScene, open_scene
+from aenerf_ns.simulator.open_scene import open_scene
+from aenerf_ns.simulator.scene import SimulationScene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 

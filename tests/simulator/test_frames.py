@@ -15,8 +15,9 @@ from helpers.small_meshes import (
 )
 
 from aenerf_ns.simulator.frames import frame_displacement, frame_parameters
+from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.paths import ObjectPath
-from aenerf_ns.simulator.scene import SimulationScene, open_scene
+from aenerf_ns.simulator.scene import SimulationScene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 

@@ -17,9 +17,9 @@ from helpers.small_meshes import (
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas, scaled
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
-from aenerf_ns.simulator.scene import open_scene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 

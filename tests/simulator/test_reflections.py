@@ -11,13 +11,14 @@ import trimesh
 from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, baked_mesh, joined, light_mesh, mesh_of, plate, ray_directions
 
 from aenerf_ns.simulator import paths
+from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.rendering import lighting
 from aenerf_ns.simulator.rendering.environment import sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight
 from aenerf_ns.simulator.rendering.mesh import Mesh
 from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.renderer import Renderer
-from aenerf_ns.simulator.scene import SimulationScene, open_scene
+from aenerf_ns.simulator.scene import SimulationScene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 

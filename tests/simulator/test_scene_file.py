@@ -21,7 +21,7 @@ from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.frames import frame_parameters
-from aenerf_ns.simulator.scene import open_scene
+from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.simulation import RAYS_PER_PIXEL
 
 pytestmark = pytest.mark.usefixtures("small_work")
