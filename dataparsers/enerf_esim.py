@@ -27,7 +27,7 @@ class EsimEventFolder(EventFile):
     """A folder of .npy files with rows of x, y, t in nanoseconds and p: one stream, in the order of the names."""
 
     def _files(self) -> list[NpyEventFile]:
-        # By the numbers in the names, because these may lack leading zeros.
+        # The order is that of the numbers in the names, which may lack leading zeros.
         paths = list_files(self.path, "*.npy")
         paths.sort(key=lambda path: [int(number) for number in re.findall(r"\d+", path.name)])
         return [NpyEventFile(path, self.width, self.height, XYTP_MATRIX, "ns") for path in paths]

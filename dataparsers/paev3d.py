@@ -109,7 +109,7 @@ def _scalar(of: _Type, content: bytes) -> str:
 _STAND_INS = {"dtype": _Type, "_reconstruct": _Array, "scalar": _scalar, "ndarray": _Array}
 
 
-# In Python, because the unpickler in C reserves as much memory as a pickle asks for.
+# This is the unpickler in Python, because the one in C reserves as much memory as a pickle asks for.
 class _ArrayUnpickler(pickle._Unpickler):
     """Read NumPy's arrays without NumPy's own functions. Refuse all other calls: a pickle may run any code."""
 

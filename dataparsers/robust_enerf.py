@@ -147,7 +147,7 @@ def _read_poses(path: Path) -> Trajectory:
 
 def _read_views(folder: Path) -> tuple[CameraIntrinsics | None, dict[Split, list[ReferenceView]]]:
     """Read the lens of the views, or None where there are no views, and the views of the val and the test split."""
-    root = next((place for place in (folder / "views", folder.parent / "views") if place.is_dir()), None)
+    root = next((views for views in (folder / "views", folder.parent / "views") if views.is_dir()), None)
     camera: CameraIntrinsics | None = None
     splits: dict[Split, list[ReferenceView]] = {"val": [], "test": []}
     for split, views in splits.items():

@@ -33,7 +33,6 @@ _INDICES = {"left": (2, 0), "right": (3, 1)}
 # The ratio C+ / C- and the refractory period (ns) are the estimates of Robust e-NeRF.
 _SENSOR = SensorModel(1.458 * 0.25, 0.25, 1375)
 
-
 T = TypeVar("T")
 
 
@@ -163,9 +162,9 @@ def _choose(data: Path) -> tuple[Path, str, str]:
 
 def _find_calibration(folder: Path, name: str) -> Path:
     """Return the path of a calibration file, which is beside the sequence or one folder up."""
-    for place in (folder, folder.parent):
-        if (place / name).is_file():
-            return place / name
+    for path in (folder / name, folder.parent / name):
+        if path.is_file():
+            return path
     raise DataError(folder / name, "there is no such file", "download the dataset's calibration to this folder")
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation
 
-# Four lost frames in a row make a segment five times as long as its neighbours. The errors of the poses at its ends
+# Four lost frames in a row make a segment five times as long as its neighbors. The errors of the poses at its ends
 # grow with its length, but the spline is still closer to the path than a straight line (docs/experiments.md).
 _MAX_SEGMENT_RATIO = 5.5
 # Closer to half a turn, the shorter way round is hardly known.
@@ -27,7 +27,7 @@ def pose_polynomials(seconds: Tensor, poses: Tensor) -> Tensor:
 
     A spline would swing in a gap. So the spline ends where a gap begins, and another spline begins where the gap ends.
     In the gap the position moves straight at a constant speed, and the rotation turns about one axis at an almost
-    constant rate. A gap is a segment more than 5.5 times as long as one of its neighbours, or one that turns by more
+    constant rate. A gap is a segment more than 5.5 times as long as one of its neighbors, or one that turns by more
     than 150 degrees. Two poses alone are joined like the ends of a gap, and three by a parabola.
 
     Args:

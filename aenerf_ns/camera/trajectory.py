@@ -28,7 +28,7 @@ class Trajectory(nn.Module):
 
     The poses pass through the knots. Between knots, positions and rotations follow cubic splines with continuous
     velocities and accelerations (:func:`~aenerf_ns.camera.pose_spline.pose_polynomials`). No spline crosses a gap,
-    which is a segment much longer than its neighbours. There the camera moves straight and turns about one axis.
+    which is a segment much longer than its neighbors. There the camera moves straight and turns about one axis.
 
     It is a module so that the knots move with a model to its device. It has no parameters and adds nothing to
     checkpoints. Everything is float64, and times are integer nanoseconds or float64 seconds since ``start``: in float32
@@ -133,7 +133,7 @@ class Trajectory(nn.Module):
         Returns:
             (..., 3, 4) float64 camera-to-world poses.
         """
-        (c0, c1, c2, c3), time = self._place(seconds)
+        (c0, c1, c2, c3), time = self._locate(seconds)
         value = torch.addcmul(c0, time, torch.addcmul(c1, time, torch.addcmul(c2, time, c3)))
         position, quaternion = value.split((3, 4), -1)
         unit = quaternion / quaternion.norm(dim=-1, keepdim=True)
@@ -152,7 +152,7 @@ class Trajectory(nn.Module):
         Returns:
             (..., 3, 4) float64 poses and (..., 3, 4) float64 rates per second.
         """
-        (c0, c1, c2, c3), time = self._place(seconds)
+        (c0, c1, c2, c3), time = self._locate(seconds)
         # Horner's scheme, which gives the derivative on the way.
         b2 = torch.addcmul(c2, time, c3)
         b1 = torch.addcmul(c1, time, b2)
@@ -167,7 +167,7 @@ class Trajectory(nn.Module):
         rotation, turning = (products.flatten(-2) @ self._products).unflatten(-1, (3, 3)).unbind(-3)
         return torch.cat([rotation, position[..., None]], -1), torch.cat([turning, velocity[..., None]], -1)
 
-    def _place(self, seconds: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    def _locate(self, seconds: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
         """Return the four coefficients (..., 7) of the segments that times (...) lie in, and the time in them.
 
         The times in the segments are (..., 1), in seconds.

@@ -47,7 +47,7 @@ class ObservedPoints:
         positions: (N, 3) float64 in the world.
         colors: (N, 3) uint8 display values.
         images: (N,) index of the image.
-        pixels: (N, 2) column and row in that image; the centre of the first pixel is at 0.5.
+        pixels: (N, 2) column and row in that image; the center of the first pixel is at 0.5.
     """
 
     positions: NDArray[np.float64]

@@ -25,7 +25,7 @@ _DIGITS = 5
 
 
 def describe_run(method: str, scene: str, num_steps: int) -> dict[str, Any]:
-    """Return what nerfbaselines calls ``nb_info``: how the predictions came about.
+    """Describe how predictions came about, as ``nb_info`` of nerfbaselines does.
 
     Args:
         method: name of the method.

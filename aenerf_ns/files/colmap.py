@@ -35,7 +35,7 @@ Row = tuple[str, list[float]]
 
 
 def read_colmap_poses(model: Path) -> dict[str, Tensor]:
-    """Read the poses of the images that a model places.
+    """Read the poses of the images in a model.
 
     Args:
         model: the folder that holds images.bin or images.txt. If it holds both, images.bin is read, as COLMAP does.
@@ -54,7 +54,7 @@ def read_colmap_poses(model: Path) -> dict[str, Tensor]:
         with path.open("rb") as file:
             rows = list(_read_binary(path, file) if path == binary else _read_text(path, file))
     if not rows:
-        raise DataError(path, "it places no image", "reconstruct again")
+        raise DataError(path, "it has no image", "reconstruct again")
     if len(dict(rows)) < len(rows):
         raise _damaged(path, "it names an image twice")
     values = np.array([values for _, values in rows])

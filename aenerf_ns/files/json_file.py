@@ -89,16 +89,16 @@ def convert(path: Path, values: Any, kind: type[T], remedy: str = DATASET_REMEDY
     try:
         return msgspec.convert(values, kind, dec_hook=_convert_other)
     except msgspec.ValidationError as error:
-        problem, _, place = str(error).partition(" - at `$")
-        place = place.removesuffix("`")
+        problem, _, key_path = str(error).partition(" - at `$")
+        key_path = key_path.removesuffix("`")
         found = ""
         # The path of a value in a dictionary has "[...]" in place of the key.
-        if place and "[..." not in place:
+        if key_path and "[..." not in key_path:
             value = values
-            for key, index in re.findall(r"\.([^.[]+)|\[(\d+)\]", place):
+            for key, index in re.findall(r"\.([^.[]+)|\[(\d+)\]", key_path):
                 value = value[key or int(index)]
             found = f" ({_shorten(value)})" if isinstance(value, (str, int, float, Decimal)) else ""
-        key = f"{name}{place}".removeprefix(".")
+        key = f"{name}{key_path}".removeprefix(".")
         problem = f"{problem[:1].lower()}{problem[1:]}{found}"
         raise DataError(path, f"{key}: {problem}" if key else problem, remedy) from None
 

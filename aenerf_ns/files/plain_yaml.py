@@ -13,8 +13,8 @@ from aenerf_ns.files.limits import read_text
 # Calibrations and the metadata of bags have 1 kB a camera or topic. PyYAML reads 0.1 MB in a second.
 _MAX_BYTES = 1 << 17
 
-# For each bracket that is open, PyYAML takes time at every token.
-_MOST_BRACKETS = 2000
+# PyYAML takes time at every token for each bracket that is open.
+_MAX_BRACKETS = 2000
 
 YAML_ERRORS = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 """What PyYAML raises for a malformed file. A value that a tag does not fit ends in Python's own errors."""
@@ -37,8 +37,8 @@ def read_yaml_text(path: Path, max_bytes: int) -> str:
     """
     text = read_text(path, max_bytes)
     brackets = text.count("[") + text.count("{")
-    if brackets > _MOST_BRACKETS:
-        raise DataError(path, f"it has {brackets:,} opening brackets", f"such a file has at most {_MOST_BRACKETS:,}")
+    if brackets > _MAX_BRACKETS:
+        raise DataError(path, f"it has {brackets:,} opening brackets", f"such a file has at most {_MAX_BRACKETS:,}")
     return text
 
 

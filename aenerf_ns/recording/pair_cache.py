@@ -115,7 +115,7 @@ class PairFile:
                 f"[yellow]{self.path.parent} cannot be written to ({error.strerror}): the pairs are in {folder} until "
                 "this process ends, and are made again by the next."
             )
-            # Without a name: it is gone when the process ends.
+            # The file has no name, and is gone when the process ends.
             self._new = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
         return self._new, folder
 

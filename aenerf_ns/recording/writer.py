@@ -275,7 +275,7 @@ class PoselessRecordingWriter(_FolderWriter):
 
 
 def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
-    # OpenCV's own writing does not tell when the disk is full.
+    # OpenCV's own writing reports no full disk.
     path.write_bytes(cv2.imencode(".png", values)[1].tobytes())
 
 
