@@ -27,8 +27,9 @@ from aenerf_ns.files.limits import MAX_LINE
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
 _COLUMNS = "xytp"
-# Bytes read at once: about 150,000 events.
-_BLOCK = 1 << 22
+BLOCK = 1 << 22
+"""Bytes that are read at once: about 150,000 events."""
+
 # Longer than any line of a file of events.
 _TAIL_BYTES = 4096
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -119,7 +120,7 @@ class _EventLines(EventReader):
         header_end = file.tell()
         file.seek(0)
         num_before = file.read(header_end).count(b"\n")
-        while text := file.read(_BLOCK):
+        while text := file.read(BLOCK):
             text += self._line(file)
             text += b"" if text.endswith(b"\n") else b"\n"
             lines = self._parse_block(text, num_before, names)

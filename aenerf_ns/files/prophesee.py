@@ -23,8 +23,9 @@ from aenerf_ns.files.event_reader import CHUNK, EventReader, resolve_sensor_size
 HEADER_BYTES = 1 << 16
 """Far more bytes than any header has."""
 
-# Words of a RAW file that are read at once.
-_BLOCK = 1 << 20
+BLOCK = 1 << 20
+"""Words of a RAW file that are read at once."""
+
 # The kind of word that holds the upper bits of a time, in the upper 4 bits of a word in both encodings. Cameras send
 # one at least every 5 ms, in which no camera sends this many words.
 _TIME_HIGH, _MAX_TIMELESS = 0x8, 1 << 20
@@ -131,7 +132,7 @@ class PropheseeRawFile(EventReader):
             raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
         with self.path.open("rb") as file:
             file.seek(self._begin)
-            while len(block := np.fromfile(file, dtype, _BLOCK)):
+            while len(block := np.fromfile(file, dtype, BLOCK)):
                 if len(block) >= _MAX_TIMELESS and not (block >> 8 * dtype.itemsize - 4 == _TIME_HIGH).any():
                     raise DataError(
                         self.path,

@@ -18,10 +18,9 @@ import numpy as np
 import pytest
 import yaml
 from helpers.bounded_reading import little_memory, read_whole, readable_folder, without_rights_of_root
-from helpers.dataset_faults import read_everything
-from helpers.malformed_inputs import FORMAT_WRITERS, camchain, npy_header
-from helpers.published_datasets import CAMCHAIN, config_of
-from helpers.vendor_recordings import RECORDINGS, config_of_recording
+from helpers.malformed_inputs import camchain, npy_header
+from helpers.published_datasets import CAMCHAIN
+from helpers.vendor_recordings import DATASETS, read_dataset
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -32,23 +31,9 @@ from aenerf_ns.errors import DataError
 SHORT, LONG, MAX_SECONDS = 12.0, 900.0, 10.0
 
 WORDS = [
-    "",
-    ".",
-    "..",
-    "../x",
-    "/",
-    "/etc/passwd",
-    "\0",
-    "a" * 300,
-    "a" * 5000,
-    "é\n",
-    "nan",
-    "inf",
-    "-1",
-    "1e999",
-    "{}",
-    "%s",
-]
+    "", ".", "..", "../x", "/", "/etc/passwd",
+    "\0", "a" * 300, "a" * 5000, "é\n", "nan", "inf", "-1", "1e999", "{}", "%s",
+]  # fmt: skip
 NUMBERS = [
     "0", "-0", "1", "-1", "0.5", "64.7", "1e-320", "-1e-30", "1e30", "1e300", "-1e300", "1e308", "1e400", "1e999999999",
     "1e-999999999", "9" * 18, "9" * 19, "9" * 400, "9" * 5000, "-9223372036854775808", "65535", "65536",
@@ -153,18 +138,8 @@ def broken_array(draw: Draw, values: np.ndarray) -> np.ndarray:
 
 
 HEADER_SHAPES = [
-    "(3,)",
-    "()",
-    "(10000000000000,)",
-    "(-1,)",
-    "(3",
-    "(3.5,)",
-    "(2, 4)",
-    f"({2**70},)",
-    "(True,)",
-    "3",
-    "None",
-]
+    "(3,)", "()", "(10000000000000,)", "(-1,)", "(3", "(3.5,)", "(2, 4)", f"({2**70},)", "(True,)", "3", "None",
+]  # fmt: skip
 HEADER_TYPES = ["'<i8'", "'|O'", "'<f8'", "'<U1000000000'", "'<q99'", "[('a', '<i8', (9, 9))]", "'<f8", "0"]
 
 
@@ -180,8 +155,12 @@ def broken_npy(draw: Draw, content: bytes) -> bytes:
         return npy_header(shape, kind, draw(st.sampled_from([", }", "", "}", ", 'x': 1}"]))) + content[128:]
     place = draw(st.integers(0, max(len(content) - 1, 0)))
     if way == "flip" and content:
-        return content[:place] + bytes([content[place] ^ 1 << draw(st.integers(0, 7))]) + content[place + 1 :]
+        return flip_bit(draw, content, place)
     return content[:place] if way == "cut" else content + bytes(place)
+
+
+def flip_bit(draw: Draw, content: bytes, index: int) -> bytes:
+    return content[:index] + bytes([content[index] ^ 1 << draw(st.integers(0, 7))]) + content[index + 1 :]
 
 
 def break_npy(draw: Draw, path: Path) -> None:
@@ -261,9 +240,7 @@ def break_any(draw: Draw, path: Path) -> None:
     if way == "cut":
         path.write_bytes(content[:place])
     elif way == "flip":
-        path.write_bytes(
-            content[:place] + bytes([content[place] ^ 1 << draw(st.integers(0, 7))]) + content[place + 1 :]
-        )
+        path.write_bytes(flip_bit(draw, content, place))
     elif way == "empty":
         path.touch()
     elif way == "folder":
@@ -298,20 +275,16 @@ BREAKS = {
     **dict.fromkeys((".raw", ".dat", ".aedat4", ".bag", ".db3", ".mcap", ".bin"), break_bytes),
 }  # fmt: skip
 WRITERS: dict[str, Callable[[Path], object]] = {
-    **FORMAT_WRITERS,
+    **DATASETS,
     "camchain": lambda folder: (
-        FORMAT_WRITERS["event-recording-data"](folder),
+        DATASETS["event-recording-data"](folder),
         camchain(yaml.dump({"cam0": {**CAMCHAIN["cam1"], "T_cn_cnm1": np.eye(4).tolist()}}))(folder),
     ),
-    **RECORDINGS,
 }
 
 
 def read(name: str, folder: Path) -> None:
-    if name in RECORDINGS:
-        read_everything(config_of_recording(folder))
-    else:
-        read_everything(config_of("event-recording-data" if name == "camchain" else name, folder))
+    read_dataset("event-recording-data" if name == "camchain" else name, folder)
 
 
 def search(folder: Path, seconds: float) -> int:

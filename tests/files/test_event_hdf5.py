@@ -13,15 +13,9 @@ import pytest
 from helpers.event_table_writers import (
     HEIGHT,
     WIDTH,
-    ZEROS,
     Columns,
-    N,
-    T,
-    assert_fault_is_one_line,
     lengths_of_read_pieces,
     made_columns,
-    records,
-    replaced,
     signed,
     write_dsec,
     write_eds,
@@ -88,50 +82,6 @@ def test_a_stated_unit_counts_where_the_file_states_none(tmp_path: Path) -> None
     (tmp_path / "events.txt").write_text("0.1 1 2 1\n")
     with pytest.raises(DataError, match="its format has a time unit, but us was given"):
         open_event_file(tmp_path / "events.txt", WIDTH, HEIGHT, time_unit="us")
-
-
-def write_with_filter(path: Path, code: int) -> None:
-    """Events in a compression for which no filter exists here."""
-    with h5py.File(path, "w") as file:
-        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        settings.set_chunk((N,))
-        settings.set_filter(code, h5py.h5z.FLAG_OPTIONAL, ())
-        kind = h5py.h5t.py_create(records(made_columns()).dtype)
-        group = file.create_group("CD")
-        dataset = h5py.h5d.create(group.id, b"events", kind, h5py.h5s.create_simple((N,)), settings)
-        dataset.write_direct_chunk((0,), b"compressed", 0)
-
-
-def set_offset(path: Path, value: object) -> None:
-    with h5py.File(path, "a") as file:
-        del file["t_offset"]
-        file["t_offset"] = value
-
-
-FAULTS: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "no HDF5 file": ("e.h5", lambda path: None, "e.h5: there is no such file"),
-    "text as HDF5": ("e.h5", lambda path: path.write_text("x y"), "e.h5: not a readable HDF5 file"),
-    "no events in HDF5": ("e.h5", replaced("p", None), "e.h5: it holds t, x, y; events must be in"),
-    "empty HDF5": ("e.h5", lambda path: h5py.File(path, "w").close(), "e.h5: it holds nothing"),
-    "short column": ("e.h5", replaced("x", np.zeros(3, int)), "its columns have lengths"),
-    "pixel outside": ("e.h5", replaced("x", ZEROS + WIDTH), "event 0 has x = 60; it must be a whole number below 60"),
-    "negative pixel": ("e.h5", replaced("y", ZEROS - 1), "event 0 has y = -1"),
-    "polarity 2": ("e.h5", replaced("p", ZEROS + 2), "event 0 has p = 2; polarities are 0 and 1, or -1 and 1"),
-    "huge time": ("e.h5", replaced("t", T * 1_000), r"event 0 has t = 1\.6e\+18; check the unit"),
-    "offset is a word": (
-        "e.h5",
-        lambda path: (write_dsec(path, made_columns()), set_offset(path, "late")),
-        "its t_offset is .*late.*; store an integer",
-    ),
-    "ECF": ("e.h5", lambda path: write_with_filter(path, 0x8ECF), "ECF filter: .* set HDF5_PLUGIN_PATH to its folder"),
-    "another filter": ("e.h5", lambda path: write_with_filter(path, 40_000), r"pip install 'aenerf-ns\[hdf5-"),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_malformed_event_files_are_one_clear_line(fault: str, tmp_path: Path) -> None:
-    name, write, message = FAULTS[fault]
-    assert_fault_is_one_line(tmp_path / name, write, message, open_events)
 
 
 def test_blosc_without_its_filter_names_the_extra(tmp_path: Path) -> None:

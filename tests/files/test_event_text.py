@@ -13,7 +13,6 @@ from helpers.event_table_writers import (
     WIDTH,
     Columns,
     N,
-    assert_fault_is_one_line,
     lengths_of_read_pieces,
     made_columns,
     write_csv,
@@ -58,7 +57,7 @@ def write_text(path: Path, columns: Columns, line: str) -> None:
 def test_every_layout_gives_the_events_it_was_written_with(
     layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(event_text, "_BLOCK", 1000)
+    monkeypatch.setattr(event_text, "BLOCK", 1000)
     name, write, error = LAYOUTS[layout]
     lengths = lengths_of_read_pieces(tmp_path / name, write, open_events, error)
     assert 5 < len(lengths) < 20
@@ -137,56 +136,6 @@ def test_numbers_are_exact(number: str, separator: bytes) -> None:
         assert abs(Decimal(fraction[0, 0]) - expected % 1) < spacing
     else:
         assert abs(int(whole[0, 0])) >= 9 * 10**18
-
-
-FAULTS: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "no CSV": ("e.csv", lambda path: None, "e.csv: there is no such file"),
-    "empty CSV": ("e.csv", lambda path: path.write_text(""), "its first line is ''; it must name the columns"),
-    "CSV without header": ("e.csv", lambda path: path.write_text("1,2,3,1\n"), "first line is '1,2,3,1'; it must name"),
-    "CSV without events": ("e.csv", lambda path: path.write_text("x,y,t,p\n"), "e.csv: the file holds no events"),
-    "CSV with a word": (
-        "e.csv",
-        lambda path: path.write_text("x,y,t,p\n1,2,now,1\n"),
-        "line 2 has t = now; write",
-    ),
-    "CSV with five": (
-        "e.csv",
-        lambda path: path.write_text("x,y,t,p\n1,2,3,1,9\n"),
-        "has 5 fields; .* the 4: x y t p",
-    ),
-    "CSV with an empty field": ("e.csv", lambda path: path.write_text("x,y,t,p\n1,,3,1\n"), "line 2 has y = nothing"),
-    "CSV with blanks between": ("e.csv", lambda path: path.write_text("x,y,t,p\n1,2 3,4,1\n"), "line 2 has y = 2 3;"),
-    "CSV with three polarities": (
-        "e.csv",
-        lambda path: path.write_text("x,y,t,p\n1,2,3,-1\n#\n1,2,3,0\n"),
-        "line 4 has p = 0; there are events of polarity -1",
-    ),
-    "text with a huge time": (
-        "e.txt",
-        lambda path: path.write_text("1e300 1 2 1\n"),
-        "line 1 has t = 9.2.*; check",
-    ),
-    "text with a fault later": (
-        "e.txt",
-        lambda path: path.write_text("# made\n" + "1 1 2 1\n" * 50 + "1 1 two 1\n1 1 2 1\n"),
-        "line 52 has y = two",
-    ),
-    "text with a bad pixel later": (
-        "e.txt",
-        lambda path: path.write_text("# made\n" + "1 1 2 1\n" * 50 + "\n1 60 2 1\n1 1 2 1\n"),
-        "line 53 has x = 60; it must be a whole number below 60",
-    ),
-    "text with a bad end": ("e.txt", lambda path: path.write_text("1 1 2 1\n" * 90 + "1 1 2\n"), "the last line has 3"),
-    "text without line ends": ("e.txt", lambda path: path.write_text("1 1 2 1 " * 90), "line 1 has 360 fields"),
-    "text of zeros": ("e.txt", lambda path: path.write_bytes(bytes(5000)), "line 1 has 1 fields"),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_malformed_event_files_are_one_clear_line(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(event_text, "_BLOCK", 100)
-    name, write, message = FAULTS[fault]
-    assert_fault_is_one_line(tmp_path / name, write, message, open_events)
 
 
 @settings(max_examples=5 * FUZZ_EXAMPLES, deadline=None)

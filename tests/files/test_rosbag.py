@@ -24,7 +24,6 @@ from helpers.bag_writers import (
 )
 from helpers.event_file_checks import (
     assert_one_line,
-    assert_rejected,
     attempt,
     read,
     table,
@@ -169,7 +168,7 @@ def test_messages_of_ros2_that_are_cut_are_told_in_one_line(cut: int, folder: Pa
         (data,) = database.execute("SELECT data FROM messages").fetchone()
         database.execute("UPDATE messages SET data = ?", (data[:-cut],))
     with pytest.raises(DataError, match="does not have the parts of its type"):
-        attempt(stored)
+        attempt(open_event_file(stored))
     with closing(sqlite3.connect(stored)) as database, database:
         # As middleware writes that pads messages.
         database.execute("UPDATE messages SET data = ?", (data + bytes(-len(data) % 4),))
@@ -192,19 +191,6 @@ def test_a_missing_package_for_bags_is_named(folder: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
     with pytest.raises(DataError, match=re.escape("pip install 'aenerf-ns[rosbag]'")):
         open_event_file(path)
-
-
-MALFORMED: dict[str, tuple[bytes, str]] = {
-    "bag with its magic alone": (b"#ROSBAG V2.0\n", "not a readable bag"),
-    "bag of version 1": (b"#ROSBAG V1.2\n", "not a readable bag"),
-}
-
-
-@pytest.mark.parametrize("name", MALFORMED)
-def test_malformed_files_are_told_in_one_line(name: str, folder: Path) -> None:
-    pytest.importorskip("rosbags")
-    content, message = MALFORMED[name]
-    assert_rejected(folder / name.replace(" ", "_"), content, message)
 
 
 def malformed_bags() -> dict[str, tuple[str, list[tuple[int, bytes]], str]]:
@@ -234,6 +220,6 @@ def test_malformed_bags_are_told_in_one_line(name: str, folder: Path) -> None:
     kind, messages, message = malformed_bags()[name]
     path = write_bag(folder / "malformed.bag", {"/events": (kind, messages)})
     with pytest.raises(DataError) as caught:
-        attempt(path)
+        attempt(open_event_file(path))
     assert_one_line(caught.value, path)
     assert message in str(caught.value)

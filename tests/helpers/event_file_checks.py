@@ -39,9 +39,8 @@ def lapless(rows: Rows, lap: int) -> np.ndarray:
     return expected
 
 
-def attempt(path: Path) -> None:
-    """Reads all there is to read, as `aenerf convert` would."""
-    file = open_event_file(path)
+def attempt(file: EventFile) -> None:
+    """Read all there is to read, as `aenerf convert` would."""
     file.count()
     start, end = file.time_span()
     chunks = list(file.chunks())
@@ -52,15 +51,6 @@ def assert_one_line(error: DataError, path: Path) -> None:
     assert str(error).startswith(f"{path}: ")
     assert "\n" not in str(error)
     assert len(str(error)) < 400
-
-
-def assert_rejected(path: Path, content: bytes, message: str) -> None:
-    """Check that a file of this content is an error of one line that holds the message."""
-    path.write_bytes(content)
-    with pytest.raises(DataError) as caught:
-        attempt(path)
-    assert_one_line(caught.value, path)
-    assert message in str(caught.value), caught.value
 
 
 # Ways to damage a file, at places given as fractions of its length.

@@ -9,7 +9,6 @@ import h5py
 import numpy as np
 import pytest
 
-from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 
 WIDTH, HEIGHT, N = 60, 40, 300
@@ -121,20 +120,3 @@ def lengths_of_read_pieces(
     assert events.time_span() == (times[0], times[-1])
     assert events.count() in (N, None)
     return [len(chunk) for chunk in chunks]
-
-
-def assert_fault_is_one_line(
-    path: Path, write: Callable[[Path], object], message: str, open_events: Callable[[Path], EventFile]
-) -> None:
-    """Check that a malformed file is an error of one line that matches the message."""
-    write(path)
-    with pytest.raises(DataError, match=message) as error:
-        read_everything(path, open_events)
-    assert "\n" not in str(error.value)
-    assert str(path.parent) in str(error.value)
-
-
-def read_everything(path: Path, open_events: Callable[[Path], EventFile]) -> None:
-    events = open_events(path)
-    events.time_span()
-    assert list(events.chunks())

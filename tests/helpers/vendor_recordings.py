@@ -17,6 +17,7 @@ import numpy as np
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.recording.options import EventDataParserConfig
 from helpers.bag_writers import ARRAY, PACKET, array_message, packet_message, write_bag, write_bag2
+from helpers.dataset_faults import read_everything
 from helpers.event_file_writers import (
     HEIGHT,
     WIDTH,
@@ -29,8 +30,8 @@ from helpers.event_file_writers import (
     evt3_words,
     flat_table,
 )
-from helpers.malformed_inputs import all_of
-from helpers.published_datasets import write_own
+from helpers.malformed_inputs import FORMAT_WRITERS, all_of
+from helpers.published_datasets import config_of, write_own
 
 # From 0.1 to 0.7 s, four events a pixel.
 ROWS: Rows = [(x % 30, 5 + x % 3, 100_000 + 5000 * x, 1 - 2 * (x // 30 % 2)) for x in range(120)]
@@ -126,6 +127,14 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "bag of ROS 2": partial(_around, write_events=lambda path: write_bag2(path, _messages(), ARRAY), suffix=""),
 }
 """By a name: writes a whole recording to a folder."""
+
+DATASETS = {**FORMAT_WRITERS, **RECORDINGS}
+"""By a name: writes a whole dataset of a format, or a recording, to a folder."""
+
+
+def read_dataset(kind: str, folder: Path) -> None:
+    """Read all of a dataset of one of the kinds."""
+    read_everything(config_of_recording(folder) if kind in RECORDINGS else config_of(kind, folder))
 
 
 # Bombs. Each change makes a whole recording of the kind before the colon one that must be refused.

@@ -1,0 +1,206 @@
+"""Malformed event files of every format: one clear line each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.event_file_checks import assert_one_line, attempt
+from helpers.event_file_writers import HEADER2, HEADER3, ROWS, aedat4_file, dat, evt2, evt3, sized, words
+from helpers.event_table_writers import (
+    HEIGHT,
+    WIDTH,
+    ZEROS,
+    N,
+    T,
+    made_columns,
+    records,
+    replaced,
+    write_dsec,
+)
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files import event_text
+from aenerf_ns.files.event_arrays import open_array_events
+from aenerf_ns.files.event_hdf5 import open_hdf5_events
+from aenerf_ns.files.event_text import CsvEventFile, TextEventFile
+from aenerf_ns.files.open import open_event_file
+
+
+def write_with_filter(path: Path, code: int) -> None:
+    """Events in a compression for which no filter exists here."""
+    with h5py.File(path, "w") as file:
+        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        settings.set_chunk((N,))
+        settings.set_filter(code, h5py.h5z.FLAG_OPTIONAL, ())
+        kind = h5py.h5t.py_create(records(made_columns()).dtype)
+        group = file.create_group("CD")
+        dataset = h5py.h5d.create(group.id, b"events", kind, h5py.h5s.create_simple((N,)), settings)
+        dataset.write_direct_chunk((0,), b"compressed", 0)
+
+
+def set_offset(path: Path, value: object) -> None:
+    with h5py.File(path, "a") as file:
+        del file["t_offset"]
+        file["t_offset"] = value
+
+
+# By the suffix of the file and a name: its content, or how it is written, and a part of the message.
+FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
+    "aedat4: of version 2": (b"#!AER-DAT2.0\r\n# events", "does not begin as an AEDAT4 file"),
+    "aedat4: with its magic alone": (b"#!AER-DAT4.0\r\n", "not a readable AEDAT4 file"),
+    "aedat4: cut in its header": (aedat4_file(ROWS)[:100], "not a readable AEDAT4 file"),
+    "aedat4: with a header of zeros": (b"#!AER-DAT4.0\r\n" + sized(bytes(64)), "not a readable AEDAT4 file"),
+    "aedat4: without events": (aedat4_file(ROWS, streams={0: "FRME"}), "no stream holds events"),
+    "aedat4: of no number": (
+        aedat4_file(ROWS).replace(b'node name="0"', b'node name="?"'),
+        "not a readable AEDAT4 file",
+    ),
+    "aedat4: of an unknown compression": (aedat4_file(ROWS, compression=9), "compression is number 9"),
+    "aedat4: of another compression": (aedat4_file(ROWS, compression=1), ""),
+    "aedat4: cut in a packet": (aedat4_file(ROWS)[:-20], "ends within the packet"),
+    "aedat4: cut in a packet's head": (aedat4_file(ROWS)[:-10], "ends within the packet"),
+    "aedat4: that ends before its table": (aedat4_file(ROWS, with_table=True)[:-300], "ends before its table"),
+    "aedat4: of other packets": (aedat4_file(ROWS).replace(b"EVTS\x06", b"FRME\x06"), "does not hold events"),
+    "aedat4: beside the sensor": (aedat4_file([(64, 1, 0, 1)]), "x = 64 on a sensor of width 64"),
+    "aedat4: at an absurd time": (aedat4_file([(1, 1, 1 << 62, 1)]), "more than 292 years"),
+    "dat: cut": (dat(ROWS)[:-1], "ends within a record of 8 bytes"),
+    "dat: without records": (dat([]), "holds no events"),
+    "dat: without a type": (dat([])[:-2], "type and size none"),
+    "dat: of triggers": (dat(ROWS).replace(b"\x0c\x08", b"\x0e\x08"), "type and size 0e 08"),
+    "dat: of version 1": (dat(ROWS).replace(b"Version 2", b"Version 1"), "its version is 1"),
+    "dat: without a version": (dat(ROWS).replace(b"% Version 2\n", b""), "its version is none"),
+    "dat: beside the sensor": (dat([(64, 1, 0, 1)]), "x = 64 on a sensor of width 64"),
+    "dat: of polarity 2": (dat([])[:] + words("<u4", 0, 2 << 28), "has polarity 3"),
+    "raw: with a header alone": (HEADER3, "holds no events"),
+    "raw: with an endless header": (b"% evt 3.0\n% geometry 64x48", "does not end"),
+    "raw: with an endless line": (b"% evt 3.0\n% " + b"x" * 100_000, "does not end"),
+    "raw: without an encoding": (
+        b"% format \n% geometry 64x48\n" + words("<u2", 0x8001),
+        "does not state the encoding",
+    ),
+    "raw: in another encoding": (b"% evt 2.1\n% geometry 64x48\n", "encoded as 2.1"),
+    "raw: of histograms": (b"% format HISTO3D;width=64;height=48\n", "encoded as HISTO3D"),
+    "raw: in big endian": (b"% format EVT3;endianness=big;width=64;height=48\n", "encoded as EVT3;endianness=big"),
+    "raw: of no size": (b"% evt 3.0\n", "does not state the size"),
+    "raw: of an absurd size": (b"% evt 3.0\n% geometry 999999x999999\n", "999999 x 999999 pixels is too large"),
+    "raw: of size zero": (b"% evt 3.0\n% geometry 0x48\n", "0 x 48 pixels cannot be"),
+    "raw: evt2 cut": (evt2(ROWS)[:-1], "ends within a word of 4 bytes"),
+    "raw: evt3 cut": (evt3(ROWS)[:-1], "ends within a word of 2 bytes"),
+    "raw: evt2 garbage": (HEADER2 + words("<u4", 0x80000001, 0x70000000), "word 1 is 0x70000000, which EVT 2.0"),
+    "raw: evt3 garbage": (HEADER3 + words("<u2", 0x8001, 0x6000, 0x9123), "word 2 is 0x9123, which EVT 3.0"),
+    "raw: evt2 beside the sensor": (HEADER2 + words("<u4", 0x80000001, 64 << 11), "x = 64 on a sensor of width 64"),
+    "raw: evt3 beside the sensor": (
+        HEADER3 + words("<u2", 0x8001, 0x6000, 0x0030, 0x2001),
+        "y = 48 on a sensor of height",
+    ),
+    "raw: evt3 vectors that never end": (
+        HEADER3 + words("<u2", 0x8001, 0x6000, 0x0001, 0x3000, *[0x4001] * 6000),
+        "on a sensor of width 64",
+    ),
+    "raw: evt3 without a time": (HEADER3 + words("<u2", 0x0001, 0x2001), "holds no events"),
+    "raw: evt3 without a row": (HEADER3 + words("<u2", 0x8001, 0x6000, 0x2001), "holds no events"),
+    "raw: evt2 read as evt3": (HEADER3 + evt2(ROWS).split(b"% end\n")[1], ""),
+    "raw: empty": (b"", "the file is empty"),
+    "raw: unknown": (b"RIFF....WAVE", "its format is not known"),
+    "bag: with its magic alone": (b"#ROSBAG V2.0\n", "not a readable bag"),
+    "bag: of version 1": (b"#ROSBAG V1.2\n", "not a readable bag"),
+    "npz: missing": (None, "there is no such file"),
+    "npy: missing": (None, "there is no such file"),
+    "npz: of text": (b"x y", "not a readable .npz file"),
+    "npy: of text": (b"x y", "not a readable .npy file"),
+    "npy: empty": (b"", "not a readable .npy file"),
+    "npz: truncated npz": (
+        lambda path: (np.savez(path, **made_columns()), path.write_bytes(path.read_bytes()[:900])),
+        "not a readable .npz file",
+    ),
+    "npz: damaged npz": (
+        lambda path: (
+            np.savez_compressed(path, **made_columns()),
+            path.write_bytes(path.read_bytes()[:200] + b"?" * 100 + path.read_bytes()[300:]),
+        ),
+        "not a readable array x",
+    ),
+    "npz: array of objects": (replaced("x", np.array([object] * N)), "not a readable array x .it holds Python objects"),
+    "npz: no events in npz": (replaced("p", None), "its arrays are t, x, y; it must hold x, y, t and p"),
+    "npz: empty stream": (
+        lambda path: np.savez(path, **{name: np.zeros(0) for name in "xytp"}),
+        "the file holds no events",
+    ),
+    "npz: matrix as column": (replaced("x", np.zeros((N, 2), int)), r"x has shape \(300, 2\)"),
+    "npy: three columns": (lambda path: np.save(path, np.zeros((9, 3))), "has 3 columns; column 3 must hold p"),
+    "npy: one column": (lambda path: np.save(path, np.zeros(9)), r"has shape \(9,\)"),
+    "npy: records without p": (
+        lambda path: np.save(path, np.zeros(9, [("x", "u2"), ("y", "u2"), ("t", "i8")])),
+        "have no field p",
+    ),
+    "npz: words": (replaced("x", np.array(["one"] * N)), "column x has type <U3; store numbers"),
+    "npz: fractional pixel": (replaced("y", ZEROS + 0.5), "event 0 has y = 0.5; it must be a whole number"),
+    "npz: three polarities": (replaced("p", np.arange(N) % 3 - 1), "event 1 has p = 0; .* -1 beside it"),
+    "npz: NaN time": (replaced("t", np.full(N, np.nan)), "event 0 has t = nan; check the unit"),
+    "npz: unsorted": (replaced("t", T[::-1].copy()), "sort the events by time"),
+    "h5: missing": (None, "there is no such file"),
+    "h5: of text": (b"x y", "not a readable HDF5 file"),
+    "h5: no events in HDF5": (replaced("p", None), "it holds t, x, y; events must be in"),
+    "h5: without anything": (lambda path: h5py.File(path, "w").close(), "it holds nothing"),
+    "h5: short column": (replaced("x", np.zeros(3, int)), "its columns have lengths"),
+    "h5: pixel outside": (replaced("x", ZEROS + WIDTH), "event 0 has x = 60; it must be a whole number below 60"),
+    "h5: negative pixel": (replaced("y", ZEROS - 1), "event 0 has y = -1"),
+    "h5: polarity 2": (replaced("p", ZEROS + 2), "event 0 has p = 2; polarities are 0 and 1, or -1 and 1"),
+    "h5: huge time": (replaced("t", T * 1_000), r"event 0 has t = 1\.6e\+18; check the unit"),
+    "h5: offset is a word": (
+        lambda path: (write_dsec(path, made_columns()), set_offset(path, "late")),
+        "its t_offset is .*late.*; store an integer",
+    ),
+    "h5: ECF": (lambda path: write_with_filter(path, 0x8ECF), "ECF filter: .* set HDF5_PLUGIN_PATH to its folder"),
+    "h5: another filter": (lambda path: write_with_filter(path, 40_000), r"pip install 'aenerf-ns\[hdf5-"),
+    "csv: missing": (None, "there is no such file"),
+    "csv: empty": (b"", "its first line is ''; it must name the columns"),
+    "csv: without header": (b"1,2,3,1\n", "first line is '1,2,3,1'; it must name"),
+    "csv: without events": (b"x,y,t,p\n", "the file holds no events"),
+    "csv: with a word": (b"x,y,t,p\n1,2,now,1\n", "line 2 has t = now; write"),
+    "csv: with five": (b"x,y,t,p\n1,2,3,1,9\n", "has 5 fields; .* the 4: x y t p"),
+    "csv: with an empty field": (b"x,y,t,p\n1,,3,1\n", "line 2 has y = nothing"),
+    "csv: with blanks between": (b"x,y,t,p\n1,2 3,4,1\n", "line 2 has y = 2 3;"),
+    "csv: with three polarities": (
+        b"x,y,t,p\n1,2,3,-1\n#\n1,2,3,0\n",
+        "line 4 has p = 0; there are events of polarity -1",
+    ),
+    "txt: with a huge time": (b"1e300 1 2 1\n", "line 1 has t = 9.2.*; check"),
+    "txt: with a fault later": (b"# made\n" + b"1 1 2 1\n" * 50 + b"1 1 two 1\n1 1 2 1\n", "line 52 has y = two"),
+    "txt: with a bad pixel later": (
+        b"# made\n" + b"1 1 2 1\n" * 50 + b"\n1 60 2 1\n1 1 2 1\n",
+        "line 53 has x = 60; it must be a whole number below 60",
+    ),
+    "txt: with a bad end": (b"1 1 2 1\n" * 90 + b"1 1 2\n", "the last line has 3"),
+    "txt: without line ends": (b"1 1 2 1 " * 90, "line 1 has 360 fields"),
+    "txt: of zeros": (bytes(5000), "line 1 has 1 fields"),
+}
+READERS: dict[str, Callable[..., EventFile]] = {
+    "npz": open_array_events,
+    "npy": open_array_events,
+    "h5": open_hdf5_events,
+    "csv": CsvEventFile,
+    "txt": TextEventFile,
+}
+
+
+@pytest.mark.parametrize("name", FAULTS, ids=lambda name: name.replace(" ", "_"))
+def test_a_malformed_event_file_is_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content, message = FAULTS[name]
+    suffix = name.split(":")[0]
+    path = tmp_path / f"e.{suffix}"
+    if suffix == "bag":
+        pytest.importorskip("rosbags")
+    monkeypatch.setattr(event_text, "BLOCK", 100)
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        content(path)
+    with pytest.raises(DataError, match=message) as error:
+        attempt(READERS[suffix](path, WIDTH, HEIGHT) if suffix in READERS else open_event_file(path))
+    assert_one_line(error.value, path)
