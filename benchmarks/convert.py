@@ -72,7 +72,7 @@ def measure(what: str, folder: Path) -> dict[str, float]:
     if what != "nothing":
         output = folder.parent / what
         Convert(folder, output, **_VARIANTS[what]).main()
-        written = Hdf5EventFile(output / "events.h5", _WIDTH, _HEIGHT).count()
+        written = Hdf5EventFile(output / "events.h5", _WIDTH, _HEIGHT).count() or 0
     return {
         "seconds": time.perf_counter() - wall,
         "cpu_seconds": time.process_time() - cpu,

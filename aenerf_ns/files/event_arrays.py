@@ -58,9 +58,7 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
     a matrix whose first four columns are x, y, t and p, or records with fields of these names.
 
     Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        path, width, height: see :class:`EventFile`.
         time_unit: of the times. By default whole numbers are microseconds and decimals seconds.
 
     Raises:

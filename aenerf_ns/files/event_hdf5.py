@@ -156,9 +156,7 @@ def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | 
     """Open an HDF5 file of events. Its content tells the format: native, DSEC, TUM-VIE, EDS, Prophesee or PAEv3D.
 
     Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        path, width, height: see :class:`EventFile`.
         time_unit: of the times, where the format states none.
 
     Raises:

@@ -50,9 +50,7 @@ class EventTableFile(EventReader):
     """Read a file whose arrays hold events as an :class:`EventLayout` says. Formats implement :meth:`open_arrays`.
 
     Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        path, width, height: see :class:`EventFile`.
         layout: where the columns are.
         time_unit: of the times, in place of the unit of the layout.
     """

@@ -175,9 +175,7 @@ class TextEventFile(_EventLines):
     """Read events.txt: lines of t in seconds, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017).
 
     Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        path, width, height: see :class:`EventFile`.
         size_remedy: what to do about a pixel outside the sensor.
     """
 
@@ -207,9 +205,7 @@ class CsvEventFile(_EventLines):
     """Read comma-separated values. The first line names the columns in any order, x, y, t and p among them.
 
     Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        path, width, height: see :class:`EventFile`.
         time_unit: of the times. By default whole numbers are microseconds and decimals seconds.
     """
 

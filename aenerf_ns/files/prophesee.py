@@ -103,8 +103,7 @@ class PropheseeRawFile(EventReader):
     Args:
         path: the file.
         header: its header.
-        width: pixel columns of the sensor; needed where the header does not state them.
-        height: pixel rows of the sensor; needed where the header does not state them.
+        width, height: size of the sensor in pixels; None where the header states it.
 
     Raises:
         DataError: the encoding is not one that is read, or a size is not known.
@@ -112,9 +111,7 @@ class PropheseeRawFile(EventReader):
 
     kind = "RAW file"
 
-    def __init__(
-        self, path: Path, header: PropheseeHeader, width: int | None = None, height: int | None = None
-    ) -> None:
+    def __init__(self, path: Path, header: PropheseeHeader, width: int | None, height: int | None) -> None:
         super().__init__(path, *resolve_sensor_size(path, header.size, width, height))
         self._encoding = _encoding_name(path, header)
         self._begin = header.end
@@ -168,8 +165,7 @@ class PropheseeDatFile(EventReader):
     Args:
         path: the file.
         header: its header.
-        width: pixel columns of the sensor; needed where the header does not state them.
-        height: pixel rows of the sensor; needed where the header does not state them.
+        width, height: size of the sensor in pixels; None where the header states it.
 
     Raises:
         DataError: the version or the records are not those that are read, or a size is not known.
@@ -177,9 +173,7 @@ class PropheseeDatFile(EventReader):
 
     kind = "DAT file"
 
-    def __init__(
-        self, path: Path, header: PropheseeHeader, width: int | None = None, height: int | None = None
-    ) -> None:
+    def __init__(self, path: Path, header: PropheseeHeader, width: int | None, height: int | None) -> None:
         super().__init__(path, *resolve_sensor_size(path, header.size, width, height))
         version = header.fields.get("version", "none")
         if version != "2":

@@ -1,0 +1,54 @@
+"""The limits within which files are read."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import pytest
+
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.limits import bounded, bounded_items
+
+LIMITS = (resource.RLIMIT_DATA, resource.RLIMIT_FSIZE)
+
+
+def allocate(path: Path) -> object:
+    return bytearray(1 << 30)
+
+
+def write(path: Path) -> object:
+    with (path.parent / "copy").open("wb") as file:
+        for _ in range(40):
+            file.write(bytes(1 << 23))
+    return None
+
+
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        (allocate, "far more memory"),
+        (write, "not a readable thing .File too large"),
+        (lambda path: {}["key"], "not a readable thing .'key'"),
+        (lambda path: (path.parent / "none").read_bytes(), "none: there is no such file"),
+    ],
+)
+def test_what_goes_wrong_is_one_line_and_limits_end(read: object, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "small"
+    path.write_text("x")
+    before = [resource.getrlimit(kind) for kind in LIMITS]
+    with pytest.raises(DataError, match=message), bounded(path, "thing"):
+        read(path)  # type: ignore[operator]
+    assert [resource.getrlimit(kind) for kind in LIMITS] == before
+
+
+def test_limits_hold_while_an_item_is_read_only(tmp_path: Path) -> None:
+    path = tmp_path / "small"
+    path.write_text("x")
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    inside = []
+    items = (inside.append(resource.getrlimit(resource.RLIMIT_DATA)) or i for i in range(2))
+    for _ in bounded_items(items, path, "thing"):
+        assert resource.getrlimit(resource.RLIMIT_DATA) == before
+    assert len(inside) == 2
+    assert before not in inside
