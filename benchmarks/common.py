@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from aenerf_ns.training.provenance import environment
+from aenerf_ns.training.provenance import provenance
 from benchmarks.owned import owned
 
 _Arguments = ParamSpec("_Arguments")
@@ -103,10 +103,10 @@ def peak_mib() -> float:
 
 def write_result(output: Path, result: dict[str, Any], show: bool = True) -> None:
     """Write a result with its machine, versions, commit and command as JSON, and print the result unless not shown."""
-    output.write_text(json.dumps({**result, **_environment()}, indent=2) + "\n", "utf8")
+    output.write_text(json.dumps({**result, **_provenance()}, indent=2) + "\n", "utf8")
     if show:
         print(json.dumps(result, indent=2), flush=True)
 
 
 # Looked up once: a result that was just written into the checkout would count as a change to the commit.
-_environment = functools.cache(environment)
+_provenance = functools.cache(provenance)

@@ -17,7 +17,7 @@ _PACKAGES = (
 """The packages that a training uses, or that the bytes of a simulated dataset depend on."""
 
 
-def environment() -> dict[str, Any]:
+def provenance() -> dict[str, Any]:
     """Return the machine, the versions, the commit and the command of this process.
 
     The commit is None outside a checkout of this project, or without git. It ends in ``+changes`` where files differ

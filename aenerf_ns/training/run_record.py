@@ -18,7 +18,7 @@ from torch import Tensor
 
 from aenerf_ns.atomic_write import atomic_write
 from aenerf_ns.training.framework import is_logged
-from aenerf_ns.training.provenance import environment
+from aenerf_ns.training.provenance import provenance
 
 RUN_FILE, SCALARS_FILE = "run.json", "scalars.csv"
 """The files' names in the folder of a run."""
@@ -43,7 +43,7 @@ class RunRecord:
         self._path = folder / RUN_FILE
         self._began = time.monotonic()
         self._record: dict[str, Any] = {
-            **environment(),
+            **provenance(),
             "seed": seed,
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
             "first_step": steps.start,

@@ -29,7 +29,7 @@ from filelock import FileLock, Timeout
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.training.provenance import environment
+from aenerf_ns.training.provenance import provenance
 from benchmarks.common import script
 from benchmarks.owned import owned
 from benchmarks.paper.plan import CEILING, Dataset, Run, digest, scene_name
@@ -78,7 +78,7 @@ class Runner:
 
     def _make(self, run: Run) -> dict[str, Any]:
         # Taken first, because the checkout may change during the run.
-        origin = environment()
+        origin = provenance()
         data = self._dataset(run.dataset)
         # A training that was killed leaves files.
         shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)

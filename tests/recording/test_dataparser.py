@@ -88,10 +88,13 @@ def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> N
 def test_opening_again_with_the_resolved_window_needs_no_events(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     config = NativeDataParserConfig(data=folder)
-    before = parse(config)
-    assert config.start_time_ns is not None
+    parser = config.setup()
+    before = parser.get_dataparser_outputs("train")
+    resolved = parser.resolved_config()
+    # The given configuration stays as it was.
+    assert (config.start_time_ns, resolved.start_time_ns) == (None, before.metadata[SCENE_KEY].window.start)
     (folder / "events.h5").unlink()
-    after = parse(config)
+    after = parse(resolved)
     assert torch.equal(before.cameras.camera_to_worlds, after.cameras.camera_to_worlds)
     # The viewer shows plain pictures then.
     assert EventDataset(after).get_numpy_image(10).std() == 0

@@ -131,7 +131,6 @@ def test_the_last_step_is_diagnosed_and_the_checkpoint_keeps_it(
     pipeline = make_pipeline(tmp_path / "made", "val", pose_correction="spline")
     config = SimpleNamespace(
         max_num_iterations=20, schedule_length=20, steps_per_save=1000, logging=SimpleNamespace(steps_per_log=10),
-        save_config=lambda: None,
     )  # fmt: skip
     trainer = SimpleNamespace(
         local_rank=0, _start_step=100, config=config, optimizers=SimpleNamespace(optimizers={}, parameters={}),
