@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -16,8 +17,6 @@ from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
 def _make_config() -> AENeRFTrainerConfig:
     config = deepcopy(aenerf.config)
-    config.method_name = "aenerf-mlp"
-    config.max_num_iterations = 50000
     # 2048 rays with 32 samples of the field: the paper's 65,536 samples.
     data = config.pipeline.datamanager
     data.train_num_rays_per_batch = data.eval_num_rays_per_batch = 2048
@@ -36,7 +35,8 @@ def _make_config() -> AENeRFTrainerConfig:
     config.optimizers["camera_opt"]["optimizer"] = FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15)
     # Every ray of a batch has gradients for all weights of the poses' network.
     config.gradient_accumulation_steps = {"camera_opt": 1}
-    return config
+    # Not set in place: a new configuration gives the schedules its number of steps.
+    return replace(config, method_name="aenerf-mlp", max_num_iterations=50000)
 
 
 aenerf_mlp = MethodSpecification(
