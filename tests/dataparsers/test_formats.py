@@ -25,14 +25,15 @@ from helpers.published_datasets import (
     write_tum_vie,
 )
 from helpers.small_datasets import AS_RECORDED, parse
+from nerfstudio.configs.base_config import MachineConfig
 
 from aenerf_ns.dataparsers.formats import FORMATS, AutomaticDataParserConfig, recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
+from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.training.datamanager import EventDataManagerConfig
-from aenerf_ns.training.pipeline import AENeRFPipelineConfig
 
 
 @pytest.fixture(params=[*WRITERS, "tum-vie-data"])
@@ -130,8 +131,9 @@ def test_a_run_opens_without_events_and_in_another_folder(
     monkeypatch.chdir(tmp_path)
     config = EventDataManagerConfig(dataparser=AutomaticDataParserConfig(data=Path(truth.data.name)))
     manager = config.setup(device="cpu", test_mode="inference", world_size=1, local_rank=0)
-    assert type(config.dataparser) is type(FORMATS[name])
-    saved = yaml.dump(config)
+    resolved = manager.resolved_config()
+    assert type(resolved.dataparser) is type(FORMATS[name])
+    saved = yaml.dump(resolved)
     events = truth.data / EVENTS[name]
     shutil.rmtree(events) if events.is_dir() else events.unlink()
     (tmp_path / "elsewhere").mkdir()
@@ -172,7 +174,7 @@ def test_errors_say_that_the_format_was_guessed(tmp_path: Path) -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_missing_gpu_is_one_line() -> None:
     with pytest.raises(SystemExit, match=r"^Error: .*no GPU can be used; .*aenerf-small --machine.device-type cpu"):
-        AENeRFPipelineConfig().setup(device="cuda:0")
+        replace(aenerf.config, machine=MachineConfig(device_type="cuda")).save_config()
 
 
 def test_estimated_poses_may_take_the_place_of_the_datasets(written: tuple[str, Truth], tmp_path: Path) -> None:

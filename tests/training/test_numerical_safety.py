@@ -240,7 +240,9 @@ def make_pipeline(model: AENeRFModel, rays: RayBundle, mixed: bool = False) -> t
     pipeline._model = model
     pipeline.training_state = TrainingState()
     batches = SimpleNamespace(
-        next_train=lambda step: (rays, make_batch(len(rays) // 2)), get_training_callbacks=lambda attributes: []
+        next_train=lambda step: (rays, make_batch(len(rays) // 2)),
+        get_training_callbacks=lambda attributes: [],
+        train_dataset=SimpleNamespace(scene=None),
     )
     pipeline.__dict__["datamanager"] = batches
     optimizer = torch.optim.Adam(model.parameters())
