@@ -35,7 +35,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     return zipfile.ZipFile(next(folder.glob("*.whl")))
 
 
-def test_the_wheel_holds_the_package_and_nothing_generic(wheel: zipfile.ZipFile) -> None:
+def test_wheel_holds_the_package_only(wheel: zipfile.ZipFile) -> None:
     names = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert {name.split("/")[0] for name in names} == {"aenerf_ns"}
     sources = {
@@ -121,7 +121,7 @@ def test_importing_the_package_costs_nothing() -> None:
     assert done.stdout.strip() == "set()"
 
 
-def test_the_registered_modules_leave_the_heaviest_imports_for_later() -> None:
+def test_registered_modules_defer_heavy_imports() -> None:
     # What the framework itself imports at every command is no cost of ours.
     code = (
         "import sys, nerfstudio.configs.method_configs as framework, aenerf_ns.files.open;"

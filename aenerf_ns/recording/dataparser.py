@@ -83,7 +83,7 @@ class EventDataParser(DataParser):
         except DataError as error:
             if self.guessed_format is None:
                 raise
-            hint = f"the format {self.guessed_format} was guessed: where it is another, name it before --data"
+            hint = f"the format {self.guessed_format} was guessed: where it is another, name it, in aenerf as --format"
             raise DataError(error.source, error.problem, f"{error.remedy} ({hint})") from None
         self._check_lens(recording.event_camera, "event camera")
         if any(recording.reference_views.values()):

@@ -91,7 +91,7 @@ def test_dataset_is_positional_or_named(
     assert {name: getattr(command, name) for name in values} == values
 
 
-def test_named_dataset_may_follow_options_of_the_format(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_named_dataset_may_follow_format_options(monkeypatch: pytest.MonkeyPatch) -> None:
     command = parse("check --format-options width=3 --data F", monkeypatch)
     assert (command.data, command.format_options) == (Path("F"), ("width=3",))
 

@@ -35,7 +35,7 @@ def opened(folder: Path) -> Recording:
     return NativeDataParserConfig(data=folder).setup().recording
 
 
-def test_images_are_written_at_the_estimated_poses_of_their_times(data: Path, tmp_path: Path) -> None:
+def test_images_have_the_poses_of_their_times(data: Path, tmp_path: Path) -> None:
     Reconstruct(data, tmp_path / "out").main()
     before, after = opened(data), opened(tmp_path / "out")
     # 200 events in batches of int(0.35 * 6 * 4).
@@ -64,7 +64,7 @@ def test_images_are_written_at_the_estimated_poses_of_their_times(data: Path, tm
     assert not list(tmp_path.glob(".*"))
 
 
-def test_the_framework_reads_the_folder_and_the_video_shows_it(data: Path, tmp_path: Path) -> None:
+def test_nerfstudio_reads_the_folder(data: Path, tmp_path: Path) -> None:
     Reconstruct(data, tmp_path / "out").main()
     as_is = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
     config = NerfstudioDataParserConfig(data=tmp_path / "out", **as_is)
@@ -82,7 +82,7 @@ def test_the_framework_reads_the_folder_and_the_video_shows_it(data: Path, tmp_p
 
 
 @pytest.mark.parametrize(("name", "network"), [("e2vid", E2VID), ("firenet", FireNet)])
-def test_a_network_reconstructs_with_the_weights_of_a_file(
+def test_network_reconstructs_with_given_weights(
     name: str, network: type[E2VID] | type[FireNet], data: Path, tmp_path: Path
 ) -> None:
     torch.manual_seed(0)
@@ -125,7 +125,7 @@ def test_images_of_another_camera_are_left_out(data: Path, tmp_path: Path, capsy
     assert "of another camera" in capsys.readouterr().out
 
 
-def test_what_cannot_be_reconstructed_ends_with_one_line_and_leaves_nothing(data: Path, tmp_path: Path) -> None:
+def test_faults_leave_nothing(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     weights = tmp_path / "weights.pth.tar"
     faults = [

@@ -81,7 +81,7 @@ def times_of(recording: Recording) -> NDArray[np.int64]:
     return np.concatenate([chunk.t for chunk in recording.event_file.chunks()])
 
 
-def test_the_command_makes_a_dataset_of_a_video_with_its_poses(
+def test_video_with_poses_becomes_a_dataset(
     frames: Path, poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     output = tmp_path / "dataset"
@@ -156,9 +156,7 @@ def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: 
     assert NativeDataParserConfig(data=tmp_path / "given").setup().recording.event_camera.fy == 21.0
 
 
-def test_without_poses_a_recording_is_written_that_only_lacks_them(
-    frames: Path, camchain: Path, tmp_path: Path
-) -> None:
+def test_video_without_poses_becomes_a_recording(frames: Path, camchain: Path, tmp_path: Path) -> None:
     output = tmp_path / "recording"
     printed = simulate(output, video=frames, calibration=camchain, event_camera="cam0", train_images=1, test_views=3)
     assert "10 images, no poses" in printed
@@ -203,7 +201,7 @@ LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
         ((), {"frame_rate": 0.0}, "--frame-rate: 0.0 is out of range"),
     ],
 )
-def test_options_that_contradict_each_other_are_refused(
+def test_contradicting_options_are_refused(
     files: tuple[str, ...],
     options: dict[str, Any],
     message: str,
@@ -226,7 +224,7 @@ def test_poses_of_another_clock_are_refused(frames: Path, tmp_path: Path) -> Non
         simulate(tmp_path / "out", video=frames, trajectory=tmp_path / "late.txt", **LENS)
 
 
-def test_frames_larger_than_any_event_sensor_are_refused(tmp_path: Path) -> None:
+def test_too_large_frames_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "large"
     folder.mkdir()
     for index in range(2):

@@ -70,7 +70,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
 @pytest.mark.parametrize("command", COMMANDS)
-def test_what_could_run_is_refused_before_the_file_is_opened(
+def test_foreign_names_are_refused(
     command: Callable[..., Evaluate], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

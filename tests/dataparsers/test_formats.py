@@ -94,7 +94,7 @@ def test_native_datasets_and_ecd_are_recognized(tmp_path: Path, slider_depth: Pa
     assert recognize(slider_depth) == "ecd-data"
 
 
-def test_converted_to_the_native_format_nothing_changes(written: tuple[str, Truth], tmp_path: Path) -> None:
+def test_conversion_to_native_changes_nothing(written: tuple[str, Truth], tmp_path: Path) -> None:
     name, truth = written
     config = config_of(name, truth.data, **AS_RECORDED)
     folder = convert_to_native(recording_of(config), tmp_path / "native")
@@ -124,7 +124,7 @@ EVENTS = {
 }
 
 
-def test_a_run_opens_without_events_and_in_another_folder(
+def test_run_opens_without_events_and_elsewhere(
     written: tuple[str, Truth], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name, truth = written
@@ -146,7 +146,7 @@ def test_a_run_opens_without_events_and_in_another_folder(
         assert before == after
 
 
-def test_a_folder_of_no_known_format_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_unknown_format_names_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(
         DataError, match=r"no known format of recordings; looked for .*raw_events.npz.*H5_Files"
     ) as error:
@@ -164,7 +164,7 @@ def test_errors_say_that_the_format_was_guessed(tmp_path: Path) -> None:
     # Another recording's folders, of the names that PAEv3D has.
     (tmp_path / "H5_Files" / "mine").mkdir(parents=True)
     guessed = AutomaticDataParserConfig(data=tmp_path).setup()
-    with pytest.raises(DataError, match=r"Intrinsics: .*the format paev3d-data was guessed: .* name it before --data"):
+    with pytest.raises(DataError, match=r"Intrinsics: .*the format paev3d-data was guessed: .* --format"):
         guessed.get_dataparser_outputs("train")
     with pytest.raises(DataError) as error:
         config_of("paev3d-data", tmp_path).setup().get_dataparser_outputs("train")
@@ -177,7 +177,7 @@ def test_a_missing_gpu_is_one_line() -> None:
         replace(aenerf.config, machine=MachineConfig(device_type="cuda")).save_config()
 
 
-def test_estimated_poses_may_take_the_place_of_the_datasets(written: tuple[str, Truth], tmp_path: Path) -> None:
+def test_estimated_poses_may_be_given(written: tuple[str, Truth], tmp_path: Path) -> None:
     name, truth = written
     other = truth.poses.copy()
     other[:, :3, 3] += 0.01
