@@ -46,14 +46,20 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def all_events(recording: Recording) -> EventStream:
-    chunks = list(recording.event_file.chunks())
-    columns = (np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in ("x", "y", "t", "p"))
-    return EventStream(*columns, chunks[0].width, chunks[0].height)
+    return EventStream.concatenate(list(recording.event_file.chunks()))
+
+
+def open_native(folder: Path) -> Recording:
+    return NativeDataParserConfig(data=folder).setup().read_recording()
+
+
+def open_ecd(folder: Path) -> Recording:
+    return EcdDataParserConfig(data=folder).setup().read_recording()
 
 
 @pytest.fixture(scope="module")
 def simulated(room: Path) -> tuple[Recording, EventStream]:
-    recording = NativeDataParserConfig(data=room).setup().read_recording()
+    recording = open_native(room)
     return recording, all_events(recording).between(0, PART)
 
 
@@ -109,10 +115,9 @@ MISTAKES = {
     "the pixels are mirrored in y": with_pixels(lambda events: (events.x, events.height - 1 - events.y)),
     "x and y of the events are swapped": with_pixels(lambda events: (events.y, events.x)),
 }
-CLOCKS = {"ahead of": 0.2, "behind": -0.2}
 
 
-def test_nothing_is_named_where_nothing_is_wrong(simulated: tuple[Recording, EventStream]) -> None:
+def test_name_nothing_where_nothing_is_wrong(simulated: tuple[Recording, EventStream]) -> None:
     recording, events = simulated
     warped = WarpedEvents([events], recording.trajectory, recording.event_camera)
     assert warped.compare_without_motion().is_clearly_worse
@@ -122,29 +127,29 @@ def test_nothing_is_named_where_nothing_is_wrong(simulated: tuple[Recording, Eve
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_planted_mistake_is_named(mistake: str, simulated: tuple[Recording, EventStream]) -> None:
+def test_name_a_planted_mistake(mistake: str, simulated: tuple[Recording, EventStream]) -> None:
     recording, events = simulated
     found = named(*MISTAKES[mistake](events, recording.trajectory), recording)
     assert found[:1] == [mistake]
 
 
-@pytest.mark.parametrize("side", CLOCKS)
-def test_a_shifted_clock_is_named_and_measured(side: str, simulated: tuple[Recording, EventStream]) -> None:
+@pytest.mark.parametrize(("side", "seconds"), [("ahead of", 0.2), ("behind", -0.2)])
+def test_name_and_measure_a_shifted_clock(side: str, seconds: float, simulated: tuple[Recording, EventStream]) -> None:
     recording, events = simulated
-    best, *_ = named(*shifted(CLOCKS[side])(events, recording.trajectory), recording)
-    seconds = best.removeprefix("the clock of the poses is ").removesuffix(f" s {side} that of the events")
-    assert float(seconds) == pytest.approx(0.2, abs=0.05)
+    best, *_ = named(*shifted(seconds)(events, recording.trajectory), recording)
+    found = best.removeprefix("the clock of the poses is ").removesuffix(f" s {side} that of the events")
+    assert float(found) == pytest.approx(0.2, abs=0.05)
 
 
-def test_a_short_clock_offset_comes_with_the_option_that_learns_the_rest() -> None:
+def test_clock_remedy_names_the_learning_option() -> None:
     for offset, option in ((20_000_000, "clock-offset 0.02"), (-50_000_000, "clock-offset -0.05"), (2 * 10**9, None)):
         remedy = clock_hypothesis(offset).remedy
         assert ("clock-offset" in remedy) == (option is not None)
         assert option is None or option in remedy
 
 
-def test_the_real_recording_prefers_its_poses(slider_depth: Path) -> None:
-    recording = EcdDataParserConfig(data=slider_depth).setup().read_recording()
+def test_real_recording_prefers_its_poses(slider_depth: Path) -> None:
+    recording = open_ecd(slider_depth)
     trajectory = recording.trajectory
     events = all_events(recording).between(trajectory.start, trajectory.end)
     warped = WarpedEvents([events], trajectory, recording.event_camera)
@@ -160,8 +165,8 @@ def test_the_real_recording_prefers_its_poses(slider_depth: Path) -> None:
         assert late.is_clearly_worse
 
 
-def test_mistakes_planted_in_the_real_recording_are_named(slider_depth: Path) -> None:
-    recording = EcdDataParserConfig(data=slider_depth).setup().read_recording()
+def test_name_mistakes_in_the_real_recording(slider_depth: Path) -> None:
+    recording = open_ecd(slider_depth)
     events = all_events(recording)
     for name in ("the poses are world-to-camera", "the camera axes x and z are flipped"):
         assert name in named(*MISTAKES[name](events, recording.trajectory), recording)
@@ -205,9 +210,8 @@ def random_events(events: EventStream, rng: np.random.Generator) -> EventStream:
 
 
 def assert_noise_is_named(folder: Path, whole: Path, change: Order) -> None:
-    """Check a native data set whose events are in another order."""
-    recording = NativeDataParserConfig(data=whole).setup().read_recording()
-    rewrite(folder, change(all_events(recording), np.random.default_rng(0)))
+    """Check a native dataset whose events are in another order."""
+    rewrite(folder, change(all_events(open_native(whole)), np.random.default_rng(0)))
     status, output = run(folder)
     assert status == 1, output
     assert "hardly sharper than the same events in a random order" in output
@@ -215,13 +219,13 @@ def assert_noise_is_named(folder: Path, whole: Path, change: Order) -> None:
 
 
 @pytest.mark.parametrize("change", [*SHUFFLES.values(), random_events], ids=[*SHUFFLES, "random"])
-def test_noise_is_not_blessed(change: Order, room: Path, shorter: Path) -> None:
+def test_reject_noise(change: Order, room: Path, shorter: Path) -> None:
     assert_noise_is_named(shorter, room, change)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [{"scene": "object"}, {"speed": "hard"}, {"scene": "shiny_object"}], ids=str)
-def test_noise_of_other_simulations_is_not_blessed(options: dict, tmp_path: Path) -> None:
+def test_reject_noise_of_other_simulations(options: dict, tmp_path: Path) -> None:
     size = {"width": 64, "height": 48, "max_displacement": 1.0}
     whole = tmp_path / "whole"
     Simulate(whole, train_images=2, validation_views=1, test_views=1, **size, **options).main()
@@ -248,9 +252,9 @@ def another_orbit(times: np.ndarray, radius: float, seed: int) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
-def test_poses_of_another_path_around_an_object_are_named(seed: int, small_object: Path, tmp_path: Path) -> None:
+def test_reject_poses_of_another_path(seed: int, small_object: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(small_object, tmp_path / "changed")
-    true = NativeDataParserConfig(data=folder).setup().read_recording().trajectory
+    true = open_native(folder).trajectory
     radius = float(true.camera_to_worlds[:, :3, 3].norm(dim=-1).mean())
     (folder / "trajectory_ground_truth.txt").unlink()
     (folder / "trajectory_estimated.txt").write_text("\n".join(another_orbit(true.times.numpy(), radius, seed)) + "\n")
@@ -273,8 +277,8 @@ def small_object(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("order", [None, *SHUFFLES], ids=["as recorded", *SHUFFLES])
-def test_the_real_recording_is_told_from_its_noise(order: str | None, slider_depth: Path, tmp_path: Path) -> None:
-    events = all_events(EcdDataParserConfig(data=slider_depth).setup().read_recording())
+def test_tell_the_real_recording_from_noise(order: str | None, slider_depth: Path, tmp_path: Path) -> None:
+    events = all_events(open_ecd(slider_depth))
     folder = shutil.copytree(slider_depth, tmp_path / "made", copy_function=link)
     (folder / "events.txt").unlink()
     kept = events if order is None else SHUFFLES[order](events, np.random.default_rng(0))
@@ -290,10 +294,10 @@ def link(source: str, target: str) -> None:
 
 
 @pytest.mark.parametrize("unit", ["milliseconds", "microseconds", "nanoseconds"])
-def test_poses_in_another_unit_are_named(unit: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_name_the_unit_of_the_pose_times(unit: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     folder = write_native(tmp_path / "made")
     factor = {"milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}[unit]
-    events = all_events(NativeDataParserConfig(data=folder).setup().read_recording())
+    events = all_events(open_native(folder))
     # Since the beginning of the recording; since 1970 no clock counts so far.
     rewrite(folder, replace(events, t=events.t - START))
     lines = (folder / "trajectory_estimated.txt").read_text().splitlines()
@@ -310,8 +314,7 @@ def test_poses_in_another_unit_are_named(unit: str, tmp_path: Path, capsys: pyte
 def shorter(room: Path, tmp_path: Path) -> Path:
     """The simulated room with a part of its events."""
     folder = shutil.copytree(room, tmp_path / "room")
-    recording = NativeDataParserConfig(data=folder).setup().read_recording()
-    rewrite(folder, all_events(recording).between(0, PART))
+    rewrite(folder, all_events(open_native(folder)).between(0, PART))
     return folder
 
 
@@ -320,11 +323,11 @@ def rewrite(folder: Path, events: EventStream) -> None:
         writer.append(events)
 
 
-def test_the_command_finds_nothing_wrong_and_draws_a_picture(shorter: Path, tmp_path: Path) -> None:
+def test_command_finds_nothing_and_draws_a_picture(shorter: Path, tmp_path: Path) -> None:
     status, output = run(shorter, picture=tmp_path / "warped.png")
     assert status == 0, output
     assert "No problems found" in output
-    count = len(all_events(NativeDataParserConfig(data=shorter).setup().read_recording()))
+    count = len(all_events(open_native(shorter)))
     assert f"Events: {count:,} in 2." in output
     assert "Events with a pose: 100.0%" in output
     # The camera is well inside a room of some metres.
@@ -334,10 +337,10 @@ def test_the_command_finds_nothing_wrong_and_draws_a_picture(shorter: Path, tmp_
         assert picture.size == (128 * 10, 480)
 
 
-def test_the_command_names_mistakes_and_remedies(shorter: Path) -> None:
+def test_command_names_mistakes_and_remedies(shorter: Path) -> None:
     path = shorter / "trajectory_estimated.txt"
     write_tum_trajectory(path, read_tum_trajectory(path).transform(torch.linalg.inv))
-    events = all_events(NativeDataParserConfig(data=shorter).setup().read_recording())
+    events = all_events(open_native(shorter))
     rng = np.random.default_rng(0)
     t = np.concatenate([events.t, np.sort(rng.integers(0, PART, 6000))])
     order = np.argsort(t, kind="stable")
@@ -354,12 +357,12 @@ def test_the_command_names_mistakes_and_remedies(shorter: Path) -> None:
     assert "(11, 7) 6," in output
 
 
-def test_the_command_reports_gaps_and_poses_that_end_early(shorter: Path) -> None:
+def test_command_reports_gaps_and_missing_poses(shorter: Path) -> None:
     path = shorter / "trajectory_estimated.txt"
     poses = read_tum_trajectory(path)
     kept = (poses.times < 200_000_000) | ((poses.times > 400_000_000) & (poses.times < 560_000_000))
     write_tum_trajectory(path, Trajectory(poses.times[kept], poses.camera_to_worlds[kept]))
-    events = all_events(NativeDataParserConfig(data=shorter).setup().read_recording())
+    events = all_events(open_native(shorter))
     one = np.ones(len(events), np.int8)
     rewrite(shorter, EventStream(events.x, events.y, events.t, one, 64, 48))
     status, output = run(shorter)
@@ -370,7 +373,7 @@ def test_the_command_reports_gaps_and_poses_that_end_early(shorter: Path) -> Non
     assert "100.0% of the events are positive" in output
 
 
-def test_the_scene_box_must_hold_what_is_seen(shorter: Path) -> None:
+def test_scene_box_must_hold_what_is_seen(shorter: Path) -> None:
     path = shorter / "transforms.json"
     meta = json.loads(path.read_text())
     for side, status in ((8.0, 0), (0.5, 1)):
@@ -390,9 +393,7 @@ def test_few_events_are_not_warped(tmp_path: Path) -> None:
     assert not picture.exists()
 
 
-def test_what_cannot_be_read_is_one_line_and_status_2(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_unreadable_data_is_one_line_and_status_2(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     folder = shutil.copytree(room, tmp_path / "broken")
     (folder / "trajectory_estimated.txt").write_text("0 0 0\n")
     for data in (tmp_path / "nothing", tmp_path, folder):

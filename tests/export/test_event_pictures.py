@@ -32,7 +32,7 @@ class Pieces(EventFile):
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000])
-def test_recorded_events_are_those_between_two_times(size: int) -> None:
+def test_sum_recorded_events(size: int) -> None:
     generator = np.random.default_rng(0)
     events = EventStream(
         generator.integers(0, 5, 200).astype(np.uint16),
@@ -53,7 +53,7 @@ def test_recorded_events_are_those_between_two_times(size: int) -> None:
         np.testing.assert_array_equal(picture, expected)
 
 
-def test_renderings_trigger_events_as_the_sensor_does() -> None:
+def test_trigger_events() -> None:
     sensor = SensorModel(positive_contrast_threshold=0.5, negative_contrast_threshold=0.25, bayer_pattern="RGGB")
     rendered = RenderedEvents(sensor, 2, 2)
     log_radiance = np.zeros((2, 2, 3))

@@ -38,7 +38,7 @@ def run(tmp_path: Path) -> TrainedRun:
     return made.eval().trained_run()
 
 
-def test_images_are_at_the_corrected_poses(run: TrainedRun) -> None:
+def test_place_images_at_corrected_poses(run: TrainedRun) -> None:
     placed = place_views(run)
     assert [(image.name, image.split) for image, _ in placed] == [
         ("val/00000.png", "val"), ("val/00001.png", "val"),
@@ -66,7 +66,7 @@ def test_images_are_at_the_corrected_poses(run: TrainedRun) -> None:
     )
 
 
-def test_points_lie_on_the_rays_of_their_pixels(run: TrainedRun) -> None:
+def test_points_lie_on_their_rays(run: TrainedRun) -> None:
     run.model.field.average_init_density = 1e3
     images = [image for image, _ in place_views(run)]
     points = observe_points(run, images, 40)
@@ -79,7 +79,7 @@ def test_points_lie_on_the_rays_of_their_pixels(run: TrainedRun) -> None:
         assert (lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy) == pytest.approx((column, row), abs=1e-3)
 
 
-def test_a_recording_without_images_has_no_cameras_to_export(tmp_path: Path) -> None:
+def test_refuse_a_recording_without_images(tmp_path: Path) -> None:
     run = make_pipeline(tmp_path / "made", "test", num_views=-1, true_world=lambda poses: poses).trained_run()
     with pytest.raises(DataError, match="it has no images; aenerf export-frames renders"):
         place_views(run)
@@ -105,7 +105,7 @@ def test_times_leave_gaps_out() -> None:
     assert times_at_rate(window, 1e-300).tolist() == [0]
 
 
-def test_a_mesh_is_in_the_units_of_the_recording(run: TrainedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_is_in_recording_units(run: TrainedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     # What a camera sees of a ball before it: the distance along the ray to its near side.
     center, radius = np.array([0.0, 0.1, 1.5]), 0.4
 

@@ -61,7 +61,7 @@ def dataset(room: SimulationScene, tmp_path_factory: pytest.TempPathFactory) -> 
     return folder, output.get()
 
 
-def test_colmap_estimates_the_poses_of_a_simulated_camera(dataset: tuple[Path, str]) -> None:
+def test_colmap_finds_simulated_poses(dataset: tuple[Path, str]) -> None:
     folder, output = dataset
     report = json.loads((folder / "poses_report.json").read_text())
     assert report["frames"] == 14
@@ -78,7 +78,7 @@ def test_colmap_estimates_the_poses_of_a_simulated_camera(dataset: tuple[Path, s
     assert "without a pose" not in output
 
 
-def test_the_estimated_poses_are_in_the_dataset_in_metres(dataset: tuple[Path, str]) -> None:
+def test_dataset_holds_metric_poses(dataset: tuple[Path, str]) -> None:
     folder, _ = dataset
     estimated, truth = (
         read_tum_trajectory(folder / f"trajectory_{name}.txt") for name in ("estimated", "ground_truth")
@@ -95,7 +95,7 @@ def test_the_estimated_poses_are_in_the_dataset_in_metres(dataset: tuple[Path, s
     assert estimated.start <= window.start < window.end == estimated.end < truth.end
 
 
-def test_colmap_estimates_the_lens_where_none_is_given(room: SimulationScene) -> None:
+def test_colmap_estimates_intrinsics(room: SimulationScene) -> None:
     camera = CameraIntrinsics(160, 120, *room.intrinsics(160, 120))
     simulation = Simulation(room, camera, SensorModel(), "easy", 14 / 25 - 0.03, 2.0, 0)
     times = simulation.frame_times(25.0, 0.003)
@@ -108,14 +108,14 @@ def test_colmap_estimates_the_lens_where_none_is_given(room: SimulationScene) ->
     assert found.camera.distortion[1:] == (0.0,) * 4
 
 
-def test_frames_without_texture_are_told() -> None:
+def test_refuse_frames_without_texture() -> None:
     frames = np.full((4, 60, 80), 128, np.uint8)
     with pytest.raises(DataError, match=r"^flat: COLMAP places none of 4 frames: they have 0 .*; .*textured") as told:
         estimate_poses(frames, np.arange(4) * FRAME, CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0), "flat")
     assert "\n" not in str(told.value)
 
 
-def test_unusable_frames_are_told(tmp_path: Path) -> None:
+def test_refuse_unusable_frames(tmp_path: Path) -> None:
     camera = CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
     frames = np.full((2, 60, 80), 128, np.uint8)
     for times, text in (([0], "1 frames"), ([5, 5], "frame 1 is not after")):
@@ -124,12 +124,17 @@ def test_unusable_frames_are_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="video, frame 0: the frame has 60 x 80 pixels"):
         estimate_poses(frames.transpose(0, 2, 1), [0, 1], camera, "video")
     Image.fromarray(frames[0].astype(np.uint16)).save(tmp_path / "deep.png")
-    with pytest.raises(DataError, match=r"deep\.png: the image is of PIL's mode I;16"):
+    with pytest.raises(DataError, match=r"deep\.png: .*mode I;16"):
         estimate_poses([tmp_path / "deep.png"] * 2, [0, 1], camera, "video")
+    whole, cut = tmp_path / "whole.png", tmp_path / "cut.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (60, 80), np.uint8)).save(whole)
+    cut.write_bytes(whole.read_bytes()[:-100])
+    with pytest.raises(DataError, match=r"cut\.png: not a PNG or JPEG image"):
+        estimate_poses([whole, cut], [0, 1], camera, "video")
 
 
 @pytest.mark.parametrize("pattern", ["", "RGGB"])
-def test_a_blurred_frame_is_the_mean_of_sharp_ones_in_linear_light(room: SimulationScene, pattern: str) -> None:
+def test_blur_averages_linear_light(room: SimulationScene, pattern: str) -> None:
     camera = CameraIntrinsics(64, 48, *room.intrinsics(64, 48))
     simulation = Simulation(room, camera, SensorModel(bayer_pattern=pattern), "hard", 0.5, 0.5, 0)
     time, exposure, steps = 100_000_000, 0.04, 64
@@ -149,7 +154,7 @@ def test_a_blurred_frame_is_the_mean_of_sharp_ones_in_linear_light(room: Simulat
     assert np.abs(light(frame) - light(sharp[steps // 2])).mean() > 0.01
 
 
-def test_frames_are_taken_all_along_the_path(room: SimulationScene) -> None:
+def test_frame_times_span_the_path(room: SimulationScene) -> None:
     camera = CameraIntrinsics(16, 12, *room.intrinsics(16, 12))
     simulation = Simulation(room, camera, SensorModel(), "easy", 0.41, 2.0, 0)
     assert simulation.frame_times(25, 0.01).tolist() == [5_000_000 + FRAME * k for k in range(11)]
@@ -172,7 +177,7 @@ def truth() -> torch.Tensor:
     return torch.cat([rotations, positions[..., None]], -1)
 
 
-def test_the_metric_world_is_found_exactly(truth: torch.Tensor) -> None:
+def test_find_the_metric_world(truth: torch.Tensor) -> None:
     rotation = rotation_from_vector(torch.tensor([0.4, -1.1, 2.0], dtype=torch.float64))
     shift = torch.tensor([3.0, -5, 8], dtype=torch.float64)
     elsewhere = Similarity(torch.tensor(0.037, dtype=torch.float64), rotation, shift)(truth)
@@ -182,7 +187,7 @@ def test_the_metric_world_is_found_exactly(truth: torch.Tensor) -> None:
     assert max(errors.values()) < 1e-8
 
 
-def test_misplaced_and_flipped_frames_are_counted_and_kept(truth: torch.Tensor) -> None:
+def test_count_misplaced_and_flipped_frames(truth: torch.Tensor) -> None:
     poses = truth.clone()
     # The last third looks the other way, one frame is turned by 8 degrees, one stands a unit aside.
     for index, vector in ((slice(28, 40), [0, torch.pi * 0.9, 0]), (20, [np.radians(8), 0, 0])):
@@ -202,7 +207,7 @@ def test_misplaced_and_flipped_frames_are_counted_and_kept(truth: torch.Tensor) 
     assert errors["rotation_error_degrees"] > 45
 
 
-def test_without_a_majority_all_frames_count(truth: torch.Tensor) -> None:
+def test_align_all_frames_without_majority(truth: torch.Tensor) -> None:
     # A drift by which no two frames turn the world alike.
     drift = rotation_from_vector(torch.linspace(0, 2.5, 40).double()[:, None] * torch.tensor([1.0, 0, 0]).double())
     poses = torch.cat([drift @ truth[..., :3], truth[..., 3:]], -1)
@@ -212,7 +217,7 @@ def test_without_a_majority_all_frames_count(truth: torch.Tensor) -> None:
     assert errors["misplaced_frames"] > 30
 
 
-def test_lost_frames_and_fragments_are_told(truth: torch.Tensor) -> None:
+def test_report_lost_frames_and_fragments(truth: torch.Tensor) -> None:
     times = FRAME * np.arange(10)
     camera = CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
     found = EstimatedPoses(times, Trajectory(times[[1, 2, 5, 6, 8]], truth[:5]), camera, [5, 3], 100, 0.5, 200.0, 1.0)
@@ -230,16 +235,6 @@ def test_lost_frames_and_fragments_are_told(truth: torch.Tensor) -> None:
     whole = dataclasses.replace(found, frame_times=times[[1, 2, 5, 6, 8]], model_sizes=[5])
     assert whole.gaps() == []
     assert "\n" not in whole.summary()
-
-
-def test_a_frame_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    whole = tmp_path / "whole.png"
-    Image.fromarray(np.random.default_rng(0).integers(0, 256, (12, 16), np.uint8)).save(whole)
-    cut = tmp_path / "cut.png"
-    cut.write_bytes(whole.read_bytes()[:-100])
-    camera = CameraIntrinsics(16, 12, 10.0, 10.0, 8.0, 6.0)
-    with pytest.raises(DataError, match=r"cut.png: not a PNG or JPEG image that can be read"):
-        estimate_poses([whole, cut], FRAME * np.arange(2), camera, "frames", 0)
 
 
 def test_pose_noise_and_colmap_exclude_each_other(room: SimulationScene, tmp_path: Path) -> None:

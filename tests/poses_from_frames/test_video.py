@@ -47,7 +47,7 @@ def write_folder(folder: Path, frames: list[NDArray[np.uint8]], times: list[str]
     return folder
 
 
-def test_a_video_file_gives_its_frames_and_times(tmp_path: Path) -> None:
+def test_read_a_video_file(tmp_path: Path) -> None:
     frames = make_frames(5)
     video = open_video(write_video(tmp_path / "video.avi", frames))
     assert (video.width, video.height) == (WIDTH, HEIGHT)
@@ -56,7 +56,7 @@ def test_a_video_file_gives_its_frames_and_times(tmp_path: Path) -> None:
         np.testing.assert_array_equal(list(video), frames)
 
 
-def test_a_folder_gives_its_images_at_the_listed_times(tmp_path: Path) -> None:
+def test_read_a_folder(tmp_path: Path) -> None:
     frames = make_frames(3)
     frames[1][...] = frames[1][..., :1]
     folder = write_folder(tmp_path / "frames", frames, ["1600000000.123456789", "1600000000.2", "1600000001"])
@@ -67,7 +67,7 @@ def test_a_folder_gives_its_images_at_the_listed_times(tmp_path: Path) -> None:
     np.testing.assert_array_equal(list(video), frames)
 
 
-def test_a_stated_rate_takes_the_place_of_the_times(tmp_path: Path) -> None:
+def test_stated_rate_replaces_times(tmp_path: Path) -> None:
     frames = make_frames(4)
     for source in (
         write_video(tmp_path / "slow_motion.avi", frames),
@@ -78,7 +78,7 @@ def test_a_stated_rate_takes_the_place_of_the_times(tmp_path: Path) -> None:
         np.testing.assert_array_equal(list(video), frames)
 
 
-def test_frames_are_read_when_they_are_needed(tmp_path: Path) -> None:
+def test_frames_are_read_lazily(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "frames", make_frames(3), ["0", "1", "2"])
     frames = iter(open_video(folder))
     next(frames)
@@ -88,7 +88,7 @@ def test_frames_are_read_when_they_are_needed(tmp_path: Path) -> None:
         next(frames)
 
 
-def test_a_video_that_is_cut_off_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_name_lost_frames_of_a_cut_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_video(tmp_path / "video.avi", make_frames(20))
     open_video(path)
     assert "can be decoded" not in capsys.readouterr().out
@@ -149,7 +149,7 @@ SMALLER, DEEP = np.zeros((HEIGHT, WIDTH - 1), np.uint8), np.zeros((HEIGHT, WIDTH
         ),
     ],
 )
-def test_an_unusable_video_is_told_in_one_line(
+def test_refuse_unusable_video(
     write: Callable[[Path], Path], message: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(DataError, match=message) as told:
@@ -160,14 +160,14 @@ def test_an_unusable_video_is_told_in_one_line(
 
 
 @pytest.mark.parametrize("frame_rate", [0.0, -1.0, float("nan"), float("inf"), 1e10])
-def test_an_impossible_rate_is_refused(frame_rate: float, tmp_path: Path) -> None:
+def test_refuse_impossible_rate(frame_rate: float, tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "frames", make_frames(2), ["0", "1"])
     with pytest.raises(DataError, match="frames: "):
         open_video(folder, frame_rate)
 
 
 @pytest.mark.filterwarnings("error")
-def test_one_image_is_no_video(tmp_path: Path) -> None:
+def test_refuse_one_image(tmp_path: Path) -> None:
     Image.fromarray(make_frames(1)[0]).save(tmp_path / "0.png")
     # OpenCV gives its only frame a time that no whole number of nanoseconds can hold.
     for frame_rate in (None, 30.0):

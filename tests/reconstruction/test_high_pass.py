@@ -16,7 +16,7 @@ SECOND = 1_000_000_000
 @pytest.mark.parametrize(
     ("cutoff", "per_event", "expected"), [(0.06, 0.06, 0.191870), (6.28, 0.0, -0.008299), (0.0, 0.0, 0.25)]
 )
-def test_the_worked_case(cutoff: float, per_event: float, expected: float) -> None:
+def test_worked_case(cutoff: float, per_event: float, expected: float) -> None:
     made = HighPassFilter(4, 3, SensorModel(0.25, 0.25), cutoff, per_event)
     events = [(2, 1, EPOCH + t * SECOND // 10, p) for t, p in ((1, 1), (2, 1), (5, -1))]
     # The state goes on from one piece of the stream to the next.
@@ -27,7 +27,7 @@ def test_the_worked_case(cutoff: float, per_event: float, expected: float) -> No
     assert np.count_nonzero(found) == 1
 
 
-def test_random_events_decay_as_the_sum_of_their_exponentials() -> None:
+def test_state_is_a_sum_of_exponentials() -> None:
     rng = np.random.default_rng(0)
     times = EPOCH + np.sort(rng.integers(0, SECOND, 300))
     rows = [(*rng.integers(0, (4, 3)), t, p) for t, p in zip(times, rng.choice([-1, 1], 300), strict=True)]
@@ -43,7 +43,7 @@ def test_random_events_decay_as_the_sum_of_their_exponentials() -> None:
     np.testing.assert_allclose(made.log_intensity(end), expected, rtol=0, atol=1e-12)
 
 
-def test_a_display_value_is_a_power_of_the_intensity() -> None:
+def test_display_values() -> None:
     made = HighPassFilter(4, 3, SensorModel(0.5, 0.5), 0.0, 0.0)
     image = made.image(make_stream([(0, 0, 1, 1), (1, 0, 2, -1), *[(2, 0, 3, 1)] * 9]))
     ratios = (image[0, :2] / image[2, 3]) ** 2.2

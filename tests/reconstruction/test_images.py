@@ -39,7 +39,7 @@ def events() -> Iterator[EventStream]:
         yield EventStream(x, y, t, p, SIZE, SIZE)
 
 
-def test_a_reconstructed_image_correlates_with_the_true_log_intensity() -> None:
+def test_image_correlates_with_the_truth() -> None:
     made = HighPassFilter(SIZE, SIZE, SENSOR)
     correlations = []
     for index, part in enumerate(events()):
@@ -51,7 +51,7 @@ def test_a_reconstructed_image_correlates_with_the_true_log_intensity() -> None:
     assert min(correlations) > 0.8
 
 
-def test_an_image_is_the_filter_at_the_last_event_of_its_batch() -> None:
+def test_image_is_of_the_last_event() -> None:
     stream = list(events())
     images = list(images_of(stream, int(EVENTS_PER_PIXEL * SIZE**2), FilteredImages(SIZE, SIZE, SENSOR)))
     assert len(images) == sum(map(len, stream)) // 358

@@ -25,7 +25,7 @@ def convolution(name: str, *shape: int, bias: bool = True) -> dict[str, tuple[in
 
 
 def normalization(name: str, size: int) -> dict[str, tuple[int, ...]]:
-    """Return the entries of a batch normalisation in a state dict."""
+    """Return the entries of a batch normalization in a state dict."""
     names = ("weight", "bias", "running_mean", "running_var")
     return {**{f"{name}.{part}": (size,) for part in names}, f"{name}.num_batches_tracked": ()}
 
@@ -95,9 +95,7 @@ def events_of(height: int, width: int, count: int, seed: int = 0) -> EventStream
 
 
 @pytest.mark.parametrize(("name", "number", "weights"), [("e2vid", 74, 10_715_503), ("firenet", 24, 37_777)])
-def test_a_file_with_the_documented_names_and_shapes_is_loaded(
-    name: NetworkName, number: int, weights: int, tmp_path: Path
-) -> None:
+def test_load_documented_weights(name: NetworkName, number: int, weights: int, tmp_path: Path) -> None:
     assert len(ENTRIES[name]) == number
     network = load_network(name, save(tmp_path / "weights.pth.tar", name))
     assert not network.training
@@ -111,7 +109,7 @@ class Foreign:
 
 
 @pytest.mark.parametrize("name", ["e2vid", "firenet"])
-def test_a_file_that_cannot_be_used_ends_with_one_line(name: NetworkName, tmp_path: Path) -> None:
+def test_refuse_unusable_weights(name: NetworkName, tmp_path: Path) -> None:
     file = "E2VID_lightweight.pth.tar" if name == "e2vid" else "firenet_1000.pth.tar"
     where = f"{file}, which https://github.com/"
     weights = made(ENTRIES[name])
@@ -143,7 +141,7 @@ def test_a_file_that_cannot_be_used_ends_with_one_line(name: NetworkName, tmp_pa
         assert str(raised.value).isprintable()
 
 
-def test_gates_are_in_the_documented_order() -> None:
+def test_gate_order() -> None:
     features = torch.ones(1, 1, 1, 1)
     lstm = ConvLSTM(1)
     with torch.no_grad():
@@ -166,7 +164,7 @@ def test_gates_are_in_the_documented_order() -> None:
 
 
 @pytest.mark.parametrize("kind", [E2VID, FireNet])
-def test_a_network_keeps_the_size_and_remembers(kind: type[E2VID] | type[FireNet]) -> None:
+def test_network_keeps_size_and_state(kind: type[E2VID] | type[FireNet]) -> None:
     network = kind().eval()
     voxels = torch.randn(1, 5, 16, 24, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -180,9 +178,7 @@ def test_a_network_keeps_the_size_and_remembers(kind: type[E2VID] | type[FireNet
 
 @pytest.mark.parametrize("pattern", ["", "RGGB"])
 @pytest.mark.parametrize("name", ["e2vid", "firenet"])
-def test_images_have_the_size_of_the_sensor_and_depend_on_the_events_before(
-    name: NetworkName, pattern: str, tmp_path: Path
-) -> None:
+def test_images_of_a_sensor(name: NetworkName, pattern: str, tmp_path: Path) -> None:
     network = load_network(name, save(tmp_path / "weights.pth.tar", name))
     sensor = SensorModel(bayer_pattern="RGGB" if pattern else "")
     events = events_of(10, 13, 400)
@@ -195,7 +191,7 @@ def test_images_have_the_size_of_the_sensor_and_depend_on_the_events_before(
     assert is_grey == (not pattern)
 
 
-def test_padding_is_cut_off_where_it_was_put() -> None:
+def test_padding_is_removed() -> None:
     class Echo(FireNet):
         multiple = 8
 
@@ -203,20 +199,20 @@ def test_padding_is_cut_off_where_it_was_put() -> None:
             assert voxels.shape[2:] == (16, 16)
             return voxels.sum(1, keepdim=True).clamp(0, 1), state
 
-    # One positive event, normalised to zero, would be invisible: two of different size.
+    # One positive event, normalized to zero, would be invisible: two of different size.
     events = make_stream([(3, 2, 0, 1), (3, 2, 0, 1), (12, 8, 0, 1)], 13, 9)
     image = NetworkImages(Echo(), SensorModel(), "cpu").image(events)
     assert np.unravel_index(image[..., 0].argmax(), (9, 13)) == (2, 3)
 
 
-def test_a_mosaic_of_one_colour_gives_that_colour() -> None:
+def test_demosaic_one_color() -> None:
     mosaic = np.zeros((6, 8), np.uint8)
     mosaic[::2, ::2], mosaic[1::2, 1::2] = 200, 50
     mosaic[::2, 1::2] = mosaic[1::2, ::2] = 120
     assert (demosaic(mosaic) == [200, 120, 50]).all()
 
 
-def test_the_filter_sees_the_colours_of_a_colour_sensor() -> None:
+def test_filter_sees_colors() -> None:
     rows = [(x, y, 0, 1 if y % 2 == 0 and x % 2 == 0 else -1) for y in range(6) for x in range(8)]
     image = FilteredImages(8, 6, SensorModel(bayer_pattern="RGGB")).image(make_stream(rows, 8, 6))
     assert (image[..., 0] > image[..., 1]).all()

@@ -13,7 +13,7 @@ from aenerf_ns.reconstruction.voxels import normalize, voxel_grid
 EPOCH = 1_600_000_000_000_000_000
 
 
-def test_the_worked_case() -> None:
+def test_worked_case() -> None:
     times = (0, 300_000_000, 500_000_000, 1_000_000_000)
     events = make_stream([(2, 1, EPOCH + t, p) for t, p in zip(times, (1, -1, 1, -1), strict=True)])
     grid = voxel_grid(events, 5)
@@ -24,7 +24,7 @@ def test_the_worked_case() -> None:
     assert np.count_nonzero(grid) == np.count_nonzero(found) == 4
 
 
-def test_a_grid_holds_all_polarities_of_its_pixels() -> None:
+def test_grid_holds_all_polarities() -> None:
     rng = np.random.default_rng(0)
     rows = [
         (*rng.integers(0, (4, 3)), EPOCH + t, p)
@@ -40,7 +40,7 @@ def test_a_grid_holds_all_polarities_of_its_pixels() -> None:
     assert active.std() == pytest.approx(1, abs=1e-6)
 
 
-def test_events_of_one_time_and_alike_values_stay_finite() -> None:
+def test_equal_times_and_values_stay_finite() -> None:
     grid = voxel_grid(make_stream([(0, 0, EPOCH, 1), (1, 2, EPOCH, 1)]), 5)
     assert grid[0, 0, 0] == grid[0, 2, 1] == 1
     assert np.abs(grid).sum() == 2
@@ -49,7 +49,7 @@ def test_events_of_one_time_and_alike_values_stay_finite() -> None:
 
 
 @pytest.mark.parametrize("lengths", [[23], [1] * 23, [5, 0, 11, 7], [7, 7, 7, 2]])
-def test_batches_are_disjoint_and_in_order_whatever_the_pieces(lengths: list[int]) -> None:
+def test_batches_are_disjoint_and_in_order(lengths: list[int]) -> None:
     stream = make_stream([(i % 4, i % 3, EPOCH + i, 1 if i % 2 else -1) for i in range(23)])
     ends = np.cumsum(lengths)
     pieces = [stream[end - length : end] for end, length in zip(ends, lengths, strict=True)]

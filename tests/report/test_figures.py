@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -33,34 +34,41 @@ from aenerf_ns.report.view_pictures import choose_views
 SECOND = 10**9
 
 
-def test_errors_are_those_that_evo_prints(random_poses: torch.Tensor) -> None:
-    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed")
-    from evo.core.trajectory import PosePath3D
+def evo_statistics(reference: Any, path: Any) -> dict[str, dict[str, float]]:
+    """What ``evo_ape -as`` and ``evo_rpe -as`` print, under the names of a report."""
+    from evo.core import metrics
 
+    path.align(reference, correct_scale=True)
+    relation = metrics.PoseRelation
+    found = {
+        "ate": metrics.APE(relation.translation_part),
+        "rpe_translation": metrics.RPE(relation.translation_part),
+        "rpe_rotation_degrees": metrics.RPE(relation.rotation_angle_deg),
+    }
+    for metric in found.values():
+        metric.process_data((reference, path))
+    return {name: metric.get_all_statistics() for name, metric in found.items()}
+
+
+def test_errors_match_evo(random_poses: torch.Tensor) -> None:
+    trajectory = pytest.importorskip("evo.core.trajectory", reason="evo is not installed")
     times = np.linspace(0, 7 * SECOND, 101).astype(np.int64)
     reference = Trajectory(times, Trajectory(SECOND * np.arange(8), random_poses).interpolate(times))
     poses = perturb(reference, rotation_degrees=3.0, translation=0.2, correlation_time=0.3, seed=1).camera_to_worlds
     poses[..., 3] *= 1.7
-    found = evo_errors(poses, reference.camera_to_worlds)
     paths = [
-        PosePath3D(
+        trajectory.PosePath3D(
             positions_xyz=p[..., 3].numpy(),
             orientations_quat_wxyz=quaternion_from_rotation(p[..., :3])[:, [3, 0, 1, 2]].numpy(),
         )
         for p in (reference.camera_to_worlds, poses)
     ]
-    paths[1].align(paths[0], correct_scale=True)
-    relation = metrics.PoseRelation
-    for name, metric in (
-        ("ate", metrics.APE(relation.translation_part)),
-        ("rpe_translation", metrics.RPE(relation.translation_part)),
-        ("rpe_rotation_degrees", metrics.RPE(relation.rotation_angle_deg)),
-    ):
-        metric.process_data(tuple(paths))
-        assert found[name] == pytest.approx(metric.get_all_statistics(), rel=1e-6), name
+    found = evo_errors(poses, reference.camera_to_worlds)
+    for name, expected in evo_statistics(*paths).items():
+        assert found[name] == pytest.approx(expected, rel=1e-6), name
 
 
-def test_a_correction_is_told_by_its_components(random_poses: torch.Tensor) -> None:
+def test_correction_components(random_poses: torch.Tensor) -> None:
     twist = torch.tensor([0.01, -0.02, 0.03, 0.02, 0.0, -0.01], dtype=torch.float64)
     found = correction_components(random_poses, (homogeneous(random_poses) @ motion_from_twist(twist))[:, :3])
     assert list(found) == [f"{kind} {axis}" for kind in ("translation", "rotation") for axis in "xyz"]
@@ -69,7 +77,7 @@ def test_a_correction_is_told_by_its_components(random_poses: torch.Tensor) -> N
         assert found[name] == pytest.approx([float(expected)] * 8, abs=6e-4), name
 
 
-def test_residuals_are_grouped_by_length_and_tile() -> None:
+def test_average_residuals_by_length_and_tile() -> None:
     length = np.array([1] * 20 + [3] * 20 + [100] * 5)
     residual = np.arange(45.0)
     rows = average_by_length(length, residual)
@@ -88,7 +96,7 @@ def test_residuals_are_grouped_by_length_and_tile() -> None:
     assert sum(value is not None for row in tiles for value in row) == 2
 
 
-def test_the_worst_the_median_and_the_best_view_are_shown() -> None:
+def test_choose_worst_median_and_best_view() -> None:
     chosen = choose_views([20.0 + index % 7 for index in range(30)])
     assert [chosen[index] for index in (0, 27)] == ["worst", "best"]
     assert list(chosen.values()).count("median") == 1
@@ -97,37 +105,25 @@ def test_the_worst_the_median_and_the_best_view_are_shown() -> None:
     assert choose_views([20.0]) == {0: "worst"}
 
 
-def test_errors_are_those_of_evo_over_all_poses_of_the_files(random_poses: torch.Tensor, tmp_path: Path) -> None:
+def test_errors_match_evo_over_all_poses_of_the_files(random_poses: torch.Tensor, tmp_path: Path) -> None:
     pytest.importorskip("evo.core.metrics", reason="evo is not installed")
-    from evo.core import metrics, sync
+    from evo.core import sync
     from evo.tools.file_interface import read_tum_trajectory_file
 
     # More poses than the training compares, and many more than are drawn.
     times = np.linspace(0, 7 * SECOND, 2501).astype(np.int64)
     true = Trajectory(times, Trajectory(SECOND * np.arange(8), random_poses).interpolate(times))
     given = perturb(true, rotation_degrees=3.0, translation=0.2, correlation_time=0.05, seed=1)
-    with NativeDatasetWriter(
-        tmp_path / "data", CameraIntrinsics(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb"
-    ) as writer:
+    data = tmp_path / "data"
+    with NativeDatasetWriter(data, CameraIntrinsics(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb") as writer:
         writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 7 * SECOND, -1)], 6, 4))
         writer.add_trajectories(given, true)
-    found = measure_poses(make_pipeline(tmp_path / "data", "test").trained_run())
+    found = measure_poses(make_pipeline(data, "test").trained_run())
     assert found.num_poses == 2501
-    assert all(len(found.errors["estimated"][kind]) == len(found.seconds) == 501 for kind in found.errors["estimated"])
-    paths = sync.associate_trajectories(
-        *(
-            read_tum_trajectory_file(tmp_path / "data" / f"trajectory_{name}.txt")
-            for name in ("ground_truth", "estimated")
-        )
-    )
-    paths[1].align(paths[0], correct_scale=True)
-    for name, metric in (
-        ("ate", metrics.APE(metrics.PoseRelation.translation_part)),
-        ("rpe_translation", metrics.RPE(metrics.PoseRelation.translation_part)),
-        ("rpe_rotation_degrees", metrics.RPE(metrics.PoseRelation.rotation_angle_deg)),
-    ):
-        metric.process_data(paths)
-        expected = metric.get_all_statistics()
+    assert {len(values) for values in found.errors["estimated"].values()} == {len(found.seconds)} == {501}
+    files = [data / f"trajectory_{name}.txt" for name in ("ground_truth", "estimated")]
+    paths = sync.associate_trajectories(*map(read_tum_trajectory_file, files))
+    for name, expected in evo_statistics(*paths).items():
         # The scene's transform is of float32.
         assert found.evo["estimated"][name] == pytest.approx(expected, rel=1e-4, abs=1e-5 * expected["max"]), name
 
@@ -138,7 +134,7 @@ def report_of(name: str, psnr: list[float]) -> RunReport:
     return RunReport(name, Path(name), {}, None, None, DataReport([]), poses, evaluation={"views": views})
 
 
-def test_differences_are_paired_by_the_views_files() -> None:
+def test_pair_differences_by_file() -> None:
     first, second = report_of("a", [20, 21, 25]), report_of("b", [21, 23, 26])
     # The order of the views says nothing.
     second.views.reverse()
@@ -156,7 +152,7 @@ def test_differences_are_paired_by_the_views_files() -> None:
     assert paired_differences([first, second], []) == []
 
 
-def test_protocols_that_differ_are_named() -> None:
+def test_name_protocol_differences() -> None:
     first = Protocol("affine", "as given", {"0.png": 10, "1.png": 11})
     assert protocol_differences(["a", "b"], [first, first]) == []
     # Another image under the same name is another view.
@@ -168,7 +164,7 @@ def test_protocols_that_differ_are_named() -> None:
     assert shared_views([first]) == ["0.png", "1.png"]
 
 
-def test_what_a_run_wrote_is_read_back(tmp_path: Path) -> None:
+def test_read_what_a_run_wrote(tmp_path: Path) -> None:
     folder = train_small_model(tmp_path, "run", 3).base_dir
     record, scalars = read_record(folder), read_scalars(folder)
     assert record is not None
