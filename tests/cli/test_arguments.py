@@ -120,7 +120,7 @@ def test_video_is_positional_or_named(video: str, monkeypatch: pytest.MonkeyPatc
 # The exit status, and a part of what is printed, for mistakes in arguments and for paths that cannot be.
 MISTAKES = [
     ("", 2, "Expected one of {simulate,"),
-    ("chek F", 2, "chek"),
+    ("inspect F", 2, "inspect"),
     ("check", 2, "DATA"),
     ("check F --data G", 2, "Unrecognized options: F"),
     ("check F G", 2, "Unrecognized options: G"),
