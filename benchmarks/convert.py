@@ -17,7 +17,6 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-import tyro
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
@@ -26,7 +25,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from benchmarks.common import in_own_process, peak_mib, write_result
+from benchmarks.runs import in_own_process, peak_mib, run_benchmark, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
 _CHUNK = 1 << 22
@@ -114,4 +113,4 @@ class ConvertBenchmark:
 
 
 if __name__ == "__main__":
-    tyro.cli(ConvertBenchmark).main()
+    run_benchmark(ConvertBenchmark)

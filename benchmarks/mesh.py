@@ -22,14 +22,13 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-import tyro
 
 from aenerf_ns.camera.alignment import align
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.rendering.embree import RayCaster
-from benchmarks.common import run_script, write_result
+from benchmarks.runs import run_benchmark, run_script, write_result
 
 _NUM_POINTS = 100_000
 _NUM_VIEWS = 100
@@ -125,4 +124,4 @@ def _summary(distances: np.ndarray) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    tyro.cli(Mesh).main()
+    run_benchmark(Mesh)

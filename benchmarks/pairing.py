@@ -19,7 +19,6 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import torch
-import tyro
 
 from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -36,7 +35,7 @@ from aenerf_ns.supervision.event_pairs import (
     PairSamplerConfig,
     PairSupervisionConfig,
 )
-from benchmarks.common import in_own_process, peak_mib, write_result
+from benchmarks.runs import in_own_process, peak_mib, run_benchmark, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
 _CHUNK = 1 << 22
@@ -222,4 +221,4 @@ class Pairing:
 
 
 if __name__ == "__main__":
-    tyro.cli(Pairing).main()
+    run_benchmark(Pairing)

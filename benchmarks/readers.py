@@ -18,12 +18,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
-from benchmarks.common import in_own_process, peak_mib, write_result
+from benchmarks.runs import in_own_process, peak_mib, run_benchmark, write_result
 
 _WIDTH, _HEIGHT = 1280, 720
 _START = 1_600_000_000_000_000
@@ -261,4 +260,4 @@ class Readers:
 
 
 if __name__ == "__main__":
-    tyro.cli(Readers).main()
+    run_benchmark(Readers)

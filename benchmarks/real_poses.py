@@ -14,11 +14,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import tyro
-
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
-from benchmarks.common import evaluate, train, write_result
+from benchmarks.runs import evaluate, run_benchmark, train, write_result
 
 
 @dataclass
@@ -70,4 +68,4 @@ class RealPoses:
 
 
 if __name__ == "__main__":
-    tyro.cli(RealPoses).main()
+    run_benchmark(RealPoses)

@@ -15,12 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
 from aenerf_ns.supervision.event_pairs import PairSamplerConfig
 from aenerf_ns.training.pipeline import AENeRFPipeline
-from benchmarks.common import write_result
+from benchmarks.runs import run_benchmark, write_result
 
 _NUM_BATCHES = 20
 
@@ -80,4 +79,4 @@ class RealRecording:
 
 
 if __name__ == "__main__":
-    tyro.cli(RealRecording).main()
+    run_benchmark(RealRecording)

@@ -9,18 +9,14 @@ lists a SHA-256 hash of each dataset, over the names and the contents of its fil
 from __future__ import annotations
 
 import hashlib
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
-import tyro
-
-from benchmarks.common import script, write_result
-from benchmarks.paper.plan import Dataset, Poses, Scale, plan, scene_name
+from aenerf_ns.errors import DataError
+from benchmarks.paper.plan import Poses, Scale, plan, scene_name
+from benchmarks.runs import run_benchmark, run_command, script, write_result
 
 
 @dataclass
@@ -33,8 +29,6 @@ class Reproducibility:
     """JSON file to write."""
     scenes: tuple[str, ...] = ("room", "object")
     """As given to the benchmark."""
-    again: tuple[str, ...] = ()
-    """The same scenes, built or copied elsewhere. By default the same files."""
     speeds: tuple[Literal["easy", "hard"], ...] = ("easy", "hard")
     """As given to the benchmark."""
     scale: Scale = "tiny"
@@ -46,17 +40,22 @@ class Reproducibility:
 
     def main(self) -> None:
         """Compare, and write the hashes after each dataset."""
-        again = dict(zip(self.scenes, self.again or self.scenes, strict=True))
         runs = plan(self.scenes, self.speeds, self.poses, ("methods",), (0,), self.scale)
         rows = []
         for dataset in dict.fromkeys(run.dataset for run in runs):
             folder = self.bench / "datasets" / dataset.name
             if not folder.exists():
                 continue
-            first, second = hashes(folder), self._generate(dataset, again[dataset.scene])
+            first = hash_files(folder)
             # The benchmark adds this file for image methods.
             first.pop("transforms_ground_truth.json", None)
+            with TemporaryDirectory() as temporary:
+                again, log = Path(temporary) / "dataset", Path(temporary) / "log"
+                threads = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self.threads))
+                run_command((script("aenerf"), "simulate", "--output", str(again), *dataset.command), log, **threads)
+                second = hash_files(again)
             different = sorted(name for name in {*first, *second} if first.get(name) != second.get(name))
+            listing = "".join(f"{name} {value}\n" for name, value in sorted(first.items()))
             rows.append(
                 {
                     "scene": scene_name(dataset.scene),
@@ -65,40 +64,20 @@ class Reproducibility:
                     "files": len(first),
                     "identical": not different,
                     "different": different,
-                    "sha256": _digest(first),
+                    "sha256": hashlib.sha256(listing.encode()).hexdigest(),
                     "events_sha256": first["events.h5"],
                 }
             )
             write_result(self.output, {"rows": rows, "threads": self.threads})
         if not rows:
-            sys.exit(f"Error: {self.bench}: it has none of the datasets; give the options that the benchmark was given")
-
-    def _generate(self, dataset: Dataset, scene: str) -> dict[str, str]:
-        with TemporaryDirectory() as folder:
-            output = Path(folder) / "dataset"
-            options = ("--output", str(output), "--scene", scene, *dataset.command[2:])
-            threads = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
-            subprocess.run(
-                [script("aenerf"), "simulate", *options],
-                check=True,
-                capture_output=True,
-                env={**os.environ, **threads},
-            )
-            return hashes(output)
+            raise DataError(self.bench, "it has none of the datasets", "give the options that the benchmark was given")
 
 
-def hashes(folder: Path) -> dict[str, str]:
+def hash_files(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of each file, by its name in the folder."""
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
-def _digest(files: dict[str, str]) -> str:
-    return hashlib.sha256("".join(f"{name} {value}\n" for name, value in sorted(files.items())).encode()).hexdigest()
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 if __name__ == "__main__":
-    tyro.cli(Reproducibility).main()
+    run_benchmark(Reproducibility)

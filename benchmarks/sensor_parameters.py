@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import tyro
-
-from benchmarks.common import evaluate, run_script, train, write_result
+from benchmarks.runs import evaluate, run_benchmark, run_script, train, write_result
 
 
 @dataclass
@@ -70,4 +68,4 @@ class SensorParametersBenchmark:
 
 
 if __name__ == "__main__":
-    tyro.cli(SensorParametersBenchmark).main()
+    run_benchmark(SensorParametersBenchmark)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import tyro
-from filelock import FileLock
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.cli.termination import sigterm_as_system_exit
@@ -19,6 +16,7 @@ from benchmarks.paper.figures import draw
 from benchmarks.paper.plan import Method, Poses, Run, Scale, Table, plan
 from benchmarks.paper.running import Runner
 from benchmarks.paper.tables import report
+from benchmarks.runs import exclusive, run_benchmark
 
 
 @dataclass
@@ -78,7 +76,7 @@ class Bench:
     def _report(self, runner: Runner, runs: list[Run], failures: dict[str, str]) -> None:
         file = self.output / "report.md"
         # One process at a time: the last one to write then writes all figures.
-        with FileLock(self.output / ".report.lock"):
+        with exclusive(file):
             figures = {run.name: one for run in runs if (one := runner.figures(run)) is not None}
             missing = {run.name: failures.get(run.name, "") for run in runs if run.name not in figures}
             file.write_text(report(list(figures.values()), missing), "utf8")
@@ -103,7 +101,4 @@ def _make(runner: Runner, runs: list[Run]) -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(Bench, prog="python -m benchmarks.paper").main()
-    except DataError as error:
-        sys.exit(f"Error: {error}")
+    run_benchmark(Bench)

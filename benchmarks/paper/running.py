@@ -17,22 +17,20 @@ import json
 import os
 import shlex
 import shutil
-import subprocess
 import sys
-from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
+from aenerf_ns.atomic_write import atomic_write
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.provenance import provenance
-from benchmarks.common import script
-from benchmarks.owned import owned
 from benchmarks.paper.plan import CEILING, Dataset, Run, digest, scene_name
+from benchmarks.runs import exclusive, run_command, script
 
 # A training has so many parts. The framework evaluates the validation views after each part but the last, because it
 # counts the final step as one less.
@@ -71,7 +69,7 @@ class Runner:
             DataError: a command failed.
         """
         try:
-            with FileLock(self._folder / "runs" / f".{run.name}.lock", timeout=0):
+            with exclusive(self._figures_file(run), timeout=0):
                 return self.figures(run) or self._make(run)
         except Timeout:
             return None
@@ -83,7 +81,8 @@ class Runner:
         # A training that was killed leaves files.
         shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)
         if run.images:
-            data = self._with_images(data, run.images)
+            name = f"{data.name}_images_{digest(run.images)}"
+            data = self._make_dataset(name, "reconstruct", str(data.resolve()), *run.images)
         training = self._train(run, data)
         evaluation = self._folder / "runs" / run.name / "evaluation.json"
         made = json.loads(evaluation.read_text("utf8"))
@@ -110,10 +109,8 @@ class Runner:
             "curve": _curve(config.parent),
             **origin,
         }
-        file = self._figures_file(run)
-        partial = file.with_suffix(f".{os.getpid()}")
-        partial.write_text(json.dumps(figures, indent=2) + "\n", "utf8")
-        partial.rename(file)
+        with atomic_write(self._figures_file(run)) as partial:
+            partial.write_text(json.dumps(figures, indent=2) + "\n", "utf8")
         return figures
 
     def _figures_file(self, run: Run) -> Path:
@@ -123,28 +120,21 @@ class Runner:
         if dataset.name in self._failed:
             # Each run of this dataset would simulate again and fail again.
             raise self._failed[dataset.name]
-        folder = self._folder / "datasets" / dataset.name
-        # If another process is making the dataset, wait until it has finished.
-        with FileLock(folder.with_name(f".{dataset.name}.lock")):
-            if not folder.exists():
-                # A file is relative to the folder in which the benchmark was started. A built-in scene has no suffix.
-                scene = str(Path(dataset.scene).resolve()) if Path(dataset.scene).suffix else dataset.scene
-                options = ("--scene", scene, *dataset.command[2:])
-                output = str(folder.resolve())
-                try:
-                    self._call(dataset.name, script("aenerf"), "simulate", "--output", output, *options)
-                except DataError as error:
-                    self._failed[dataset.name] = error
-                    raise
-        return folder
+        # A file is relative to the folder in which the benchmark was started. A built-in scene has no suffix.
+        scene = str(Path(dataset.scene).resolve()) if Path(dataset.scene).suffix else dataset.scene
+        try:
+            return self._make_dataset(dataset.name, "simulate", "--scene", scene, *dataset.command[2:])
+        except DataError as error:
+            self._failed[dataset.name] = error
+            raise
 
-    def _with_images(self, data: Path, options: Sequence[str]) -> Path:
-        """Return a dataset whose training images are reconstructed from the events of a dataset."""
-        folder = data.with_name(f"{data.name}_images_{digest(options)}")
-        with FileLock(folder.with_name(f".{folder.name}.lock")):
+    def _make_dataset(self, name: str, command: str, *arguments: str) -> Path:
+        """Make a dataset by a command of aenerf, unless it has been made, and return its folder."""
+        folder = self._folder / "datasets" / name
+        # If another process is making the dataset, wait until it has finished.
+        with exclusive(folder):
             if not folder.exists():
-                arguments = ("--data", str(data.resolve()), "--output", str(folder.resolve()), *options)
-                self._call(folder.name, script("aenerf"), "reconstruct", *arguments)
+                self._call(name, script("aenerf"), command, *arguments, "--output", str(folder.resolve()))
         return folder
 
     def _train(self, run: Run, data: Path) -> tuple[str, ...]:
@@ -173,28 +163,9 @@ class Runner:
         return ("ns-train", *(word.replace(f"{self._folder.resolve()}/", "") for word in words))
 
     def _call(self, log: str, *command: str) -> None:
-        """Run a command in the benchmark's folder.
-
-        Raises:
-            DataError: it failed.
-        """
-        file = self._folder / "logs" / f"{log}.log"
         # ns-eval has no option for the device.
         hidden = {"CUDA_VISIBLE_DEVICES": ""} if self._device == "cpu" else {}
-        with file.open("a", encoding="utf8") as output:
-            output.write(f"$ {shlex.join(command)}\n")
-            output.flush()
-            with subprocess.Popen(
-                owned(command), cwd=self._folder, env={**os.environ, **hidden}, stdout=output, stderr=subprocess.STDOUT
-            ) as process:
-                try:
-                    status = process.wait()
-                except BaseException:
-                    # Otherwise the command would continue beside its successor from the next call.
-                    process.terminate()
-                    raise
-        if status:
-            raise DataError(file, f"a command ended with status {status}", "see the end of this file")
+        run_command(command, self._folder / "logs" / f"{log}.log", self._folder, **hidden)
 
 
 def _read(file: Path) -> dict[str, Any] | None:
@@ -210,9 +181,9 @@ def _with_true_poses(data: Path) -> Path:
         if frame["file_path"] in meta["train_filenames"]:
             pose = homogeneous(truth.interpolate(int(frame["timestamp"] * 10**9))) @ OPENCV_TO_OPENGL
             frame["transform_matrix"] = pose.tolist()
-    partial = file.with_suffix(f".{os.getpid()}")
-    partial.write_text(json.dumps(meta, default=float), "utf8")
-    partial.rename(file)
+    # Another process may write the same at the same time.
+    with atomic_write(file, file.with_suffix(f".{os.getpid()}")) as partial:
+        partial.write_text(json.dumps(meta, default=float), "utf8")
     return file
 
 

@@ -14,21 +14,16 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import shlex
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
-
 from aenerf_ns.progress import progress_bar
-from benchmarks.common import run_script, write_result
-from benchmarks.owned import owned
 from benchmarks.poses.scenes import SCENES, Split, scene_argument
+from benchmarks.runs import run_benchmark, run_command, run_script, write_result
 
 _WORKER = Path(__file__).with_name("worker.py")
 _CASES = {
@@ -138,19 +133,13 @@ class Poses:
         digest = hashlib.sha256("\0".join((name, poses, evaluation, *arguments)).encode()).hexdigest()[:12]
         result = self.work / "runs" / f"{digest}.json"
         if not result.exists():
-            log = self.work / "logs" / f"{digest}.log"
             command = [
                 sys.executable, str(_WORKER), str(result.resolve()), evaluation, *arguments,
                 "--output-dir", str((self.work / "outputs" / digest).resolve()),
                 "aenerf-data", "--data", str(data.resolve()), "--poses", poses,
             ]  # fmt: skip
-            threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-            with log.open("w", encoding="utf8") as output:
-                done = subprocess.run(
-                    owned(command), stdout=output, stderr=subprocess.STDOUT, env={**os.environ, **threads}, check=False
-                )
-            if done.returncode:
-                sys.exit(f"a training ended with status {done.returncode}; see the end of {log}")
+            log = self.work / "logs" / f"{digest}.log"
+            run_command(command, log, OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
         return json.loads(result.read_text("utf8"))
 
 
@@ -223,4 +212,4 @@ def _file_name(name: str) -> str:
 
 
 if __name__ == "__main__":
-    tyro.cli(Poses).main()
+    run_benchmark(Poses)

@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from filelock import FileLock
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import binary_dilation
@@ -23,6 +22,7 @@ from scipy.ndimage import binary_dilation
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator import textures
+from benchmarks.runs import exclusive
 from benchmarks.scenes.meshes import Material, Model, paint, srgb_picture
 from benchmarks.scenes.obj import read_obj
 
@@ -86,9 +86,8 @@ def _made_once(path: Path, make: Callable[[Path], Path]) -> Path:
         make: makes it in an empty folder, and returns where.
     """
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
         # Another process that builds scenes may be making it, too.
-        with FileLock(path.with_name(f".{path.name}.lock")):
+        with exclusive(path):
             if not path.exists():
                 with TemporaryDirectory(dir=path.parent) as empty:
                     make(Path(empty)).rename(path)

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from aenerf_ns.errors import DataError
+from benchmarks.runs import run_benchmark
 from benchmarks.scenes.assets import Library, cv2
 from benchmarks.scenes.catalogue import SCENES
 from benchmarks.scenes.glb import write_glb
@@ -64,7 +64,4 @@ def build_scene(name: str, library: Library, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(Build).main()
-    except DataError as error:
-        raise SystemExit(str(error)) from None
+    run_benchmark(Build)

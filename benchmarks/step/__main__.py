@@ -19,9 +19,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 import torch
-import tyro
 
-from benchmarks.common import write_result
+from benchmarks.runs import run_benchmark, write_result
 from benchmarks.step.sides import Side, Training, install
 
 Measurement = Literal[
@@ -202,4 +201,4 @@ def _compare(seconds: list[list[dict[str, float]]], count: int, unit: str, units
 
 
 if __name__ == "__main__":
-    tyro.cli(StepCost).main()
+    run_benchmark(StepCost)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -62,7 +60,7 @@ def small_plan(**changes: Any) -> list[Run]:
     return plan(**{**options, **changes})
 
 
-def test_the_plan_has_every_run_once() -> None:
+def test_plan_has_every_run_once() -> None:
     runs = small_plan()
     assert len({run.name for run in runs}) == len(runs) == 2 * (2 * 2 * 4 + 2 * 4)
     rows = Counter(run.row for run in runs)
@@ -79,7 +77,7 @@ def test_the_plan_has_every_run_once() -> None:
 ALL_METHODS = ("aenerf", *PEERS, "nerfacto")
 
 
-def test_other_papers_methods_have_rows_on_estimated_poses_corrected_ones_and_true_ones() -> None:
+def test_plan_has_three_rows_per_peer() -> None:
     runs = small_plan(methods=ALL_METHODS, tables=("methods",), seeds=(1,), scenes=("room",), speeds=("hard",))
     assert len({run.name for run in runs}) == len(runs) == 4 + 5 * 3
     rows = {run.row: run for run in runs}
@@ -101,7 +99,7 @@ def test_other_papers_methods_have_rows_on_estimated_poses_corrected_ones_and_tr
     assert {run.method for run in full} == {"paev3d"}
 
 
-def test_e2vid_makes_the_images_if_there_are_weights(tmp_path: Path) -> None:
+def test_weights_choose_e2vid(tmp_path: Path) -> None:
     options: dict[str, Any] = {"methods": ("e2vid-nerf",), "tables": ("methods",)}
     with_weights = small_plan(e2vid_weights=tmp_path / "e2vid.pth.tar", **options)
     assert {run.row for run in with_weights} == {"E2VID + NeRF" + end for end in ("", CORRECTED, ON_TRUE_POSES)}
@@ -109,7 +107,7 @@ def test_e2vid_makes_the_images_if_there_are_weights(tmp_path: Path) -> None:
     assert not {run.name for run in with_weights} & {run.name for run in small_plan(**options)}
 
 
-def test_all_losses_are_compared_on_as_many_pairs() -> None:
+def test_losses_are_compared_on_equal_pairs() -> None:
     option = "--pipeline.datamanager.train-num-rays-per-batch"
     for scale, method in (("tiny", aenerf_small), ("full", aenerf)):
         own = method.config.pipeline.datamanager.train_num_rays_per_batch
@@ -119,7 +117,7 @@ def test_all_losses_are_compared_on_as_many_pairs() -> None:
         assert rays["l_p + l_r + l_g"] == rays["all"] == own // 2 * 3
 
 
-def test_whatever_a_run_depends_on_is_in_its_name() -> None:
+def test_name_tells_runs_apart() -> None:
     names = {run.name for run in small_plan()}
     for change in (
         {"steps": 7},
@@ -132,7 +130,7 @@ def test_whatever_a_run_depends_on_is_in_its_name() -> None:
         assert not changed & names, change
 
 
-def test_published_runs_go_by_what_they_hold() -> None:
+def test_published_runs_have_their_names() -> None:
     published = list(PUBLISHED.glob("tiny*/*.json"))
     assert Counter(path.parent.name for path in published) == {"tiny": 108, "tiny_methods": 648, "tiny_version_0.1": 96}
     for path in published:
@@ -141,7 +139,7 @@ def test_published_runs_go_by_what_they_hold() -> None:
         assert path.name.startswith(f"{run['scene']}_{run['speed']}_{row}_seed{run['seed']}_")
 
 
-def test_a_scene_file_goes_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_file_has_the_name_of_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (run, *_) = small_plan(scenes=("scenes/piano/scene.json",))
     assert run.name.startswith("piano_easy_")
     (run, *_) = small_plan(scenes=("models/lamp.glb",))
@@ -182,7 +180,7 @@ def cells(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
 
 
-def test_each_path_has_errors_of_its_own() -> None:
+def test_datasets_have_seeds_of_their_own() -> None:
     datasets = {run.dataset for run in small_plan()}
     seeds = {one.options[one.options.index("--seed") + 1] for one in datasets}
     assert len(seeds) == len(datasets) == 4
@@ -223,7 +221,7 @@ def test_tables_are_means_over_scenes_and_seeds() -> None:
     assert f"± {24 / 2**0.5:.2f} / - |" in text
 
 
-def test_the_papers_order_stands_beside_ours() -> None:
+def test_report_orders_methods() -> None:
     runs = small_plan(methods=ALL_METHODS, tables=("methods",), speeds=("hard",), scenes=("object",))
     # The worst row has 10 dB; a seed is worth 1 dB, a refined test pose 2 dB.
     rank = {run.row: index for index, run in enumerate(runs[: len(runs) // 2])}
@@ -266,7 +264,7 @@ def test_the_papers_order_stands_beside_ours() -> None:
     assert "Order by PSNR" not in own
 
 
-def test_refined_figures_stand_beside_the_placed_ones() -> None:
+def test_tables_show_refined_test_poses() -> None:
     runs = [run for run in small_plan(speeds=("hard",), tables=("losses",)) if run.dataset.scene == "room"]
     figures = [figures_of(run, 20.0, "large", (1.0, 0.5)) for run in runs]
     for one in figures:
@@ -280,7 +278,7 @@ def test_refined_figures_stand_beside_the_placed_ones() -> None:
     assert rows[0][1] == "20.00 / -"
 
 
-def test_means_are_over_what_all_rows_have() -> None:
+def test_means_are_over_common_runs() -> None:
     runs = [run for run in small_plan(speeds=("hard",), seeds=(1,)) if run.row != CEILING]
     worth = {"room": 20.0, "object": 30.0}
     figures = [figures_of(run, worth[run.dataset.scene], "large", (1.0, 0.5)) for run in runs]
@@ -294,7 +292,7 @@ def test_means_are_over_what_all_rows_have() -> None:
         assert {row[1] for row in rows} == {"20.00 / -"}
 
 
-def test_what_colmap_made_of_a_sequence_is_reported() -> None:
+def test_report_lists_colmap_sequences() -> None:
     run, other = small_plan(poses="colmap", tables=("losses",), seeds=(1,))[:2]
     errors = {"rotation_error_degrees": 0.5, "translation_error": 0.04, "misplaced_frames": 2}
     poses = {"frames": 33, "registered_frames": 30, "errors": errors}
@@ -304,7 +302,7 @@ def test_what_colmap_made_of_a_sequence_is_reported() -> None:
     assert text.count("| room | hard | 33 | 30 | 2 | 0.50° | 4.0 cm | 3.00° | 25.0 cm |") == 1
 
 
-def test_the_ceiling_has_the_same_metrics_as_all_else(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nerfacto_has_the_same_ssim(monkeypatch: pytest.MonkeyPatch) -> None:
     # As the wrapper changes them; put back at the end.
     monkeypatch.setattr(lpip, "LearnedPerceptualImagePatchSimilarity", lpip.LearnedPerceptualImagePatchSimilarity)
     name = "structural_similarity_index_measure"
@@ -321,7 +319,7 @@ def test_the_ceiling_has_the_same_metrics_as_all_else(monkeypatch: pytest.Monkey
     assert ssim.item() == pytest.approx(ImageMetrics(with_lpips=False)(predicted, reference)["ssim"])
 
 
-def test_the_error_map_is_dark_where_there_is_no_error() -> None:
+def test_error_map() -> None:
     truth = np.full((2, 2, 3), 100, np.uint8)
     rendered = truth.copy()
     rendered[0, 0] += 64
@@ -330,7 +328,7 @@ def test_the_error_map_is_dark_where_there_is_no_error() -> None:
     assert (picture.ravel()[1:] < 10).all()
 
 
-def test_figures_are_drawn_of_whatever_seed_there_is(tmp_path: Path) -> None:
+def test_draw_figures_of_any_seed(tmp_path: Path) -> None:
     # As one process finds them while the others are still at work.
     made = [
         run for run in small_plan(tables=("losses",)) if (run.dataset.scene, run.seed) in (("room", 1), ("object", 2))
@@ -363,17 +361,20 @@ def small_bench(folder: Path, *tables: str) -> list[str]:
 
 
 # Behind what is there already: the package as it is installed comes first.
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(ROOT))))}
+PATHS = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(ROOT))))
 
 
-def test_a_benchmark_that_is_ended_leaves_no_command_at_work(tmp_path: Path) -> None:
-    process = subprocess.Popen(small_bench(tmp_path, "methods"), cwd=tmp_path, env=ENVIRONMENT, start_new_session=True)
-    while not list(tmp_path.glob("bench/logs/*")):
+def start(command: list[str], folder: Path) -> subprocess.Popen:
+    environment = {**os.environ, "PYTHONPATH": PATHS, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True)
+
+
+def wait_for(pattern: str, folder: Path, process: subprocess.Popen) -> list[Path]:
+    """Wait until a running process has made a file."""
+    while not (found := list(folder.glob(pattern))):
         assert process.poll() is None
-        time.sleep(0.1)
-    process.terminate()
-    assert process.wait() == 128 + signal.SIGTERM
-    assert_gone(process.pid)
+        time.sleep(0.05)
+    return found
 
 
 def assert_gone(group: int) -> None:
@@ -388,80 +389,53 @@ def assert_gone(group: int) -> None:
     raise AssertionError("a process is still there")
 
 
-@pytest.mark.slow
-def test_a_benchmark_that_is_killed_alone_takes_its_command_along_and_starts_again(tmp_path: Path) -> None:
-    command = small_bench(tmp_path, "losses")
-    process = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True)
-    while not list(tmp_path.glob("bench/datasets/.*.partial/events.h5")):
-        assert process.poll() is None
-        time.sleep(0.1)
-    process.kill()
-    process.wait()
+def test_ended_benchmark_ends_its_command(tmp_path: Path) -> None:
+    process = start(small_bench(tmp_path, "methods"), tmp_path)
+    wait_for("bench/logs/*", tmp_path, process)
+    process.terminate()
+    assert process.wait() == 128 + signal.SIGTERM
     assert_gone(process.pid)
-    # A command that is left would have finished the dataset.
-    assert not list(tmp_path.glob("bench/datasets/*/transforms.json"))
-    # And the lock is free.
-    again = subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True)
-    while not list(tmp_path.glob("bench/datasets/*/transforms.json")):
-        assert again.poll() is None
-        time.sleep(0.1)
-    again.terminate()
-    assert again.wait() == 128 + signal.SIGTERM
-    assert not list(tmp_path.glob("bench/datasets/.*.partial*"))
 
 
 @pytest.mark.slow
-def test_a_benchmark_that_is_killed_at_twenty_moments_is_finished_by_the_next_start(tmp_path: Path) -> None:
-    command = small_bench(tmp_path, "losses")
-    bench, environment = tmp_path / "bench", {**ENVIRONMENT, "OMP_NUM_THREADS": "1"}
-    begin = time.monotonic()
-    process = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
-    while not list(bench.glob("runs/*.json")):
-        assert process.poll() is None
-        time.sleep(0.2)
-    of_one_run = time.monotonic() - begin
-    process.kill()
-    process.wait()
-    assert_gone(process.pid)
-    shutil.rmtree(bench)
-    stages, finished = set(), {}
-    for moment in np.linspace(0, of_one_run, 20):
-        begin = time.monotonic()
-        process = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(moment)
+def test_benchmark_resumes_after_each_kill(tmp_path: Path) -> None:
+    """A kill at any stage of a run takes the command along, and the next start goes on from what is whole."""
+    command, bench, finished = small_bench(tmp_path, "losses"), tmp_path / "bench", {}
+    for stage in (
+        "logs/*",
+        "datasets/.*.partial/events.h5",
+        "datasets/*/transforms.json",
+        "outputs/*/*/*/config.yml",
+        "outputs/*/*/*/*/*.ckpt",
+        "runs/*/pictures/*.png",
+        "runs/*.json",
+    ):
+        process = start(command, tmp_path)
+        wait_for(stage, bench, process)
         process.kill()
         process.wait()
         assert_gone(process.pid)
-        assert time.monotonic() - begin < moment + 20
         # What is there under its final name is whole, and later starts leave it as it is.
-        stages.add((len(list(bench.glob("datasets/*/transforms.json"))), len(list(bench.glob("runs/*.json")))))
         for file in (*bench.glob("datasets/*/transforms.json"), *bench.glob("runs/*.json")):
             json.loads(file.read_text())
             assert finished.setdefault(file, file.stat().st_mtime_ns) == file.stat().st_mtime_ns
         for file in bench.glob("datasets/*/transforms.json"):
             NativeDataParserConfig(data=file.parent).setup().read_recording()
-    assert len(stages) > 1
-    assert subprocess.run(command, cwd=tmp_path, env=environment, check=False).returncode == 0
+    assert start(command, tmp_path).wait() == 0
     assert len(list(bench.glob("runs/*.json"))) == len(LOSSES)
     assert "missing" not in (bench / "report.md").read_text()
-    left = [path.name for path in bench.rglob("*") if ".partial" in path.name]
-    assert not left
+    assert not [path for path in bench.rglob("*") if ".partial" in path.name]
 
 
 @pytest.mark.slow
-def test_a_benchmark_that_is_killed_is_finished_by_two_processes(tmp_path: Path) -> None:
+def test_two_processes_finish_a_benchmark(tmp_path: Path) -> None:
     command = small_bench(tmp_path, "methods", "losses")
-    environment = {**ENVIRONMENT, "OMP_NUM_THREADS": "1"}
-    first = subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True)
-    while not list(tmp_path.glob("bench/runs/*.json")):
-        assert first.poll() is None
-        time.sleep(0.2)
+    first = start(command, tmp_path)
+    (done,) = wait_for("bench/runs/*.json", tmp_path, first)
     os.killpg(first.pid, signal.SIGKILL)
     first.wait()
-    (done,) = tmp_path.glob("bench/runs/*.json")
     before = done.stat().st_mtime_ns
-    both = [subprocess.Popen(command, cwd=tmp_path, env=environment) for _ in range(2)]
+    both = [start(command, tmp_path) for _ in range(2)]
     assert [process.wait() for process in both] == [0, 0]
     assert done.stat().st_mtime_ns == before
     figures = [json.loads(path.read_text()) for path in tmp_path.glob("bench/runs/*.json")]

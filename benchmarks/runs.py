@@ -1,23 +1,29 @@
-"""Run commands, measure in a separate process and write results, for all benchmarks."""
+"""Run commands, keep what they made, measure in a separate process and write results, for all benchmarks."""
 
 from __future__ import annotations
 
 import functools
 import json
+import os
 import resource
+import shlex
+import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import torch
+import tyro
+from filelock import FileLock
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.training.provenance import provenance
-from benchmarks.owned import owned
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -28,28 +34,69 @@ def script(name: str) -> str:
     return str(Path(sys.executable).parent / name)
 
 
-def run_script(folder: Path, name: str, *arguments: str) -> float:
-    """Run a console script of this Python environment.
+def die_with_parent(command: Sequence[str]) -> list[str]:
+    """Return a command that runs a command and is killed when this process, or its thread that starts it, ends.
+
+    A benchmark that is killed cannot end its commands. They would go on and write where its next start writes. Only
+    Linux tells a process that its parent ends; elsewhere the command is returned as it is.
+    """
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", "KILL", "--", *command] if setpriv else list(command)
+
+
+def run_command(command: Sequence[str], log: Path, folder: Path = Path(), **variables: str) -> float:
+    """Run a command.
 
     Args:
-        folder: working directory of the script.
-        name: of the script.
-        arguments: of the script.
+        command: a program and its arguments.
+        log: file that its output is added to.
+        folder: working directory of the command.
+        variables: more environment variables.
 
     Returns:
         Seconds of wall-clock time.
 
     Raises:
-        SystemExit: the script failed; with the end of what it printed.
+        DataError: the command failed.
     """
     begin = time.perf_counter()
-    done = subprocess.run(
-        owned([script(name), *arguments]),
-        cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
-    )  # fmt: skip
-    if done.returncode:
-        sys.exit(f"{name} {' '.join(arguments)} ended with status {done.returncode}:\n{done.stdout[-3000:]}")
+    with log.open("a", encoding="utf8") as output:
+        output.write(f"$ {shlex.join(command)}\n")
+        output.flush()
+        with subprocess.Popen(
+            die_with_parent(command), cwd=folder, env=os.environ | variables, stdout=output, stderr=subprocess.STDOUT
+        ) as process:
+            try:
+                status = process.wait()
+            except BaseException:
+                # Otherwise the command would continue beside its successor from the next start.
+                process.terminate()
+                raise
+    if status:
+        raise DataError(log, f"a command ended with status {status}", "see the end of this file")
     return time.perf_counter() - begin
+
+
+def run_script(folder: Path, name: str, *arguments: str) -> float:
+    """Run a console script of this Python environment in a folder that may be temporary; see :func:`run_command`."""
+    log = folder / f"{name}.log"
+    try:
+        return run_command((script(name), *arguments), log, folder)
+    except DataError:
+        print(log.read_text("utf8", errors="replace")[-3000:], file=sys.stderr)
+        raise
+
+
+@contextmanager
+def exclusive(path: Path, timeout: float = -1) -> Iterator[None]:
+    """Hold the lock of a file or folder that is being made, which may lie beside others that make it.
+
+    Raises:
+        Timeout: another process holds it after ``timeout`` seconds. By default this one waits.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(path.with_name(f".{path.name}.lock"), timeout=timeout):
+        yield
 
 
 def train(folder: Path, name: str, method: str, steps: int, options: Sequence[str], data: Sequence[str]) -> float:
@@ -110,3 +157,11 @@ def write_result(output: Path, result: dict[str, Any], show: bool = True) -> Non
 
 # Looked up once: a result that was just written into the checkout would count as a change to the commit.
 _provenance = functools.cache(provenance)
+
+
+def run_benchmark(kind: Callable[[], Any]) -> None:
+    """Run the command of a benchmark: a dataclass of its options with a method ``main``."""
+    try:
+        tyro.cli(kind).main()
+    except DataError as error:
+        sys.exit(f"Error: {error}")
