@@ -52,7 +52,9 @@ class Reproducibility:
             with TemporaryDirectory() as temporary:
                 again, log = Path(temporary) / "dataset", Path(temporary) / "log"
                 threads = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self.threads))
-                run_command((script("aenerf"), "simulate", "--output", str(again), *dataset.command), log, **threads)
+                run_command(
+                    (script("aenerf"), "simulate", "--output", str(again), *dataset.command), log, Path(), **threads
+                )
                 second = hash_files(again)
             different = sorted(name for name in {*first, *second} if first.get(name) != second.get(name))
             listing = "".join(f"{name} {value}\n" for name, value in sorted(first.items()))

@@ -159,7 +159,7 @@ def write_result(output: Path, result: dict[str, Any], show: bool = True) -> Non
 _provenance = functools.cache(provenance)
 
 
-def run_benchmark(kind: Callable[[], Any]) -> None:
+def run_benchmark(kind: Callable[..., Any]) -> None:
     """Run the command of a benchmark: a dataclass of its options with a method ``main``."""
     try:
         tyro.cli(kind).main()

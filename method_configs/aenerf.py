@@ -90,7 +90,8 @@ def small(config: AENeRFTrainerConfig) -> AENeRFTrainerConfig:
     # On a CPU twice as fast as 8192, because the memory of a piece stays small.
     config.pipeline.model.eval_num_rays_per_chunk = 1 << 10
     # A new configuration, because the schedules follow the number of steps when it is made.
-    return replace(config, method_name=f"{config.method_name}-small", max_num_iterations=2000, steps_per_save=1000)
+    name = f"{config.method_name}-small"
+    return replace(config, method_name=name, max_num_iterations=2000, steps_per_save=1000)  # type: ignore[call-arg]
 
 
 aenerf_small = MethodSpecification(

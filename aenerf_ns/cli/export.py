@@ -50,10 +50,10 @@ class ExportTrajectory:
         estimated = correction.trajectory
         trajectory = estimated
         if self.poses == "ground-truth":
-            trajectory = run.scene.ground_truth
-            if trajectory is None:
+            true = run.scene.ground_truth
+            if true is None:
                 raise DataError(run.data, "it has no true poses", "export corrected or estimated ones")
-            trajectory = trajectory.to(run.device).crop(estimated.start, estimated.end)
+            trajectory = true.to(run.device).crop(estimated.start, estimated.end)
         times = trajectory.times
         if self.rate is not None:
             times = regular_times(trajectory.start, trajectory.end, self.rate).to(times.device)

@@ -92,7 +92,7 @@ def measure_reference_views(
 
 def _describe_refined(run: TrainedRun, refined: Sequence[dict[str, float]], with_deviations: bool) -> dict[str, Any]:
     """Return the mean metrics of the reference views from refined poses, and how the poses were refined."""
-    metrics = average_metrics(refined, with_deviations)
+    metrics: dict[str, Any] = average_metrics(refined, with_deviations)
     _require_finite(metrics, run)
     # The time to render includes no refinement, so it says nothing new.
     metrics = {name: value for name, value in metrics.items() if name.removesuffix("_std") in IMAGE_METRICS}

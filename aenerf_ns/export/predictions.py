@@ -27,6 +27,7 @@ def export_predictions(run: TrainedRun, folder: Path, config: TrainerConfig, vie
         config: of the run.
         views: one or more; see :func:`~aenerf_ns.evaluation.view_metrics.describe_views`.
     """
+    assert run.views is not None
     names = picture_names(run.views.image_filenames)
     info = describe_run(config.method_name, run.data.name, config.max_num_iterations)
     write_predictions(folder / PREDICTIONS, _render_views(run, names), info)
@@ -40,6 +41,7 @@ def export_predictions(run: TrainedRun, folder: Path, config: TrainerConfig, vie
 def _render_views(run: TrainedRun, names: list[str]) -> Iterator[tuple[str, Image.Image, Image.Image]]:
     """Yield name, rendering and truth of each test view."""
     model, views = run.model.eval(), run.views
+    assert views is not None
     for index, name in enumerate(track(names, "Rendering predictions")):
         outputs = model.get_outputs_for_camera(views.cameras[index : index + 1].to(run.device))
         truth = model.reference_display(views.get_image_float32(index).to(run.device))

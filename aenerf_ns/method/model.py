@@ -82,7 +82,7 @@ class AENeRFModelConfig(ModelConfig):
     average_init_density: float = 10.0
     """Density of field and proposal networks before training, per scene unit. A scene that starts nearly transparent
     sits in a fog for hundreds of steps, until matter grows out of it."""
-    loss_coefficients: LossCoefficients = dataclasses.field(default_factory=PairLossCoefficients)  # type: ignore[assignment]
+    loss_coefficients: LossCoefficients = dataclasses.field(default_factory=PairLossCoefficients)
     """Weights of the losses (paper, eq. 14)."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=PairSupervisionConfig)
     """How renderings are compared with the sensor's record. The datamanager's sampler draws the batches."""

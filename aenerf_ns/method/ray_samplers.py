@@ -41,7 +41,7 @@ class ProposalSampler(ProposalNetworkSampler):
         self, ray_bundle: RayBundle | None = None, density_fns: list[Callable] | None = None
     ) -> tuple[RaySamples, list, list]:
         """Return samples of the field, and weights and samples of each round of proposals."""
-        steps_since_update = self._steps_since_update
+        steps_since_update: int = self._steps_since_update  # type: ignore[has-type]
         found = super().generate_ray_samples(ray_bundle, density_fns)
         if not self.training:
             # A picture must not move the steps that train the proposal networks.

@@ -61,7 +61,7 @@ class EventDataParserConfig(DataParserConfig):
                 raise DataError(str(self.data), f"{name} is {value}", "give nanoseconds, which have 19 digits at most")
         # A run's saved configuration is also read in other working directories.
         paths = {option: value.absolute() for option, value in values.items() if isinstance(value, Path)}
-        return super(EventDataParserConfig, replace(self, **paths)).setup(**kwargs)
+        return super(EventDataParserConfig, replace(self, **paths)).setup(**kwargs)  # type: ignore[arg-type]
 
 
 @dataclass

@@ -134,7 +134,7 @@ def pose_errors(reports: Sequence[RunReport]) -> go.Figure | None:
     figure = make_subplots(2, 1, subplot_titles=list(titles.values()), shared_xaxes=True, vertical_spacing=0.12)
     for row, kind in enumerate(titles, start=1):
         for run, report in known:
-            for name, errors in report.poses.errors.items():
+            for name, errors in (report.poses.errors or {}).items():
                 figure.add_scatter(
                     x=report.poses.seconds, y=errors[kind], mode="lines", line=_line(name, run),
                     name=name if len(reports) == 1 else f"{name}, {report.name}", legendgroup=f"{report.name}{name}",
@@ -147,16 +147,16 @@ def pose_errors(reports: Sequence[RunReport]) -> go.Figure | None:
 
 def correction(reports: Sequence[RunReport]) -> go.Figure | None:
     """Plot the six components of the correction ψ over time; None where no run corrects poses."""
-    known = [(run, report) for run, report in enumerate(reports) if report.poses.correction]
+    known = [(run, report, report.poses.correction) for run, report in enumerate(reports) if report.poses.correction]
     if not known:
         return None
-    names = list(known[0][1].poses.correction)
+    names = list(known[0][2])
     titles = [f"{name} ({'degrees' if 'rotation' in name else 'recording units'})" for name in names]
     figure = make_subplots(2, 3, subplot_titles=titles, shared_xaxes=True, vertical_spacing=0.14)
     for index, name in enumerate(names):
-        for run, report in known:
+        for run, report, components in known:
             figure.add_scatter(
-                x=report.poses.seconds, y=report.poses.correction[name], mode="lines", line_color=color(run),
+                x=report.poses.seconds, y=components[name], mode="lines", line_color=color(run),
                 name=report.name, legendgroup=report.name, showlegend=len(known) > 1 and index == 0,
                 row=index // 3 + 1, col=index % 3 + 1,
             )  # fmt: skip

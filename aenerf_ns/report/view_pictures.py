@@ -73,6 +73,7 @@ def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPic
         deviation of the rendered log-radiance, before color correction, as a share of that of the images.
     """
     model, dataset = run.model, run.views
+    assert dataset is not None
     scale = run.scene.scale
     pictures, rendered, true = [], [], []
     for index in track(indices, "Rendering views"):

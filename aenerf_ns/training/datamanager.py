@@ -58,7 +58,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     def resolved_config(self) -> EventDataManagerConfig:
         """Return the configuration with what the dataparser resolved: its format, its paths and its time window."""
         dataparser = self.dataparser.resolved_config()
-        return replace(self.config, dataparser=dataparser, data=dataparser.data)
+        # The framework's fields, whose types mypy does not see.
+        return replace(self.config, dataparser=dataparser, data=dataparser.data)  # type: ignore[call-arg]
 
     def create_eval_dataset(self) -> EventDataset | None:
         """Return the reference views.

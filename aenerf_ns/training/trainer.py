@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import yaml
@@ -42,7 +42,7 @@ class AENeRFTrainerConfig(TrainerConfig):
                 group["scheduler"].max_steps = self.schedule_length or self.max_num_iterations
 
     @property
-    def load_step(self) -> int | None:  # type: ignore[override]
+    def load_step(self) -> int | None:
         """The step to load: the one that was asked for, or that of the newest whole checkpoint, where a run is opened.
 
         Nerfstudio's commands that open a run set ``load_dir`` to its own folder, and then ask for this step. Without an
@@ -59,7 +59,7 @@ class AENeRFTrainerConfig(TrainerConfig):
 
     @load_step.setter
     def load_step(self, step: int | None) -> None:
-        vars(self)["load_step"] = step
+        self.__dict__["load_step"] = step
 
     def save_config(self) -> None:
         """Check the options. The trainer saves them when the dataset has resolved those that were left open.
@@ -91,7 +91,7 @@ class AENeRFTrainer(Trainer):
     checkpoint_dir: Path
 
     def __init__(self, config: AENeRFTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        changes: dict[str, object] = {"schedule_length": config.schedule_length or config.max_num_iterations}
+        changes: dict[str, Any] = {"schedule_length": config.schedule_length or config.max_num_iterations}
         with errors_as_one_line():
             if config.load_dir is not None:
                 # As one path: commands that open this run would look for a load_step among its own checkpoints.
@@ -125,7 +125,8 @@ class AENeRFTrainer(Trainer):
         """Return the configuration with what the dataset has resolved: opening the run must give the same cameras."""
         data = self.pipeline.datamanager
         assert isinstance(data, EventDataManager)
-        return replace(self.config, pipeline=replace(self.config.pipeline, datamanager=data.resolved_config()))
+        pipeline = replace(self.config.pipeline, datamanager=data.resolved_config())
+        return replace(self.config, pipeline=pipeline)  # type: ignore[call-arg]
 
     def train(self) -> None:
         """Train the model, and record how far that came."""

@@ -189,7 +189,7 @@ class FlowPatchSampler(WindowSampler):
         DataError: an option is out of range, or no patch can be used.
     """
 
-    batch_type = PatchBatch
+    batch_type = PatchBatch  # type: ignore[assignment]
     pixels_per_draw = 4
 
     def __init__(
