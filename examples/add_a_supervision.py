@@ -45,7 +45,6 @@ def main(data: Path, output: Path, steps: int = 2000) -> None:
     # Changes of silent pixels are known up to a threshold only, which this loss does not handle.
     config.pipeline.datamanager.sampler.silent_pair_share = 0.0
     config.data, config.output_dir, config.max_num_iterations, config.vis = data, output, steps, "tensorboard"
-    config.machine.device_type = "cpu"
     train(config)
 
 

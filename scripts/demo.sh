@@ -16,10 +16,9 @@ aenerf simulate --output demo/room --width 160 --height 120 --max-displacement 1
 
 # The simulated poses are exact: nothing of them is corrected here.
 echo "2/4 Training from its events alone (watch it at http://localhost:7007) ..."
-device=$(python -c "import torch; print('cuda' if torch.cuda.is_available() else 'cpu')")
-ns-train aenerf-small --machine.device-type "$device" --max-num-iterations 1200 --output-dir demo/outputs \
+ns-train aenerf-small --max-num-iterations 1200 --output-dir demo/outputs \
   --pipeline.model.camera-optimizer.mode off --pipeline.refine-test-poses False \
-  --viewer.quit-on-train-completion True --viewer.websocket-host 127.0.0.1 --data demo/room
+  --viewer.quit-on-train-completion True --data demo/room
 config=$(ls -t demo/outputs/room/aenerf-small/*/config.yml | head -n 1)
 
 echo "3/4 Evaluating on novel views ..."
@@ -33,7 +32,7 @@ import json
 
 results = json.load(open("demo/evaluation.json"))["results"]
 print(f"""
-Novel views: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.3f} (colour correction {results['color_correction']})
+Novel views: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.3f} (color correction {results['color_correction']})
   demo/evaluation/eval_img_*.png    the truth (left) beside what was reconstructed (right)
   demo/evaluation/eval_depth_*.png  its depth
   demo/flight.mp4                   a flight through the reconstructed room

@@ -12,7 +12,7 @@ from torch import Tensor
 from aenerf_ns.camera.rotation import quaternion_from_rotation
 
 # Four lost frames in a row make a segment five times as long as its neighbors. The errors of the poses at its ends
-# grow with its length, but the spline is still closer to the path than a straight line (docs/experiments.md).
+# grow with its length, but the spline is still closer to the path than a straight line (benchmarks/LOG.md).
 _MAX_SEGMENT_RATIO = 5.5
 # Closer to half a turn, the shorter way round is hardly known.
 _MAX_TURN = math.radians(150)

@@ -223,7 +223,7 @@ class SimulateVideo(SimulationCommand):
         missing = "trajectory.txt" if camera is not None else "calibration.json and trajectory.txt"
         return (
             f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(kept)} images, no poses.\n"
-            f"To train on them, add {missing} (docs/datasets/own_recording.md)."
+            f"To train on them, add {missing} (docs/your_data.md)."
         )
 
 
