@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
+import subprocess
 import time
 from collections.abc import Callable
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -319,16 +318,12 @@ def test_a_killed_command_leaves_no_dataset(tmp_path: Path) -> None:
             writer.append(EventStream(zeros, zeros, t, np.ones(len(t), np.int8), 6, 4))
     output, partial = tmp_path / "converted", tmp_path / ".converted.partial"
     for end in (signal.SIGTERM, signal.SIGKILL):
-        # A copy of this process, because a start of Python imports for seconds.
-        process = get_context("fork").Process(target=Convert(data, output).main)
-        process.start()
+        process = subprocess.Popen(["aenerf", "convert", data, "--output", output])
         while not (partial / "events.h5").exists():
-            assert process.is_alive()
+            assert process.poll() is None
             time.sleep(0.02)
-        assert process.pid is not None
-        os.kill(process.pid, end)
-        process.join(600)
-        assert process.exitcode == (128 + end if end is signal.SIGTERM else -end)
+        process.send_signal(end)
+        assert process.wait(600) == (128 + end if end is signal.SIGTERM else -end)
         assert not output.exists()
         assert partial.exists() == (end is signal.SIGKILL)
         # The next attempt clears what SIGKILL leaves behind.
