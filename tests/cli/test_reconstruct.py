@@ -86,7 +86,9 @@ def test_network_reconstructs_with_given_weights(
     name: str, network: type[E2VID] | type[FireNet], data: Path, tmp_path: Path
 ) -> None:
     torch.manual_seed(0)
-    torch.save({"state_dict": network().state_dict()}, tmp_path / "weights.pth.tar")
+    made = network()
+    state = torch.nn.ModuleDict({made.name_in_file: made}).state_dict()
+    torch.save({"state_dict": state}, tmp_path / "weights.pth.tar")
     Reconstruct(data, tmp_path / "out", name, tmp_path / "weights.pth.tar", events_per_pixel=2.0).main()  # type: ignore[arg-type]
     assert len(opened(tmp_path / "out").reference_views["train"]) == 4
 
