@@ -70,6 +70,12 @@ class CheckResult:
     planes: dict[str, str] = field(default_factory=dict)
     warped: WarpedEvents | None = None
 
+    @property
+    def events_per_second(self) -> list[float]:
+        """Rate of the events in equal parts of their time."""
+        counted = self.statistics
+        return (counted.rate * (len(counted.rate) / max(counted.end - counted.start, 1) * 1e9)).tolist()
+
 
 def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult:
     """Check a recording: its events, its poses, and whether the poses fit the events.

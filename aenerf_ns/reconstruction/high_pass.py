@@ -12,7 +12,7 @@ from aenerf_ns.events.stream import EventStream
 CUTOFF = 0.06
 """ω and ω_e of the authors' code, which calls them Hz and uses them as 1 / s."""
 
-# Radiance of a pixel whose state is zero, as a share of display white: the photographers' middle grey.
+# Radiance of a pixel whose state is zero, as a share of display white: the photographers' middle gray.
 _MIDDLE_GREY = 0.18
 # A state times this power is a display value. Then log-radiance is an exact multiple of the display value's logarithm.
 _DISPLAY_POWER = 1 / 2.2

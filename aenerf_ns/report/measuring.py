@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from nerfstudio.engine.trainer import TrainerConfig
-from PIL import Image
 
 from aenerf_ns.evaluation.evaluate import evaluate
 from aenerf_ns.evaluation.run import TrainedRun
@@ -18,58 +17,8 @@ from aenerf_ns.report.poses import RunPoses, measure_poses
 from aenerf_ns.report.run_files import TrainingRecord, read_record, read_scalars
 from aenerf_ns.report.view_pictures import ViewPictures, choose_views, picture_views
 
-
-@dataclass
-class EventFigures:
-    """Figures of a recording's events.
-
-    Attributes:
-        num_events: all of them.
-        num_positive: those of polarity +1.
-        start_ns: time of the first event.
-        end_ns: time of the last event.
-        rate: events per second in equal parts of the time between.
-    """
-
-    num_events: int
-    num_positive: int
-    start_ns: int
-    end_ns: int
-    rate: list[float]
-
-
-@dataclass
-class DataReport:
-    """What a run was trained on.
-
-    Attributes:
-        pose_gaps_ns: first and last time of each gap of the poses.
-        check: the figures that ``aenerf check`` prints.
-        problems: what it finds wrong.
-        events: None where the events are no longer there.
-        pairs: the account of the pairs, None where batches are not pairs of events.
-        check_picture: :meth:`~aenerf_ns.checking.contrast.WarpedEvents.picture`; None if too few events have a pose.
-    """
-
-    pose_gaps_ns: list[list[int]]
-    check: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    events: EventFigures | None = None
-    pairs: str | None = None
-    check_picture: Image.Image | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return all figures in plain values, without those that are not known."""
-        figures: dict[str, Any] = {
-            "pose_gaps_ns": self.pose_gaps_ns,
-            "check": self.check,
-            "problems": self.problems,
-        }
-        if self.events is not None:
-            figures |= asdict(self.events)
-        if self.pairs is not None:
-            figures["pairs"] = self.pairs
-        return figures
+if TYPE_CHECKING:
+    from aenerf_ns.checking.report import CheckResult
 
 
 @dataclass
@@ -82,13 +31,15 @@ class RunReport:
         config: the settings that tell runs apart: method, data, steps, pose correction, seed.
         record: how the run was made, or None.
         scalars: see :func:`~aenerf_ns.report.run_files.read_scalars`.
-        data: what the run was trained on.
+        pose_gaps_ns: first and last time of each gap of the poses.
         poses: along the trajectory.
+        check: what ``aenerf check`` finds in the data, None where the events are no longer there.
         evaluation: what ``ns-eval`` writes as results.
         contrast: of each channel; see :func:`~aenerf_ns.report.view_pictures.picture_views`.
         chosen: why a view is shown, by its file.
         pictures: by the file of the view.
-        pairs: rendered against measured changes, or None.
+        pairs: rendered against measured changes, None where batches are not pairs of events.
+        num_pairs: the account of the pairs, in words.
         missing: what was not measured, and why.
     """
 
@@ -97,13 +48,15 @@ class RunReport:
     config: dict[str, Any]
     record: TrainingRecord | None
     scalars: dict[str, tuple[list[int], list[float]]] | None
-    data: DataReport
+    pose_gaps_ns: list[list[int]]
     poses: RunPoses
+    check: CheckResult | None = None
     evaluation: dict[str, Any] = field(default_factory=dict)
     contrast: list[float] = field(default_factory=list)
     chosen: dict[str, str] = field(default_factory=dict)
     pictures: dict[str, ViewPictures] = field(default_factory=dict)
     pairs: PairResiduals | None = None
+    num_pairs: str | None = None
     missing: list[str] = field(default_factory=list)
 
     @property
@@ -113,6 +66,20 @@ class RunReport:
 
     def as_json(self) -> dict[str, Any]:
         """Return all figures in plain values."""
+        data: dict[str, Any] = {"pose_gaps_ns": self.pose_gaps_ns, "check": [], "problems": []}
+        if self.check is not None:
+            events = self.check.statistics
+            data |= {
+                "check": self.check.figures,
+                "problems": self.check.problems,
+                "num_events": events.num_events,
+                "num_positive": events.num_positive,
+                "start_ns": events.start,
+                "end_ns": events.end,
+                "rate": self.check.events_per_second,
+            }
+        if self.num_pairs is not None:
+            data["pairs"] = self.num_pairs
         return {
             "name": self.name,
             "folder": str(self.folder),
@@ -120,7 +87,7 @@ class RunReport:
             "record": msgspec.to_builtins(self.record),
             "evaluation": self.evaluation,
             "contrast_per_channel": self.contrast,
-            "data": self.data.as_json(),
+            "data": data,
             "poses": asdict(self.poses),
             "pairs": None if self.pairs is None else asdict(self.pairs),
             "scalars": self.scalars,
@@ -151,7 +118,7 @@ def measure_run(
         _settings(config, run),
         read_record(folder),
         read_scalars(folder),
-        DataReport([list(gap) for gap in run.scene.window.gaps]),
+        [list(gap) for gap in run.scene.window.gaps],
         measure_poses(run),
     )
     missing = report.missing
@@ -209,23 +176,17 @@ def _measure_data(report: RunReport, run: TrainedRun) -> None:
     # Imported lazily, because numba is slow to import.
     from aenerf_ns.checking.report import check
 
-    scene, data = run.scene, report.data
+    scene = run.scene
     if not scene.event_file.path.is_file():
         report.missing.append(
             f"Rate, polarity, pairs and the check: the events are no longer at {scene.event_file.path}."
         )
         return
-    found = check(run.recording, scene.window, scene.scale)
-    data.check, data.problems, counted = found.figures, found.problems, found.statistics
-    parts_per_second = len(counted.rate) / max(counted.end - counted.start, 1) * 1e9
-    rate = (counted.rate * parts_per_second).tolist()
-    data.events = EventFigures(counted.num_events, counted.num_positive, counted.start, counted.end, rate)
-    if found.warped is None:
+    report.check = check(run.recording, scene.window, scene.scale)
+    if report.check.warped is None:
         report.missing.append("The check's picture: too few events have a pose.")
-    else:
-        data.check_picture = Image.fromarray(found.warped.picture())
     report.pairs = measure_pair_residuals(run)
     if report.pairs is None:
         report.missing.append("Rendered against measured changes: the batches of this method are no pairs of events.")
     else:
-        data.pairs = run.dataset.pairs.summary()
+        report.num_pairs = run.dataset.pairs.summary()

@@ -9,8 +9,10 @@ from importlib.resources import files
 from typing import Any
 
 import jinja2
+import numpy as np
 import plotly.graph_objects as go
 from markupsafe import Markup
+from numpy.typing import NDArray
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
@@ -75,8 +77,9 @@ def _plot(figure: go.Figure | None, otherwise: str = "") -> Markup:
     return Markup(figure.to_html(full_html=False, include_plotlyjs=False, config=config))
 
 
-def _picture(image: Image.Image, max_width: int = _MAX_WIDTH) -> str:
+def _picture(values: Image.Image | NDArray[np.uint8], max_width: int = _MAX_WIDTH) -> str:
     """Encode a picture as a data URL."""
+    image = Image.fromarray(values) if isinstance(values, np.ndarray) else values
     if image.width > max_width:
         size = max_width, round(image.height * max_width / image.width)
         image = image.resize(size, Image.Resampling.LANCZOS)

@@ -9,7 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from aenerf_ns.report.measuring import DataReport, RunReport
+from aenerf_ns.report.measuring import RunReport
 from aenerf_ns.report.pair_residuals import PairResiduals
 
 # Colors of the runs and of true poses.
@@ -57,12 +57,8 @@ def curves(reports: Sequence[RunReport]) -> go.Figure | None:
         row, column = index // columns + 1, index % columns + 1
         for run, (report, scalars) in enumerate(zip(reports, kept, strict=True)):
             if name in scalars:
-                steps, values = scalars[name]
-                mode = "lines" if len(steps) > 1 else "markers"
-                figure.add_scatter(
-                    x=steps, y=values, name=report.name, mode=mode, line_color=color(run), legendgroup=report.name,
-                    showlegend=len(reports) > 1 and index == 0, row=row, col=column,
-                )  # fmt: skip
+                show = len(reports) > 1 and index == 0
+                _add_line(figure, *scalars[name], report.name, {"color": color(run)}, show, row, column)
         figure.update_yaxes(exponentformat="power", row=row, col=column)
         if logarithmic:
             logged = [value for scalars in kept for value in scalars.get(name, ([], []))[1] if value > 0]
@@ -82,13 +78,14 @@ def _decades(values: Sequence[float]) -> list[float] | None:
     return [max(low, high - _MAX_DECADES) - margin, high + margin]
 
 
-def event_rate(data: DataReport) -> go.Figure:
+def event_rate(report: RunReport) -> go.Figure:
     """Plot the rate of the events over time, with the gaps of the poses."""
-    assert data.events is not None
-    start, end, rate = data.events.start_ns * 1e-9, data.events.end_ns * 1e-9, data.events.rate
+    assert report.check is not None
+    events = report.check.statistics
+    start, end, rate = events.start * 1e-9, events.end * 1e-9, report.check.events_per_second
     times = np.linspace(start, end, len(rate), endpoint=False) + (end - start) / len(rate) / 2
     figure = go.Figure(go.Bar(x=times, y=rate, marker_color=color(0), width=(end - start) / len(rate)))
-    for first, last in data.pose_gaps_ns:
+    for first, last in report.pose_gaps_ns:
         figure.add_vrect(first * 1e-9, last * 1e-9, fillcolor="#d62728", opacity=0.2, line_width=0)
     figure.update_layout(xaxis_title="time (s), clock of the events", yaxis_title="events a second", bargap=0)
     return _style(figure, 260)
@@ -100,12 +97,9 @@ def trajectory(reports: Sequence[RunReport]) -> go.Figure:
     for column, (across, up) in enumerate(((0, 1), (0, 2)), start=1):
         for run, report in enumerate(reports):
             for name, points in _paths(report, first=run == 0):
-                x, y = (np.array(points)[:, axis] for axis in (across, up))
-                figure.add_scatter(
-                    x=x, y=y, mode="lines", legendgroup=f"{report.name}{name}", showlegend=column == 1,
-                    name=name if len(reports) == 1 or name == "true" else f"{name}, {report.name}",
-                    line=_line(name, run), row=1, col=column,
-                )  # fmt: skip
+                x, y = ([point[axis] for point in points] for axis in (across, up))
+                shown = name if len(reports) == 1 or name == "true" else f"{name}, {report.name}"
+                _add_line(figure, x, y, shown, _line(name, run), column == 1, 1, column)
         figure.update_xaxes(title_text="x", row=1, col=column)
         figure.update_yaxes(title_text="xyz"[up], scaleanchor=f"x{column if column > 1 else ''}", row=1, col=column)
     return _style(figure, 460)
@@ -117,6 +111,17 @@ def _paths(report: RunReport, first: bool) -> list[tuple[str, Any]]:
     shown = [(name, points) for name, points in positions.items() if first or name != "true"]
     # Below the others.
     return sorted(shown, key=lambda path: path[0] != "true")
+
+
+def _add_line(
+    figure: go.Figure, x: Sequence[float], y: Sequence[float], name: str, line: dict[str, Any], show: bool, row: int,
+    column: int,
+) -> None:  # fmt: skip
+    """Add a line, or its only point, to a panel. ``show`` puts it in the legend."""
+    mode = "lines" if len(x) > 1 else "markers"
+    figure.add_scatter(
+        x=x, y=y, name=name, line=line, mode=mode, legendgroup=name, showlegend=show, row=row, col=column
+    )
 
 
 def _line(name: str, run: int) -> dict[str, Any]:
@@ -135,11 +140,8 @@ def pose_errors(reports: Sequence[RunReport]) -> go.Figure | None:
     for row, kind in enumerate(titles, start=1):
         for run, report in known:
             for name, errors in (report.poses.errors or {}).items():
-                figure.add_scatter(
-                    x=report.poses.seconds, y=errors[kind], mode="lines", line=_line(name, run),
-                    name=name if len(reports) == 1 else f"{name}, {report.name}", legendgroup=f"{report.name}{name}",
-                    showlegend=row == 1, row=row, col=1,
-                )  # fmt: skip
+                shown = name if len(reports) == 1 else f"{name}, {report.name}"
+                _add_line(figure, report.poses.seconds, errors[kind], shown, _line(name, run), row == 1, row, 1)
     figure.update_xaxes(title_text="seconds since the start of the trajectory", row=2)
     figure.update_yaxes(rangemode="tozero")
     return _style(figure, 480)
@@ -155,11 +157,9 @@ def correction(reports: Sequence[RunReport]) -> go.Figure | None:
     figure = make_subplots(2, 3, subplot_titles=titles, shared_xaxes=True, vertical_spacing=0.14)
     for index, name in enumerate(names):
         for run, report, components in known:
-            figure.add_scatter(
-                x=report.poses.seconds, y=components[name], mode="lines", line_color=color(run),
-                name=report.name, legendgroup=report.name, showlegend=len(known) > 1 and index == 0,
-                row=index // 3 + 1, col=index % 3 + 1,
-            )  # fmt: skip
+            show, line = len(known) > 1 and index == 0, {"color": color(run)}
+            x, y = report.poses.seconds, components[name]
+            _add_line(figure, x, y, report.name, line, show, index // 3 + 1, index % 3 + 1)
     figure.update_xaxes(title_text="seconds", row=2)
     return _style(figure, 440)
 

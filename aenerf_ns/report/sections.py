@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from aenerf_ns.report.measuring import DataReport, RunReport
+from aenerf_ns.report.measuring import RunReport
 
 METRIC_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
 """Decimals of the image metrics."""
@@ -86,19 +86,15 @@ def _describe_metrics(metrics: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def describe_events(data: DataReport) -> str:
+def describe_events(report: RunReport) -> str:
     """Describe the events of a recording, which are still there, and the gaps between its poses."""
-    events, gaps = data.events, data.pose_gaps_ns
-    assert events is not None
-    seconds = (events.end_ns - events.start_ns) * 1e-9
+    assert report.check is not None
+    events, gaps = report.check.statistics, report.pose_gaps_ns
+    seconds = (events.end - events.start) * 1e-9
     lost = sum(last - first for first, last in gaps) * 1e-9
     share = events.num_positive / max(events.num_events, 1)
-    line = f"{events.num_events:,} events in {seconds:.3f} s, {share:.1%} positive."
-    return (
-        f"{line} {len(gaps)} gaps of the poses, {lost:.3f} s in all, in red."
-        if gaps
-        else f"{line} No gap of the poses."
-    )
+    described = f"{len(gaps)} gaps of the poses, {lost:.3f} s in all, in red." if gaps else "No gap of the poses."
+    return f"{events.num_events:,} events in {seconds:.3f} s, {share:.1%} positive. {described}"
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.report.comparison import confidence_interval, paired_differences, views_left_out
-from aenerf_ns.report.measuring import DataReport, RunReport
+from aenerf_ns.report.measuring import RunReport
 from aenerf_ns.report.pair_residuals import average_by_length, average_by_tile
 from aenerf_ns.report.poses import RunPoses, measure_poses
 from aenerf_ns.report.protocol import Protocol, protocol_differences, shared_views
@@ -131,7 +131,7 @@ def test_errors_match_evo_over_all_poses_of_the_files(random_poses: torch.Tensor
 def report_of(name: str, psnr: list[float]) -> RunReport:
     views = [{"file": f"{index}.png", "placed": {"psnr": value}} for index, value in enumerate(psnr)]
     poses = RunPoses(0, [], {}, [], [], None, None, None)
-    return RunReport(name, Path(name), {}, None, None, DataReport([]), poses, evaluation={"views": views})
+    return RunReport(name, Path(name), {}, None, None, [], poses, evaluation={"views": views})
 
 
 def test_pair_differences_by_file() -> None:

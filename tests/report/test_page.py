@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
+from aenerf_ns.checking.contrast import WarpedEvents
+from aenerf_ns.checking.report import CheckResult
+from aenerf_ns.events.statistics import EventStatistics
 from aenerf_ns.report.comparison import paired_differences, views_left_out
-from aenerf_ns.report.measuring import DataReport, EventFigures, RunReport
+from aenerf_ns.report.measuring import RunReport
 from aenerf_ns.report.page import make_page
 from aenerf_ns.report.pair_residuals import PairResiduals
 from aenerf_ns.report.poses import RunPoses
@@ -19,8 +24,15 @@ from aenerf_ns.report.view_pictures import ViewPictures
 HOSTILE = '<script>alert("&")</script>'
 
 
-def picture(size: tuple[int, int] = (6, 4)) -> Image.Image:
-    return Image.new("RGB", size, "red")
+def picture() -> Image.Image:
+    return Image.new("RGB", (6, 4), "red")
+
+
+class Drawing:
+    """Stands in for warped events, of which a page only needs the picture."""
+
+    def picture(self) -> NDArray[np.uint8]:
+        return np.zeros((100, 2000, 3), np.uint8)
 
 
 def make_report(name: str, **changes: Any) -> RunReport:
@@ -49,7 +61,8 @@ def make_report(name: str, **changes: Any) -> RunReport:
         "data": HOSTILE, "method": "aenerf", "supervision": "pairs", "pose_correction": "spline", "seed": 1,
         "sensor": "6 x 4 pixels", "window_ns": [0, 10**9], "thresholds": [0.25, 0.25],
     }  # fmt: skip
-    events = EventFigures(1000, 400, 0, 10**9, [500.0, 1500.0])
+    counts = np.array([[400, 600]])
+    events = EventStatistics(counts, 400, 0, np.array([250, 750]), np.zeros((0, 2), np.int64), 0, 10**9)
     figures = {
         "config": settings,
         "record": TrainingRecord(
@@ -57,7 +70,9 @@ def make_report(name: str, **changes: Any) -> RunReport:
             machine=Machine("cpu", 2), peak_memory_bytes={"host": 2**30, "gpu": None},
         ),
         "scalars": {"Train Loss Dict/reconstruction_loss": ([0, 1], [1.0, 0.5])},
-        "data": DataReport([[1, 2]], ["Events: 1000"], [HOSTILE], events, "1000 pairs", picture((2000, 100))),
+        "pose_gaps_ns": [[1, 2]],
+        "check": CheckResult(events, ["Events: 1000"], [HOSTILE], warped=cast(WarpedEvents, Drawing())),
+        "num_pairs": "1000 pairs",
         "poses": RunPoses(2, [0.0, 1.0], {"estimated": path, "true": path}, [1.0, 1.0], [0.0, 0.0],
                           {"estimated": kinds, "corrected": kinds}, {"estimated": over_time},
                           {axis: [0.0, 0.1] for axis in axes}),
@@ -98,10 +113,10 @@ def test_page_shows_everything_escaped() -> None:
 
 
 def test_page_of_a_run_without_measurements() -> None:
-    bare = {"record": None, "scalars": None, "data": DataReport([]), "evaluation": {}, "chosen": {}, "pictures": {},
-            "pairs": None, "missing": [], "poses": RunPoses(0, [0.0], {"estimated": [[0.0] * 3]}, [0.0], [0.0], None,
-                                                             None, None)}  # fmt: skip
-    page = page_of([make_report("a", **bare)], [])
+    bare = dict.fromkeys(("record", "scalars", "check", "num_pairs", "pairs"))
+    empty = {"pose_gaps_ns": [], "evaluation": {}, "chosen": {}, "pictures": {}, "missing": []}
+    poses = RunPoses(0, [0.0], {"estimated": [[0.0] * 3]}, [0.0], [0.0], None, None, None)
+    page = page_of([make_report("a", **bare, **empty, poses=poses)], [])
     for text in ("made by an earlier version", "No run kept its scalars", "There are no views with images",
                  "the recording has no true poses", "No run corrects poses", "Nothing is missing"):  # fmt: skip
         assert text in page, text
