@@ -77,5 +77,7 @@ def test_no_steps_or_rays_is_one_line(option: str) -> None:
 
 def test_missing_gpu_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    config = deepcopy(aenerf.config)
+    config.machine.device_type = "cuda"
     with pytest.raises(SystemExit, match=r"^Error: --machine.device-type cuda: no GPU can be used; train on the CPU"):
-        deepcopy(aenerf.config).save_config()
+        config.save_config()

@@ -227,7 +227,7 @@ def test_a_recording_without_reference_views_trains_and_says_so_at_evaluation(wo
     (data / "trajectory_ground_truth.txt").unlink()
     output = run(*command, cwd=workspace, fails=True)
     assert "Error: " in output
-    assert "the test split has no reference images to evaluate on" in output
+    assert "it has no reference images to evaluate on" in output
     # The renderers start from places on the trajectory then.
     for mode in (("spiral", "--seconds", "0.1"), ("interpolate", "--interpolation-steps", "1")):
         video = workspace / f"bare_{mode[0]}.mp4"
