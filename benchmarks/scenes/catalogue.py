@@ -54,11 +54,7 @@ class BenchmarkScene:
         if self.walk is not None:
             path = {"kind": "walk", "positions": self.walk[0], "targets": self.walk[1]}
         path["duration"] = self.duration
-        light: dict[str, object] = {
-            "environment": environment,
-            "turn_degrees": self.turn_degrees,
-            "gain": self.gain,
-        }
+        light: dict[str, object] = {"environment": environment, "turn_degrees": self.turn_degrees, "gain": self.gain}
         if self.lamps:
             light["lamps"] = list(self.lamps)
         return {
@@ -85,16 +81,9 @@ def loop(
     """
     turn = 2 * np.pi * np.arange(count) / count
     across = turn + np.pi + 0.45 * np.sin(2 * turn + 0.4)
-    eyes = np.column_stack(
-        [half_length * np.cos(turn), half_width * np.sin(turn), height + 0.14 * np.sin(3 * turn + 0.7)]
-    )
-    targets = np.column_stack(
-        [
-            reach * half_length * np.cos(across),
-            reach * half_width * np.sin(across),
-            look_height + 0.3 * np.sin(3 * turn - 0.6),
-        ]
-    )
+    bob, nod = height + 0.14 * np.sin(3 * turn + 0.7), look_height + 0.3 * np.sin(3 * turn - 0.6)
+    eyes = np.column_stack([half_length * np.cos(turn), half_width * np.sin(turn), bob])
+    targets = np.column_stack([reach * half_length * np.cos(across), reach * half_width * np.sin(across), nod])
     return eyes.round(3).tolist(), targets.round(3).tolist()
 
 
@@ -108,33 +97,19 @@ SCENES: dict[str, BenchmarkScene] = {
     "forklift": BenchmarkScene(object_scenes.forklift, "warehouse"),
     "games": BenchmarkScene(object_scenes.games, "lab"),
     "living_room": BenchmarkScene(
-        place_scenes.living_room,
-        "park",
-        lamps=place_scenes.LIVING_ROOM_LAMPS,
-        walk=loop(1.2, 0.9, 1.4, 0.9, 0.95),
-        show_environment=True,
+        place_scenes.living_room, "park", lamps=place_scenes.LIVING_ROOM_LAMPS,
+        walk=loop(1.2, 0.9, 1.4, 0.9, 0.95), show_environment=True,
     ),
     "terrace": BenchmarkScene(
-        place_scenes.terrace,
-        "park",
-        turn_degrees=200,
-        walk=loop(2.7, 2.0, 1.55, 0.8, 0.85),
-        duration=6.0,
-        show_environment=True,
+        place_scenes.terrace, "park", turn_degrees=200,
+        walk=loop(2.7, 2.0, 1.55, 0.8, 0.85), duration=6.0, show_environment=True,
     ),
     "gallery": BenchmarkScene(
-        place_scenes.gallery,
-        "lobby",
-        lamps=place_scenes.GALLERY_LAMPS,
-        walk=loop(6.1, 1.55, 1.6, 0.75, 1.35),
-        duration=8.0,
+        place_scenes.gallery, "lobby", lamps=place_scenes.GALLERY_LAMPS,
+        walk=loop(6.1, 1.55, 1.6, 0.75, 1.35), duration=8.0,
     ),
     "workshop": BenchmarkScene(
-        place_scenes.workshop,
-        "venice",
-        lamps=place_scenes.WORKSHOP_LAMPS,
-        walk=loop(2.0, 1.55, 1.6, 0.9, 1.0),
-        duration=5.0,
-        show_environment=True,
+        place_scenes.workshop, "venice", lamps=place_scenes.WORKSHOP_LAMPS,
+        walk=loop(2.0, 1.55, 1.6, 0.9, 1.0), duration=5.0, show_environment=True,
     ),
-}
+}  # fmt: skip

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from aenerf_ns.simulator import textures as tx
+from benchmarks.scenes.assets import Library
 from benchmarks.scenes.meshes import Material, Model, colored_copy, join, paint
 from benchmarks.scenes.shapes import box, disc, rectangle, revolved
 
@@ -136,30 +138,42 @@ def window(width: float, height: float, material: Material, columns: int = 2, ro
     return join(uprights + rails)
 
 
+Placing = tuple[str, float, float, float]
+"""Name of a model, the x and y where it is put down, and its turn in degrees."""
+
+
+def furnish(scene: Model, library: Library, placings: Sequence[Placing], below: float = np.inf) -> Model:
+    """Put models down on the highest surfaces lower than ``below``, so not on a ceiling or an umbrella."""
+    for name, x, y, turn in placings:
+        scene = scene.with_dropped(library.model(name), x, y, turn, below)
+    return scene
+
+
+Cladding = tuple[Material, float]
+"""Material of a surface, and the side of its texture's tiles in meters."""
+Wall = tuple[Any, ...]
+"""Arguments of `wall` from the material on."""
+
+
 def room(
     low: tuple[float, float],
     high: tuple[float, float],
     height: float,
-    walls: Sequence[Model],
-    floor: Model,
-    ceiling: Model,
+    walls: Sequence[Wall],
+    floor: Cladding,
+    ceiling: Cladding,
 ) -> Model:
-    """Put walls from `wall`, a floor and a ceiling in their places.
-
-    The order of the walls is far (+y), right (+x), near (-y), left (-x). The floor and the ceiling begin at the origin.
-    """
+    """Make a room. The order of the walls is far (+y), right (+x), near (-y), left (-x)."""
     (x0, y0), (x1, y1) = low, high
-    far, right, near, left = walls
-    return join(
-        (
-            far.moved((x0, y1, 0)),
-            right.moved((x1, y1, 0), -90),
-            near.moved((x1, y0, 0), 180),
-            left.moved((x0, y0, 0), 90),
-            floor.moved((x0, y0, 0)),
-            ceiling.moved((x0, y1, height)),
-        )
-    )
+    wide, deep = x1 - x0, y1 - y0
+    corners = ((x0, y1, 0, 0), (x1, y1, 0, -90), (x1, y0, 0, 180), (x0, y0, 0, 90))
+    parts = [
+        wall(width, height, *cladding).moved(corner[:3], corner[3])
+        for width, cladding, corner in zip((wide, deep, wide, deep), walls, corners, strict=True)
+    ]
+    parts.append(rectangle((0, 0, 0), (wide, 0, 0), (0, deep, 0), *floor).moved((x0, y0, 0)))
+    parts.append(rectangle((0, 0, 0), (wide, 0, 0), (0, -deep, 0), *ceiling).moved((x0, y1, height)))
+    return join(parts)
 
 
 def skirting(low: tuple[float, float], high: tuple[float, float], material: Material, height: float = 0.1) -> Model:

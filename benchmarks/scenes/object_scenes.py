@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from aenerf_ns.simulator import textures as tx
 from benchmarks.scenes.assets import Library
-from benchmarks.scenes.furnishings import bookcase, framed_picture, oak, podium, steel, walnut
+from benchmarks.scenes.furnishings import bookcase, framed_picture, furnish, oak, podium, steel, walnut
 from benchmarks.scenes.meshes import Model, paint
 from benchmarks.scenes.shapes import box, disc, revolved, top
 
@@ -22,8 +22,9 @@ def piano(library: Library) -> Model:
     scene += bench.moved((0, -0.92, 0))
     scene = scene.with_dropped(library.model("teddyBear"), 0.05, -0.92, 165)
     scene += library.model("electricGuitar").moved((0.85, -0.55, 0), -30)
-    scene = scene.with_dropped(library.model("stool2"), -0.95, -0.35)
-    return scene.with_dropped(library.model("orchids"), -0.95, -0.35)
+    return furnish(scene, library, [
+        ("stool2", -0.95, -0.35, 0), ("orchids", -0.95, -0.35, 0),
+    ])  # fmt: skip
 
 
 def bookshelf(library: Library) -> Model:
@@ -47,11 +48,10 @@ def bookshelf(library: Library) -> Model:
     ):
         scene = scene.with_dropped(library.model(name), x, 0.43, turn, below)
     scene += library.model("caballito", "wood").moved((-0.35, -0.35, 0), 25)
-    scene = scene.with_dropped(library.model("stool2"), 0.55, -0.45)
-    scene = scene.with_dropped(library.model("teddyBear"), 0.55, -0.45, -20)
-    scene = scene.with_dropped(library.model("tennisRacket"), -0.35, 0.85, 90)
-    scene = scene.with_dropped(library.model("chicken"), 0.3, 0.88, 130)
-    return scene.with_dropped(library.model("basketball"), 0.05, -0.8)
+    return furnish(scene, library, [
+        ("stool2", 0.55, -0.45, 0), ("teddyBear", 0.55, -0.45, -20), ("tennisRacket", -0.35, 0.85, 90),
+        ("chicken", 0.3, 0.88, 130), ("basketball", 0.05, -0.8, 0),
+    ])  # fmt: skip
 
 
 def plants(library: Library) -> Model:
@@ -59,23 +59,12 @@ def plants(library: Library) -> Model:
     tiles = paint("terracotta tiles", tx.checker, ["b0795a", "c69a7a"], cells=6)
     scene = podium(1.1, 0.1, tiles, paint("stone", tx.mottled, ["8f8a80", "a39e92", "b5b0a4"], 0.08), 1.0)
     scene += library.model("oakTable").moved((0, 0, 0), scale=0.8)
-    for name, x, y, turn in (
-        ("augalas", -0.12, 0.18, 60),
-        ("orchids", 0.2, 0.12, 0),
-        ("littlePlant", -0.22, -0.2, 0),
-        ("cactus", 0.12, -0.22, 0),
-        ("kalender", 0.33, -0.1, 30),
-    ):
-        scene = scene.with_dropped(library.model(name), x, y, turn)
-    for name, x, y, turn in (
-        ("plant", -0.75, 0.45, 0),
-        ("decorativePlant", 0.72, 0.5, 0),
-        ("plantie", 0.1, -0.85, 5),
-        ("rock3", 0.8, -0.4, 40),
-        ("stoneLantern", -0.78, -0.4, 0),
-    ):
-        scene = scene.with_dropped(library.model(name), x, y, turn)
-    return scene
+    return furnish(scene, library, [
+        ("augalas", -0.12, 0.18, 60), ("orchids", 0.2, 0.12, 0), ("littlePlant", -0.22, -0.2, 0),
+        ("cactus", 0.12, -0.22, 0), ("kalender", 0.33, -0.1, 30),
+        ("plant", -0.75, 0.45, 0), ("decorativePlant", 0.72, 0.5, 0), ("plantie", 0.1, -0.85, 5),
+        ("rock3", 0.8, -0.4, 40), ("stoneLantern", -0.78, -0.4, 0),
+    ])  # fmt: skip
 
 
 def playground(library: Library) -> Model:
@@ -129,11 +118,10 @@ def lounge(library: Library) -> Model:
     scene += library.model("armchair2", "cloth").moved((-0.95, -0.75, 0), 120)
     scene += library.model("oakTable").moved((0.35, -0.35, 0), scale=0.6)
     scene += library.model("bedsideTable2").moved((-1.4, 1.15, 0))
-    scene = scene.with_dropped(library.model("desklamp"), -1.4, 1.15)
-    scene = scene.with_dropped(library.model("plant"), 1.4, -1.2)
-    scene = scene.with_dropped(library.model("cardGame"), 0.3, -0.45, 20)
-    scene = scene.with_dropped(library.model("caffe_final"), 0.5, -0.25)
-    return scene.with_dropped(library.model("teddyBear"), 0.55, 1.05, -10)
+    return furnish(scene, library, [
+        ("desklamp", -1.4, 1.15, 0), ("plant", 1.4, -1.2, 0), ("cardGame", 0.3, -0.45, 20),
+        ("caffe_final", 0.5, -0.25, 0), ("teddyBear", 0.55, 1.05, -10),
+    ])  # fmt: skip
 
 
 def forklift(library: Library) -> Model:
@@ -144,14 +132,15 @@ def forklift(library: Library) -> Model:
     scene += box((-2.6, -1.7, -0.15), (2.6, 1.7, 0), hazard, 1.0, without="zZ")
     truck = library.model("forkLift")
     scene += truck.moved((0.5, 0.1, 0))
-    scene = scene.with_dropped(library.model("pallet"), -1.85, -0.9, 10)
-    scene = scene.with_dropped(library.model("crate"), -2.1, -0.75, 10)
-    scene = scene.with_dropped(library.model("crate"), -1.65, -1.05, 30)
+    scene = furnish(scene, library, [
+        ("pallet", -1.85, -0.9, 10), ("crate", -2.1, -0.75, 10), ("crate", -1.65, -1.05, 30),
+    ])  # fmt: skip
     scene = scene.with_dropped(library.model("ammoBox").moved(scale=0.8), -1.9, -0.95, 40)
     for x, y in ((1.2, 1.2), (2.05, 1.1), (1.9, -1.1)):
         scene = scene.with_dropped(library.model("barrel"), x, y, 60 * x)
-    scene = scene.with_dropped(library.model("box"), -1.9, 1.1, 15)
-    return scene.with_dropped(library.model("fireExtinguisher"), 1.0, -1.3)
+    return furnish(scene, library, [
+        ("box", -1.9, 1.1, 15), ("fireExtinguisher", 1.0, -1.3, 0),
+    ])  # fmt: skip
 
 
 def games(library: Library) -> Model:
@@ -160,9 +149,8 @@ def games(library: Library) -> Model:
     scene = box((-1.3, -1.3, -0.1), (1.3, 1.3, 0), tiles, 1.0, without="xXyY")
     scene += box((-1.3, -1.3, -0.1), (1.3, 1.3, 0), steel(), 0.5, without="zZ")
     scene += library.model("table_football", "wood").moved((0, 0.05, 0), 15)
-    scene = scene.with_dropped(library.model("silla2"), -0.95, -0.85, 20)
-    scene = scene.with_dropped(library.model("stool2"), 0.95, -0.75)
-    scene = scene.with_dropped(library.model("tableFan"), 0.95, -0.75, 30)
-    scene = scene.with_dropped(library.model("caballito"), -0.95, 0.95, 30)
-    scene = scene.with_dropped(library.model("basketball"), 0.5, -1.0)
+    scene = furnish(scene, library, [
+        ("silla2", -0.95, -0.85, 20), ("stool2", 0.95, -0.75, 0), ("tableFan", 0.95, -0.75, 30),
+        ("caballito", -0.95, 0.95, 30), ("basketball", 0.5, -1.0, 0),
+    ])  # fmt: skip
     return scene.with_dropped(library.model("motorbike").moved(scale=0.6), 0.95, 1.0, 200)

@@ -9,6 +9,7 @@ from benchmarks.scenes.assets import Library
 from benchmarks.scenes.furnishings import (
     bookcase,
     framed_picture,
+    furnish,
     lamp,
     oak,
     room,
@@ -21,16 +22,6 @@ from benchmarks.scenes.furnishings import (
 )
 from benchmarks.scenes.meshes import Material, Model, paint
 from benchmarks.scenes.shapes import box, disc, rectangle, revolved, top
-
-Placing = tuple[str, float, float, float]
-"""Name of a model, the x and y where it is put down, and its turn in degrees."""
-
-
-def _with_all(scene: Model, library: Library, placings: list[Placing], below: float) -> Model:
-    """Put furniture down on the highest surfaces lower than ``below``, so not on a ceiling or an umbrella."""
-    for name, x, y, turn in placings:
-        scene = scene.with_dropped(library.model(name), x, y, turn, below)
-    return scene
 
 
 def _canvas(number: int) -> Material:
@@ -52,22 +43,14 @@ _LIVING_LOW, _LIVING_HIGH, _LIVING_HEIGHT = (-3.4, -2.7), (3.4, 2.7), 2.7
 def living_room(library: Library) -> Model:
     """Build sofas around a low table, bookcases, a piano, plants and pictures, with a wide window to the right."""
     low, high, z = _LIVING_LOW, _LIVING_HIGH, _LIVING_HEIGHT
-    wide, deep = high[0] - low[0], high[1] - low[1]
     sage = paint("sage wallpaper", tx.striped_wallpaper, ["b3b99f", "a5ad92", "bcc1a9"])
     sand = paint("sand plaster", tx.mottled, ["c2b08f", "cbbb9d", "d4c6ab"], 0.05)
     brick = paint("painted bricks", tx.bricks, ["b08a72", "b9967f", "c2a28d"], "bfb3a3")
     leafy = paint("leafy wallpaper", tx.leafy_wallpaper, "b7bba5", ["8f9f82", "9aa58a", "a79a78"])
     boards = paint("oak boards", tx.planks, ["9c7750", "ab875f", "ba9a73"])
     opening = (1.2, 4.2, 0.85, 2.25)
-    walls = (
-        wall(wide, z, sage, 1.2),
-        wall(deep, z, sand, 2.0, [opening], white_paint()),
-        wall(wide, z, brick, 1.3),
-        wall(deep, z, leafy, 1.4),
-    )
-    floor = rectangle((0, 0, 0), (wide, 0, 0), (0, deep, 0), boards, 1.6)
-    ceiling = rectangle((0, 0, 0), (wide, 0, 0), (0, -deep, 0), white_paint(), 1.5)
-    scene = room(low, high, z, walls, floor, ceiling) + skirting(low, high, white_paint())
+    walls = ((sage, 1.2), (sand, 2.0, [opening], white_paint()), (brick, 1.3), (leafy, 1.4))
+    scene = room(low, high, z, walls, (boards, 1.6), (white_paint(), 1.5)) + skirting(low, high, white_paint())
     bars = window(opening[1] - opening[0], opening[3] - opening[2], white_paint(), columns=3)
     scene += bars.moved((high[0] + 0.06, high[1] - opening[0], opening[2]), -90)
     rug = paint("living room rug", tx.rug, ["7a4a40", "5f728a", "c2a574", "cfc5b0"], size=512)
@@ -86,33 +69,18 @@ def living_room(library: Library) -> Model:
         inwards = np.array([np.sin(np.radians(turn)), -np.cos(np.radians(turn)), 0])
         scene += picture.moved(np.array([x, y, 1.65]) + 0.001 * inwards, turn)
     scene += library.model("cuckooClock").moved((low[0] + 0.1, 1.5, 1.35), 90)
-    scene = _with_all(
-        scene,
-        library,
-        [
-            ("couch", 0.4, -2.2, 180),
-            ("armchair2", -1.9, -1.95, 150),
-            ("sofa2", -2.85, -0.2, 90),
-            ("televisionCabinet", 1.0, 2.3, 0),
-            ("pianoAQueue", 2.48, 0.3, -90),
-            ("plant", -2.95, 2.3, 0),
-            ("decorativePlant", 2.95, 2.25, 0),
-            ("bedsideTable2", -3.05, -1.65, 90),
-            ("desklamp", -3.05, -1.65, 0),
-            ("caballito", -2.2, 1.35, 30),
-            ("electricGuitar", 0.05, 2.4, 0),
-            ("augalas", -1.7, 2.5, 180),
-            ("teddyBear", -2.75, 0.2, 90),
-            ("stool2", 2.8, -1.2, 0),
-            ("orchids", 2.8, -1.2, 0),
-            ("basketball", -0.6, 2.0, 0),
-        ],
-        2.2,
-    )
+    scene = furnish(scene, library, [
+        ("couch", 0.4, -2.2, 180), ("armchair2", -1.9, -1.95, 150), ("sofa2", -2.85, -0.2, 90),
+        ("televisionCabinet", 1.0, 2.3, 0), ("pianoAQueue", 2.48, 0.3, -90), ("plant", -2.95, 2.3, 0),
+        ("decorativePlant", 2.95, 2.25, 0), ("bedsideTable2", -3.05, -1.65, 90), ("desklamp", -3.05, -1.65, 0),
+        ("caballito", -2.2, 1.35, 30), ("electricGuitar", 0.05, 2.4, 0), ("augalas", -1.7, 2.5, 180),
+        ("teddyBear", -2.75, 0.2, 90), ("stool2", 2.8, -1.2, 0), ("orchids", 2.8, -1.2, 0),
+        ("basketball", -0.6, 2.0, 0),
+    ], 2.2)  # fmt: skip
     scene += library.model("oakTable").moved((0, 0, 0.012), scale=0.62)
-    return _with_all(
-        scene, library, [("cardGame", 0.12, -0.12, 20), ("caffe_final", -0.12, 0.1, 0), ("cactus", 0.0, 0.17, 0)], 2.2
-    )
+    return furnish(scene, library, [
+        ("cardGame", 0.12, -0.12, 20), ("caffe_final", -0.12, 0.1, 0), ("cactus", 0.0, 0.17, 0),
+    ], 2.2)  # fmt: skip
 
 
 LIVING_ROOM_LAMPS = tuple(lamp(x, y, 2.45, 0.35, (10, 9.2, 8)) for x in (-1.7, 1.7) for y in (-1.0, 1.0))
@@ -147,62 +115,23 @@ def terrace(library: Library) -> Model:
     for low, high in (((-6.3, -5.5, -0.05), (-6.0, 5.6, 0.75)), ((6.0, -5.5, -0.05), (6.3, 5.6, 0.75))):
         scene += box(low, high, stone, 1.2, without="z")
         scene += box((low[0] - 0.04, low[1] - 0.04, 0.75), (high[0] + 0.04, high[1] + 0.04, 0.81), paving, 1.6)
-    scene = _with_all(
-        scene,
-        library,
-        [
-            ("table", 0, 0, 10),
-            ("umbrella", 4.2, 3.1, 0),
-            ("deckChair", 3.2, 2.9, 140),
-            ("deckChair", -3.9, 2.8, 215),
-            ("osakaChair", -0.5, -0.85, 190),
-            ("osakaChair", 0.65, 0.85, 15),
-            ("osakaChair", 0.5, -0.75, 170),
-            ("chairWithCushion", -0.65, 0.75, -10),
-            ("bench", -4.4, -0.6, 90),
-            ("wheelbarrow", 4.4, -3.6, 150),
-            ("stoneLantern", -4.5, -3.6, 0),
-            ("lantern", 4.6, 0.4, 0),
-            ("barrel", 5.4, 4.8, 0),
-            ("rock1", -5.3, -5.2, 0),
-            ("rock2", 1.9, -6.0, 60),
-            ("rock3", 2.9, -5.6, 0),
-            ("childHut", -6.0, -11.0, 200),
-            ("childSwing", 5.5, -10.5, 30),
-            ("seesaw", 0.5, -9.5, 100),
-            ("fence", -1.1, -4.45, 0),
-            ("fence", 0.9, -4.45, 0),
-            ("plantie", 2.5, 4.2, 0),
-            ("flowerBox", -2.2, 4.2, 0),
-            ("flowerBox", -1.5, 4.2, 0),
-            ("plant", 1.3, 4.1, 0),
-            ("decorativePlant", -4.6, 4.1, 0),
-            ("decorativePlant", 4.7, -2.2, 0),
-            ("plant", -4.6, -2.2, 40),
-            ("littlePlant", -6.15, -3.0, 0),
-            ("littlePlant", -6.15, 0.5, 50),
-            ("augalas", 6.15, -0.8, 90),
-            ("littlePlant", 6.15, 2.0, 20),
-            ("mofx_mailbox", 2.6, -4.3, 180),
-            ("basketball", 3.2, -2.6, 0),
-            ("chicken", -2.9, -6.2, 60),
-            ("chicken", -2.2, -6.9, 200),
-        ],
-        1.4,
-    )
-    return _with_all(
-        scene,
-        library,
-        [
-            ("bread", -0.5, 0.05, 40),
-            ("caffe_final", 0.3, 0.2, 0),
-            ("caffe_final", -0.2, -0.25, 90),
-            ("tetrapak", 0.3, -0.2, 30),
-            ("cupcake", 0.6, -0.05, 0),
-            ("orchids", -0.05, -0.02, 0),
-        ],
-        1.4,
-    )
+    scene = furnish(scene, library, [
+        ("table", 0, 0, 10), ("umbrella", 4.2, 3.1, 0), ("deckChair", 3.2, 2.9, 140), ("deckChair", -3.9, 2.8, 215),
+        ("osakaChair", -0.5, -0.85, 190), ("osakaChair", 0.65, 0.85, 15), ("osakaChair", 0.5, -0.75, 170),
+        ("chairWithCushion", -0.65, 0.75, -10), ("bench", -4.4, -0.6, 90), ("wheelbarrow", 4.4, -3.6, 150),
+        ("stoneLantern", -4.5, -3.6, 0), ("lantern", 4.6, 0.4, 0), ("barrel", 5.4, 4.8, 0), ("rock1", -5.3, -5.2, 0),
+        ("rock2", 1.9, -6.0, 60), ("rock3", 2.9, -5.6, 0), ("childHut", -6.0, -11.0, 200),
+        ("childSwing", 5.5, -10.5, 30), ("seesaw", 0.5, -9.5, 100), ("fence", -1.1, -4.45, 0),
+        ("fence", 0.9, -4.45, 0), ("plantie", 2.5, 4.2, 0), ("flowerBox", -2.2, 4.2, 0), ("flowerBox", -1.5, 4.2, 0),
+        ("plant", 1.3, 4.1, 0), ("decorativePlant", -4.6, 4.1, 0), ("decorativePlant", 4.7, -2.2, 0),
+        ("plant", -4.6, -2.2, 40), ("littlePlant", -6.15, -3.0, 0), ("littlePlant", -6.15, 0.5, 50),
+        ("augalas", 6.15, -0.8, 90), ("littlePlant", 6.15, 2.0, 20), ("mofx_mailbox", 2.6, -4.3, 180),
+        ("basketball", 3.2, -2.6, 0), ("chicken", -2.9, -6.2, 60), ("chicken", -2.2, -6.9, 200),
+    ], 1.4)  # fmt: skip
+    return furnish(scene, library, [
+        ("bread", -0.5, 0.05, 40), ("caffe_final", 0.3, 0.2, 0), ("caffe_final", -0.2, -0.25, 90),
+        ("tetrapak", 0.3, -0.2, 30), ("cupcake", 0.6, -0.05, 0), ("orchids", -0.05, -0.02, 0),
+    ], 1.4)  # fmt: skip
 
 
 # A gallery
@@ -213,22 +142,14 @@ _GALLERY_LOW, _GALLERY_HIGH, _GALLERY_HEIGHT = (-7.0, -3.2), (7.0, 3.2), 4.0
 def gallery(library: Library) -> Model:
     """Build a long hall with paintings on its walls, columns, and exhibits on plinths along its middle."""
     low, high, z = _GALLERY_LOW, _GALLERY_HIGH, _GALLERY_HEIGHT
-    wide, deep = high[0] - low[0], high[1] - low[1]
     plaster = paint("gallery plaster", tx.mottled, ["c4b7a3", "ccc1af", "d3cabb"], 0.05)
     red = paint("gallery red", tx.mottled, ["a5685a", "ad7365", "b57f72"], 0.05)
     marble = paint("marble", tx.mottled, ["b7b2a8", "c4c0b7", "d0ccc4"], 0.05)
     floor_tiles = paint("marble tiles", tx.checker, ["a8a090", "c2bbac"], cells=4)
     doorway = [(2.4, 4.0, 0.0, 2.6)]
     beyond = paint("doorway", tx.mottled, ["6f675c", "7a7267", "857d72"], 0.05)
-    walls = (
-        wall(wide, z, plaster, 2.0),
-        wall(deep, z, red, 2.0, doorway, walnut()),
-        wall(wide, z, plaster, 2.0),
-        wall(deep, z, red, 2.0, doorway, walnut()),
-    )
-    floor = rectangle((0, 0, 0), (wide, 0, 0), (0, deep, 0), floor_tiles, 2.0)
-    ceiling = rectangle((0, 0, 0), (wide, 0, 0), (0, -deep, 0), white_paint(), 1.5)
-    scene = room(low, high, z, walls, floor, ceiling) + skirting(low, high, walnut(), 0.16)
+    walls = 2 * ((plaster, 2.0), (red, 2.0, doorway, walnut()))
+    scene = room(low, high, z, walls, (floor_tiles, 2.0), (white_paint(), 1.5)) + skirting(low, high, walnut(), 0.16)
     for x, turn in ((high[0] + 0.15, -90), (low[0] - 0.15, 90)):
         scene += rectangle((-0.9, 0, 0), (1.8, 0, 0), (0, 0, 2.7), beyond, 1.0).moved((x, 0, 0), turn)
     number = 0
@@ -255,21 +176,11 @@ def gallery(library: Library) -> Model:
         scene += box((x - 0.3, -0.3, 0.12), (x + 0.3, 0.3, 0.85), marble, 0.6, without="zZ")
         scene += box((x - 0.36, -0.36, 0.85), (x + 0.36, 0.36, 0.92), marble, 0.6)
         scene = scene.with_dropped(library.model(name).moved(scale=scale), x, 0, turn, below=1.4)
-    return _with_all(
-        scene,
-        library,
-        [
-            ("decorativePlant", -6.4, 2.6, 0),
-            ("plant", -6.4, -2.6, 0),
-            ("plant", 6.4, 2.6, 0),
-            ("decorativePlant", 6.4, -2.6, 0),
-            ("sofa2", -2.1, 2.75, 0),
-            ("sofa2", 2.5, -2.75, 180),
-            ("armchair2", 2.9, 2.5, 20),
-            ("couch", -2.1, -2.65, 180),
-        ],
-        1.4,
-    )
+    return furnish(scene, library, [
+        ("decorativePlant", -6.4, 2.6, 0), ("plant", -6.4, -2.6, 0), ("plant", 6.4, 2.6, 0),
+        ("decorativePlant", 6.4, -2.6, 0), ("sofa2", -2.1, 2.75, 0), ("sofa2", 2.5, -2.75, 180),
+        ("armchair2", 2.9, 2.5, 20), ("couch", -2.1, -2.65, 180),
+    ], 1.4)  # fmt: skip
 
 
 GALLERY_LAMPS = tuple(lamp(x, y, 3.7, 0.4, (14, 13.2, 12)) for x in (-5.4, -1.8, 1.8, 5.4) for y in (-1.3, 1.3))
@@ -283,22 +194,15 @@ _WORKSHOP_LOW, _WORKSHOP_HIGH, _WORKSHOP_HEIGHT = (-5.5, -4.5), (5.5, 4.5), 4.2
 def workshop(library: Library) -> Model:
     """Build a workshop with a fork-lift truck, crates, barrels, shelves, lockers and a stair, under high windows."""
     low, high, z = _WORKSHOP_LOW, _WORKSHOP_HIGH, _WORKSHOP_HEIGHT
-    wide, deep = high[0] - low[0], high[1] - low[1]
     brick = paint("workshop bricks", tx.bricks, ["a06a55", "ab7863", "b58875"], "b0a596")
     block = paint("concrete blocks", tx.bricks, ["9a978f", "a3a098", "aba8a1"], "8f8c85", rows=8, columns=4)
     concrete = paint("workshop floor", tx.mottled, ["8a8882", "95938d", "a09e99"], 0.1, size=512)
     panels = paint("roof panels", tx.planks, ["a8a59b", "b2afa6", "bab8b0"], rows=4, columns=1)
     yellow = paint("yellow line", tx.mottled, ["c9a23a", "d3ae4a", "dab85c"], 0.06)
     lights = [(1.0, 4.0, 2.4, 3.5), (5.0, 8.0, 2.4, 3.5)]
-    walls = (
-        wall(wide, z, brick, 1.4, [*lights, (9.0, 10.6, 2.4, 3.5)], white_paint()),
-        wall(deep, z, block, 1.8),
-        wall(wide, z, brick, 1.4),
-        wall(deep, z, block, 1.8, [(1.0, 4.0, 2.4, 3.5), (5.0, 8.0, 2.4, 3.5)], white_paint()),
-    )
-    floor = rectangle((0, 0, 0), (wide, 0, 0), (0, deep, 0), concrete, 3.0)
-    ceiling = rectangle((0, 0, 0), (wide, 0, 0), (0, -deep, 0), panels, 2.0)
-    scene = room(low, high, z, walls, floor, ceiling)
+    far = (brick, 1.4, [*lights, (9.0, 10.6, 2.4, 3.5)], white_paint())
+    walls = (far, (block, 1.8), (brick, 1.4), (block, 1.8, lights, white_paint()))
+    scene = room(low, high, z, walls, (concrete, 3.0), (panels, 2.0))
     for x0, x1 in ((1.0, 4.0), (5.0, 8.0), (9.0, 10.6)):
         scene += window(x1 - x0, 1.1, steel(), 3).moved((low[0] + x0, high[1] + 0.06, 2.4))
     for y0 in (1.0, 5.0):
@@ -318,48 +222,20 @@ def workshop(library: Library) -> Model:
     for number, x in ((5, 1.4), (10, 3.2)):
         scene += framed_picture(1.0, 0.8, _canvas(number), steel()).moved((x, low[1] + 0.001, 1.7), 180)
     scene += library.model("emergencySign").moved((high[0] - 0.03, 0.0, 2.5), -90)
-    scene = _with_all(
-        scene,
-        library,
-        [
-            ("forkLift", 3.6, 2.9, 8),
-            ("pallet", -0.2, 0.15, 12),
-            ("pallet", 4.4, -0.6, 80),
-            ("crate", 4.4, -0.95, 5),
-            ("crate", 4.4, -0.26, 93),
-            ("barrel", -4.9, 3.95, 0),
-            ("barrel", -4.9, 2.95, 50),
-            ("barrel", -4.85, 1.9, 100),
-            ("spiralStaircase", -4.5, -3.5, 0),
-            ("lockedLocker", 0.3, -4.25, 180),
-            ("technicalTable1", 2.6, -3.9, 180),
-            ("riggedFan", 3.4, -3.9, 160),
-            ("desklamp", 1.9, -3.95, 0),
-            ("kitchenaid", 2.5, -3.9, 150),
-            ("motorbike", -4.5, 0.3, 60),
-            ("wheelbarrow", -4.4, -1.4, 200),
-            ("electricGuitar", 1.05, 4.1, 0),
-            ("table_football", -0.9, 3.75, 0),
-            ("plant", 0.35, 4.05, 0),
-            ("desk", -3.0, 4.0, 0),
-            ("fireExtinguisher", 5.2, 0.8, -90),
-            ("dustbin", 4.9, -3.9, 0),
-            ("box", 4.6, -2.3, 85),
-            ("speaker3", 1.4, 4.1, 0),
-        ],
-        2.2,
-    )
-    return _with_all(
-        scene,
-        library,
-        [
-            ("crate", -0.55, 0.0, 12),
-            ("crate", 0.2, 0.25, 25),
-            ("ammoBox", 4.5, -2.3, 70),
-            ("teddyBear", 0.25, 0.2, 200),
-        ],
-        2.2,
-    )
+    scene = furnish(scene, library, [
+        ("forkLift", 3.6, 2.9, 8), ("pallet", -0.2, 0.15, 12), ("pallet", 4.4, -0.6, 80), ("crate", 4.4, -0.95, 5),
+        ("crate", 4.4, -0.26, 93), ("barrel", -4.9, 3.95, 0), ("barrel", -4.9, 2.95, 50),
+        ("barrel", -4.85, 1.9, 100), ("spiralStaircase", -4.5, -3.5, 0), ("lockedLocker", 0.3, -4.25, 180),
+        ("technicalTable1", 2.6, -3.9, 180), ("riggedFan", 3.4, -3.9, 160), ("desklamp", 1.9, -3.95, 0),
+        ("kitchenaid", 2.5, -3.9, 150), ("motorbike", -4.5, 0.3, 60), ("wheelbarrow", -4.4, -1.4, 200),
+        ("electricGuitar", 1.05, 4.1, 0), ("table_football", -0.9, 3.75, 0), ("plant", 0.35, 4.05, 0),
+        ("desk", -3.0, 4.0, 0), ("fireExtinguisher", 5.2, 0.8, -90), ("dustbin", 4.9, -3.9, 0),
+        ("box", 4.6, -2.3, 85), ("speaker3", 1.4, 4.1, 0),
+    ], 2.2)  # fmt: skip
+    return furnish(scene, library, [
+        ("crate", -0.55, 0.0, 12), ("crate", 0.2, 0.25, 25), ("ammoBox", 4.5, -2.3, 70),
+        ("teddyBear", 0.25, 0.2, 200),
+    ], 2.2)  # fmt: skip
 
 
 WORKSHOP_LAMPS = tuple(lamp(x, y, 3.7, 0.4, (13, 12.6, 12)) for x in (-3.5, 0.0, 3.5) for y in (-2.2, 2.2))
