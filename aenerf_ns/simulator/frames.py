@@ -16,7 +16,7 @@ DISPLACEMENT_PERCENTILE = 99.0
 """Percentage of the picture that a limit on the motion between two pictures holds for."""
 _MARGIN = 0.98
 """Each step is guessed from the step before. A target a little below the limit saves most second guesses."""
-_LARGEST_STEP = 0.01
+_MAX_STEP = 0.01
 
 
 def frame_displacement(
@@ -86,7 +86,7 @@ def frame_parameters(
         while parameters[-1] < 1.0:
             depth = scene.renderer.render(pose, probe, _PROBE_WIDTH, rows, 1)[1]
             while True:
-                step = min(step, _LARGEST_STEP, 1.0 - parameters[-1])
+                step = min(step, _MAX_STEP, 1.0 - parameters[-1])
                 next_pose = scene.path(parameters[-1] + step)
                 displacement = frame_displacement(depth, pose, next_pose, probe, scene.background is None) / shrink
                 if displacement <= maximum_displacement:

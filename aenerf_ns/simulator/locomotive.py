@@ -12,7 +12,7 @@ from aenerf_ns.simulator.rendering.environment import sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight
 from aenerf_ns.simulator.rendering.mesh import Gloss
 from aenerf_ns.simulator.rendering.renderer import Renderer
-from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, Shape, box, lit, pillar, rod, sphere, turned_box
+from aenerf_ns.simulator.shapes import ALONG_X, ALONG_Y, Shape, box, light_shapes, pillar, rod, rotated_box, sphere
 
 TEXTURE_SIZE = 256
 BACKGROUND = (0.5, 0.5, 0.5)
@@ -40,7 +40,7 @@ def locomotive_scene(seed: int = 0, *, shiny: bool = False) -> Renderer:
     shapes = [*_track(), *_wheels(), *_frame(), *_boiler(), *_cab(), *_tender()]
     lamp = AreaLight((2.0, -2.4, 3.6), (-0.42, 0.5, 0.75), (0.85, 0.7, 0.0), (8.4, 7.9, 7.1))
     above = sky((0.3, 0.28, 0.26), (0.62, 0.66, 0.74))
-    scene = lit(
+    scene = light_shapes(
         shapes,
         _textures(rng),
         above,
@@ -123,7 +123,7 @@ def _frame() -> list[Shape]:
         parts.append(rod((1.12, side * 0.27, -0.13), 0.075, 0.025, ALONG_X, "brass", 0.2))
         parts.append(sphere((1.0, side * 0.3, 0.06), 0.07, "cream", 0.3))
     for k in range(3):
-        parts.append(turned_box((1.04 - 0.02 * k, 0, -0.3 - 0.06 * k), (0.05, 0.5 + 0.1 * k, 0.05), 0, "red", 0.3))
+        parts.append(rotated_box((1.04 - 0.02 * k, 0, -0.3 - 0.06 * k), (0.05, 0.5 + 0.1 * k, 0.05), 0, "red", 0.3))
     return parts
 
 
@@ -186,5 +186,5 @@ def _tender() -> list[Shape]:
     for k in range(10):
         x, y = -0.98 + 0.14 * (k % 2) + 0.02 * (k % 3), -0.25 + 0.125 * (k // 2)
         degrees, size = 37.0 * k, 0.13 + 0.012 * (k % 4)
-        parts.append(turned_box((x, y, 0.22 + 0.013 * (k % 5)), (size, size, 0.16), degrees, "coal", 0.25))
+        parts.append(rotated_box((x, y, 0.22 + 0.013 * (k % 5)), (size, size, 0.16), degrees, "coal", 0.25))
     return parts

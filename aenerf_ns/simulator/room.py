@@ -10,7 +10,7 @@ from aenerf_ns.simulator.arrays import Texture
 from aenerf_ns.simulator.rendering.environment import sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight
 from aenerf_ns.simulator.rendering.renderer import Renderer
-from aenerf_ns.simulator.shapes import ALONG_X, Shape, axes, box, lit, panel, pillar, rod, sphere, turned_box
+from aenerf_ns.simulator.shapes import ALONG_X, Shape, axes, box, light_shapes, panel, pillar, rod, rotated_box, sphere
 
 TEXTURE_SIZE = 256
 HALF_SIZE = 2.0
@@ -39,7 +39,7 @@ def room_scene(seed: int = 0) -> Renderer:
         AreaLight((1.72, 0.95, 0.99), (0.1, 0, 0), (0, -0.1, 0), (1.2, 0.9, 0.6)),
     ]
     darkness = sky((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    return lit(shapes, _textures(rng), darkness, lights, np.zeros(3), spacing=0.08, ambient=0.09, seed=seed)
+    return light_shapes(shapes, _textures(rng), darkness, lights, np.zeros(3), spacing=0.08, ambient=0.09, seed=seed)
 
 
 def _textures(rng: np.random.Generator) -> dict[str, Texture]:
@@ -165,7 +165,7 @@ def _table() -> list[Shape]:
     stack = ((0.0, 0.30, 0.21, "3f6d8e", 12), (0.035, 0.27, 0.19, "b5523b", -9), (0.075, 0.24, 0.18, "d9a441", 27))
     for lift, long, wide, color, degrees in stack:
         center, tint = (0.33, 0.1, top + lift + 0.0175), tx.linear_color(color) * 1.1
-        parts.append(turned_box(center, (long, wide, 0.0344), degrees, "book", 0.3, tint=tint))
+        parts.append(rotated_box(center, (long, wide, 0.0344), degrees, "book", 0.3, tint=tint))
     return parts
 
 
@@ -218,7 +218,7 @@ def _sofa() -> list[Shape]:
     for low, high in ((-0.84, 0.045), (0.055, 0.94)):
         parts.append(box((-1.715, low, 0.362), (-1.17, high, 0.47), "fabric", 0.4, tint=(1.15, 1.1, 1.05)))
     for y, texture, lean in ((-0.55, "warm fabric", 15), (0.62, "checker", -12)):
-        parts.append(turned_box((-1.6, y, 0.65), (0.12, 0.38, 0.34), lean, texture, 0.35))
+        parts.append(rotated_box((-1.6, y, 0.65), (0.12, 0.38, 0.34), lean, texture, 0.35))
     for x in (-1.85, -1.25):
         for y in (-0.95, 1.05):
             parts.append(pillar((x, y, 0), 0.025, 0.1, "wood", 0.3))
@@ -263,8 +263,8 @@ def _corners() -> list[Shape]:
     for dx, dy, z, radius in ((0, 0, 0.98, 0.24), (0.14, -0.12, 0.78, 0.16), (-0.15, 0.08, 0.8, 0.17)):
         parts.append(sphere((1.55 + dx, 1.6 + dy, z), radius, "leaves", 0.35, tint=(0.5, 0.8, 0.4)))
     parts += [
-        turned_box((-1.45, -1.55, 0.25), (0.76, 0.52, 0.5), 12, "wood", 0.6),
-        turned_box((-1.45, -1.55, 0.521), (0.8, 0.56, 0.04), 12, "pale wood", 0.6),
+        rotated_box((-1.45, -1.55, 0.25), (0.76, 0.52, 0.5), 12, "wood", 0.6),
+        rotated_box((-1.45, -1.55, 0.521), (0.8, 0.56, 0.04), 12, "pale wood", 0.6),
         sphere((-1.4, -1.55, 0.7), 0.16, "checker", 0.5),
         pillar((1.45, -1.5, 0.4), 0.24, 0.06, "warm fabric", 0.4),
     ]

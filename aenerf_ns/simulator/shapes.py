@@ -19,9 +19,9 @@ from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh, scaled
 from aenerf_ns.simulator.rendering.mesh_repair import repair
 from aenerf_ns.simulator.rendering.renderer import Renderer
 
-_SAGITTA = 5e-4
+_MAX_SAGITTA = 5e-4
 """Largest distance of a triangle from the round surface that it approximates, in meters."""
-_FEWEST_SIDES = 12
+_MIN_SIDES = 12
 """The faces of a prism with fewer than 10 sides would meet at creases."""
 
 Surface = tuple[Array, NDArray[np.int64], Array]
@@ -88,7 +88,7 @@ def mesh_of(
     return scaled(mesh, 1.0)
 
 
-def lit(
+def light_shapes(
     shapes: Sequence[Shape],
     textures: Mapping[str, Texture],
     environment: Environment,
@@ -119,7 +119,7 @@ def axes(right: ArrayLike, up: ArrayLike) -> Array:
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
-def turned(degrees: float) -> Array:
+def vertical_rotation(degrees: float) -> Array:
     """Return the world-from-local rotation (3, 3) about the vertical."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
@@ -131,12 +131,12 @@ ALONG_Y = axes((0, 0, 1), (1, 0, 0))
 
 
 def box(low: ArrayLike, high: ArrayLike, texture: str, scale: float, **rest: Any) -> Shape:
-    """Make a box between two corners (3,). For the other arguments see `turned_box`."""
+    """Make a box between two corners (3,). For the other arguments see `rotated_box`."""
     low_corner, high_corner = np.asarray(low, float), np.asarray(high, float)
-    return turned_box((low_corner + high_corner) / 2, high_corner - low_corner, 0.0, texture, scale, **rest)
+    return rotated_box((low_corner + high_corner) / 2, high_corner - low_corner, 0.0, texture, scale, **rest)
 
 
-def turned_box(center: ArrayLike, size: ArrayLike, degrees: float, texture: str, scale: float, **rest: Any) -> Shape:
+def rotated_box(center: ArrayLike, size: ArrayLike, degrees: float, texture: str, scale: float, **rest: Any) -> Shape:
     """Make a box turned about the vertical.
 
     Args:
@@ -147,26 +147,26 @@ def turned_box(center: ArrayLike, size: ArrayLike, degrees: float, texture: str,
         scale: side of one tile of the texture, in meters.
         rest: ``texture_offset``, ``tint``, ``emission`` and ``spacing`` of the `Shape`.
     """
-    return Shape(partial(_box, np.asarray(size, float), scale), center, turned(degrees), texture, **rest)
+    return Shape(partial(_box, np.asarray(size, float), scale), center, vertical_rotation(degrees), texture, **rest)
 
 
 def sphere(center: ArrayLike, radius: float, texture: str, scale: float, **rest: Any) -> Shape:
     """Make a sphere. A tilted axis keeps the poles of the texture at the sides, away from views from above.
 
-    For the other arguments see `turned_box`.
+    For the other arguments see `rotated_box`.
     """
     return Shape(partial(_sphere, radius, scale), center, axes((0, 0.6, 0.8), (1, 0, 0)), texture, **rest)
 
 
 def pillar(foot: ArrayLike, radius: float, height: float, texture: str, scale: float, **rest: Any) -> Shape:
-    """Make an upright cylinder that stands on ``foot``. For the other arguments see `turned_box`."""
+    """Make an upright cylinder that stands on ``foot``. For the other arguments see `rotated_box`."""
     return rod(np.add(foot, (0.0, 0.0, height / 2)), radius, height, np.eye(3), texture, scale, **rest)
 
 
 def rod(
     center: ArrayLike, radius: float, length: float, along: Array, texture: str, scale: float, **rest: Any
 ) -> Shape:
-    """Make a lying cylinder; ``along`` is ALONG_X or ALONG_Y. For the other arguments see `turned_box`."""
+    """Make a lying cylinder; ``along`` is ALONG_X or ALONG_Y. For the other arguments see `rotated_box`."""
     return Shape(partial(_cylinder, radius, length, scale), center, along, texture, **rest)
 
 
@@ -181,7 +181,7 @@ def panel(
 ) -> Shape:
     """Make a rectangle (width, height) that faces a viewer to whom ``right`` and ``up`` look so.
 
-    For the other arguments see `turned_box`.
+    For the other arguments see `rotated_box`.
     """
     return Shape(partial(_rectangle, size, scale), center, axes(right, up), texture, **rest)
 
@@ -205,7 +205,7 @@ def _box(size: Array, scale: float, spacing: float) -> Surface:
             # Together with the outward normal, u and v are right-handed for x and z, and left-handed for y.
             is_right_handed = (sign > 0) != (axis == 1)
             sides.append((positions, faces if is_right_handed else faces[:, ::-1], uv))
-    return _joined(sides)
+    return _join(sides)
 
 
 def _sphere(radius: float, scale: float, spacing: float) -> Surface:
@@ -236,10 +236,10 @@ def _cylinder(radius: float, length: float, scale: float, spacing: float) -> Sur
         rings = np.linspace(1, 0, _cells(radius, spacing) + 1)[:, None, None] * circle
         cap = np.insert(rings.reshape(-1, 2), 2, end * length / 2, axis=1)
         parts.append((cap, _triangles(rings)[:, ::end], cap[:, :2] / scale))
-    return _joined(parts)
+    return _join(parts)
 
 
-def _joined(parts: Sequence[Surface]) -> Surface:
+def _join(parts: Sequence[Surface]) -> Surface:
     first = np.cumsum([0, *(len(positions) for positions, _, _ in parts)])
     positions, faces, uv = zip(*parts, strict=True)
     moved = [part + start for part, start in zip(faces, first, strict=False)]
@@ -259,7 +259,7 @@ def _cells(length: float, spacing: float) -> int:
 
 def _circle(radius: float, spacing: float) -> tuple[Array, Array]:
     """Return turns (N + 1,) from -0.5 to 0.5 and points (N + 1, 2) of a circle, N even; the last point is the first."""
-    sides = max(_FEWEST_SIDES, math.pi / math.acos(1 - _SAGITTA / radius), _cells(2 * math.pi * radius, spacing))
+    sides = max(_MIN_SIDES, math.pi / math.acos(1 - _MAX_SAGITTA / radius), _cells(2 * math.pi * radius, spacing))
     turn = np.linspace(-0.5, 0.5, 2 * math.ceil(sides / 2) + 1)
     circle = radius * np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], axis=1)
     circle[-1] = circle[0]
