@@ -19,7 +19,7 @@ from torch import Tensor
 from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.evaluation.color_fit import ColorFit
 from aenerf_ns.evaluation.evaluate import evaluate, measure_reference_views
-from aenerf_ns.evaluation.pose_diagnosis import LAST_PART, diagnose
+from aenerf_ns.evaluation.pose_diagnosis import diagnose
 from aenerf_ns.evaluation.poses import compare_with_ground_truth
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import average_metrics
@@ -138,16 +138,11 @@ class AENeRFPipeline(VanillaPipeline):
         self.training_state.resume(trainer, self.model.proposal_sampler)
         # A run that goes on from a checkpoint is diagnosed anew at its own end.
         self._pose_diagnosis = None
-        earlier_poses: list[Tensor] = []
 
         def diagnose_poses(step: int) -> None:
-            if not self.model.camera_optimizer.is_learned or not comms.is_main_process():
-                return
-            if step == max(steps[-1] - max(round(LAST_PART * len(steps)), 1), steps.start):
-                earlier_poses.append(self.model.camera_optimizer.compared_poses()[1])
-            if step == steps[-1]:
-                sampler = self.datamanager.train_pixel_sampler
-                self._pose_diagnosis = diagnose(self.model, self.datamanager.train_dataset, sampler, *earlier_poses)
+            if step == steps[-1] and self.model.camera_optimizer.is_learned and comms.is_main_process():
+                data = self.datamanager
+                self._pose_diagnosis = diagnose(self.model, data.train_dataset, data.train_pixel_sampler)
                 CONSOLE.print(self._pose_diagnosis["summary"], soft_wrap=True)
 
         def fit(step: int) -> None:

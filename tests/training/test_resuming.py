@@ -52,8 +52,6 @@ def test_run_in_two_pieces_equals_one(tmp_path: Path) -> None:
     second = train_small_model(tmp_path, "second", NUM_STEPS - NUM_FIRST, seed=7, load_dir=first.checkpoint_dir)
     assert second.config.schedule_length == NUM_STEPS
     resumed = checkpoint(second)
-    # The diagnosis compares with poses at nine tenths of each run.
-    del whole["pipeline"]["_extra_state"], resumed["pipeline"]["_extra_state"]
     assert_equal(whole, resumed)
     assert whole["pipeline"]["_model.camera_optimizer.twists.control_twists"].any()
     assert checkpoint(first)["pipeline"]["training_state._extra_state"]["gradients"]["camera_opt"][0].any()
