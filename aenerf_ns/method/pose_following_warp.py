@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
 import torch.autograd.forward_ad as forward_ad
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
-from aenerf_ns.method.kernels.loader import is_float_in_memory, kernels_or_none
 from aenerf_ns.method.pose_correction import PoseCorrection
 
 # Cells along an axis of the unit cube of the scene. The times that see a place change little from cell to cell.
@@ -77,7 +74,7 @@ class PoseFollowingWarp(nn.Module):
     def follow(self) -> None:
         """Take the corrections as they are now, for all positions until the next call."""
         twists = self._correction[0].world_twists(self._seconds, self._base_poses).to(self._weights)
-        # Half precision would round the places to a thousandth of the twists' size, and kernels take float32.
+        # Half precision would round the places to a thousandth of the twists' size.
         with torch.autocast(twists.device.type, enabled=False):
             self._twists = (self._weights @ twists).unflatten(0, [_RESOLUTION] * 3)
 
@@ -99,11 +96,6 @@ class PoseFollowingWarp(nn.Module):
 
     def _look_up(self, grid: Tensor, unit: Tensor) -> Tensor:
         """Return values (N, columns) of a grid (r, r, r, columns) between its cells, at unit places (N, 3)."""
-        fits = unit.device.type == "cpu" and is_float_in_memory(grid) and is_float_in_memory(unit)
-        kernels = kernels_or_none(f"{__package__}.kernels.pose_following_warp", unit.device) if fits else None
-        if kernels is not None:
-            found: Tensor = _LookUp.apply(grid, unit.contiguous(), kernels)
-            return found
         # torch counts the coordinates of a place from the last axis.
         places = (2 * unit - 1).flip(-1)[None, None, None]
         cells = grid.permute(3, 0, 1, 2)[None]
@@ -145,19 +137,3 @@ class PoseFollowingWarp(nn.Module):
         everywhere = self._seen.mean(0) * 1e-6 + torch.finfo(total.dtype).tiny
         total = total.flatten(1).T + everywhere
         self._weights.copy_(total / total.sum(-1, keepdim=True))
-
-
-class _LookUp(torch.autograd.Function):
-    """Look values up; only the grid has gradients."""
-
-    @staticmethod
-    def forward(ctx: Any, grid: Tensor, unit: Tensor, kernels: Any) -> Tensor:
-        ctx.save_for_backward(unit)
-        ctx.resolution, ctx.kernels = len(grid), kernels
-        return kernels.values(grid.contiguous(), unit)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        (unit,) = ctx.saved_tensors
-        return ctx.kernels.gradient(unit, grad.contiguous(), ctx.resolution), None, None

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from aenerf_ns.camera.rotation import motion_from_twist
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
-from aenerf_ns.method import pose_following_warp
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 
@@ -90,35 +89,7 @@ def test_without_corrections_nothing_moves(correction: PoseCorrection) -> None:
     assert torch.equal(space(positions), positions)
 
 
-def test_kernels_and_plain_torch_agree(correction: PoseCorrection, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch.manual_seed(0)
-    space = PoseFollowingWarp(correction, _unit)
-    correction.twists.control_twists.data.normal_(0, 0.05)
-    space._weights.copy_(torch.rand_like(space._weights).softmax(-1))
-    # Some lie outside the cube.
-    positions = 2.4 * torch.rand(5000, 3) - 1.2
-    weights = torch.randn(5000, 3)
-
-    def found() -> tuple[Tensor, Tensor]:
-        correction.zero_grad()
-        space.follow()
-        out = space(positions)
-        (out * weights).sum().backward()
-        return out.detach(), correction.twists.control_twists.grad.clone()
-
-    by_kernels = found()
-    monkeypatch.setattr(pose_following_warp, "kernels_or_none", lambda *_: None)
-    plain = found()
-    torch.testing.assert_close(by_kernels[0], plain[0], rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(by_kernels[1], plain[1], rtol=1e-4, atol=1e-3)
-
-
-@pytest.mark.parametrize("plain", [False, True])
-def test_a_position_that_is_not_a_number_stays_one(
-    correction: PoseCorrection, monkeypatch: pytest.MonkeyPatch, plain: bool
-) -> None:
-    if plain:
-        monkeypatch.setattr(pose_following_warp, "kernels_or_none", lambda *_: None)
+def test_a_position_that_is_not_a_number_stays_one(correction: PoseCorrection) -> None:
     space = PoseFollowingWarp(correction, _unit)
     space.follow()
     found = space(torch.tensor([[math.nan, math.inf, -math.inf], [0.0, 0.0, 0.0]]))
