@@ -32,7 +32,7 @@ from benchmarks.runs import run_benchmark, run_script, write_result
 
 _NUM_POINTS = 100_000
 _NUM_VIEWS = 100
-# Metres within which a point counts as found.
+# Meters within which a point counts as found.
 _NEAR = (0.02, 0.05, 0.1)
 
 

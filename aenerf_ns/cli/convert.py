@@ -123,7 +123,7 @@ class Convert(DatasetCommand):
             if recording.sensor.bayer_pattern and (self.region[0] % 2 or self.region[1] % 2):
                 raise DataError(
                     "aenerf convert",
-                    f"a region of interest from pixel {self.region[0]} {self.region[1]} of a colour sensor",
+                    f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor",
                     "begin it at an even column and row, so that its first pixel is red",
                 )
         with NativeDatasetWriter(

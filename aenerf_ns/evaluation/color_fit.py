@@ -59,7 +59,7 @@ class ColorFit:
         self._pixels: _Pixels | None = None
         if model.color_correction.protocol == "affine-test":
             CONSOLE.print(
-                "[yellow]Colour correction affine-test is fitted on the test views themselves: only to compare with "
+                "[yellow]Color correction affine-test is fitted on the test views themselves: only to compare with "
                 "figures that were made so."
             )
 

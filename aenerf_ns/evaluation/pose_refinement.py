@@ -24,9 +24,9 @@ _LEAST_DIAGONAL = 1e-9
 
 
 def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras:
-    """Move a camera so that its rendering fits its image, while field and colour correction stay as they are.
+    """Move a camera so that its rendering fits its image, while field and color correction stay as they are.
 
-    Minimise the squared errors of display values over twists in the camera's frame, by the method of Levenberg and
+    Minimize the squared errors of display values over twists in the camera's frame, by the method of Levenberg and
     Marquardt. The start is where :meth:`PoseCorrection.apply_to_camera` puts the camera. The pixels are the same in
     every step and in every run.
 
@@ -103,7 +103,7 @@ class _Pixels:
     def __init__(self, model: AENeRFModel, camera: Cameras, image: Tensor, generator: torch.Generator) -> None:
         self._model = model
         pixels = (torch.rand(_NUM_RAYS, 2, generator=generator) * torch.tensor(image.shape[:2])).long()
-        # A sensor of one channel is shown as grey, which is three times the same.
+        # A sensor of one channel is shown as gray, which is three times the same.
         num_channels = model.sensor.num_channels
         chosen = image[pixels[:, 0], pixels[:, 1]].to(model.device)
         self._reference = model.reference_display(chosen)[:, :num_channels]

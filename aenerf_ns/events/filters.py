@@ -16,7 +16,7 @@ from aenerf_ns.events.stream import EventFile, EventStream
 
 _NEVER = np.iinfo(np.int64).min
 
-# A hot pixel has more events than its neighbours by this factor and by so many standard deviations.
+# A hot pixel has more events than its neighbors by this factor and by so many standard deviations.
 _HOT_FACTOR = 4.0
 _HOT_DEVIATIONS = 6.0
 _MAX_SHOWN = 10

@@ -1,4 +1,4 @@
-"""Optical flow of events: how the image moves, tile by tile, by contrast maximisation (Gallego et al. 2018)."""
+"""Optical flow of events: how the image moves, tile by tile, by contrast maximization (Gallego et al. 2018)."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from aenerf_ns.events.stream import EventStream
 
 # Display value of a pixel without events, and what one positive or negative event adds to it.
-_GREY = 118
+_GRAY = 118
 _POSITIVE_STEP = np.array([90, -60, -90])
 _NEGATIVE_STEP = np.array([-90, -60, 90])
 
@@ -28,12 +28,12 @@ def polarity_picture(
         height: number of pixel rows.
 
     Returns:
-        (height, width, 3) uint8 display colours; grey where there are no events.
+        (height, width, 3) uint8 display colors; gray where there are no events.
     """
     net = np.zeros((height, width), dtype=np.int64)
     np.add.at(net, (y, x), polarity)
     steps = np.abs(net)[..., None] * np.where(net[..., None] > 0, _POSITIVE_STEP, _NEGATIVE_STEP)
-    return np.clip(_GREY + steps, 0, 255).astype(np.uint8)
+    return np.clip(_GRAY + steps, 0, 255).astype(np.uint8)
 
 
 class PolaritySums:

@@ -21,7 +21,7 @@ _THRESHOLDS = (1e-4, 1e3)
 # Nanoseconds. Refractory periods are microseconds to milliseconds long.
 _MAX_REFRACTORY_PERIOD = 10**12
 
-# Colour filter (0 red, 1 green, 2 blue) of the 2 x 2 pixels that repeat: [row % 2, column % 2].
+# Color filter (0 red, 1 green, 2 blue) of the 2 x 2 pixels that repeat: [row % 2, column % 2].
 RGGB = np.array([[0, 1], [1, 2]], dtype=np.uint8)
 
 
@@ -33,7 +33,7 @@ class SensorModel:
         positive_contrast_threshold: C+, the rise of log-radiance that triggers an event of polarity +1.
         negative_contrast_threshold: C−, the fall of log-radiance (a positive number) that triggers one of polarity −1.
         refractory_period: τ in nanoseconds. A pixel is blind for this time after each of its events.
-        bayer_pattern: "RGGB" for a colour sensor whose pixel (0, 0) is red, "" for a monochrome one.
+        bayer_pattern: "RGGB" for a color sensor whose pixel (0, 0) is red, "" for a monochrome one.
 
     Raises:
         ValueError: a threshold is below 1e-4 or above 1e3, the refractory period is negative or beyond 1000 s, or the
@@ -59,7 +59,7 @@ class SensorModel:
 
     @property
     def num_channels(self) -> int:
-        """Number of radiance channels the sensor sees: 1 for a monochrome sensor, 3 for a colour one."""
+        """Number of radiance channels the sensor sees: 1 for a monochrome sensor, 3 for a color one."""
         return 3 if self.bayer_pattern else 1
 
     def channel(self, x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -70,7 +70,7 @@ class SensorModel:
             y: (N,) raw integer pixel rows.
 
         Returns:
-            (N,) channel indices: 0 for a monochrome sensor; 0 red, 1 green, 2 blue for a colour one.
+            (N,) channel indices: 0 for a monochrome sensor; 0 red, 1 green, 2 blue for a color one.
         """
         if not self.bayer_pattern:
             return np.zeros(len(x), dtype=np.int64)

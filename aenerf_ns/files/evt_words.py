@@ -107,7 +107,7 @@ def _decode_evt3(words, position, x, y, t, p, n, state):
         elif kind == 0x3:  # where the following vectors begin
             base = value & 0x7FF
             polarity = 1 if value & 0x800 else -1
-        elif kind == 0x4 or kind == 0x5:  # 12 or 8 neighbouring pixels of a row
+        elif kind == 0x4 or kind == 0x5:  # 12 or 8 neighboring pixels of a row
             length = 12 if kind == 0x4 else 8
             if ready and base != _UNKNOWN:
                 for bit in range(length):

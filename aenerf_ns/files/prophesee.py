@@ -35,7 +35,7 @@ _RECORD = np.dtype([("time", "<u4"), ("address", "<u4")])
 # Records of Event2d and of EventCd have the same fields.
 _EVENT_TYPES = (0x00, 0x0C)
 _LAP = 1 << 32
-# Times that are read to count how often they wrapped. Two neighbours must be less than half a lap, 36 min, apart.
+# Times that are read to count how often they wrapped. Two neighbors must be less than half a lap, 36 min, apart.
 _MAX_SAMPLES = 10_000
 
 

@@ -1,1 +1,1 @@
-"""The method of docs/method.md as code: field, poses, colour, model."""
+"""The method of docs/method.md as code: field, poses, color, model."""

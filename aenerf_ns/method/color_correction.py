@@ -1,4 +1,4 @@
-"""Colour correction: from rendered log-radiance to a picture, by five named protocols.
+"""Color correction: from rendered log-radiance to a picture, by five named protocols.
 
 Events determine log-radiance only up to an affine map per channel, so that map has to come from elsewhere.
 """

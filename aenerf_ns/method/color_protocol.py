@@ -1,8 +1,8 @@
-"""The names of the colour corrections: commands show them without importing torch."""
+"""The names of the color corrections: commands show them without importing torch."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 ColorCorrectionProtocol = Literal["affine", "affine-test", "translated-gamma", "network", "none"]
-"""How the colours of renderings are fitted to images."""
+"""How the colors of renderings are fitted to images."""

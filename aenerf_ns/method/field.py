@@ -167,7 +167,7 @@ class EventRadianceField(DensityField):
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Tensor | None = None
     ) -> dict[FieldHeadNames, Tensor]:
-        """Return radiance (rays, samples, num_channels), positive and unbounded, by the framework's name for colour."""
+        """Return radiance (rays, samples, num_channels), positive and unbounded, by the framework's name for color."""
         assert density_embedding is not None
         # All samples of a ray have its direction, so the first layer's part for it is computed once a ray.
         directions = self.direction_encoding(ray_samples.frustums.directions[..., :1, :])

@@ -45,7 +45,7 @@ from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervis
 
 # ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
-# The error of a display value that has the last colour of the error's colour map.
+# The error of a display value that has the last color of the error's color map.
 _LARGEST_SHOWN_ERROR = 0.5
 
 # Share of a run in which the space that moves along with the poses counts rays, and the steps between two of its
@@ -94,7 +94,7 @@ class AENeRFModelConfig(ModelConfig):
     "translated-gamma": by a power and a black level per channel, fitted on the validation views. "network": by a
     network fitted on the validation views (paper, eq. 15). "none": unchanged."""
     color_correction_num_rays: int = 16384
-    """Pixels that the colour correction is fitted on, spread over the reference views."""
+    """Pixels that the color correction is fitted on, spread over the reference views."""
     lpips: bool = False
     """Report LPIPS too. It needs torchvision's weights of AlexNet, which are downloaded on first use."""
     eval_num_rays_per_chunk: int = 1 << 13
@@ -110,7 +110,7 @@ class AENeRFModel(Model):
     config: AENeRFModelConfig
 
     def populate_modules(self) -> None:
-        """Build the networks, the samplers, the supervision and the colour correction."""
+        """Build the networks, the samplers, the supervision and the color correction."""
         scene: SceneRecording = self.kwargs["metadata"][SCENE_KEY]
         config = self.config
         _require_possible(config)
@@ -242,9 +242,9 @@ class AENeRFModel(Model):
         Returns:
             ``log_radiance`` (N, channels), the raw log L̂. While training, also the samples and weights of both stages,
             and the ``log_radiance_rate`` (rate rays, channels) of the rays at the end of the batch that the supervision
-            needs rates of. Otherwise also ``rgb`` (N, 3) colour-corrected display values, ``uncorrected_rgb`` (N, 3)
+            needs rates of. Otherwise also ``rgb`` (N, 3) color-corrected display values, ``uncorrected_rgb`` (N, 3)
             display values of the radiance as it was rendered, ``accumulation`` (N, 1) and ``depth`` (N, 1), the median
-            distance along the ray in scene units; of a colour sensor also ``mean_log_radiance`` (N, 1) of its channels.
+            distance along the ray in scene units; of a color sensor also ``mean_log_radiance`` (N, 1) of its channels.
         """
         if self.space is not None:
             self.space.follow()
@@ -277,10 +277,10 @@ class AENeRFModel(Model):
         else:
             # The viewer shows the first at the start, and lists the others in this order.
             outputs["rgb"] = self.display(log_radiance.detach())
-            outputs["uncorrected_rgb"] = _grey_to_rgb(encode(log_radiance.detach().exp(), self.image_encoding))
+            outputs["uncorrected_rgb"] = _gray_to_rgb(encode(log_radiance.detach().exp(), self.image_encoding))
             outputs["log_radiance"] = log_radiance
             if self.sensor.num_channels > 1:
-                # The viewer takes three channels for a picture: it has colour maps for single channels only.
+                # The viewer takes three channels for a picture: it has color maps for single channels only.
                 outputs["mean_log_radiance"] = log_radiance.mean(-1, keepdim=True)
             outputs["accumulation"] = self.renderer_accumulation(weights)
             outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
@@ -315,7 +315,7 @@ class AENeRFModel(Model):
         return metrics | self.supervision.learned_values()
 
     def new_color_correction(self, protocol: ColorCorrectionProtocol) -> ColorCorrection:
-        """Return a colour correction for this model's pictures, not yet fitted."""
+        """Return a color correction for this model's pictures, not yet fitted."""
         return COLOR_CORRECTIONS[protocol](self.sensor.num_channels, self.image_encoding)
 
     def reference_radiance(self, image: Tensor) -> Tensor:
@@ -324,11 +324,11 @@ class AENeRFModel(Model):
 
     def reference_display(self, image: Tensor) -> Tensor:
         """Return display values (..., 3), as the sensor sees them, for reference image values (..., 3)."""
-        return _grey_to_rgb(encode(self.reference_radiance(image), self.image_encoding))
+        return _gray_to_rgb(encode(self.reference_radiance(image), self.image_encoding))
 
     def display(self, log_radiance: Tensor) -> Tensor:
-        """Return colour-corrected display values (..., 3) for rendered log-radiance (..., channels)."""
-        return _grey_to_rgb(self.color_correction(log_radiance))
+        """Return color-corrected display values (..., 3) for rendered log-radiance (..., channels)."""
+        return _gray_to_rgb(self.color_correction(log_radiance))
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Return display values and opacity (..., 4): exporters leave out what is transparent."""
@@ -339,8 +339,8 @@ class AENeRFModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Return the metrics of the display values, and pictures with the reference beside the rendering.
 
-        The reference is shown as the sensor sees it: grey for a monochrome sensor. The picture ``error`` shows the
-        absolute difference of the display values, the mean over their channels, in the colours of viridis: from dark
+        The reference is shown as the sensor sees it: gray for a monochrome sensor. The picture ``error`` shows the
+        absolute difference of the display values, the mean over their channels, in the colors of viridis: from dark
         blue for 0 to yellow for 0.5 and more.
         """
         predicted = outputs["rgb"]
@@ -391,6 +391,6 @@ def _is_of_batch(ray_bundle: RayBundle) -> bool:
     return CAMERA_DIRECTIONS in ray_bundle.metadata
 
 
-def _grey_to_rgb(values: Tensor) -> Tensor:
+def _gray_to_rgb(values: Tensor) -> Tensor:
     """Return (..., 3) values for (..., channels) values of 1 or 3 channels."""
     return values.expand(*values.shape[:-1], 3)

@@ -64,7 +64,7 @@ class PoseCorrection(CameraOptimizer):
 
     ξ is zero before training, but its gradients are not. Network and spline count rotation in radians and translation
     in units of the trajectory's extent (root mean square distance from its middle). So a learning rate means the same
-    for a camera that moves by centimetres and for a camera that is carried through a hall.
+    for a camera that moves by centimeters and for a camera that is carried through a hall.
 
     The scene is reconstructed in the frame of the corrected poses. Reference images have poses in the frame of the true
     trajectory or, where the true trajectory is not known, of the estimated one. :meth:`apply_to_camera` carries the
@@ -373,7 +373,7 @@ class TwistNetwork(nn.Module):
         size = self.encoding.get_out_dim()
         for _ in range(4):
             linear = nn.Linear(size, width)
-            # With PyTorch's initialisation and a blunt softplus, hardly any variation of the input reaches the output:
+            # With PyTorch's initialization and a blunt softplus, hardly any variation of the input reaches the output:
             # for long, such a network learns only one correction for all times.
             nn.init.kaiming_normal_(linear.weight)
             nn.init.zeros_(linear.bias)

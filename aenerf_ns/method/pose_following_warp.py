@@ -38,7 +38,7 @@ class PoseFollowingWarp(nn.Module):
     counted in the cells of a coarse grid, by :meth:`observe`.
 
     Twists and weights are differentiated, the place at which they are looked up is not: within the span of a gradient,
-    neighbours move alike.
+    neighbors move alike.
 
     Args:
         correction: of the poses, of which something is learned. It stays the model's.

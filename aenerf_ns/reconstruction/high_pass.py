@@ -13,7 +13,7 @@ CUTOFF = 0.06
 """ω and ω_e of the authors' code, which calls them Hz and uses them as 1 / s."""
 
 # Radiance of a pixel whose state is zero, as a share of display white: the photographers' middle gray.
-_MIDDLE_GREY = 0.18
+_MIDDLE_GRAY = 0.18
 # A state times this power is a display value. Then log-radiance is an exact multiple of the display value's logarithm.
 _DISPLAY_POWER = 1 / 2.2
 
@@ -60,7 +60,7 @@ class HighPassFilter:
         clips changes of more than 40 %.
         """
         self.add(events)
-        radiance = _MIDDLE_GREY * np.exp(self.log_intensity(int(events.t[-1])))
+        radiance = _MIDDLE_GRAY * np.exp(self.log_intensity(int(events.t[-1])))
         return np.rint(np.clip(radiance, 0, 1) ** _DISPLAY_POWER * 255).astype(np.uint8)
 
 

@@ -55,7 +55,7 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(num_channels, num_channels, 3, padding=1, bias=not normalize)
         self.conv2 = nn.Conv2d(num_channels, num_channels, 3, padding=1, bias=not normalize)
-        # Identities have no parameters, so that a file without normalisation fits strictly.
+        # Identities have no parameters, so that a file without normalization fits strictly.
         self.bn1 = nn.BatchNorm2d(num_channels) if normalize else nn.Identity()
         self.bn2 = nn.BatchNorm2d(num_channels) if normalize else nn.Identity()
 

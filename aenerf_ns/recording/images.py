@@ -30,9 +30,9 @@ def check_image(file: Path, camera: CameraIntrinsics) -> None:
 
 
 def require_8_bits(mode: str, source: str | Path) -> None:
-    """Raise a DataError unless PIL's mode of an image is 8 bits of grey or RGB, with or without an alpha channel."""
+    """Raise a DataError unless PIL's mode of an image is 8 bits of gray or RGB, with or without an alpha channel."""
     if mode not in ("L", "RGB", "RGBA"):
-        raise DataError(source, f"the image is of PIL's mode {mode}", "store 8 bits of grey or RGB")
+        raise DataError(source, f"the image is of PIL's mode {mode}", "store 8 bits of gray or RGB")
 
 
 def read_image(file: Path) -> Image.Image:

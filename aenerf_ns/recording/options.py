@@ -70,7 +70,7 @@ class SensorOptions:
 
     positive_contrast_threshold: float | None = None
     """C+, in place of the dataset's value or of the one assumed for its sensor. The size of both thresholds only sets
-    the scale of the log-radiance, which colour correction finds."""
+    the scale of the log-radiance, which color correction finds."""
     negative_contrast_threshold: float | None = None
     """C-, in place of the dataset's value or of the assumed one. Its ratio to C+ matters."""
     refractory_period_ns: int | None = None
@@ -91,7 +91,7 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
     """The options that the formats of other projects have in common."""
 
     auto_scale_poses: bool | None = False
-    """Scale the estimated poses to fit in a box of +/- 1. Off by default: poses are in metres, and slow recordings move
+    """Scale the estimated poses to fit in a box of +/- 1. Off by default: poses are in meters, and slow recordings move
     little compared to the distance of the scene. Choose a scale_factor instead."""
     trajectory: Path | None = None
     """Estimated poses of the event camera, as t tx ty tz qx qy qz qw in seconds, camera-to-world, to be used in place

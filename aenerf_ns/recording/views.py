@@ -23,7 +23,7 @@ IMAGE_LIST = "images.txt"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 MAX_VIEWS = 20
-"""Images of a split that a published format uses at most. Each is rendered to fit the colour correction or to evaluate,
+"""Images of a split that a published format uses at most. Each is rendered to fit the color correction or to evaluate,
 and cameras take thousands."""
 
 # Training cameras only serve the viewer. The viewer and Nerfstudio's start slow down with their number.

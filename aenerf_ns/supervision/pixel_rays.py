@@ -16,7 +16,7 @@ from aenerf_ns.recording.scene import SceneRecording
 
 
 class PixelRays:
-    """Give pixels their rays, and the channel of their colour filter. Pixels are numbered row by row.
+    """Give pixels their rays, and the channel of their color filter. Pixels are numbered row by row.
 
     Args:
         scene: the recording.

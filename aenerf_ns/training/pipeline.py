@@ -32,7 +32,7 @@ from aenerf_ns.training.training_state import TrainingState
 from aenerf_ns.viewer.panel import RecordingPanel
 from aenerf_ns.viewer.recording_view import RecordingView
 
-# Steps between rough fits of the colour correction, on a share of its pixels, for the viewer's picture while training.
+# Steps between rough fits of the color correction, on a share of its pixels, for the viewer's picture while training.
 _ROUGH_FIT_INTERVAL = 50
 _ROUGH_FIT_SHARE = 1 / 8
 # Steps between the errors of the corrected poses in the log, where true ones are known.
@@ -50,7 +50,7 @@ class AENeRFPipelineConfig(VanillaPipelineConfig):
 
 
 class AENeRFPipeline(VanillaPipeline):
-    """Fits the colour correction before each checkpoint, and evaluates with the one in the checkpoint."""
+    """Fits the color correction before each checkpoint, and evaluates with the one in the checkpoint."""
 
     config: AENeRFPipelineConfig
     datamanager: EventDataManager
@@ -131,7 +131,7 @@ class AENeRFPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return all callbacks, with the colour correction's and the diagnosis', and let optimizers check gradients."""
+        """Return all callbacks, with the color correction's and the diagnosis', and let optimizers check gradients."""
         trainer = training_callback_attributes.trainer
         assert trainer is not None
         steps = steps_of(trainer)

@@ -127,7 +127,7 @@ class RecordingView:
 
     @torch.no_grad()
     def points(self, events: EventStream) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return places (N, 3) in the scene of at most 2000 of the events, and their colours (N, 3).
+        """Return places (N, 3) in the scene of at most 2000 of the events, and their colors (N, 3).
 
         An event lies on the surface that its pixel sees from the corrected pose of its time, 1 % nearer to the camera.
         """
@@ -152,7 +152,7 @@ class RecordingView:
         return places[seen], colors[seen]
 
     def figures(self) -> str:
-        """Return pose errors, contrast thresholds and the state of the colour correction, in Markdown."""
+        """Return pose errors, contrast thresholds and the state of the color correction, in Markdown."""
         return "\n\n".join([self._pose_figures(), self._threshold_figures(), self._color_figures()])
 
     def _pose_figures(self) -> str:
@@ -190,7 +190,7 @@ class RecordingView:
         return text if period is None else f"{text}; refractory period {period / 1e3:.4g} µs (learned)"
 
     def _color_figures(self) -> str:
-        return f"**Colour correction** {self._model.color_correction.description}"
+        return f"**Color correction** {self._model.color_correction.description}"
 
     @torch.no_grad()
     def trajectory_file(self) -> bytes:

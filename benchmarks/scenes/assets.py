@@ -135,7 +135,7 @@ class Library:
 
     @cache  # noqa: B019
     def _catalogue(self) -> dict[str, dict[str, str]]:
-        """Read the entries of the furniture's catalogue, by model name."""
+        """Read the entries of the furniture's catalog, by model name."""
         entries: dict[str, dict[str, str]] = {}
         for line in (self._furniture() / _CATALOGUE).read_text(encoding="latin-1").splitlines():
             key, _, value = line.partition("=")

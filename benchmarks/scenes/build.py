@@ -17,7 +17,7 @@ import numpy as np
 from aenerf_ns.errors import DataError
 from benchmarks.runs import run_benchmark
 from benchmarks.scenes.assets import Library, cv2
-from benchmarks.scenes.catalogue import SCENES
+from benchmarks.scenes.catalog import SCENES
 from benchmarks.scenes.glb import write_glb
 
 _BRIGHTEST = 300.0

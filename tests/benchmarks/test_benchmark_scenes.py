@@ -12,7 +12,7 @@ import trimesh
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
-from benchmarks.scenes import assets, catalogue, furnishings, meshes, object_scenes, place_scenes, shapes
+from benchmarks.scenes import assets, catalog, furnishings, meshes, object_scenes, place_scenes, shapes
 from benchmarks.scenes.cleaning import without_coincident_faces
 from benchmarks.scenes.glb import write_glb
 from benchmarks.scenes.obj import read_obj, triangulate
@@ -157,9 +157,9 @@ def test_credits_name_every_asset_of_every_scene(monkeypatch):
     # Patterns take seconds, and do not matter here.
     for module in (furnishings, object_scenes, place_scenes):
         monkeypatch.setattr(module, "paint", lambda name, *rest, **options: meshes.Material(name, PLAIN.picture))
-    credits = Path(catalogue.__file__).with_name("CREDITS.md").read_text()
+    credits = Path(catalog.__file__).with_name("CREDITS.md").read_text()
     rows = {line.split("|")[1].strip(): line for line in credits.splitlines() if line.startswith("| ")}
-    for name, scene in catalogue.SCENES.items():
+    for name, scene in catalog.SCENES.items():
         library = StandIns()
         assert np.isfinite(scene.compose(library).triangles).all()
         for asset in (*library.names, scene.environment):
@@ -167,7 +167,7 @@ def test_credits_name_every_asset_of_every_scene(monkeypatch):
 
 
 def test_walks_are_closed_loops_of_as_many_targets():
-    walks = [scene.walk for scene in catalogue.SCENES.values() if scene.walk]
+    walks = [scene.walk for scene in catalog.SCENES.values() if scene.walk]
     assert len(walks) >= 4
     for positions, targets in walks:
         eyes = np.array(positions)

@@ -59,6 +59,6 @@ def test_without_an_end_a_window_contains_all_times(window: TimeWindow) -> None:
     assert window.contains(4) == (not window.gaps)
     pieces = window.pieces()
     assert (pieces[0][0], pieces[-1][1]) == (FIRST_TIME, LAST_TIME)
-    # Their neighbours still fit in 64 bits, as EventStream.between needs.
+    # Their neighbors still fit in 64 bits, as EventStream.between needs.
     limits = np.iinfo(np.int64)
     assert limits.min < FIRST_TIME < LAST_TIME < limits.max

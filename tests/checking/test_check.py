@@ -330,7 +330,7 @@ def test_command_finds_nothing_and_draws_a_picture(shorter: Path, tmp_path: Path
     count = len(all_events(open_native(shorter)))
     assert f"Events: {count:,} in 2." in output
     assert "Events with a pose: 100.0%" in output
-    # The camera is well inside a room of some metres.
+    # The camera is well inside a room of some meters.
     near, far = (float(output.split("What is seen is ")[1].split()[i]) for i in (0, 2))
     assert 0.3 < near < 2 < far < 8
     with Image.open(tmp_path / "warped.png") as picture:

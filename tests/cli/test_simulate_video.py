@@ -122,7 +122,7 @@ def test_noise_is_added_to_the_given_poses(frames: Path, poses: Path, camchain: 
     options = {"video": frames, "trajectory": poses, "calibration": camchain, "event_camera": "cam0"}
     simulate(tmp_path / "dataset", **options, pose_noise_degrees=1.0)
     recording = NativeDataParserConfig(data=tmp_path / "dataset").setup().recording
-    # Kalibr counts from the centre of the first pixel.
+    # Kalibr counts from the center of the first pixel.
     assert (recording.event_camera.cx, recording.event_camera.distortion[0]) == (11.5, -0.1)
     assert recording.ground_truth is not None
     torch.testing.assert_close(recording.ground_truth.camera_to_worlds, make_poses().camera_to_worlds)

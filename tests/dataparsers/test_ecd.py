@@ -41,7 +41,7 @@ def test_ecd_text_reads(tmp_path: Path) -> None:
     config = EcdDataParserConfig(data=write_ecd(tmp_path / "made"))
     dataset = EventDataset(parse(config))
     camera = dataset.metadata[SCENE_KEY].event_camera
-    # The format counts the principal point from the centre of the first pixel.
+    # The format counts the principal point from the center of the first pixel.
     assert (camera.width, camera.height, camera.cx, camera.cy) == (6, 4, 3.0, 2.0)
     (chunk,) = dataset.metadata[SCENE_KEY].event_file.chunks()
     assert chunk.t.tolist() == [10_000_000, 20_000_000, 30_000_000, 310_000_000]

@@ -18,11 +18,11 @@ def moving_dots(width: int, height: int, size: float) -> EventStream:
     duration, per_half = 0.15, 40
     columns = []
     for half, velocity in enumerate(VELOCITIES):
-        centre = rng.uniform([half * width / 2, 0], [(half + 1) * width / 2, height], (per_half, 2))
+        center = rng.uniform([half * width / 2, 0], [(half + 1) * width / 2, height], (per_half, 2))
         sign = rng.choice([-1, 1], per_half)
         for _ in range(40):
             t = rng.uniform(0, duration, per_half)
-            place = centre + velocity * size * (t - duration / 2)[:, None] + rng.uniform(0, size, (per_half, 2))
+            place = center + velocity * size * (t - duration / 2)[:, None] + rng.uniform(0, size, (per_half, 2))
             columns.append(np.column_stack([place, t * 1e9, sign]))
     x, y, t, p = np.concatenate(columns).T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & ((x < width / 2) == (np.arange(len(x)) // 1600 < 1))

@@ -124,7 +124,7 @@ def test_mesh_is_in_recording_units(run: TrainedRun, monkeypatch: pytest.MonkeyP
     made = mesh.extract_mesh(run, num_views=5, resolution=48)
     distance = np.linalg.norm(made.vertices - center, axis=1)
     assert len(made.faces) > 500
-    # To a voxel and a pixel: the visible cap is less than a metre wide.
+    # To a voxel and a pixel: the visible cap is less than a meter wide.
     assert np.abs(distance - radius).mean() < 0.01
     assert np.quantile(np.abs(distance - radius), 0.95) < 0.03
     assert (made.visual.vertex_colors[distance < radius + 0.01] == [255, 128, 0, 255]).mean() > 0.9

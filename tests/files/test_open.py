@@ -48,10 +48,10 @@ LAPS = {"evt2": 1 << 34, "evt3": 1 << 24, "dat": 1 << 32, "aedat4": 1 << 60}
 
 @st.composite
 def recordings(draw: st.DrawFn, longest_gap: int) -> Rows:
-    """Events with equal times, neighbours in a row, short and long gaps."""
+    """Events with equal times, neighbors in a row, short and long gaps."""
     gap = st.one_of(st.just(0), st.integers(0, 5000), st.integers(0, longest_gap))
     rows, time = [], draw(st.integers(0, 20_000_000))
-    for step, x, y, p, neighbours in draw(
+    for step, x, y, p, neighbors in draw(
         st.lists(
             st.tuples(
                 gap,
@@ -65,7 +65,7 @@ def recordings(draw: st.DrawFn, longest_gap: int) -> Rows:
         )
     ):
         time += step
-        columns = np.cumsum([x, *neighbours])
+        columns = np.cumsum([x, *neighbors])
         rows += [(int(column), y, time, p) for column in columns if column < WIDTH]
     # The first time of such a file is only known up to its laps.
     return rows

@@ -26,7 +26,7 @@ def evt2(rows: Rows) -> bytes:
 
 
 def evt3_words(rows: Rows) -> np.ndarray:
-    """Neighbouring events of one time, row and polarity are vectors; in between are words without events."""
+    """Neighboring events of one time, row and polarity are vectors; in between are words without events."""
     words: list[int] = []
     last_high = None
     for (t, y, p), group in groupby(rows, lambda row: (row[2], row[1], row[3])):

@@ -233,7 +233,7 @@ def write_eventnerf(folder: Path) -> Truth:
     (folder / "train" / "events").mkdir()
     np.savez(folder / "train" / "events" / "test_lego.npz", **events)
     times = np.array([2_000_000_000 * i // 20 for i in range(N_POSES)])
-    # Written with the centre of the first pixel at 0, as OpenCV has it.
+    # Written with the center of the first pixel at 0, as OpenCV has it.
     matrix = np.array([[400.0, 0, 169.5], [0, 410.0, 128.0], [0, 0, 1]])
     return Truth(folder, times, poses, events, 346, 260, matrix, (-0.1, 0.02, 0.0, 0.0))
 

@@ -28,9 +28,9 @@ def make_pipeline_config(
     pose_correction: str = "off",
     true_world: Callable[[torch.Tensor], torch.Tensor] | None = None,
 ) -> AENeRFPipelineConfig:
-    """Make the configuration of a small model of a colour sensor, and its dataset where it does not exist.
+    """Make the configuration of a small model of a color sensor, and its dataset where it does not exist.
 
-    The validation views are grey, the test views, one more, orange. With ``true_world`` there are true poses, in the
+    The validation views are gray, the test views, one more, orange. With ``true_world`` there are true poses, in the
     world that it maps to, where the views are too.
     """
     if not folder.exists():

@@ -50,7 +50,7 @@ def share_batches(trainer: Trainer) -> None:
 
 
 def train_and_keep(trainer: Trainer) -> None:
-    """Trains, and keeps the times of the first batch, what was learned, and how often colours were fitted."""
+    """Trains, and keeps the times of the first batch, what was learned, and how often colors were fitted."""
     if "SHARED_BATCHES" in os.environ:
         share_batches(trainer)
     datamanager, pipeline = trainer.pipeline.datamanager, trainer.pipeline

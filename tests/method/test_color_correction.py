@@ -1,4 +1,4 @@
-"""The protocols of colour correction: what each recovers, from which views, and that it is stored."""
+"""The protocols of color correction: what each recovers, from which views, and that it is stored."""
 
 from __future__ import annotations
 
@@ -174,19 +174,19 @@ def test_checkpoints_of_the_affine_protocol_hold_these_buffers() -> None:
 @pytest.mark.parametrize("test_mode", ["val", "test"])
 def test_each_protocol_is_fitted_on_its_own_views(test_mode: Literal["test", "val"], tmp_path: Path) -> None:
     pipeline = make_pipeline(tmp_path / "made", test_mode)
-    grey, orange = torch.full((3,), 0.4), torch.tensor([0.8, 0.4, 0.2])
+    gray, orange = torch.full((3,), 0.4), torch.tensor([0.8, 0.4, 0.2])
     expected: dict[ColorCorrectionProtocol, tuple[str, torch.Tensor]] = {
-        "affine": ("affine, fitted on 2 validation views", grey),
+        "affine": ("affine, fitted on 2 validation views", gray),
         "affine-test": ("affine-test, fitted on the 3 test views themselves", orange),
-        "translated-gamma": ("translated-gamma, fitted on 2 validation views, exponent a = ", grey),
-        "network": ("network, fitted on 2 validation views", grey),
+        "translated-gamma": ("translated-gamma, fitted on 2 validation views, exponent a = ", gray),
+        "network": ("network, fitted on 2 validation views", gray),
     }
     camera = pipeline.datamanager.reference_views("test").cameras[0:1]
     rays = camera.generate_rays(0, keep_shape=False)
     for protocol, (description, color) in expected.items():
         replace_color_correction(pipeline.trained_run(), protocol)
         assert pipeline.model.color_correction.description.startswith(description)
-        # All references are alike, so whatever is rendered becomes their colour.
+        # All references are alike, so whatever is rendered becomes their color.
         shown = pipeline.model.eval()(rays)["rgb"]
         torch.testing.assert_close(shown, color.expand_as(shown), atol=0.02, rtol=0)
     replace_color_correction(pipeline.trained_run(), "none")

@@ -229,7 +229,7 @@ def test_a_run_is_trained_resumed_and_evaluated(method: str, precision: str, tmp
     config = max((tmp_path / "out").rglob("config.yml"))
     output = tmp_path / "evaluation.json"
     run("ns-eval", "--load-config", config, "--output-path", output, cwd=tmp_path, gpu=True)
-    # Better than grey, and poses that have not been thrown about.
+    # Better than gray, and poses that have not been thrown about.
     results = json.loads(output.read_text())["results"]
     assert results["psnr"] > 5
     assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 5

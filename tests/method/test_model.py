@@ -1,4 +1,4 @@
-"""The model: rendering, losses and colour correction on small exact cases."""
+"""The model: rendering, losses and color correction on small exact cases."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_a_camera_within_the_box_sees_nothing_nearer_than_the_near_plane() -> No
     assert model(rays)["accumulation"].max() < 1e-3
 
 
-def test_the_picture_is_the_colour_corrected_one() -> None:
+def test_the_picture_is_the_color_corrected_one() -> None:
     model = make_model().eval()
     model.color_correction.scale.fill_(0.5)
     model.color_correction.offset.fill_(-1.0)
@@ -187,21 +187,21 @@ def test_the_picture_is_the_colour_corrected_one() -> None:
 def test_image_metrics_compare_with_what_the_sensor_sees() -> None:
     model = make_model().eval()
     reference = torch.rand(16, 16, 3)
-    grey = model.reference_display(reference)
-    outputs = {"rgb": grey, "accumulation": torch.ones(16, 16, 1), "depth": torch.ones(16, 16, 1)}
+    gray = model.reference_display(reference)
+    outputs = {"rgb": gray, "accumulation": torch.ones(16, 16, 1), "depth": torch.ones(16, 16, 1)}
     metrics, images = model.get_image_metrics_and_images(outputs, {"image": reference})
     assert metrics["psnr"] > 60
     assert metrics["ssim"] == pytest.approx(1.0, abs=1e-4)
     assert images["img"].shape == (16, 32, 3)
-    # The ends of the colour map: no error, and one of half of the range of display values.
+    # The ends of the color map: no error, and one of half of the range of display values.
     dark, bright = torch.tensor([0.267, 0.005, 0.329]), torch.tensor([0.993, 0.906, 0.144])
     torch.testing.assert_close(images["error"], dark.expand(16, 16, 3), atol=2e-3, rtol=0)
-    outputs["rgb"] = torch.where(grey > 0.5, grey - 0.5, grey + 0.5)
+    outputs["rgb"] = torch.where(gray > 0.5, gray - 0.5, gray + 0.5)
     _, images = model.get_image_metrics_and_images(outputs, {"image": reference})
     torch.testing.assert_close(images["error"], bright.expand(16, 16, 3), atol=0.02, rtol=0)
 
 
-def test_pictures_are_also_rendered_without_colour_correction() -> None:
+def test_pictures_are_also_rendered_without_color_correction() -> None:
     rays = make_rays()
     outputs = make_model(color_correction="none").eval()(rays)
     # The viewer shows the first when it starts.

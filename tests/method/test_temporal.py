@@ -163,7 +163,7 @@ def test_off_has_no_parameters_and_changes_nothing() -> None:
 
 
 def test_the_unit_of_length_does_not_matter() -> None:
-    """Parameters that turn a trajectory into another one do the same to the same trajectory in millimetres."""
+    """Parameters that turn a trajectory into another one do the same to the same trajectory in millimeters."""
     correction = make_correction("spline")
     scaled = correction.trajectory.camera_to_worlds.clone()
     scaled[:, :, 3] *= 1000

@@ -187,8 +187,8 @@ def test_images_of_a_sensor(name: NetworkName, pattern: str, tmp_path: Path) -> 
     assert all(image.shape == (10, 13, 3) and image.dtype == np.uint8 for _, image in found)
     fresh = NetworkImages(network, sensor, "cpu").image(events[130:260])
     assert (fresh != found[1][1]).any()
-    is_grey = (found[0][1] == found[0][1][..., :1]).all()
-    assert is_grey == (not pattern)
+    is_gray = (found[0][1] == found[0][1][..., :1]).all()
+    assert is_gray == (not pattern)
 
 
 def test_padding_is_removed() -> None:
@@ -217,5 +217,5 @@ def test_filter_sees_colors() -> None:
     image = FilteredImages(8, 6, SensorModel(bayer_pattern="RGGB")).image(make_stream(rows, 8, 6))
     assert (image[..., 0] > image[..., 1]).all()
     assert (image[..., 1] == image[..., 2]).all()
-    grey = FilteredImages(8, 6, SensorModel()).image(make_stream(rows, 8, 6))
-    assert (grey[..., 0] == grey[..., 2]).all()
+    gray = FilteredImages(8, 6, SensorModel()).image(make_stream(rows, 8, 6))
+    assert (gray[..., 0] == gray[..., 2]).all()

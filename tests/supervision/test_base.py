@@ -25,18 +25,18 @@ class Moments(Batch):
 
 
 @dataclass
-class GreyCoefficients(LossCoefficients):
-    grey_loss: float = 2.0
+class GrayCoefficients(LossCoefficients):
+    gray_loss: float = 2.0
 
 
 @dataclass
-class GreyConfig(SupervisionConfig):
+class GrayConfig(SupervisionConfig):
     """Says that everything looks the same."""
 
-    _target: type = field(default_factory=lambda: Grey)
+    _target: type = field(default_factory=lambda: Gray)
 
 
-class Grey(Supervision):
+class Gray(Supervision):
     batch_type = Moments
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -50,7 +50,7 @@ class Grey(Supervision):
         return self.sensor.negative_contrast_threshold
 
     def losses(self, outputs: Mapping[str, Any], batch: Moments) -> dict[str, Tensor]:
-        return {"grey_loss": (outputs["log_radiance"] - outputs["level"] - batch.offset).square().mean()}
+        return {"gray_loss": (outputs["log_radiance"] - outputs["level"] - batch.offset).square().mean()}
 
     def learned_values(self) -> dict[str, float]:
         return {"level": self.level.item()}
@@ -84,7 +84,7 @@ class MomentSampler(Sampler):
 
 def test_another_supervision_is_trained_and_what_it_learns_is_logged(tmp_path: Path) -> None:
     config = make_pipeline_config(tmp_path / "data", pose_correction="spline")
-    config.model = replace(config.model, supervision=GreyConfig(), loss_coefficients=GreyCoefficients())
+    config.model = replace(config.model, supervision=GrayConfig(), loss_coefficients=GrayCoefficients())
     config.datamanager = replace(config.datamanager, sampler=MomentSamplerConfig(), train_num_rays_per_batch=30)
     pipeline = config.setup(device="cpu", test_mode="val")
     groups = pipeline.get_param_groups()
@@ -96,7 +96,7 @@ def test_another_supervision_is_trained_and_what_it_learns_is_logged(tmp_path: P
         outputs, losses, metrics = pipeline.get_train_loss_dict(step)
         sum(losses.values()).backward()
         optimizer.step()
-        history.append(losses["grey_loss"].item())
+        history.append(losses["gray_loss"].item())
     assert len(outputs["log_radiance"]) == 30
     assert history[-1] < 0.05 * history[0]
     assert metrics["level"] != -1.0

@@ -152,7 +152,7 @@ def test_an_impossible_number_of_events_is_refused(number: int, random_poses: to
         make_sampler(random_poses, SensorModel(), max_events_per_pair=number)
 
 
-def test_the_colour_filter_is_that_of_the_raw_pixel(random_poses: torch.Tensor) -> None:
+def test_the_color_filter_is_that_of_the_raw_pixel(random_poses: torch.Tensor) -> None:
     _, batch = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB")).sample(40)
     # Pixel (3, 1) is blue and pixel (0, 2) red.
     assert set(batch.channel.tolist()) == {0, 2}

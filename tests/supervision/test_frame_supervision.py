@@ -38,12 +38,12 @@ class Dataset:
     scene: SceneRecording
 
 
-def make_sampler(folder: Path, poses: torch.Tensor, pattern: BayerPattern = "", grey: bool = True) -> FrameSampler:
-    """A sampler of three images; pixel i of image f has the values 80 f + 5 i, and the colours 1 and 2 more."""
+def make_sampler(folder: Path, poses: torch.Tensor, pattern: BayerPattern = "", gray: bool = True) -> FrameSampler:
+    """A sampler of three images; pixel i of image f has the values 80 f + 5 i, and the colors 1 and 2 more."""
     frames = []
     for index, seconds in enumerate(SECONDS):
         values = (80 * index + 5 * np.arange(12, dtype=np.uint8)).reshape(3, 4)
-        picture = values if grey else np.stack([values, values + 1, values + 2], -1).astype(np.uint8)
+        picture = values if gray else np.stack([values, values + 1, values + 2], -1).astype(np.uint8)
         Image.fromarray(picture.astype(np.uint8)).save(folder / f"{index}.png")
         frames.append((EPOCH + round(seconds * 1e9), folder / f"{index}.png"))
     trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), poses)
@@ -53,16 +53,16 @@ def make_sampler(folder: Path, poses: torch.Tensor, pattern: BayerPattern = "", 
     return FrameSamplerConfig().setup(dataset=Dataset(scene), supervision=supervision, device="cpu")
 
 
-@pytest.mark.parametrize(("pattern", "grey"), [("", True), ("RGGB", True), ("RGGB", False)])
+@pytest.mark.parametrize(("pattern", "gray"), [("", True), ("RGGB", True), ("RGGB", False)])
 def test_a_pixel_has_the_value_of_its_image_and_the_ray_of_its_time(
-    pattern: BayerPattern, grey: bool, random_poses: torch.Tensor, tmp_path: Path
+    pattern: BayerPattern, gray: bool, random_poses: torch.Tensor, tmp_path: Path
 ) -> None:
-    rays, batch = make_sampler(tmp_path, random_poses, pattern, grey).sample(600)
+    rays, batch = make_sampler(tmp_path, random_poses, pattern, gray).sample(600)
     assert rays.origins.shape == (600, 3)
     values = torch.round(batch.values * 255).long()
     assert values.shape == (600, 3 if pattern else 1)
     if pattern:
-        assert (values - values[:, :1] == (torch.zeros(3).long() if grey else torch.arange(3))).all()
+        assert (values - values[:, :1] == (torch.zeros(3).long() if gray else torch.arange(3))).all()
     directions = CAMERA.pixel_directions()[0].reshape(-1, 3)
     pixels = [int(np.abs(directions - ray).sum(1).argmin()) for ray in rays.metadata[CAMERA_DIRECTIONS].numpy()]
     taken = torch.tensor(SECONDS, dtype=torch.float64)

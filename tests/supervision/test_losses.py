@@ -67,9 +67,9 @@ def test_srgb_encoding_has_the_standards_values_and_inverts() -> None:
 
 
 def test_a_monochrome_sensor_sees_luminance() -> None:
-    colours = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    torch.testing.assert_close(to_channels(colours, 1)[:, 0], torch.tensor([1.0, 0.2126, 0.7152]))
-    assert torch.equal(to_channels(colours, 3), colours)
+    colors = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    torch.testing.assert_close(to_channels(colors, 1)[:, 0], torch.tensor([1.0, 0.2126, 0.7152]))
+    assert torch.equal(to_channels(colors, 3), colors)
 
 
 def test_psnr_by_hand_and_lpips_is_absent_unless_asked_for() -> None:

@@ -205,7 +205,7 @@ def test_poses_with_gaps_alone_are_refused(random_poses: torch.Tensor) -> None:
 def compare(
     supervision: WindowSupervision, predicted: torch.Tensor, positive: list[float], negative: list[float]
 ) -> dict[str, torch.Tensor]:
-    """The losses for rendered changes of a grey sensor's pixels."""
+    """The losses for rendered changes of a gray sensor's pixels."""
     outputs = {"log_radiance": torch.cat([torch.zeros_like(predicted), predicted])[:, None]}
     outputs |= supervision.shift_ray_times(make_rays(2 * len(predicted), with_times=True))
     channel = torch.zeros(len(predicted), dtype=torch.long)

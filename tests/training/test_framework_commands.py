@@ -160,7 +160,7 @@ def test_a_run_is_evaluated_under_other_protocols(
     assert results["color_correction"] == "network, fitted on 4 validation views"
     for name, figures in (("placed", results), ("refined", results["refined_test_poses"])):
         assert re.search(rf"PSNR {figures['psnr']:.2f} dB,\s+SSIM\s+{figures['ssim']:.3f}", said), name
-    # The same pictures in other colours.
+    # The same pictures in other colors.
     assert 0 < abs(results["psnr"] - of_run["psnr"]) < 3
     assert len(list(pictures.glob("eval_img_*.png"))) == 3
     assert (trained.read_bytes(), checkpoint.read_bytes()) == before
@@ -235,7 +235,7 @@ def test_cameras_frames_and_a_mesh_go_on_to_other_tools(trained: Path, workspace
         frame = np.array(Image.open(workspace / "frames" / "images" / f"{index:06d}.png"))
         assert frame.shape == (36, 48, 3)
         assert frame.std() > 5
-        # The room is some metres large, and depth is in millimetres.
+        # The room is some meters large, and depth is in millimeters.
         depth = np.array(Image.open(workspace / "frames" / "depth" / f"{index:06d}.png"))
         assert 500 < np.median(depth) < 8000
     outputs = NerfstudioDataParserConfig(data=workspace / "frames").setup().get_dataparser_outputs("train")
@@ -244,7 +244,7 @@ def test_cameras_frames_and_a_mesh_go_on_to_other_tools(trained: Path, workspace
     ExportMesh(trained, workspace / "mesh.ply", resolution=48, num_views=8).main()
     mesh = trimesh.load(workspace / "mesh.ply")
     assert len(mesh.faces) > 300
-    # The room has 4.5 x 4.5 x 2.8 metres.
+    # The room has 4.5 x 4.5 x 2.8 meters.
     assert 2 < mesh.extents.max() < 12
 
 
@@ -299,7 +299,7 @@ def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
         browser.open_file(workspace / "report" / "report.html")
         browser.wait_for("[...document.querySelectorAll('.plotly-graph-div')].every((plot) => plot._fullLayout)")
         assert browser.evaluate("document.querySelectorAll('.plotly-graph-div').length") >= 8
-        # No plot reaches over its neighbour.
+        # No plot reaches over its neighbor.
         wide = "[...document.querySelectorAll('.plotly-graph-div')].filter((one) => one.scrollWidth > one.clientWidth)"
         assert browser.evaluate(f"{wide}.length") == 0
         assert browser.evaluate("[...document.images].every((image) => image.naturalWidth > 0)")

@@ -82,7 +82,7 @@ CASES: dict[str, dict[str, Any]] = {
     "radiance that underflows": {"model": lambda model: set_radiance(model, -200.0)},
     "huge radiance": {"model": lambda model: set_radiance(model, 1e30)},
     "rays from afar": {"rays": moved_to(50.0)},
-    "rays from the centre": {"rays": moved_to(0.0)},
+    "rays from the center": {"rays": moved_to(0.0)},
     "rays that miss": {"rays": turned_away},
     "a single pair": {"pairs": 1},
 }

@@ -134,7 +134,7 @@ def test_two_processes_learn_the_same_from_different_pairs(room: Path, workspace
     )  # fmt: skip
     assert not torch.equal(first["times"], second["times"])
     for name, value in first["weights"].items():
-        # Only the process that writes the checkpoints fits colours.
+        # Only the process that writes the checkpoints fits colors.
         if not name.startswith("color_correction."):
             assert torch.equal(value, second["weights"][name]), name
     # Roughly after the first step, and after the last.

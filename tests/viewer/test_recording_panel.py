@@ -188,7 +188,7 @@ def test_points_are_limited_for_slow_links(viewer: Viewer, pipeline: AENeRFPipel
     assert len(points) <= 2000
 
 
-def test_figures_tell_errors_thresholds_and_colours(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
+def test_figures_tell_errors_thresholds_and_colors(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     panel = pipeline.recording
     with viewer.train_lock:
         pipeline.color_fit.fit()

@@ -20,7 +20,7 @@ _BLOCK = 128
 def features(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor) -> tuple[Tensor, Tensor | None]:
     """Return features (N, 2 levels), and their rates where the positions move. See :class:`.hash_grid.Kernels`."""
     num_points, num_levels = len(positions), len(scales)
-    # Level after level, as the programs run; a warp then writes to neighbouring places.
+    # Level after level, as the programs run; a warp then writes to neighboring places.
     out = positions.new_empty(num_levels, num_points, 2)
     rates = None if tangents is None else torch.empty_like(out)
     # Triton launches on the current GPU, which Nerfstudio's processes do not set.

@@ -1,10 +1,10 @@
 """PAEv3D's supervision: patches in windows of time, and priors from the optical flow of the events.
 
 J. Wang, J. He, Z. Zhang and R. Xu, *Physical Priors Augmented Event-Based 3D Reconstruction*, ICRA 2024. Its release is
-Mercerai/PAEv3d, read at 97f6a2b. The release has no licence, so nothing of it was copied. It differs from what is here:
+Mercerai/PAEv3d, read at 97f6a2b. The release has no license, so nothing of it was copied. It differs from what is here:
 
 - **Flow.** The release takes the flow from a network, and from random weights if the network's file is missing. Its
-  README says that the paper's flow came from an optimisation. Here it comes from this project's contrast maximisation:
+  README says that the paper's flow came from an optimization. Here it comes from this project's contrast maximization:
   one velocity for each tile of 16 pixels, over events in a row that are twice as many as the pixels. A pixel without
   events in the window has no flow.
 - **Flow loss.** The release compares the change of a linear brightness with a change of its logarithm, and multiplies
