@@ -5,16 +5,12 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
+from aenerf_ns.cli.console import say
 from aenerf_ns.cli.dataset import DatasetCommand, training_command
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import creating, require_writable
-
-if TYPE_CHECKING:
-    from aenerf_ns.checking.contrast import WarpedEvents
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -38,15 +34,17 @@ class Check(DatasetCommand):
             require_writable(self.picture, "--picture")
         problems = self._find_problems()
         if problems:
-            _print(f"\n{len(problems)} {'problem' if len(problems) == 1 else 'problems'}:")
+            say(f"\n{len(problems)} {'problem' if len(problems) == 1 else 'problems'}:")
             for problem in problems:
-                _print(f"  - {problem}")
+                say(f"  - {problem}")
             sys.exit(1)
-        _print("\nNo problems found.")
+        say("\nNo problems found.")
 
     def _find_problems(self) -> list[str]:
         """Print the figures, write the picture and return the problems."""
         parser = self.open_dataset()
+        from PIL import Image
+
         from aenerf_ns.checking.report import check
         from aenerf_ns.recording.scene import SCENE_KEY
 
@@ -54,7 +52,7 @@ class Check(DatasetCommand):
         outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
         result = check(parser.recording, outputs[0].metadata[SCENE_KEY].window, outputs[0].dataparser_scale)
         for figure in result.figures:
-            _print(figure)
+            say(figure)
         format_words: list[str] = []
         if self.format != "auto" or self.format_options:
             format_words = [parser.guessed_format or self.format]
@@ -62,22 +60,11 @@ class Check(DatasetCommand):
                 format_words += f"--{option}".split("=", 1)
         command = training_command(self.data, options=result.planes, format_words=format_words)
         remark = " (near and far plane for a camera that stays that close)" if result.planes else ""
-        _print(f"Train with{remark}: {command}")
-        if self.picture is not None:
-            if result.warped is None:
-                _print(f"{self.picture}: not written, because too few events have a pose")
-            else:
-                _write_picture(self.picture, result.warped)
+        say(f"Train with{remark}: {command}")
+        if self.picture is not None and result.warped is None:
+            say(f"{self.picture}: not written, because too few events have a pose")
+        elif self.picture is not None:
+            with creating(self.picture, "--picture"):
+                Image.fromarray(result.warped.picture()).save(self.picture)
+            say(f"{self.picture}: events as they came, and warped")
         return result.problems
-
-
-def _print(line: str) -> None:
-    CONSOLE.print(line, highlight=False, markup=False, soft_wrap=True)
-
-
-def _write_picture(path: Path, warped: WarpedEvents) -> None:
-    from PIL import Image
-
-    with creating(path, "--picture"):
-        Image.fromarray(warped.picture()).save(path)
-    _print(f"{path}: events as they came, and warped")

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.cli.dataset import DatasetCommand, training_command
+from aenerf_ns.cli.console import say
+from aenerf_ns.cli.dataset import DatasetCommand, copy_images, open_writer, training_command
 from aenerf_ns.cli.ranges import require_seed
-from aenerf_ns.cli.termination import sigterm_as_system_exit
-from aenerf_ns.errors import DataError
+from aenerf_ns.cli.termination import exclusive_output
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.progress import tracked
 
@@ -73,15 +73,13 @@ class Convert(DatasetCommand):
         require_seed(self.seed)
         filters = self._make_filters()
         parser = self.open_dataset()
-        from aenerf_ns.recording.output_lock import OutputLock
-
-        with sigterm_as_system_exit(), OutputLock(self.output) as lock:
+        with exclusive_output(self.output) as lock:
             self._convert(parser, filters, lock)
 
     def _make_filters(self) -> EventFilters:
         from aenerf_ns.events.filters import EventFilters
 
-        try:
+        with value_errors_as_data_error("aenerf convert", "see aenerf convert --help"):
             return EventFilters(
                 start=self.start_time_ns,
                 end=self.end_time_ns,
@@ -91,16 +89,11 @@ class Convert(DatasetCommand):
                 shortest_interval=self.shortest_interval_ns,
                 seed=self.seed,
             )
-        except ValueError as error:
-            raise DataError("aenerf convert", str(error), "see aenerf convert --help") from None
 
     def _convert(self, parser: EventDataParser, filters: EventFilters, lock: OutputLock) -> None:
         from aenerf_ns.events.filters import FilteredEventFile
-        from aenerf_ns.recording.images import check_image
         from aenerf_ns.recording.views import thinned
-        from aenerf_ns.recording.writer import NativeDatasetWriter
 
-        longest_gap = parser.config.max_pose_gap_ns
         report = None
         if self.poses == "colmap":
             recording, report = _with_estimated_poses(parser.read_frames(), filters.window, self.data, self.seed)
@@ -115,8 +108,6 @@ class Convert(DatasetCommand):
             )
             for split, views in recording.reference_views.items()
         }
-        for file in {view.file for split in views.values() for view in split}:
-            check_image(file, recording.frame_camera)
         camera = recording.event_camera
         if self.region is not None:
             camera = camera.crop(*self.region)
@@ -126,32 +117,17 @@ class Convert(DatasetCommand):
                     f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor",
                     "begin it at an even column and row, so that its first pixel is red",
                 )
-        with NativeDatasetWriter(
-            lock,
-            camera,
-            recording.sensor,
-            recording.image_encoding,
-            scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
-            max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
-            frame_camera=recording.frame_camera,
-            # Near and far planes keep their units.
-            auto_scale_poses=parser.scales_poses(recording),
-        ) as writer:
+        with open_writer(lock, parser, recording, camera, recording.frame_camera) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is not None:
                 writer.add_poses_report(report)
-            for split, kept in views.items():
-                for view in kept:
-                    background = recording.image_background
-                    writer.add_image_file(split, view.file, view.camera_to_world, view.time, background)
+            copy_images(writer, recording, views)
             num_read, num_written = _copy_events(recording.event_file, events, writer)
         counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
-        CONSOLE.print(
+        say(
             f"{self.output}: {num_written:,} of {num_read:,} events, {len(trajectory)} poses, images: {counts}.\n"
             f"Look it over with: aenerf check {self.output}\n"
-            f"Train with: {training_command(self.output)}",
-            highlight=False,
-            soft_wrap=True,
+            f"Train with: {training_command(self.output)}"
         )
 
 
@@ -191,7 +167,7 @@ def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDat
     if num_written == 0:
         raise events.empty_error()
     if events.hot_pixels is not None and events.counts is not None:
-        CONSOLE.print(hot_pixel_summary(events.hot_pixels, events.counts), highlight=False, soft_wrap=True)
+        say(hot_pixel_summary(events.hot_pixels, events.counts))
     return num_read, num_written
 
 
@@ -214,24 +190,21 @@ def _with_estimated_poses(
     kept = [(time, file) for time, file in frames.images if window.contains(time)]
     found = estimate_poses([file for _, file in kept], [time for time, _ in kept], capture.frame_camera, source, seed)
     trajectory, report = found.trajectory, found.report()
-    CONSOLE.print(found.summary(), highlight=False, soft_wrap=True)
-    CONSOLE.print(
+    say(found.summary())
+    say(
         "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale, because frames of one "
-        "camera tell no lengths.",
-        soft_wrap=True,
+        "camera tell no lengths."
     )
     if isinstance(capture, Recording):
         truth = capture.reference_trajectory
-        knots = trajectory.times[(trajectory.times >= truth.start) & (trajectory.times <= truth.end)]
+        knots = trajectory.knots_between(truth.start, truth.end)
         if len(knots) > 1:
             covered = Trajectory(knots, trajectory.interpolate(knots))
             _, errors = compare_with_truth(covered, truth.interpolate(knots))
             report["errors"] = errors
-            CONSOLE.print(
+            say(
                 f"Compared with the given poses, which are kept as ground truth: mean errors "
-                f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units.",
-                highlight=False,
-                soft_wrap=True,
+                f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units."
             )
         # The scene box is in the world of the given poses, and the longest gap is about the given poses.
         return replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None), report

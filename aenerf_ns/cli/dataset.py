@@ -16,8 +16,12 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import require_dataset
 
 if TYPE_CHECKING:
+    from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.recording.dataparser import EventDataParser
     from aenerf_ns.recording.options import EventDataParserConfig
+    from aenerf_ns.recording.output_lock import OutputLock
+    from aenerf_ns.recording.recording import Recording, ReferenceView, Split
+    from aenerf_ns.recording.writer import NativeDatasetWriter
 
     FormatName = str
 else:
@@ -83,6 +87,45 @@ def _with_options(config: EventDataParserConfig, name: str, options: Sequence[st
             remedy = f"see {name} in docs/options.md for what {key} may be"
             raise DataError(f"--format-options {option}", f"{value!r} is not a value of {key}", remedy) from None
     return config
+
+
+def open_writer(
+    lock: OutputLock,
+    parser: EventDataParser,
+    recording: Recording,
+    event_camera: CameraIntrinsics,
+    frame_camera: CameraIntrinsics,
+) -> NativeDatasetWriter:
+    """Open a dataset folder for what a command makes of a recording, in the world of the recording."""
+    from aenerf_ns.recording.writer import NativeDatasetWriter
+
+    longest_gap = parser.config.max_pose_gap_ns
+    return NativeDatasetWriter(
+        lock,
+        event_camera,
+        recording.sensor,
+        recording.image_encoding,
+        scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
+        max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
+        frame_camera=frame_camera,
+        # Near and far planes keep their units.
+        auto_scale_poses=parser.scales_poses(recording),
+    )
+
+
+def copy_images(writer: NativeDatasetWriter, recording: Recording, views: Mapping[Split, list[ReferenceView]]) -> None:
+    """Copy the images of views of a recording to a dataset folder.
+
+    Raises:
+        DataError: an image cannot be read, or is of another size than the camera.
+    """
+    from aenerf_ns.recording.images import check_image
+
+    for file in {view.file for split in views.values() for view in split}:
+        check_image(file, recording.frame_camera)
+    for split, kept in views.items():
+        for view in kept:
+            writer.add_image_file(split, view.file, view.camera_to_world, view.time, recording.image_background)
 
 
 def training_command(

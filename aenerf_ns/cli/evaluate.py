@@ -6,8 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
+from aenerf_ns.cli.console import say
 from aenerf_ns.cli.trained_run import RunPath, open_run
 from aenerf_ns.files.output_paths import creating, require_absent, require_writable
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
@@ -61,7 +60,7 @@ class Evaluate:
         with creating(self.output):
             self.output.write_text(json.dumps(evaluation, indent=2) + "\n", "utf8")
         if results["num_views"] == 0:
-            CONSOLE.print(f"{self.output}: errors of the poses; there are no views to evaluate on.")
+            say(f"{self.output}: errors of the poses; there are no views to evaluate on.")
             return
         if self.nerfbaselines is not None:
             from aenerf_ns.export.predictions import export_predictions
@@ -74,7 +73,4 @@ class Evaluate:
             f"PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.3f} with test poses {name}"
             for name, values in metrics.items()
         )
-        CONSOLE.print(
-            f"{self.output}: {shown}; {results['num_views']} views; color correction {results['color_correction']}.",
-            soft_wrap=True,
-        )
+        say(f"{self.output}: {shown}; {results['num_views']} views; color correction {results['color_correction']}.")

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
+from aenerf_ns.cli.console import say
 from aenerf_ns.cli.ranges import RATES, require_range
 from aenerf_ns.cli.trained_run import RunPath, open_run
 from aenerf_ns.errors import DataError
@@ -63,7 +62,7 @@ class ExportTrajectory:
         written = Trajectory(times.cpu(), run.scene.to_recording(poses))
         with creating(self.output):
             write_tum_trajectory(self.output, written)
-        CONSOLE.print(f"{self.output}: {len(written)} {self.poses} poses.")
+        say(f"{self.output}: {len(written)} {self.poses} poses.")
 
 
 @dataclass
@@ -102,12 +101,10 @@ class ExportCameras:
                 else:
                     target.symlink_to(file.resolve())
             write_cameras(self.output, images, points)
-        CONSOLE.print(
+        say(
             f"{self.output}: {len(images)} images with cameras, {len(points.positions)} points. Train on them with:\n"
             f"  ns-train splatfacto --data {self.output} nerfstudio-data --load-3D-points True\n"
-            f"  ns-train nerfacto --data {self.output} colmap --colmap-path sparse/0",
-            highlight=False,
-            soft_wrap=True,
+            f"  ns-train nerfacto --data {self.output} colmap --colmap-path sparse/0"
         )
 
 
@@ -144,7 +141,7 @@ class ExportFrames:
             times = times_at_rate(run.scene.window, 10.0 if self.rate is None else self.rate)
         with creating(self.output):
             export_frames(run, self.output, times, self.num_points)
-        CONSOLE.print(f"{self.output}: {len(times)} frames with depths, times and cameras.", soft_wrap=True)
+        say(f"{self.output}: {len(times)} frames with depths, times and cameras.")
 
 
 @dataclass
@@ -175,11 +172,7 @@ class ExportMesh:
         with creating(self.output):
             mesh.export(self.output)
         sides = " x ".join(f"{side:.3g}" for side in mesh.extents)
-        CONSOLE.print(
-            f"{self.output}: {len(mesh.faces)} triangles, {sides} units of the recording.",
-            highlight=False,
-            soft_wrap=True,
-        )
+        say(f"{self.output}: {len(mesh.faces)} triangles, {sides} units of the recording.")
 
 
 @dataclass
@@ -221,4 +214,4 @@ class ExportVideo:
             video.send(first.tobytes())
             for picture in pictures:
                 video.send(picture.tobytes())
-        CONSOLE.print(f"{self.output}: {len(times) - 1} frames.", soft_wrap=True)
+        say(f"{self.output}: {len(times) - 1} frames.")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 from aenerf_ns.errors import DataError
 
 RATES = (1e-6, 1e9)
@@ -20,14 +17,3 @@ def require_range(option: str, value: float, low: float, high: float) -> None:
 def require_seed(seed: int) -> None:
     """Raise a DataError for a seed that a random generator does not take."""
     require_range("seed", seed, 0, 2**63 - 1)
-
-
-@contextmanager
-def value_error_as_data_error(command: str) -> Iterator[None]:
-    """Turn a ValueError, with which a class refuses the value of an option, into a DataError that names the command."""
-    try:
-        yield
-    except DataError:
-        raise
-    except ValueError as error:
-        raise DataError(f"aenerf {command}", str(error), f"see aenerf {command} --help") from error

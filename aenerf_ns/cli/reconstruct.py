@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
-from aenerf_ns.cli.dataset import DatasetCommand, training_command
+from aenerf_ns.cli.console import say
+from aenerf_ns.cli.dataset import DatasetCommand, copy_images, open_writer, training_command
 from aenerf_ns.cli.ranges import require_range
-from aenerf_ns.cli.termination import sigterm_as_system_exit
+from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.progress import tracked
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.events.stream import EventStream
     from aenerf_ns.reconstruction.images import ImageSource
     from aenerf_ns.recording.dataparser import EventDataParser
@@ -58,46 +58,32 @@ class Reconstruct(DatasetCommand):
         elif self.weights is not None:
             raise DataError(self.weights, "the high-pass filter has no weights", "leave out --weights")
         parser = self.open_dataset()
-        from aenerf_ns.recording.output_lock import OutputLock
-
-        with sigterm_as_system_exit(), OutputLock(self.output) as lock:
+        with exclusive_output(self.output) as lock:
             self._reconstruct(parser, lock)
 
     def _reconstruct(self, parser: EventDataParser, lock: OutputLock) -> None:
         from aenerf_ns.camera.trajectory import homogeneous
         from aenerf_ns.cli.video_file import new_video
-        from aenerf_ns.recording.writer import NativeDatasetWriter
 
         recording = parser.recording
         source = self._source(recording)
         camera, longest_gap = recording.event_camera, parser.config.max_pose_gap_ns
-        longest_gap = recording.max_pose_gap if longest_gap is None else longest_gap
+        known = recording.trajectory.known_time(recording.max_pose_gap if longest_gap is None else longest_gap)
         with (
-            NativeDatasetWriter(
-                lock,
-                camera,
-                recording.sensor,
-                recording.image_encoding,
-                scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
-                max_pose_gap=longest_gap,
-                # The field then has the scale that a field of the recording's events has.
-                auto_scale_poses=parser.scales_poses(recording),
-            ) as writer,
+            open_writer(lock, parser, recording, camera, camera) as writer,
             closing(new_video(writer.other_file(_VIDEO), camera.width, camera.height, _VIDEO_RATE)) as video,
         ):
             writer.add_trajectories(recording.trajectory, recording.ground_truth)
             _add_reference_views(recording, writer)
             num_images = 0
-            for time, image in self._images(recording, source, longest_gap, writer):
+            for time, image in self._images(recording, source, known, writer):
                 pose = homogeneous(recording.trajectory.interpolate(time))
                 writer.add_image("train", image, pose, time)
                 video.send(image.tobytes())
                 num_images += 1
-        CONSOLE.print(
+        say(
             f"{self.output}: {num_images} images reconstructed by {self.method}, and {_VIDEO}.\n"
-            f"Train on them with: {training_command(self.output, method='e2vid-nerf')}",
-            highlight=False,
-            soft_wrap=True,
+            f"Train on them with: {training_command(self.output, method='e2vid-nerf')}"
         )
 
     def _source(self, recording: Recording) -> ImageSource:
@@ -113,13 +99,12 @@ class Reconstruct(DatasetCommand):
         return NetworkImages(load_network(self.method, self.weights), sensor, device)
 
     def _images(
-        self, recording: Recording, source: ImageSource, longest_gap: int | None, writer: NativeDatasetWriter
+        self, recording: Recording, source: ImageSource, known: TimeWindow, writer: NativeDatasetWriter
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Write the events, and yield time and image of each batch of them that ends at a time with a pose."""
         from aenerf_ns.reconstruction.images import images_of
 
         events = recording.event_file
-        known = recording.trajectory.known_time(longest_gap)
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
 
         def copied() -> Iterator[EventStream]:
@@ -140,24 +125,17 @@ class Reconstruct(DatasetCommand):
                 "give a smaller --events-per-pixel, or poses that cover the events",
             )
         if num_posed < num_images:
-            CONSOLE.print(
-                f"{num_images - num_posed} of {num_images} images are left out: no pose is known at their times."
-            )
+            say(f"{num_images - num_posed} of {num_images} images are left out: no pose is known at their times.")
 
 
 def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> None:
     """Copy the validation and test views, with which every method on this recording is evaluated."""
-    from aenerf_ns.recording.images import check_image
     from aenerf_ns.recording.recording import SPLITS
     from aenerf_ns.recording.views import thinned
 
     views = {split: thinned(recording.reference_views[split], recording.max_views) for split in SPLITS[1:]}
     if recording.frame_camera != recording.event_camera:
         if any(views.values()):
-            CONSOLE.print("The recording's images are left out: they are of another camera than the events.")
+            say("The recording's images are left out: they are of another camera than the events.")
         return
-    for file in {view.file for split in views.values() for view in split}:
-        check_image(file, recording.frame_camera)
-    for split, kept in views.items():
-        for view in kept:
-            writer.add_image_file(split, view.file, view.camera_to_world, view.time, recording.image_background)
+    copy_images(writer, recording, views)

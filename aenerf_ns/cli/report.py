@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
-from nerfstudio.utils.rich_utils import CONSOLE
 
+from aenerf_ns.cli.console import say
 from aenerf_ns.cli.trained_run import open_run
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import creating, require_run, require_writable
@@ -87,7 +87,7 @@ class ReportCommand:
             }
             (self.output / "report.json").write_text(json.dumps(figures, indent=1) + "\n", "utf8")
         size = len(page.encode()) / 1e6
-        CONSOLE.print(f"{self.output / 'report.html'}: {size:.1f} MB, with views.csv and report.json.", soft_wrap=True)
+        say(f"{self.output / 'report.html'}: {size:.1f} MB, with views.csv and report.json.")
 
 
 def _names(configs: Sequence[TrainerConfig]) -> list[str]:

@@ -6,30 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
+from aenerf_ns.cli.console import say
 from aenerf_ns.cli.dataset import training_command
-from aenerf_ns.cli.ranges import value_error_as_data_error
 from aenerf_ns.cli.simulation import SimulationCommand
-from aenerf_ns.cli.termination import sigterm_as_system_exit
-from aenerf_ns.errors import DataError
+from aenerf_ns.cli.termination import exclusive_output
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
 from aenerf_ns.files.limits import MAX_ROWS
-from aenerf_ns.simulator.options import BUILT_IN, DURATIONS, require_scene_file
+from aenerf_ns.simulator.options import BUILT_IN, require_scene_file
 
 if TYPE_CHECKING:
     from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.simulator.simulation import Simulation
-
-_RANGES = {
-    "width": (1, 1 << 14),
-    "height": (1, 1 << 14),
-    "duration": DURATIONS,
-    "pose_rate": (1e-3, 1e6),
-    "exposure": (1e-9, 1e3),
-}
 
 
 @dataclass
@@ -60,7 +50,7 @@ class Simulate(SimulationCommand):
 
     def main(self) -> None:
         """Render the scene along its path and write the dataset."""
-        self.require_possible(_RANGES)
+        self.require_possible()
         require_event_sensor_size(self.width, self.height, "aenerf simulate")
         if self.duration is not None:
             self._require_poses(self.duration)
@@ -70,9 +60,7 @@ class Simulate(SimulationCommand):
         if self.scene not in BUILT_IN:
             require_scene_file(Path(self.scene))
         sensor = self.make_sensor()
-        from aenerf_ns.recording.output_lock import OutputLock
-
-        with sigterm_as_system_exit(), OutputLock(self.output) as lock:
+        with exclusive_output(self.output) as lock:
             self._simulate(sensor, lock)
 
     def _require_poses(self, duration: float) -> None:
@@ -99,12 +87,12 @@ class Simulate(SimulationCommand):
         duration = scene.duration if self.duration is None else self.duration
         self._require_poses(duration)
         for note in scene.notes:
-            CONSOLE.print(note, highlight=False, markup=False)
+            say(note)
         held_out: dict[Split, torch.Tensor] = {
             "val": torch.from_numpy(scene.path.validation_views(self.validation_views)),
             "test": torch.from_numpy(scene.path.test_views(self.test_views, self.seed)),
         }
-        with value_error_as_data_error("simulate"):
+        with value_errors_as_data_error("aenerf simulate", "see aenerf simulate --help"):
             camera = CameraIntrinsics(self.width, self.height, *scene.intrinsics(self.width, self.height))
             simulation = Simulation(
                 scene, camera, sensor, self.speed, duration, self.max_displacement, self.seed, self.noise
@@ -128,12 +116,10 @@ class Simulate(SimulationCommand):
                 for pose in poses:
                     seen = simulation.reference_picture(pose)
                     writer.add_image(split, seen.display, pose, linear=seen.linear, depth=seen.depth)
-        CONSOLE.print(
+        say(
             f"{self.output}: {num_events:,} events in {truth.duration:.2f} s, {len(estimated)} poses, "
             f"{self.train_images} train, {self.validation_views} validation and {self.test_views} test images.\n"
-            f"Train with: {training_command(self.output)}",
-            highlight=False,
-            soft_wrap=True,
+            f"Train with: {training_command(self.output)}"
         )
 
     def _estimate_poses(
@@ -147,5 +133,5 @@ class Simulate(SimulationCommand):
         estimated, report, summary = poses_from_frames(
             simulation, camera, truth, self.frame_rate, self.exposure, self.seed
         )
-        CONSOLE.print(summary)
+        say(summary)
         return estimated, report

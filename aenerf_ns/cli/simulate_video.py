@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from nerfstudio.utils.rich_utils import CONSOLE
 
+from aenerf_ns.cli.console import say
 from aenerf_ns.cli.dataset import training_command
-from aenerf_ns.cli.ranges import value_error_as_data_error
 from aenerf_ns.cli.simulation import SimulationCommand
-from aenerf_ns.cli.termination import sigterm_as_system_exit
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.cli.termination import exclusive_output
+from aenerf_ns.errors import DataError, reading, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
 from aenerf_ns.files.limits import require_file
 from aenerf_ns.simulator.options import Interpolation
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.poses_from_frames.video import Video
     from aenerf_ns.recording.output_lock import OutputLock
+    from aenerf_ns.recording.writer import NativeDatasetWriter, PoselessRecordingWriter
     from aenerf_ns.simulator.video_events import VideoInterval
 
 _COMMAND = "aenerf simulate-video"
@@ -58,7 +61,7 @@ class SimulateVideo(SimulationCommand):
 
     def main(self) -> None:
         """Read the video and write the dataset."""
-        self.require_possible({})
+        self.require_possible()
         self._require_compatible()
         sensor = self.make_sensor()
         with reading(self.video):
@@ -67,9 +70,7 @@ class SimulateVideo(SimulationCommand):
         for file in (self.trajectory, self.calibration):
             if file is not None:
                 require_file(file)
-        from aenerf_ns.recording.output_lock import OutputLock
-
-        with sigterm_as_system_exit(), OutputLock(self.output) as lock, value_error_as_data_error("simulate-video"):
+        with exclusive_output(self.output) as lock, value_errors_as_data_error(_COMMAND, f"see {_COMMAND} --help"):
             self._simulate(sensor, lock)
 
     def _require_compatible(self) -> None:
@@ -100,15 +101,13 @@ class SimulateVideo(SimulationCommand):
         poses = self._find_poses(video, camera)
         intervals = video_events(video, sensor, self.noise, self.interpolation, self.max_displacement, self.seed)
         if poses is None:
-            written = self._write_events(lock, video, camera, sensor, intervals)
+            written = self._write_poseless(lock, video, camera, sensor, intervals)
         else:
             written = self._write_dataset(lock, video, sensor, poses, intervals)
         longest = np.diff(video.times).max() * 1e-6
-        CONSOLE.print(
+        say(
             f"{written}\nEvents between two frames, up to {longest:.3g} ms apart, are interpolated. What moves faster "
-            "than the frames follow, what blur smears, and what is clipped to white or black in the video is lost.",
-            highlight=False,
-            soft_wrap=True,
+            "than the frames follow, what blur smears, and what is clipped to white or black in the video is lost."
         )
 
     def _read_camera(self, video: Video) -> CameraIntrinsics | None:
@@ -127,10 +126,8 @@ class SimulateVideo(SimulationCommand):
                 )
             return camera
         if self.intrinsics is not None:
-            try:
+            with value_errors_as_data_error("--intrinsics", "give fl_x fl_y cx cy in pixels"):
                 return CameraIntrinsics(video.width, video.height, *self.intrinsics)
-            except ValueError as error:
-                raise DataError("--intrinsics", str(error), "give fl_x fl_y cx cy in pixels") from None
         return None
 
     def _find_poses(self, video: Video, camera: CameraIntrinsics | None) -> _VideoPoses | None:
@@ -148,13 +145,11 @@ class SimulateVideo(SimulationCommand):
         if self.poses == "colmap":
             lens = (video.width, video.height) if camera is None else camera
             found = estimate_poses(video, video.times, lens, video.source, self.seed)
-            CONSOLE.print(found.summary(), highlight=False, soft_wrap=True)
+            say(found.summary())
             if camera is None:
-                CONSOLE.print(
+                say(
                     f"COLMAP estimates the lens: focal length {found.camera.fx:.1f} pixels, radial distortion "
-                    f"{found.camera.distortion[0]:.3g}.",
-                    highlight=False,
-                    soft_wrap=True,
+                    f"{found.camera.distortion[0]:.3g}."
                 )
             return _VideoPoses(found.camera, found.trajectory, report=found.report())
         return None
@@ -185,21 +180,20 @@ class SimulateVideo(SimulationCommand):
             writer.add_trajectories(poses.estimated, poses.truth)
             if poses.report is not None:
                 writer.add_poses_report(poses.report)
-            num_events = 0
-            for frame, time, events in intervals:
-                writer.events.append(events)
-                num_events += len(events)
+
+            def add_image(frame: NDArray[np.uint8], time: int) -> None:
                 for split, times in chosen.items():
                     if time in times:
                         writer.add_image(split, frame, homogeneous(reference.interpolate(time)), time)
-            _require_events(num_events, video)
+
+            num_events = _write_events(writer, video, intervals, add_image)
         counts = ", ".join(f"{len(times)} {split}" for split, times in chosen.items())
         return (
             f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(poses.estimated)} poses, images: "
             f"{counts}.\nTrain with: {training_command(self.output)}"
         )
 
-    def _write_events(
+    def _write_poseless(
         self,
         lock: OutputLock,
         video: Video,
@@ -213,13 +207,12 @@ class SimulateVideo(SimulationCommand):
 
         kept = evenly_spread(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
         with PoselessRecordingWriter(lock, camera, sensor) as writer:
-            num_events = 0
-            for frame, time, events in intervals:
-                writer.events.append(events)
-                num_events += len(events)
+
+            def add_image(frame: NDArray[np.uint8], time: int) -> None:
                 if time in kept:
                     writer.add_image(frame, time)
-            _require_events(num_events, video)
+
+            num_events = _write_events(writer, video, intervals, add_image)
         missing = "trajectory.txt" if camera is not None else "calibration.json and trajectory.txt"
         return (
             f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(kept)} images, no poses.\n"
@@ -237,6 +230,18 @@ class _VideoPoses:
     report: dict[str, Any] | None = None
 
 
-def _require_events(num_events: int, video: Video) -> None:
+def _write_events(
+    writer: NativeDatasetWriter | PoselessRecordingWriter,
+    video: Video,
+    intervals: Iterable[VideoInterval],
+    add_image: Callable[[NDArray[np.uint8], int], None],
+) -> int:
+    """Write and count the events of a video, and give its frames with their times to ``add_image``."""
+    num_events = 0
+    for frame, time, events in intervals:
+        writer.events.append(events)
+        num_events += len(events)
+        add_image(frame, time)
     if num_events == 0:
         raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")
+    return num_events

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
-from aenerf_ns.cli.ranges import require_range, require_seed, value_error_as_data_error
+from aenerf_ns.cli.ranges import require_range, require_seed
+from aenerf_ns.errors import value_errors_as_data_error
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.files.output_paths import require_absent
-from aenerf_ns.simulator.options import SensorNoise
+from aenerf_ns.simulator.options import DURATIONS, SensorNoise
 
 if TYPE_CHECKING:
     from aenerf_ns.camera.trajectory import Trajectory
@@ -30,6 +30,11 @@ _RANGES = {
     "train_images": (0, 100_000),
     "validation_views": (0, 100_000),
     "test_views": (0, 100_000),
+    "width": (1, 1 << 14),
+    "height": (1, 1 << 14),
+    "duration": DURATIONS,
+    "pose_rate": (1e-3, 1e6),
+    "exposure": (1e-9, 1e3),
 }
 
 
@@ -71,17 +76,12 @@ class SimulationCommand:
         """Error of the estimated poses: degrees and scene units."""
         return self.pose_noise_degrees, self.pose_noise_translation
 
-    def require_possible(self, ranges: Mapping[str, tuple[float, float]]) -> None:
-        """Raise a DataError if the output exists or a number is out of range.
-
-        Args:
-            ranges: lowest and highest value of options of one command.
-        """
+    def require_possible(self) -> None:
+        """Raise a DataError if the output exists or a number is out of range."""
         require_absent(self.output)
-        ranges = {**_RANGES, **ranges}
         for name, value in {**vars(self), **vars(self.noise)}.items():
-            if name in ranges and value is not None:
-                require_range(name.replace("_", "-"), value, *ranges[name])
+            if name in _RANGES and value is not None:
+                require_range(name.replace("_", "-"), value, *_RANGES[name])
         require_seed(self.seed)
 
     def make_sensor(self) -> SensorModel:
@@ -90,7 +90,7 @@ class SimulationCommand:
         Raises:
             DataError: a value is impossible.
         """
-        with value_error_as_data_error("simulate"):
+        with value_errors_as_data_error("aenerf simulate", "see aenerf simulate --help"):
             return SensorModel(
                 self.positive_contrast_threshold,
                 self.negative_contrast_threshold,

@@ -1,4 +1,4 @@
-"""SIGTERM during a command."""
+"""SIGTERM during a command that writes an output."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+from aenerf_ns.recording.output_lock import OutputLock
 
 
 @contextmanager
@@ -20,3 +23,14 @@ def sigterm_as_system_exit() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def exclusive_output(output: Path) -> Iterator[OutputLock]:
+    """Keep an output that does not exist yet to this process, which cleans up if it is terminated.
+
+    Raises:
+        DataError: see :class:`~aenerf_ns.recording.output_lock.OutputLock`.
+    """
+    with sigterm_as_system_exit(), OutputLock(output) as lock:
+        yield lock

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.small_datasets import START, write_native
+from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,6 @@ from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_qu
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.hypotheses import clock_hypothesis
-from aenerf_ns.cli import check as command
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
@@ -178,7 +178,7 @@ def test_name_mistakes_in_the_real_recording(slider_depth: Path) -> None:
 def run(folder: Path, **options: Path) -> tuple[int, str]:
     """Return the exit status of the check, and its output."""
     status = 0
-    with command.CONSOLE.capture() as output:
+    with CONSOLE.capture() as output:
         try:
             Check(folder, **options).main()
         except SystemExit as end:

@@ -29,7 +29,6 @@ from PIL import Image
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.cli import convert as command
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -182,7 +181,7 @@ def test_hot_pixels_are_named(tmp_path: Path) -> None:
     x[::2], y[::2] = 3, 1
     with Hdf5EventWriter(data / "events.h5") as writer:
         writer.append(EventStream(x, y, t, np.ones(n, np.int8), 6, 4))
-    with command.CONSOLE.capture() as output:
+    with CONSOLE.capture() as output:
         after = convert(data, tmp_path / "converted", drop_hot_pixels=True)
     assert "Hot pixels: 1, with 5" in output.get()
     assert "(3, 1) 1,5" in output.get()
@@ -202,7 +201,7 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr("aenerf_ns.poses_from_frames.structure_from_motion.estimate_poses", place)
     data = write_ecd(tmp_path / "made")
-    with command.CONSOLE.capture() as output:
+    with CONSOLE.capture() as output:
         with_truth = convert(data, tmp_path / "with_truth", poses="colmap")
     assert "of arbitrary position, orientation and scale" in output.get()
     assert "3 of 4 frames registered" in output.get()

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli import main as program
-from aenerf_ns.cli import simulate_video as command
 from aenerf_ns.cli.simulate_video import SimulateVideo
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
@@ -72,7 +72,7 @@ def camchain(tmp_path: Path) -> Path:
 
 
 def simulate(output: Path, **options: Any) -> str:
-    with command.CONSOLE.capture() as printed:
+    with CONSOLE.capture() as printed:
         SimulateVideo(output, **options).main()
     return printed.get()
 
@@ -90,7 +90,7 @@ def test_video_with_poses_becomes_a_dataset(
         "--interpolation linear --positive-contrast-threshold 0.3 --leak-rate 2 --seed 4"
     )
     monkeypatch.setattr(sys, "argv", arguments.split())
-    with command.CONSOLE.capture() as printed:
+    with CONSOLE.capture() as printed:
         program.main()
     assert "up to 40 ms apart, are interpolated. What moves faster" in printed.get()
     assert f"ns-train aenerf --data {output}" in printed.get()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
 from aenerf_ns.camera.alignment import Similarity, align
@@ -16,7 +17,6 @@ from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.cli import simulate as command
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
@@ -52,7 +52,7 @@ def room() -> SimulationScene:
 def dataset(room: SimulationScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A dataset whose poses COLMAP estimated from 14 frames, and what the command printed."""
     folder = tmp_path_factory.mktemp("colmap") / "scene"
-    with pytest.MonkeyPatch.context() as patch, command.CONSOLE.capture() as output:
+    with pytest.MonkeyPatch.context() as patch, CONSOLE.capture() as output:
         patch.setattr("aenerf_ns.simulator.open_scene.open_scene", lambda *_: room)
         Simulate(
             folder, poses="colmap", width=160, height=120, duration=14 / 25 - 0.03, max_displacement=2.0,
