@@ -63,7 +63,7 @@ class Evaluate:
             say(f"{self.output}: errors of the poses; there are no views to evaluate on.")
             return
         if self.nerfbaselines is not None:
-            from aenerf_ns.export.predictions import export_predictions
+            from aenerf_ns.export.nerfbaselines import export_predictions
 
             with creating(self.nerfbaselines, "--nerfbaselines"):
                 export_predictions(run, self.nerfbaselines, config, results["views"])

@@ -84,8 +84,7 @@ class ExportCameras:
         require_absent(self.output)
         require_range("num-points", self.num_points, 1, _MAX_POINTS)
         _, run, _ = open_run(self.load_config, test_mode="inference")
-        from aenerf_ns.export.camera_model_files import IMAGE_FOLDER
-        from aenerf_ns.export.frames import write_cameras
+        from aenerf_ns.export.camera_model_files import IMAGE_FOLDER, write_cameras
         from aenerf_ns.export.placing import place_views
         from aenerf_ns.export.rendering import observe_points
 

@@ -56,7 +56,13 @@ class ObservedPoints:
     pixels: NDArray[np.float64]
 
 
-def write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
+def write_cameras(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
+    """Write images' cameras as a COLMAP model and as a transforms.json, with points of the scene."""
+    _write_colmap_model(folder, images, points)
+    _write_transforms(folder, images, points)
+
+
+def _write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
     """Write a COLMAP model in binary form, and the lists of images that Nerfstudio's ``colmap`` dataparser splits by.
 
     Args:
@@ -102,7 +108,7 @@ def write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: Obse
         (folder / f"{split}_list.txt").write_text("".join(f"{name}\n" for name in names), "utf8")
 
 
-def write_transforms(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
+def _write_transforms(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
     """Write ``transforms.json`` and ``points.ply``, as Nerfstudio's ``nerfstudio`` dataparser reads them.
 
     Poses are camera-to-world with OpenGL camera axes, in the same world as ``points.ply``.

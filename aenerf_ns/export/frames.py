@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,8 @@ from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.export.camera_model_files import (
     IMAGE_FOLDER,
-    ObservedPoints,
     PlacedImage,
-    write_colmap_model,
-    write_transforms,
+    write_cameras,
 )
 from aenerf_ns.export.placing import corrected_poses
 from aenerf_ns.export.rendering import observe_points, render
@@ -64,9 +61,3 @@ def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int)
         lines.append(f"{format_seconds(int(times[index]))} {IMAGE_FOLDER}/{name}\n")
     (folder / IMAGE_LIST).write_text("".join(lines), "utf8")
     write_cameras(folder, images, observe_points(run, images, num_points))
-
-
-def write_cameras(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
-    """Write images' cameras as a COLMAP model and as a transforms.json, with points of the scene."""
-    write_colmap_model(folder, images, points)
-    write_transforms(folder, images, points)

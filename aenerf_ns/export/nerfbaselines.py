@@ -5,23 +5,60 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
-PREDICTIONS, RESULTS_FILE = "predictions", "results.json"
-"""Names of the written folder and file, which nerfbaselines' own archives of a run have too."""
+from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.evaluation.view_metrics import IMAGE_METRICS, picture_names, to_image
+from aenerf_ns.progress import track
 
+# Names of the written folder and file, which nerfbaselines' own archives of a run have too.
+_PREDICTIONS, _RESULTS_FILE = "predictions", "results.json"
 _RENDERED, _TRUE = "color", "gt-color"
 # The evaluator's protocol that rounds display values to 8 bits and knows no background.
 _PROTOCOL = "default"
 _DATASET = "event-data"
 _DIGITS = 5
+
+
+def export_predictions(run: TrainedRun, folder: Path, config: TrainerConfig, views: list[dict[str, Any]]) -> None:
+    """Write the test views as ``predictions``, and their metrics as ``results.json``, in the layout of nerfbaselines.
+
+    The cameras are as the evaluation places them, not refined.
+
+    Args:
+        run: as it is opened to be tested.
+        folder: to create.
+        config: of the run.
+        views: one or more; see :func:`~aenerf_ns.evaluation.view_metrics.describe_views`.
+    """
+    assert run.views is not None
+    names = picture_names(run.views.image_filenames)
+    info = describe_run(config.method_name, run.data.name, config.max_num_iterations)
+    write_predictions(folder / _PREDICTIONS, _render_views(run, names), info)
+    # The evaluator reads the views in the order of their names.
+    placed = [view["placed"] for _, view in sorted(zip(names, views, strict=True), key=lambda pair: pair[0])]
+    metrics = {name: [view[name] for view in placed] for name in IMAGE_METRICS if name in placed[0]}
+    write_results(folder / _RESULTS_FILE, folder / _PREDICTIONS, info, metrics)
+
+
+@torch.no_grad()
+def _render_views(run: TrainedRun, names: list[str]) -> Iterator[tuple[str, Image.Image, Image.Image]]:
+    """Yield name, rendering and truth of each test view."""
+    model, views = run.model.eval(), run.views
+    assert views is not None
+    for index, name in enumerate(track(names, "Rendering predictions")):
+        outputs = model.get_outputs_for_camera(views.cameras[index : index + 1].to(run.device))
+        truth = model.reference_display(views.get_image_float32(index).to(run.device))
+        yield name, to_image(outputs["rgb"]), to_image(truth)
 
 
 def describe_run(method: str, scene: str, num_steps: int) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -56,20 +55,16 @@ def observe_points(run: TrainedRun, images: Sequence[PlacedImage], max_points: i
     generator = torch.Generator().manual_seed(0)
     parts: list[tuple[NDArray, ...]] = []
     per_image = -(-max_points // len(images))
-    chunk = run.model.config.eval_num_rays_per_chunk
     for index, image in enumerate(track(images, "Rendering points")):
         size = torch.tensor([image.camera.height, image.camera.width])
         coordinates = (torch.rand(per_image, 2, generator=generator) * size).floor() + 0.5
         rays = _make_cameras(run, image.camera, torch.from_numpy(image.camera_to_world)[None]).generate_rays(
             torch.zeros(per_image, 1, dtype=torch.long, device=run.device), coords=coordinates.to(run.device)
         )
-        for begin in range(0, per_image, chunk):
-            part = rays[begin : begin + chunk]
-            outputs = run.model(replace(part))
-            seen = (outputs["accumulation"] > _MIN_OPACITY)[:, 0]
-            positions = (part.origins + part.directions * outputs["depth"])[seen].cpu().double()
-            colors = (255 * outputs["rgb"][seen].clamp(0, 1)).round().byte().cpu()
-            pixels = coordinates[begin : begin + chunk].flip(-1)[seen.cpu()].double()
-            found = np.full(len(pixels), index)
-            parts.append((to_recording.map_points(positions).numpy(), colors.numpy(), found, pixels.numpy()))
+        rgb, depth, accumulation = run.model.render_rays(rays, "rgb", "depth", "accumulation")
+        seen = (accumulation > _MIN_OPACITY)[:, 0]
+        positions = to_recording.map_points((rays.origins + rays.directions * depth)[seen].cpu().double())
+        colors = (255 * rgb[seen].clamp(0, 1)).round().byte().cpu()
+        pixels = coordinates.flip(-1)[seen.cpu()].double()
+        parts.append((positions.numpy(), colors.numpy(), np.full(len(pixels), index), pixels.numpy()))
     return ObservedPoints(*(np.concatenate(column)[:max_points] for column in zip(*parts, strict=True)))

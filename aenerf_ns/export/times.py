@@ -15,8 +15,6 @@ from aenerf_ns.files.limits import MAX_ROWS
 
 def spread_times(window: TimeWindow, count: int) -> Tensor:
     """Spread (count,) times in nanoseconds evenly over a time window, its gaps left out."""
-    if count < 1:
-        raise DataError("aenerf", f"{count} views", "give one or more")
     starts, ends = torch.tensor(window.pieces()).T
     elapsed = (ends - starts).cumsum(0)
     # The times are in the middles of equal parts.
@@ -29,24 +27,16 @@ def regular_times(start: int, end: int, rate: float) -> Tensor:
     """Return times in nanoseconds from a start to an end, at a rate per second.
 
     Raises:
-        DataError: the rate is not positive, or gives more times than a reader of trajectories takes.
+        DataError: the rate gives more times than a reader of trajectories takes.
     """
-    if not 0 < rate <= 1e9:
-        raise DataError("aenerf", f"a rate of {rate}", "give one above 0 and up to 1e9 a second")
     count = (end - start) * 1e-9 * rate
     if count > MAX_ROWS:
-        remedy = f"give one that gives at most {MAX_ROWS:,}"
-        raise DataError("aenerf", f"a rate of {rate:g} gives {count:.3g} times", remedy)
-    # An interval beyond the end gives the start alone.
-    return torch.arange(start, end + 1, max(round(min(1e9 / rate, end - start + 1)), 1))
+        raise DataError("--rate", f"{rate:g} gives {count:.3g} times", f"give one that gives at most {MAX_ROWS:,}")
+    return torch.arange(start, end + 1, round(1e9 / rate))
 
 
 def times_at_rate(window: TimeWindow, rate: float) -> Tensor:
-    """Return times in nanoseconds, at a rate per second, in a time window but not in its gaps.
-
-    Raises:
-        DataError: the rate is not positive, or too high for the run.
-    """
+    """Return times in nanoseconds, at a rate per second, in a time window but not in its gaps."""
     times = regular_times(window.start, window.end, rate)
     return times[torch.from_numpy(window.contains(times))]
 

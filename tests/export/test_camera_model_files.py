@@ -14,7 +14,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.export.camera_model_files import ObservedPoints, PlacedImage, write_colmap_model, write_transforms
+from aenerf_ns.export.camera_model_files import ObservedPoints, PlacedImage, write_cameras
 
 LENSES = {
     "pinhole": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5),
@@ -43,13 +43,12 @@ def write(folder: Path, lens: CameraIntrinsics, random_poses: torch.Tensor) -> t
         indices.append(np.full(5, index))
     colors = generator.integers(0, 256, (40, 3)).astype(np.uint8)
     points = ObservedPoints(np.concatenate(positions), colors, np.concatenate(indices), np.concatenate(pixels))
-    write_colmap_model(folder, images, points)
-    write_transforms(folder, images, points)
+    write_cameras(folder, images, points)
     return images, points
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_the_model_is_read_by_pycolmap(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
+def test_pycolmap_reads_the_model(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
     images, points = write(tmp_path, LENSES[name], random_poses)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert [model.images[index + 1].name for index in range(8)] == [image.name for image in images]
@@ -96,7 +95,7 @@ READ_BY_THE_FRAMEWORK = {
 
 
 @pytest.mark.parametrize("name", READ_BY_THE_FRAMEWORK)
-def test_the_model_is_read_by_the_framework(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
+def test_framework_reads_the_model(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
     images, points = write(tmp_path, READ_BY_THE_FRAMEWORK[name], random_poses)
     config = ColmapDataParserConfig(data=tmp_path, colmap_path=Path("sparse/0"), downscale_factor=1)
     for split in ("train", "val", "test"):
@@ -105,7 +104,7 @@ def test_the_model_is_read_by_the_framework(name: str, tmp_path: Path, random_po
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_transforms_json_is_read_by_the_framework(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
+def test_framework_reads_transforms_json(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
     images, points = write(tmp_path, LENSES[name], random_poses)
     config = NerfstudioDataParserConfig(data=tmp_path, downscale_factor=1, load_3D_points=True)
     for split in ("train", "val", "test"):

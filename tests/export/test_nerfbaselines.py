@@ -12,7 +12,7 @@ from PIL import Image
 from aenerf_ns.export.nerfbaselines import describe_run, write_predictions, write_results
 
 
-def test_predictions_and_results_are_laid_out_as_nerfbaselines_does(tmp_path: Path) -> None:
+def test_write_layout_of_nerfbaselines(tmp_path: Path) -> None:
     pictures = [Image.fromarray(np.full((4, 6, 3), value, np.uint8)) for value in (10, 20, 30, 40)]
     info = describe_run("aenerf", "room", 300)
     folder = tmp_path / "predictions"
