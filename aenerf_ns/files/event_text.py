@@ -194,9 +194,7 @@ class TextEventFile(_EventLines):
         if negative.any():
             row = int(np.argmax(negative))
             raise DataError(
-                self.path,
-                f"{lines.line_of(row)} has p = {lines.whole[3, row]}",
-                "polarities are 0 or 1 in this format",
+                self.path, f"{lines.line_of(row)} has p = {lines.whole[3, row]}", "polarities are 0 or 1 in this format"
             )
         return super()._events(lines, tick)
 

@@ -302,11 +302,7 @@ class _Workspace:
         output.mkdir()
         with self._step("Placing frames", len(self._names)) as task:
             models = pycolmap.incremental_mapping(
-                self._database,
-                self._images,
-                output,
-                options,
-                next_image_callback=lambda: self._progress.advance(task),
+                self._database, self._images, output, options, next_image_callback=lambda: self._progress.advance(task)
             )
         return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 

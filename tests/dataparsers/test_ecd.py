@@ -7,10 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.dataset_faults import replace_line
-from helpers.small_datasets import (
-    parse,
-    write_ecd,
-)
+from helpers.small_datasets import parse, write_ecd
 from helpers.unpacked_pairs import unpacked
 
 from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS

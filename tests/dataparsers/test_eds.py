@@ -6,15 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from helpers.published_datasets import (
-    CAMCHAIN,
-    EPOCH,
-    config_of,
-    interpolated,
-    make_poses,
-    recording_of,
-    write_eds,
-)
+from helpers.published_datasets import CAMCHAIN, EPOCH, config_of, interpolated, make_poses, recording_of, write_eds
 
 
 def test_eds_views_are_those_of_the_frame_camera(tmp_path: Path) -> None:

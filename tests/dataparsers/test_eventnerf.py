@@ -7,12 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.published_datasets import (
-    DURATION,
-    config_of,
-    recording_of,
-    write_eventnerf,
-)
+from helpers.published_datasets import DURATION, config_of, recording_of, write_eventnerf
 
 from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.errors import DataError

@@ -9,15 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from helpers.small_datasets import (
-    AS_RECORDED,
-    CAMERA,
-    SENSOR,
-    START,
-    make_trajectory,
-    parse,
-    write_native,
-)
+from helpers.small_datasets import AS_RECORDED, CAMERA, SENSOR, START, make_trajectory, parse, write_native
 from helpers.streams import make_stream
 
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous

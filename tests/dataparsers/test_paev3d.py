@@ -8,10 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.published_datasets import (
-    recording_of,
-    write_paev3d,
-)
+from helpers.published_datasets import recording_of, write_paev3d
 
 from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.paev3d import PAEv3DDataParserConfig

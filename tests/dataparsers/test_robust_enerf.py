@@ -8,11 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from helpers.published_datasets import (
-    config_of,
-    recording_of,
-    write_robust_enerf,
-)
+from helpers.published_datasets import config_of, recording_of, write_robust_enerf
 from helpers.small_datasets import parse
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics

@@ -8,13 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.event_file_checks import (
-    read,
-    table,
-)
-from helpers.event_file_writers import (
-    aedat4_file,
-)
+from helpers.event_file_checks import read, table
+from helpers.event_file_writers import aedat4_file
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.open import open_event_file

@@ -8,15 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.event_table_writers import (
-    HEIGHT,
-    WIDTH,
-    Columns,
-    N,
-    lengths_of_read_pieces,
-    made_columns,
-    write_csv,
-)
+from helpers.event_table_writers import HEIGHT, WIDTH, Columns, N, lengths_of_read_pieces, made_columns, write_csv
 from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import example, given, settings
 from hypothesis import strategies as st

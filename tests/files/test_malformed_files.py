@@ -10,17 +10,7 @@ import numpy as np
 import pytest
 from helpers.event_file_checks import assert_one_line, attempt
 from helpers.event_file_writers import HEADER2, HEADER3, ROWS, aedat4_file, dat, evt2, evt3, sized, words
-from helpers.event_table_writers import (
-    HEIGHT,
-    WIDTH,
-    ZEROS,
-    N,
-    T,
-    made_columns,
-    records,
-    replaced,
-    write_dsec,
-)
+from helpers.event_table_writers import HEIGHT, WIDTH, ZEROS, N, T, made_columns, records, replaced, write_dsec
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile

@@ -9,28 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.bag_writers import PACKET, START, array_bag, packet_messages, write_bag, write_bag2
-from helpers.event_file_checks import (
-    EDITS,
-    attempt,
-    edited,
-    lapless,
-    read,
-    survives,
-    table,
-    vendor_file,
-)
-from helpers.event_file_writers import (
-    ENCODERS,
-    HEADER2,
-    HEADER3,
-    HEIGHT,
-    ROWS,
-    WIDTH,
-    Rows,
-    aedat4_file,
-    dat,
-    evt2,
-)
+from helpers.event_file_checks import EDITS, attempt, edited, lapless, read, survives, table, vendor_file
+from helpers.event_file_writers import ENCODERS, HEADER2, HEADER3, HEIGHT, ROWS, WIDTH, Rows, aedat4_file, dat, evt2
 from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st

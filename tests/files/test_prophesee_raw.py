@@ -6,14 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.event_file_checks import (
-    lapless,
-    read,
-)
-from helpers.event_file_writers import (
-    WIDTH,
-    evt3,
-)
+from helpers.event_file_checks import lapless, read
+from helpers.event_file_writers import WIDTH, evt3
 
 from aenerf_ns.files import prophesee
 from aenerf_ns.files.open import open_event_file

@@ -22,20 +22,8 @@ from helpers.bag_writers import (
     write_bag,
     write_bag2,
 )
-from helpers.event_file_checks import (
-    assert_one_line,
-    attempt,
-    read,
-    table,
-    vendor_file,
-)
-from helpers.event_file_writers import (
-    HEIGHT,
-    ROWS,
-    WIDTH,
-    evt3_words,
-    words,
-)
+from helpers.event_file_checks import assert_one_line, attempt, read, table, vendor_file
+from helpers.event_file_writers import HEIGHT, ROWS, WIDTH, evt3_words, words
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.files import event_reader

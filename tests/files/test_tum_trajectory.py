@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.small_datasets import (
-    make_trajectory,
-)
+from helpers.small_datasets import make_trajectory
 from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import given, settings
 from hypothesis import strategies as st

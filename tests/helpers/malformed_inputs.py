@@ -20,11 +20,7 @@ from helpers.small_datasets import START, set_attribute, write_ecd, write_native
 
 Change = Callable[[Path], object]
 
-FORMAT_WRITERS: dict[str, Callable[[Path], object]] = {
-    "aenerf-data": write_native,
-    "ecd-data": write_ecd,
-    **WRITERS,
-}
+FORMAT_WRITERS: dict[str, Callable[[Path], object]] = {"aenerf-data": write_native, "ecd-data": write_ecd, **WRITERS}
 
 _NATIVE, _ECD, _ROBUST, _EDS = "aenerf-data", "ecd-data", "robust-enerf-data", "eds-data"
 _ESIM, _EVENTNERF, _PAEV3D, _OWN = "enerf-esim-data", "eventnerf-data", "paev3d-data", "event-recording-data"
@@ -596,8 +592,7 @@ _CHANGES: dict[str, dict[str, Change]] = {
     _EDS: {
         "HDF5 columns of 10^12 rows": unallocated("events.h5", {**_COLUMNS, "p": "u1"}),
         "eds enumeration": hdf5(
-            "events.h5",
-            lambda f: without(f, "p").create_dataset("p", (200,), h5py.enum_dtype({"A": 0, "B": 1}, "i1")),
+            "events.h5", lambda f: without(f, "p").create_dataset("p", (200,), h5py.enum_dtype({"A": 0, "B": 1}, "i1"))
         ),
         "eds lists": hdf5("events.h5", lambda f: without(f, "p").create_dataset("p", (200,), h5py.vlen_dtype("i1"))),
     },

@@ -385,11 +385,7 @@ BOMBS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "mcap: zeros without end": ("mcap", _sparse(".mcap", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n")),
     "mcap: zeros with a footer": (
         "mcap",
-        _sparse(
-            ".mcap",
-            b"\x89MCAP0\r\n" + _ROS2_HEAD,
-            struct.pack("<BQQQI", 2, 20, 0, 0, 0) + b"\x89MCAP0\r\n",
-        ),
+        _sparse(".mcap", b"\x89MCAP0\r\n" + _ROS2_HEAD, struct.pack("<BQQQI", 2, 20, 0, 0, 0) + b"\x89MCAP0\r\n"),
     ),
     "mcap: a chunk of 2^62 bytes": ("mcap", _edit(".mcap", _huge_chunk)),
     "mcap: zstd that unpacks to 4 GB": ("mcap", _mcap_chunk(zstd_bomb, b"zstd", 4 << 30)),
@@ -405,10 +401,7 @@ BOMBS: dict[str, tuple[str, Callable[[Path], object]]] = {
         "bag of ROS 2",
         _edit("metadata.yaml", lambda _: f"{_LAUGHS}rosbag2_bagfile_information: *a11\n".encode()),
     ),
-    "bag of ROS 2: a file 10^5 times": (
-        "bag of ROS 2",
-        _metadata("  - events.db3\n", "  - events.db3\n" * 5_000),
-    ),
+    "bag of ROS 2: a file 10^5 times": ("bag of ROS 2", _metadata("  - events.db3\n", "  - events.db3\n" * 5_000)),
     "colmap: 10^18 images": ("colmap", _edit("images.bin", lambda b: struct.pack("<Q", 10**18) + b[8:])),
     "colmap: zeros without end": (
         "colmap",

@@ -22,11 +22,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.poses_from_frames.structure_from_motion import (
-    EstimatedPoses,
-    compare_with_truth,
-    estimate_poses,
-)
+from aenerf_ns.poses_from_frames.structure_from_motion import EstimatedPoses, compare_with_truth, estimate_poses
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.paths import RoomPath

@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.published_datasets import DURATION, EPOCH, config_of, seconds, write_images, write_own
-from helpers.small_datasets import (
-    END,
-    START,
-    make_trajectory,
-    parse,
-    write_ecd,
-    write_native,
-)
+from helpers.small_datasets import END, START, make_trajectory, parse, write_ecd, write_native
 from helpers.unpacked_pairs import unpacked
 
 from aenerf_ns.camera.time_window import TimeWindow

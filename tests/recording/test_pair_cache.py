@@ -129,10 +129,7 @@ def test_pairs_are_made_again_when_events_or_options_change(
     ],
 )
 def test_a_broken_file_is_made_again(
-    data: Path,
-    long_recording: list[Path],
-    damage: Callable[[bytes], bytes],
-    capsys: pytest.CaptureFixture[str],
+    data: Path, long_recording: list[Path], damage: Callable[[bytes], bytes], capsys: pytest.CaptureFixture[str]
 ) -> None:
     pairs = opened(data).pairs
     content = (data / KEPT).read_bytes()

@@ -12,12 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from helpers.small_datasets import (
-    CAMERA,
-    SENSOR,
-    make_trajectory,
-    write_native,
-)
+from helpers.small_datasets import CAMERA, SENSOR, make_trajectory, write_native
 from PIL import Image
 
 from aenerf_ns.camera.trajectory import homogeneous
