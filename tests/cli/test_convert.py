@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 import torch
 from helpers.commands import run
-from helpers.dataset_faults import remove
+from helpers.dataset_faults import put, remove
 from helpers.small_datasets import (
     END,
     START,
     make_trajectory,
-    replace_column,
     write_ecd,
     write_native,
 )
@@ -261,8 +260,8 @@ def test_options_that_cannot_be_met_are_one_clear_line(options: dict, message: s
         remove("transforms.json"),
         remove("images/val/00000.png"),
         remove("events.h5"),
-        replace_column("p", np.zeros(200, np.int8)),
-        replace_column("t", np.arange(200)),
+        put("events.h5", "events/p", np.zeros(200, np.int8)),
+        put("events.h5", "events/t", np.arange(200)),
     ],
 )
 def test_malformed_datasets_leave_nothing(change: Callable[[Path], object], tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.dataset_faults import replace_line
 from helpers.small_datasets import parse, write_ecd
 from helpers.unpacked_pairs import unpacked
 
@@ -72,18 +71,6 @@ def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     assert views.metadata is not None
     taken = views.metadata[REFERENCE_SECONDS][0, 0].item()
     assert taken == pytest.approx(0.15 - 1e-9 * outputs.metadata[SCENE_KEY].trajectory.start)
-
-
-def test_ecd_text_may_hold_comments_and_empty_lines(tmp_path: Path) -> None:
-    folder = write_ecd(tmp_path / "made")
-    events = folder / "events.txt"
-    events.write_text("# t x y p\n\n" + events.read_text() + "\n\n")
-    dataset = EventDataset(parse(EcdDataParserConfig(data=folder)))
-    assert dataset.metadata[SCENE_KEY].window == TimeWindow(10_000_000, 310_000_000)
-    assert dataset.pairs.num_events == 4
-    replace_line("events.txt", 4, "0.03 9 3 1")(folder)
-    with pytest.raises(DataError, match="line 5 has x = 9"):
-        list(dataset.metadata[SCENE_KEY].event_file.chunks())
 
 
 def test_the_real_recording_reads(slider_depth: Path) -> None:

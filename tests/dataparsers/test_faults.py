@@ -6,51 +6,51 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import yaml
-from helpers.dataset_faults import edit_json, edit_npz, read_everything, remove, replace_line, write_text
-from helpers.published_datasets import (
-    CAMCHAIN,
-    N_EVENTS,
-    N_POSES,
-    WRITERS,
-    config_of,
-    make_poses,
-    write_colmap,
-    write_tum_vie,
+from helpers.dataset_faults import (
+    Change,
+    all_of,
+    edit_json,
+    edit_npz,
+    put,
+    read_everything,
+    remove,
+    replace_line,
+    saved_as,
+    set_attribute,
+    set_in,
+    write_bytes,
+    write_text,
 )
-from helpers.small_datasets import START, replace_column, resize_image, set_attribute, write_ecd, write_native
+from helpers.malformed_inputs import FORMAT_WRITERS, camchain, camera
+from helpers.published_datasets import CAMCHAIN, N_EVENTS, N_POSES, config_of, make_poses, write_colmap, write_tum_vie
+from helpers.small_datasets import START
 
 from aenerf_ns.errors import DataError
 
-Change = Callable[[Path], object]
 # What is done to the dataset, a part of the error's source, and a part of its problem.
 Fault = tuple[Change, str, str]
 
+DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 MIRRORED, SCALED = np.diag([1.0, 1, -1, 1]).tolist(), np.diag([2.0, 2, 2, 1]).tolist()
-
-
-def all_of(*changes: Change) -> Change:
-    return lambda folder: [change(folder) for change in changes]
 
 
 def native(edit: Callable[[dict], object]) -> Change:
     return edit_json("transforms.json", edit)
 
 
-def event_camera(**values: object) -> Change:
-    return native(lambda meta: meta["event_camera"].update(values))
+def top(**values: object) -> Change:
+    return native(lambda meta: meta.update(values))
 
 
 def frame(**values: object) -> Change:
     return native(lambda meta: meta["frames"][0].update(values))
 
 
-def no_events(folder: Path) -> None:
-    for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.int8)):
-        replace_column(name, np.zeros(0, dtype))(folder)
+def column(name: str, values: np.ndarray | None) -> Change:
+    return put("events.h5", f"events/{name}", values)
 
 
 NATIVE: dict[str, Fault] = {
@@ -59,37 +59,37 @@ NATIVE: dict[str, Fault] = {
     "a list": (write_text("transforms.json", "[]"), "transforms.json", "expected `object`"),
     "no event camera": (native(lambda m: m.pop("event_camera")), "transforms.json", "`event_camera`"),
     "no focal length": (native(lambda m: m["event_camera"].pop("fl_x")), "transforms.json", "event_camera: "),
-    "width is a word": (event_camera(width="wide"), "transforms.json", "event_camera.width"),
-    "no threshold": (event_camera(positive_contrast_threshold=None), "transforms.json", "positive_contrast"),
-    "negative threshold": (event_camera(negative_contrast_threshold=-1), "transforms.json", "negative_contrast"),
-    "unknown Bayer pattern": (event_camera(bayer_pattern="GRBG"), "transforms.json", '"GRBG"'),
-    "unknown lens": (event_camera(camera_model="KB4"), "transforms.json", "event_camera: the lens model is 'KB4'"),
-    "image of another size": (resize_image("images/val/00000.png"), "val/00000.png", "3 x 2 pixels"),
+    "width is a word": (camera(width="wide"), "transforms.json", "event_camera.width"),
+    "no threshold": (camera(positive_contrast_threshold=None), "transforms.json", "positive_contrast"),
+    "negative threshold": (camera(negative_contrast_threshold=-1), "transforms.json", "negative_contrast"),
+    "unknown Bayer pattern": (camera(bayer_pattern="GRBG"), "transforms.json", '"GRBG"'),
+    "unknown lens": (camera(camera_model="KB4"), "transforms.json", "event_camera: the lens model is 'KB4'"),
+    "image of another size": (saved_as("PNG", "images/val/00000.png", (3, 2)), "val/00000.png", "3 x 2 pixels"),
     "mirrored pose": (frame(transform_matrix=MIRRORED), "frames[0].transform_matrix", "not a rigid motion"),
-    "scaled mount": (event_camera(T_frame_event=SCALED), "event_camera.T_frame_event", "not a rigid motion"),
+    "scaled mount": (camera(T_frame_event=SCALED), "event_camera.T_frame_event", "not a rigid motion"),
     "frame twice": (native(lambda m: m["frames"].append(m["frames"][0])), "transforms.json", "train/00000.png again"),
-    "unknown encoding": (native(lambda m: m.update(image_encoding="log")), "transforms.json", "image_encoding"),
-    "box inside out": (native(lambda m: m.update(scene_box=[[1] * 3, [0] * 3])), "transforms.json", "scene_box"),
-    "box is flat": (native(lambda m: m.update(scene_box=[[1] * 3])), "transforms.json", "scene_box"),
-    "no longest gap": (native(lambda m: m.update(max_pose_gap_ns=0)), "transforms.json", "max_pose_gap_ns"),
+    "unknown encoding": (top(image_encoding="log"), "transforms.json", "image_encoding"),
+    "box inside out": (top(scene_box=[[1] * 3, [0] * 3]), "transforms.json", "scene_box"),
+    "box is flat": (top(scene_box=[[1] * 3]), "transforms.json", "scene_box"),
+    "no longest gap": (top(max_pose_gap_ns=0), "transforms.json", "max_pose_gap_ns"),
     "missing image": (remove("images/val/00000.png"), "transforms.json", "val/00000.png, which does not exist"),
-    "unknown image": (native(lambda m: m.update(test_filenames=["x.png"])), "transforms.json", "test_filenames"),
+    "unknown image": (top(test_filenames=["x.png"]), "transforms.json", "test_filenames"),
     "short matrix": (frame(transform_matrix=[[1]]), "transforms.json", "frames[0].transform_matrix"),
     "no pose and time": (frame(transform_matrix=None, timestamp=None), "transforms.json", "frames[0] has neither"),
     "no event file": (remove("events.h5"), "events.h5", "no such file"),
-    "no name of events": (event_camera(file=None), "transforms.json", "file"),
+    "no name of events": (camera(file=None), "transforms.json", "file"),
     "not HDF5": (write_text("events.h5", "t x y p"), "events.h5", "HDF5"),
-    "no column": (replace_column("p", None), "events.h5", "/events/p"),
-    "wrong dtype": (replace_column("t", np.zeros(200)), "events.h5", "/events/t has type float64"),
-    "short column": (replace_column("x", np.zeros(3, np.uint16)), "events.h5", "lengths"),
-    "no events": (no_events, "events.h5", "no events"),
+    "no column": (column("p", None), "events.h5", "/events/p"),
+    "wrong dtype": (column("t", np.zeros(200)), "events.h5", "/events/t has type float64"),
+    "short column": (column("x", np.zeros(3, np.uint16)), "events.h5", "lengths"),
+    "no events": (all_of(*(column(n, np.zeros(0, dtype)) for n, dtype in DTYPES.items())), "events.h5", "no events"),
     "fractional offset": (set_attribute("time_offset", 0.5), "events.h5", "time offset is 0.5"),
     "offset is NaN": (set_attribute("time_offset", np.nan), "events.h5", "time offset is nan"),
     "unknown unit": (set_attribute("time_unit", "fortnight"), "events.h5", "time unit is 'fortnight'"),
-    "polarity 0": (replace_column("p", np.zeros(200, np.int8)), "events.h5", "polarity 0"),
-    "pixel outside": (replace_column("x", np.full(200, 6, np.uint16)), "events.h5", "x = 6"),
-    "unsorted": (replace_column("t", START + 10**9 - np.arange(200)), "events.h5", "before"),
-    "no overlap": (replace_column("t", np.arange(200)), "trajectory_estimated.txt", "do not overlap"),
+    "polarity 0": (column("p", np.zeros(200, np.int8)), "events.h5", "polarity 0"),
+    "pixel outside": (column("x", np.full(200, 6, np.uint16)), "events.h5", "x = 6"),
+    "unsorted": (column("t", START + 10**9 - np.arange(200)), "events.h5", "before"),
+    "no overlap": (column("t", np.arange(200)), "trajectory_estimated.txt", "do not overlap"),
     "no poses": (remove("trajectory_estimated.txt"), "trajectory_estimated.txt", "no such file"),
 }
 
@@ -102,6 +102,7 @@ def pose(line: str) -> Change:
     return replace_line("groundtruth.txt", 2, line)
 
 
+LATE = write_text("groundtruth.txt", "5 0 0 0 0 0 0 1\n6 1 0 0 0 0 0 1\n")
 ECD: dict[str, Fault] = {
     "no folder": (shutil.rmtree, "made", "no such folder"),
     "no event file": (remove("events.txt"), "events.txt", "no such file"),
@@ -125,17 +126,14 @@ ECD: dict[str, Fault] = {
     "unsorted poses": (pose("0.05 0 0 0 0 0 0 1"), "groundtruth.txt", "pose 2 is at 50000000 ns, not after"),
     "one pose": (write_text("groundtruth.txt", "0 0 0 0 0 0 0 1\n"), "groundtruth.txt", "1 poses"),
     "no pose": (write_text("groundtruth.txt", "# nothing\n"), "groundtruth.txt", "no poses"),
-    "no overlap": (
-        write_text("groundtruth.txt", "5 0 0 0 0 0 0 1\n6 1 0 0 0 0 0 1\n"),
-        "groundtruth.txt",
-        "do not overlap the events from 10000000 to 310000000 ns",
-    ),
+    "no overlap": (LATE, "groundtruth.txt", "do not overlap the events from 10000000 to 310000000 ns"),
     "short calibration": (write_text("calib.txt", "5 5.5 2.5 1.5\n"), "calib.txt", "line 1 has 4 fields"),
     "empty calibration": (write_text("calib.txt", ""), "calib.txt", "empty"),
     "no focal length": (write_text("calib.txt", "0 5 2 1 0 0 0 0 0\n"), "calib.txt", "fx must be from 0.01"),
 }
 
 CALIBRATION, POSES, VIEWS = "camera_calibration.npz", "camera_poses.npz", "views/transforms_val.json"
+SCALED_VIEW = set_in(VIEWS, "frames", 0, "transform_matrix", value=SCALED)
 
 
 def views(edit: Callable[[dict], object]) -> Change:
@@ -161,11 +159,7 @@ ROBUST: dict[str, Fault] = {
     "no frames": (write_text(VIEWS, "{}"), VIEWS, "`frames`"),
     "frame is a number": (write_text(VIEWS, '{"frames": [3]}'), VIEWS, "frames[0]: expected `object`, got `int`"),
     "no image": (remove("views/val/r_1.png"), VIEWS, "frames[1] names ./val/r_1"),
-    "scaled pose": (
-        views(lambda m: m["frames"][0].update(transform_matrix=SCALED)),
-        "frames[0].transform_matrix",
-        "not a rigid motion",
-    ),
+    "scaled pose": (SCALED_VIEW, "frames[0].transform_matrix", "not a rigid motion"),
     "no pose": (views(lambda m: m["frames"][0].pop("transform_matrix")), VIEWS, "`transform_matrix`"),
     "no angle": (views(lambda m: m.pop("camera_angle_x")), VIEWS, "neither camera_angle_x nor intrinsics"),
     "angle is 0": (views(lambda m: m.update(camera_angle_x=0)), VIEWS, "camera_angle_x"),
@@ -188,11 +182,7 @@ TUM_VIE: dict[str, Fault] = {
     "one camera": (tum_cameras(lambda m: m.update(T_imu_cam=m["T_imu_cam"][:1])), CAMERAS, "value0.T_imu_cam"),
     "no k4": (tum_cameras(lambda m: m["intrinsics"][2]["intrinsics"].pop("k4")), CAMERAS, "`k4`"),
     "size is a word": (tum_cameras(lambda m: m.update(resolution=["big"] * 4)), CAMERAS, "value0.resolution[0]"),
-    "long quaternion": (
-        edit_json(MOCAP, lambda m: m["value0"]["T_imu_marker"].update(qw=3.0)),
-        MOCAP,
-        "pose 0 has length 3",
-    ),
+    "long quaternion": (set_in(MOCAP, "value0", "T_imu_marker", "qw", value=3.0), MOCAP, "pose 0 has length 3"),
     "no marker": (edit_json(MOCAP, lambda m: m["value0"].pop("T_imu_marker")), MOCAP, "`T_imu_marker`"),
     "a word": (replace_line(f"{TRUTH}/mocap_data.txt", 1, "early 0 0 0 0 0 0 1"), "mocap_data.txt", "in microseconds"),
     "lost image": (remove(f"{TRUTH}/left_images/00001.jpg"), "image_timestamps_left.txt", "3 times for 2 images"),
@@ -203,7 +193,7 @@ TIMES = "images_timestamps.txt"
 EDS: dict[str, Fault] = {
     "no poses": (remove("stamped*"), "stamped_groundtruth.txt", "no such file"),
     "no events": (remove("events.h5"), "events.h5", "no such file"),
-    "no column": (lambda folder: h5py.File(folder / "events.h5", "a").pop("p"), "events.h5", "no dataset /p"),
+    "no column": (put("events.h5", "p", None), "events.h5", "no dataset /p"),
     "five images": (write_text(TIMES, "1\n2\n3\n4\n5\n"), TIMES, "5 times for 3 images"),
     "image time is a word": (write_text(TIMES, "1\ntwo\n3\n"), TIMES, "two is not a time in microseconds"),
     "huge time": (write_text(TIMES, "1\n2\n1e99999999\n"), TIMES, "1e99999999 is not a time"),
@@ -227,6 +217,7 @@ ESIM: dict[str, Fault] = {
 }
 
 MATRIX = "train/pose/r_00003.txt"
+ONE_TIME = edit_npz("train/events/test_lego.npz", t=np.zeros(N_EVENTS, int))
 EVENTNERF: dict[str, Fault] = {
     "no events": (remove("train/events"), "events.npz", "no such file"),
     "two event files": (lambda folder: np.savez(folder / "train/events/b.npz"), "train/events", "2 files *.npz"),
@@ -240,23 +231,14 @@ EVENTNERF: dict[str, Fault] = {
     "no focal length": (write_text("train/intrinsics/r_00000.txt", "0 " * 16), "r_00000.txt", "fx must be from 0.01"),
     "lost image": (remove("train/rgb/00003.png"), "train/rgb", "20 images for 21 poses"),
     "lost test image": (remove("test/rgb/00001.png"), "test/rgb", "1 images for 2 poses"),
-    "one event time": (
-        edit_npz("train/events/test_lego.npz", t=np.zeros(N_EVENTS, int)),
-        "train/pose",
-        "pose 1 is at 0 ns, not after",
-    ),
+    "one event time": (ONE_TIME, "train/pose", "pose 1 is at 0 ns, not after"),
 }
 
-EVENT_FILE = "H5_Files/Bunny/event.h5"
+EVENT_FILE, OBJECTS = "H5_Files/Bunny/event.h5", "Render_info/Bunny/0002.npz"
 
 
 def objects(*values: dict) -> Change:
-    return lambda folder: np.savez(folder / "Render_info/Bunny/0002.npz", object_poses=list(values))
-
-
-def three_columns(folder: Path) -> None:
-    with h5py.File(folder / EVENT_FILE, "w") as file:
-        file["events"] = np.zeros((9, 3))
+    return lambda folder: np.savez(folder / OBJECTS, object_poses=list(values))
 
 
 PAEV3D: dict[str, Fault] = {
@@ -270,73 +252,51 @@ PAEV3D: dict[str, Fault] = {
     "small pose": (objects({"name": "Camera", "pose": np.eye(3)}), "0002.npz", "no 'Camera' with a pose"),
     "NaN pose": (objects({"name": "Camera", "pose": np.full((4, 4), np.nan)}), "0002.npz", "not a rigid motion"),
     "no object_poses": (
-        lambda folder: np.savez(folder / "Render_info/Bunny/0002.npz", depth=np.zeros(3)),
+        lambda folder: np.savez(folder / OBJECTS, depth=np.zeros(3)),
         "0002.npz",
         "no array object_poses",
     ),
-    "text": (write_text("Render_info/Bunny/0002.npz", "pose"), "0002.npz", ".npz file"),
+    "text": (write_text(OBJECTS, "pose"), "0002.npz", ".npz file"),
     "lost image": (remove("Render_info/Bunny/00003.png"), "Render_info/Bunny", "20 images for 21 poses"),
-    "columns": (three_columns, "event.h5", "3 columns"),
+    "columns": (put(EVENT_FILE, "events", np.zeros((9, 3))), "event.h5", "3 columns"),
 }
 
 
-def calibration(edit: Callable[[dict], object]) -> Change:
-    return edit_json("calibration.json", edit)
+def mount(value: object) -> Change:
+    return set_in("calibration.json", "event_camera", "T_frame_event", value=value)
 
 
-def camchain(text: str) -> Change:
-    return all_of(remove("calibration.json"), write_text("camchain.yaml", text))
+def kalibr(name: str, **values: object) -> Change:
+    return camchain(yaml.dump({**CAMCHAIN, name: {**CAMCHAIN[name], **values}}))
 
 
-def colmap(make: Change) -> Change:
+def colmap(make: Change = lambda folder: None) -> Change:
     return all_of(remove("trajectory.txt"), lambda folder: (folder / "colmap").mkdir(), make)
 
 
+def other_images(folder: Path) -> None:
+    write_colmap(folder / "colmap/sparse/0", make_poses(2), ["00000.png", "other.png"])
+
+
+INFINITE = np.full((4, 4), np.inf).tolist()
+NEGATIVE = set_in("calibration.json", "event_camera", "positive_contrast_threshold", value=-1)
 OWN: dict[str, Fault] = {
     "no folder": (shutil.rmtree, "made", "no such folder"),
     "no events": (remove("events.h5"), "made", "0 files events{.raw,"),
     "two event files": (write_text("events.csv", ""), "made", "2 files events"),
     "no calibration": (remove("calibration.json"), "made", "0 of calibration.json and camchain.yaml"),
     "no poses": (remove("trajectory.txt"), "trajectory.txt", "no such file"),
-    "negative threshold": (
-        calibration(lambda m: m["event_camera"].update(positive_contrast_threshold=-1)),
-        "calibration.json",
-        "positive_contrast_threshold",
-    ),
-    "scaled mount": (
-        calibration(lambda m: m["event_camera"].update(T_frame_event=SCALED)),
-        "event_camera.T_frame_event",
-        "not a rigid motion",
-    ),
+    "negative threshold": (NEGATIVE, "calibration.json", "positive_contrast_threshold"),
+    "scaled mount": (mount(SCALED), "event_camera.T_frame_event", "not a rigid motion"),
     "missing image": (remove("images/00001.png"), "images.txt", "images/00001.png, which does not exist"),
     "image without time": (write_text("images.txt", "00001.png\n"), "images.txt", "line 1 has 1 fields"),
-    "COLMAP without times": (all_of(remove("images.txt"), colmap(lambda _: None)), "images.txt", "no such list"),
-    "empty COLMAP": (colmap(lambda _: None), "colmap", "no COLMAP model"),
-    "COLMAP of other images": (
-        colmap(lambda folder: write_colmap(folder / "colmap/sparse/0", make_poses(2), ["00000.png", "other.png"])),
-        "images.txt",
-        "it lists other.png 0 times",
-    ),
-    "broken COLMAP": (
-        colmap(lambda folder: (folder / "colmap" / "images.bin").write_bytes(b"\1")),
-        "images.bin",
-        "not a COLMAP model",
-    ),
-    "unknown distortion": (
-        camchain(yaml.dump({"cam0": {**CAMCHAIN["cam0"], "distortion_model": "fov"}})),
-        "camchain.yaml",
-        "cam0: the lens model is 'fov'",
-    ),
-    "three distortions": (
-        camchain(yaml.dump({"cam0": {**CAMCHAIN["cam0"], "distortion_coeffs": [0.1, 0, 0]}})),
-        "camchain.yaml",
-        "cam0: it has 3 distortion_coeffs",
-    ),
-    "infinite mount": (
-        camchain(yaml.dump({**CAMCHAIN, "cam1": {**CAMCHAIN["cam1"], "T_cn_cnm1": np.full((4, 4), np.inf).tolist()}})),
-        "cam1.T_cn_cnm1",
-        "not a rigid motion",
-    ),
+    "COLMAP without times": (all_of(remove("images.txt"), colmap()), "images.txt", "no such list"),
+    "empty COLMAP": (colmap(), "colmap", "no COLMAP model"),
+    "COLMAP of other images": (colmap(other_images), "images.txt", "it lists other.png 0 times"),
+    "broken COLMAP": (colmap(write_bytes("colmap/images.bin", b"\1")), "images.bin", "not a COLMAP model"),
+    "unknown distortion": (kalibr("cam0", distortion_model="fov"), "camchain.yaml", "cam0: the lens model is 'fov'"),
+    "three distortions": (kalibr("cam0", distortion_coeffs=[0.1, 0, 0]), "camchain.yaml", "3 distortion_coeffs"),
+    "infinite mount": (kalibr("cam1", T_cn_cnm1=INFINITE), "cam1.T_cn_cnm1", "not a rigid motion"),
     "camchain of numbers": (camchain("cam0: 3"), "camchain.yaml", "no camera"),
     "no YAML": (camchain("{:"), "camchain.yaml", "not valid YAML"),
 }
@@ -365,7 +325,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
             if name == "tum-vie-data":
                 write_tum_vie(root / name, request.getfixturevalue("tum_vie_calibration"))
             else:
-                {"aenerf-data": write_native, "ecd-data": write_ecd, **WRITERS}[name](root / name)
+                FORMAT_WRITERS[name](root / name)
         return written[name]
 
     return folder

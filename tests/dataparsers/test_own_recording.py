@@ -19,16 +19,12 @@ from helpers.published_datasets import (
     write_colmap,
     write_own,
 )
-from helpers.streams import FUZZ_EXAMPLES
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.kalibr import read_camchain
 
 
 def test_own_recordings_have_views_at_their_times(tmp_path: Path) -> None:
@@ -103,43 +99,3 @@ def test_a_colmap_model_gives_poses_at_the_times_of_its_images(
     # The images are where COLMAP put them.
     for view, pose in zip(recording.reference_views["train"], truth.poses[[0, 5, 10]], strict=True):
         np.testing.assert_allclose(view.camera_to_world.numpy(), pose, rtol=0, atol=1e-7)
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
-    max_leaves=6,
-)
-
-
-def damage(data: st.DataObject, value: object) -> object:
-    """Replaces, drops or adds something somewhere in a tree of dictionaries and lists."""
-    keys = list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []
-    if not keys or data.draw(st.integers(0, 5)) == 0:
-        return data.draw(JSON)
-    key = data.draw(st.sampled_from(keys))
-    copy = dict(value) if isinstance(value, dict) else list(value)  # type: ignore[call-overload]
-    if data.draw(st.integers(0, 5)) == 0:
-        del copy[key]
-    else:
-        copy[key] = damage(data, copy[key])
-    return copy
-
-
-@settings(max_examples=3 * FUZZ_EXAMPLES, deadline=None)
-@given(st.data())
-def test_no_calibration_crashes_its_readers(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    folder = tmp_path_factory.getbasetemp() / "fuzzed"
-    if not folder.exists():
-        write_own(folder)
-    yaml_file, json_file = folder.parent / "fuzzed.yaml", folder.parent / "fuzzed.json"
-    yaml_file.write_text(yaml.dump(damage(data, CAMCHAIN)))
-    json_file.write_text(json.dumps(damage(data, CALIBRATION)))
-    for read in (
-        lambda: read_camchain(yaml_file),
-        lambda: recording_of(OwnRecordingDataParserConfig(data=folder, calibration=json_file)),
-    ):
-        try:
-            read()
-        except DataError as error:
-            assert "\n" not in str(error)  # noqa: PT017

@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 import yaml
 from helpers.bounded_reading import little_memory, read_whole, readable_folder, without_rights_of_root
-from helpers.malformed_inputs import camchain, npy_header
+from helpers.dataset_faults import dump_raw, load_raw, npy_header, rewrite_zip, zip_members
+from helpers.event_file_checks import EDITS, edited
+from helpers.malformed_inputs import camchain
 from helpers.published_datasets import CAMCHAIN
 from helpers.vendor_recordings import DATASETS, read_dataset
 from hypothesis import HealthCheck, given, settings
@@ -58,7 +60,7 @@ def places(tree: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def break_tree(draw: Draw, tree: Any) -> Any:
-    """Replace, drop or repeat one value in a tree. Numbers stay texts that :func:`written` writes without quotes."""
+    """Replace, drop or repeat one value in a tree. Numbers stay texts that :func:`dump_raw` writes without quotes."""
     parent, key = draw(st.sampled_from(list(places(tree))))
     way = draw(st.sampled_from(["replace"] * 6 + ["drop", "repeat", "swap"]))
     if way == "replace":
@@ -72,22 +74,13 @@ def break_tree(draw: Draw, tree: Any) -> Any:
     return tree
 
 
-def written(tree: Any) -> str:
-    if isinstance(tree, dict):
-        return "{" + ", ".join(f"{json.dumps(key)}: {written(value)}" for key, value in tree.items()) + "}"
-    if isinstance(tree, list):
-        return "[" + ", ".join(map(written, tree)) + "]"
-    return tree[4:] if isinstance(tree, str) and tree.startswith("RAW:") else json.dumps(tree)
-
-
 def break_json(draw: Draw, path: Path) -> None:
-    tree = json.loads(path.read_text(), parse_float=lambda text: f"RAW:{text}")
-    path.write_text(written(break_tree(draw, tree)))
+    path.write_text(dump_raw(break_tree(draw, load_raw(path.read_text()))))
 
 
 def break_yaml(draw: Draw, path: Path) -> None:
     # JSON is YAML, but for the exponents of numbers.
-    path.write_text(written(break_tree(draw, yaml.safe_load(path.read_text()))))
+    path.write_text(dump_raw(break_tree(draw, yaml.safe_load(path.read_text()))))
 
 
 def break_text(draw: Draw, path: Path) -> None:
@@ -168,17 +161,14 @@ def break_npy(draw: Draw, path: Path) -> None:
 
 
 def break_npz(draw: Draw, path: Path) -> None:
-    with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
+    members = zip_members(path)
     name = draw(st.sampled_from(sorted(members)))
     if draw(st.integers(0, 5)) == 0:
         del members[name]
     else:
         members[name] = broken_npy(draw, members[name])
     kind = draw(st.sampled_from([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]))
-    with zipfile.ZipFile(path, "w", kind) as archive:
-        for member, content in members.items():
-            archive.writestr(member, content)
+    rewrite_zip(path, members, kind)
 
 
 def break_hdf5(draw: Draw, path: Path) -> None:
@@ -204,13 +194,9 @@ def break_hdf5(draw: Draw, path: Path) -> None:
             array = broken_array(draw, np.asarray(values))
             file[name] = array.astype("S") if array.dtype.kind == "U" else array if array.dtype.kind != "m" else 3
         elif way == "link":
-            targets: list[Any] = [
-                h5py.SoftLink(f"/{name}"),
-                h5py.SoftLink("/none"),
-                h5py.SoftLink("/"),
-                h5py.SoftLink(".."),
-            ]
-            targets += [h5py.ExternalLink(str(path.parent / "none.h5"), "/"), h5py.ExternalLink(str(path), f"/{name}")]
+            outside = [(str(path.parent / "none.h5"), "/"), (str(path), f"/{name}")]
+            targets = [h5py.SoftLink(target) for target in (f"/{name}", "/none", "/", "..")]
+            targets += [h5py.ExternalLink(*target) for target in outside]
             file[name] = targets[draw(st.integers(0, len(targets) - 1))]
         elif way == "huge":
             shape = draw(st.sampled_from([(10**12,), (10**12, 4), (4, 10**9), (200, 10**6)]))
@@ -232,41 +218,22 @@ def break_any(draw: Draw, path: Path) -> None:
     place = draw(st.integers(0, max(len(content) - 1, 0)))
     if way == "locked":
         path.chmod(0)
-        return
-    if way == "zeros":
+    elif way == "zeros":
         os.truncate(path, 4 << 30)
-        return
-    path.unlink()
-    if way == "cut":
-        path.write_bytes(content[:place])
-    elif way == "flip":
+    elif way == "flip" and content:
         path.write_bytes(flip_bit(draw, content, place))
-    elif way == "empty":
-        path.touch()
-    elif way == "folder":
-        path.mkdir()
-    elif way == "loop":
-        path.symlink_to(path.name)
+    elif way in ("cut", "empty"):
+        path.write_bytes(content[:place] if way == "cut" else b"")
+    else:
+        path.unlink()
+        if way == "folder":
+            path.mkdir()
+        elif way == "loop":
+            path.symlink_to(path.name)
 
 
 def break_bytes(draw: Draw, path: Path) -> None:
-    """Put other numbers into the bytes of a file, flip bits, or repeat or drop a part."""
-    data = bytearray(path.read_bytes())
-    for _ in range(draw(st.integers(1, 4))):
-        # Headers are where the sizes are.
-        place = draw(st.integers(0, max(len(data) - 1, 0)) | st.integers(0, min(200, max(len(data) - 1, 0))))
-        way = draw(st.sampled_from(["number", "long", "flip", "repeat", "drop"]))
-        if way in ("number", "long"):
-            size = 4 if way == "number" else 8
-            number = draw(st.sampled_from([0, 1, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**64 - 1]))
-            data[place : place + size] = (number % (1 << 8 * size)).to_bytes(size, "little")
-        elif way == "flip" and data:
-            data[place] ^= 1 << draw(st.integers(0, 7))
-        elif way == "repeat":
-            data[place:place] = data[place : place + draw(st.integers(1, 5000))]
-        else:
-            del data[place : place + draw(st.integers(1, 5000))]
-    path.write_bytes(data)
+    path.write_bytes(edited(path.read_bytes(), draw(EDITS)))
 
 
 BREAKS = {

@@ -15,12 +15,11 @@ from helpers.published_datasets import (
     convert_to_native,
     interpolated,
     recording_of,
+    tum_vie_matrix,
     write_tum_vie,
 )
 from helpers.small_datasets import parse
 from helpers.unpacked_pairs import unpacked
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -49,16 +48,11 @@ def test_tum_vie_views_are_those_of_the_frame_camera(tmp_path: Path, tum_vie_cal
     truth = write_tum_vie(tmp_path / "made", tum_vie_calibration)
     recording = recording_of(config_of("tum-vie-data", truth.data))
     cameras = json.loads((tum_vie_calibration / "camera-calibrationA.json").read_text())["value0"]
-
-    def imu_from(index: int) -> NDArray[np.float64]:
-        values, pose = cameras["T_imu_cam"][index], np.eye(4)
-        pose[:3, :3] = Rotation.from_quat([values[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
-        pose[:3, 3] = [values[name] for name in ("px", "py", "pz")]
-        return pose
+    imu_from_frame, _, imu_from_event, _ = map(tum_vie_matrix, cameras["T_imu_cam"])
 
     for view, time in zip(recording.reference_views["train"], (100_000, 333_333, 1_900_000), strict=True):
         assert view.time == (EPOCH + time) * 1_000
-        expected = interpolated(truth, view.time) @ np.linalg.inv(imu_from(2)) @ imu_from(0)
+        expected = interpolated(truth, view.time) @ np.linalg.inv(imu_from_event) @ imu_from_frame
         np.testing.assert_allclose(view.camera_to_world.numpy(), expected, rtol=0, atol=1e-9)
     assert recording.frame_camera.width == recording.frame_camera.height == 1024
     assert recording.frame_camera.cx == cameras["intrinsics"][0]["intrinsics"]["cx"] + 0.5

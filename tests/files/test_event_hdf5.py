@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -13,45 +12,19 @@ import pytest
 from helpers.event_table_writers import (
     HEIGHT,
     WIDTH,
-    Columns,
-    lengths_of_read_pieces,
     made_columns,
     signed,
-    write_dsec,
-    write_eds,
-    write_paev3d,
-    write_prophesee,
     write_tum_vie,
 )
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files import event_table
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter, open_hdf5_events
 from aenerf_ns.files.open import open_event_file
 
 
 def open_events(path: Path) -> EventFile:
     return open_hdf5_events(path, WIDTH, HEIGHT)
-
-
-LAYOUTS: dict[str, tuple[str, Callable[[Path, Columns], object]]] = {
-    "DSEC": ("dsec.h5", write_dsec),
-    "TUM-VIE": ("tum_vie.h5", write_tum_vie),
-    "EDS": ("eds.h5", write_eds),
-    "PAEv3D": ("paev3d.hdf5", write_paev3d),
-    "Prophesee": ("prophesee.hdf5", write_prophesee),
-}
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_layout_gives_the_events_it_was_written_with(
-    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Several pieces.
-    monkeypatch.setattr(event_table, "CHUNK", 128)
-    name, write = LAYOUTS[layout]
-    assert lengths_of_read_pieces(tmp_path / name, write, open_events) == [128, 128, 44]
 
 
 def test_a_native_file_is_told_from_others(tmp_path: Path) -> None:

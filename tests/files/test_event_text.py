@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.event_table_writers import HEIGHT, WIDTH, Columns, N, lengths_of_read_pieces, made_columns, write_csv
+from helpers.event_table_writers import HEIGHT, WIDTH
 from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.files import event_text
 from aenerf_ns.files.event_text import CsvEventFile, TextEventFile, parse_lines
 from aenerf_ns.files.open import open_event_file
-from aenerf_ns.files.text import TimeUnit
 
 
 def open_events(path: Path) -> EventFile:
@@ -28,37 +25,6 @@ def open_events(path: Path) -> EventFile:
 def written(path: Path, text: str) -> Path:
     path.write_bytes(text.encode())
     return path
-
-
-LAYOUTS: dict[str, tuple[str, Callable[[Path, Columns], object], int]] = {
-    "CSV": ("events.csv", write_csv, 0),
-    # The spacing of float64 seconds since 1970 is 238 ns.
-    "CSV in seconds": ("events.csv", lambda path, columns: write_csv(path, {**columns, "t": columns["t"] * 1e-6}), 500),
-    "text": ("events.txt", lambda path, columns: write_text(path, columns, "{s}.{us:06d} {x} {y} {p}\n"), 0),
-    "text with an exponent": ("events.txt", lambda path, c: write_text(path, c, "{t}.00e-6  {x}.0\t{y}e0 {p}\r\n"), 0),
-}
-
-
-def write_text(path: Path, columns: Columns, line: str) -> None:
-    rows = zip(*(columns[name].tolist() for name in "xytp"), strict=True)
-    text = "".join(line.format(x=x, y=y, t=t, s=t // 10**6, us=t % 10**6, p=p) for x, y, t, p in rows)
-    written(path, f"# made\n{text}")
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_layout_gives_the_events_it_was_written_with(
-    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(event_text, "BLOCK", 1000)
-    name, write, error = LAYOUTS[layout]
-    lengths = lengths_of_read_pieces(tmp_path / name, write, open_events, error)
-    assert 5 < len(lengths) < 20
-
-
-@pytest.mark.parametrize(("unit", "end"), [(None, 299_000), ("ns", 299), ("s", 299 * 10**9)])
-def test_the_unit_of_times_may_be_given(unit: TimeUnit | None, end: int, tmp_path: Path) -> None:
-    write_csv(tmp_path / "events.csv", {**made_columns(), "t": np.arange(N)})
-    assert open_event_file(tmp_path / "events.csv", WIDTH, HEIGHT, time_unit=unit).time_span() == (0, end)
 
 
 @pytest.mark.parametrize("name", ["events.csv", "EVENTS.CSV"])

@@ -53,12 +53,12 @@ def assert_one_line(error: DataError, path: Path) -> None:
     assert len(str(error)) < 400
 
 
-# Ways to damage a file, at places given as fractions of its length.
+# Ways to damage a file. Half of the places lie in the first sixteenth of its length: headers are where the sizes are.
 EDITS = st.lists(
     st.tuples(
-        st.sampled_from(["set", "flip", "cut", "insert", "repeat", "number"]),
-        st.floats(0, 1, exclude_max=True),
-        st.one_of(st.integers(0, 255), st.sampled_from([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40])),
+        st.sampled_from(["set", "flip", "cut", "insert", "repeat", "number", "long number"]),
+        st.floats(0, 1, exclude_max=True).map(lambda fraction: fraction**4),
+        st.integers(0, 255) | st.sampled_from([2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**64 - 1]),
     ),
     max_size=6,
 )
@@ -71,11 +71,12 @@ def edited(content: bytes, edits: list[tuple[str, float, int]]) -> bytes:
         if kind == "cut":
             del data[place : place + 1 + value % 64 if value < 2**31 else len(data)]
         elif kind == "insert":
-            data[place:place] = value.to_bytes(6, "little")
+            data[place:place] = value.to_bytes(8, "little")
         elif kind == "repeat":
-            data[place:place] = data[place : place + value % 256]
-        elif kind == "number":
-            data[place : place + 4] = (value & 0xFFFFFFFF).to_bytes(4, "little")
+            data[place:place] = data[place : place + value % 5000]
+        elif "number" in kind:
+            size = 8 if kind == "long number" else 4
+            data[place : place + size] = value.to_bytes(8, "little")[:size]
         elif place < len(data):
             data[place] = value & 0xFF if kind == "set" else data[place] ^ (1 << value % 8)
     return bytes(data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 import struct
 import zipfile
@@ -14,103 +13,78 @@ import h5py
 import numpy as np
 from PIL import Image
 
-from helpers.dataset_faults import edit_json, edit_npz, remove, write_text
+from helpers.dataset_faults import (
+    Change,
+    all_of,
+    edit_bytes,
+    edit_hdf5,
+    edit_json,
+    edit_npz,
+    member,
+    npy_header,
+    put,
+    remove,
+    saved_as,
+    set_attribute,
+    set_in,
+    sparse,
+    truncated,
+    without,
+    write_bytes,
+    write_text,
+)
 from helpers.published_datasets import WRITERS
-from helpers.small_datasets import START, set_attribute, write_ecd, write_native
-
-Change = Callable[[Path], object]
+from helpers.small_datasets import START, write_ecd, write_native
 
 FORMAT_WRITERS: dict[str, Callable[[Path], object]] = {"aenerf-data": write_native, "ecd-data": write_ecd, **WRITERS}
 
 _NATIVE, _ECD, _ROBUST, _EDS = "aenerf-data", "ecd-data", "robust-enerf-data", "eds-data"
 _ESIM, _EVENTNERF, _PAEV3D, _OWN = "enerf-esim-data", "eventnerf-data", "paev3d-data", "event-recording-data"
+_VAL_IMAGE, _TRAIN_IMAGE, _PAEV3D_EVENTS = "images/val/00000.png", "images/train/00001.png", "H5_Files/Bunny/event.h5"
 
 
-def set_in(name: str, *keys: object, value: object) -> Change:
-    """Set the value at a path of keys in a JSON file. A text that begins with "RAW:" is written without quotes."""
-
-    def change(folder: Path) -> None:
-        meta = json.loads((folder / name).read_text(), parse_float=lambda text: f"RAW:{text}")
-        place = meta
-        for key in keys[:-1]:
-            place = place[key]
-        place[keys[-1]] = value
-        text = json.dumps(meta)
-        while '"RAW:' in text:
-            before, _, after = text.partition('"RAW:')
-            raw, _, after = after.partition('"')
-            text = before + raw + after
-        (folder / name).write_text(text)
-
-    return change
+def camera(**values: object) -> Change:
+    return edit_json("transforms.json", lambda meta: meta["event_camera"].update(values))
 
 
-def native(*keys: object, value: object) -> Change:
-    return set_in("transforms.json", *keys, value=value)
+def poses(content: str) -> Change:
+    return write_text("trajectory_estimated.txt", content)
 
 
-def camera(key: str, value: object) -> Change:
-    return native("event_camera", key, value=value)
+def calibration(**arrays: object) -> Change:
+    return edit_npz("camera_calibration.npz", **arrays)
 
 
-def all_of(*changes: Change) -> Change:
-    return lambda folder: [change(folder) for change in changes]
+def robust_poses(**arrays: object) -> Change:
+    return edit_npz("camera_poses.npz", **arrays)
 
 
-def hdf5(name: str, edit: Callable[[h5py.File], object]) -> Change:
-    def change(folder: Path) -> None:
-        with h5py.File(folder / name, "r+") as file:
-            edit(file)
-
-    return change
+def robust_events(**arrays: object) -> Change:
+    return edit_npz("raw_events.npz", **arrays)
 
 
-def without(file: h5py.File, name: str) -> h5py.File:
-    del file[name]
-    return file
+def view(*keys: object, value: object) -> Change:
+    return set_in("views/transforms_val.json", *keys, value=value)
 
 
-def npy_header(shape: str, descr: str = "'<i8'", end: str = ", }") -> bytes:
-    """The beginning of an .npy file that states any shape."""
-    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}{end}".encode()
-    text += b" " * (-(len(text) + 11) % 64) + b"\n"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+def bounds(value: float) -> Change:
+    return lambda folder: np.save(folder / "poses_bounds.npy", np.full((3, 17), value))
 
 
-def write_bytes(name: str, content: bytes) -> Change:
-    return lambda folder: (folder / name).write_bytes(content)
-
-
-def member(name: str, array: str, content: bytes, compressed: bool = False) -> Change:
-    """Replace an array of an .npz file by raw bytes."""
-
-    def change(folder: Path) -> None:
-        with zipfile.ZipFile(folder / name) as archive:
-            others = {entry: archive.read(entry) for entry in archive.namelist()}
-        others[f"{array}.npy"] = content
-        kind = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
-        with zipfile.ZipFile(folder / name, "w", kind) as archive:
-            for entry, data in others.items():
-                archive.writestr(entry, data)
-
-    return change
-
-
-def deflated_zeros(gigabytes: int) -> bytes:
-    """Zeros, compressed by a factor of 1000."""
+def deflated_zeros(gigabytes: int, beginning: bytes = b"") -> bytes:
+    """Zeros behind a beginning, compressed by a factor of 1000."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    first = packer.compress(beginning) + packer.flush(zlib.Z_FULL_FLUSH)
     block = packer.compress(bytes(1 << 24)) + packer.flush(zlib.Z_FULL_FLUSH)
-    return block * (gigabytes << 6) + packer.flush()
+    return first + block * (gigabytes << 6) + packer.flush()
 
 
 def npz_bomb(name: str, array: str) -> Change:
     """A member of 3 GB in 3 MB, as its header says."""
 
     def change(folder: Path) -> None:
-        packer = zlib.compressobj(9, zlib.DEFLATED, -15)
         header = npy_header(f"({3 << 27},)")
-        content = packer.compress(header) + packer.flush(zlib.Z_FULL_FLUSH) + deflated_zeros(3)
-        member(name, array, content)(folder)
+        member(name, array, deflated_zeros(3, header))(folder)
         with zipfile.ZipFile(folder / name, "a") as archive:
             # The list at the end of the file counts.
             entry = archive.getinfo(f"{array}.npy")
@@ -120,44 +94,28 @@ def npz_bomb(name: str, array: str) -> Change:
     return change
 
 
-def sparse(name: str, gigabytes: int = 8) -> Change:
-    """A file of so many zeros that take no room on the disk."""
-
-    def change(folder: Path) -> None:
-        with (folder / name).open("r+b") as file:
-            file.truncate(gigabytes << 30)
-
-    return change
-
-
 def unallocated(name: str, columns: dict[str, str], group: str = "", shape: tuple[int, ...] = (10**12,)) -> Change:
     """Columns of 10^12 rows that were never written."""
 
     def edit(file: h5py.File) -> None:
         for column, dtype in columns.items():
-            if f"{group}{column}" in file:
-                del file[f"{group}{column}"]
-            file.create_dataset(f"{group}{column}", shape, dtype, chunks=(1 << 16, *shape[1:]), compression="gzip")
+            key, chunks = f"{group}{column}", (1 << 16, *shape[1:])
+            without(file, key).create_dataset(key, shape, dtype, chunks=chunks, compression="gzip")
 
-    return hdf5(name, edit)
+    return edit_hdf5(name, edit)
 
 
 _COLUMNS = {"x": "u2", "y": "u2", "t": "i8", "p": "i1"}
 
 
-def huge_chunk(folder: Path) -> None:
+def huge_chunk(file: h5py.File) -> None:
     """One compressed piece of 2 GB."""
-    with h5py.File(folder / "events.h5", "r+") as file:
-        times = file["events/t"][:]
-        del file["events/t"]
-        column = file.create_dataset(
-            "events/t", (200,), "i8", chunks=(1 << 28,), maxshape=(None,), compression="gzip", compression_opts=1
-        )
-        zeros = deflated_zeros(2)
-        packer = zlib.compressobj(9, zlib.DEFLATED, -15)
-        first = packer.compress(times.tobytes()) + packer.flush(zlib.Z_FULL_FLUSH)
-        # No checksum: it is at the end.
-        column.id.write_direct_chunk((0,), b"\x78\x9c" + first + zeros)
+    times = file["events/t"][:]
+    column = without(file, "events/t").create_dataset(
+        "events/t", (200,), "i8", chunks=(1 << 28,), maxshape=(None,), compression="gzip", compression_opts=1
+    )
+    # No checksum: it is at the end.
+    column.id.write_direct_chunk((0,), b"\x78\x9c" + deflated_zeros(2, times.tobytes()))
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
@@ -165,63 +123,37 @@ def chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def animation(name: str) -> Change:
-    """A picture that claims to be the first of 2^32 frames. The next frame has no size."""
+def with_chunks(name: str, make_chunks: Callable[[], bytes]) -> Change:
+    """Put further parts behind the header of a PNG."""
+    return edit_bytes(name, lambda content: content[:33] + make_chunks() + content[33:])
+
+
+def animation() -> bytes:
+    """A claim to be the first of 2^32 pictures, the next of which has no size."""
+    return chunk(b"acTL", struct.pack(">II", 2**32 - 1, 0)) + chunk(b"fcTL", bytes(26))
+
+
+def text_bomb() -> bytes:
+    """A comment of 64 MB of zeros."""
+    return chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(64 << 20)))
+
+
+def black(name: str, side: int) -> Change:
+    """A square PNG of one bit a pixel."""
 
     def change(folder: Path) -> None:
-        content = (folder / name).read_bytes()
-        parts = chunk(b"acTL", struct.pack(">II", 2**32 - 1, 0)) + chunk(b"fcTL", bytes(26))
-        (folder / name).write_bytes(content[:33] + parts + content[33:])
+        data = zlib.compress(bytes(1 + (side + 7) // 8) * side)
+        header = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
+        parts = chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+        (folder / name).write_bytes(b"\x89PNG\r\n\x1a\n" + parts)
 
     return change
 
 
-def png(width: int, height: int) -> bytes:
-    """A black picture of one bit a pixel."""
-    packer = zlib.compressobj(9)
-    row = bytes(1 + (width + 7) // 8)
-    data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
-    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-
-
-def saved_as(format: str, name: str, size: tuple[int, int] = (6, 4), mode: str = "RGB") -> Change:
-    def change(folder: Path) -> None:
-        Image.new(mode, size).save(folder / name, format=format)
-
-    return change
-
-
-def truncated(name: str, keep: float = 0.5) -> Change:
-    def change(folder: Path) -> None:
-        content = (folder / name).read_bytes()
-        (folder / name).write_bytes(content[: int(len(content) * keep)])
-
-    return change
-
-
-def noisy_image(name: str, size: tuple[int, int]) -> Change:
-    """A picture whose bytes do not compress, cut in the middle."""
-
-    def change(folder: Path) -> None:
-        values = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
-        Image.fromarray(values).save(folder / name)
-        truncated(name, 0.7)(folder)
-
-    return change
-
-
-def text_bomb(name: str, size: tuple[int, int]) -> Change:
-    """A PNG whose comment is 64 MB of zeros."""
-
-    def change(folder: Path) -> None:
-        Image.new("RGB", size).save(folder / name)
-        content = (folder / name).read_bytes()
-        data = b"Comment\0\0" + zlib.compress(bytes(64 << 20))
-        chunk = struct.pack(">I", len(data)) + b"zTXt" + data + struct.pack(">I", zlib.crc32(b"zTXt" + data))
-        (folder / name).write_bytes(content[:33] + chunk + content[33:])
-
-    return change
+def cut_image(name: str, keep: float, format: str = "PNG") -> Change:
+    """The beginning of a picture whose bytes do not compress."""
+    noise = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
+    return all_of(lambda folder: Image.fromarray(noise).save(folder / name, format=format), truncated(name, keep))
 
 
 def camchain(text: str) -> Change:
@@ -260,11 +192,11 @@ def unreadable(name: str) -> Change:
 
 
 def link(name: str, target: str) -> Change:
-    def change(folder: Path) -> None:
-        (folder / name).unlink(missing_ok=True)
-        (folder / name).symlink_to(target)
+    return all_of(remove(name), lambda folder: (folder / name).symlink_to(target))
 
-    return change
+
+def folder_for(name: str) -> Change:
+    return all_of(remove(name), lambda folder: (folder / name).mkdir())
 
 
 def outside_events(folder: Path) -> Path:
@@ -274,69 +206,33 @@ def outside_events(folder: Path) -> Path:
     return other
 
 
-def external_link(group: bool) -> Change:
-    def change(folder: Path) -> None:
-        other = outside_events(folder)
-        with h5py.File(folder / "events.h5", "r+") as file:
-            name = "events" if group else "events/t"
-            del file[name]
-            file[name] = h5py.ExternalLink(str(other), name)
-
-    return change
+def external_link(name: str) -> Change:
+    return lambda folder: put("events.h5", name, h5py.ExternalLink(str(outside_events(folder)), name))(folder)
 
 
 def external_storage(folder: Path) -> None:
-    (folder.parent / "raw.bin").write_bytes(np.sort(np.arange(200) + START).astype("<i8").tobytes())
+    raw = folder.parent / "raw.bin"
+    raw.write_bytes((np.arange(200) + START).astype("<i8").tobytes())
     with h5py.File(folder / "events.h5", "r+") as file:
-        del file["events/t"]
-        file.create_dataset("events/t", (200,), "i8", external=[(str(folder.parent / "raw.bin"), 0, 1600)])
+        without(file, "events/t").create_dataset("events/t", (200,), "i8", external=[(str(raw), 0, 1600)])
 
 
 def virtual(folder: Path) -> None:
-    other = outside_events(folder)
     layout = h5py.VirtualLayout((200,), "i8")
-    layout[:] = h5py.VirtualSource(str(other), "events/t", (200,))
+    layout[:] = h5py.VirtualSource(str(outside_events(folder)), "events/t", (200,))
     with h5py.File(folder / "events.h5", "r+") as file:
-        del file["events/t"]
-        file.create_virtual_dataset("events/t", layout)
+        without(file, "events/t").create_virtual_dataset("events/t", layout)
 
 
-def moved_image(file: str, key: str) -> Change:
-    """An image beside the data set that its JSON file names with two dots."""
-
-    def change(folder: Path) -> None:
-        Image.new("RGB", (6, 4)).save(folder.parent / "outside.png")
-        set_in(file, "frames", 0, key, value="../outside.png")(folder)
-
-    return change
+def outside_image(change: Change, size: tuple[int, int] = (6, 4), mode: str = "RGB") -> Change:
+    """An image beside the data set, which the change names."""
+    return all_of(lambda folder: Image.new(mode, size).save(folder.parent / "outside.png"), change)
 
 
-def _named_type(file: h5py.File) -> None:
-    del file["events/t"]
-    file["events/t"] = np.dtype("i8")
-
-
-def _soft_loop(file: h5py.File) -> None:
-    del file["events/t"]
-    file["events/t"] = h5py.SoftLink("/events/t2")
-    file["events/t2"] = h5py.SoftLink("/events/t")
-
-
-def _with(name: str, value: object) -> Callable[[h5py.File], None]:
-    def edit(file: h5py.File) -> None:
-        if name in file:
-            del file[name]
-        file[name] = value
-
-    return edit
-
-
-def _late_times(file: h5py.File) -> None:
-    del file["events/t"]
-    file["events/t"] = np.arange(200) + (1 << 62)
-    file["events"].attrs["time_unit"] = "ms"
-
-
+_SOFT_LOOP = all_of(
+    put("events.h5", "events/t", h5py.SoftLink("/events/t2")), put("events.h5", "events/t2", h5py.SoftLink("/events/t"))
+)
+_NAMED_TYPE = put("events.h5", "events/t", np.dtype("i8"))
 BIG, HUGE = int("9" * 400), "RAW:1e999999999"
 
 # Values in transforms.json, by the keys that lead to them.
@@ -383,7 +279,7 @@ _HDF5_VALUES: dict[tuple[str, str, str], list] = {
     (_NATIVE, "events.h5", "events/t"): [h5py.SoftLink("/none"), h5py.Empty("i8"), np.int64(3), ["a", "b"]],
     (_NATIVE, "events.h5", "events"): [np.arange(9)],
     (_OWN, "events.h5", "events/t"): [h5py.Empty("i8")],
-    (_PAEV3D, "H5_Files/Bunny/event.h5", "events"): [[["a"] * 4] * 3, 3.0],
+    (_PAEV3D, _PAEV3D_EVENTS, "events"): [[["a"] * 4] * 3, 3.0],
 }
 _UNREADABLE: dict[str, list[str]] = {
     _NATIVE: [
@@ -445,82 +341,69 @@ _NPY = {
 }
 _CHANGES: dict[str, dict[str, Change]] = {
     _NATIVE: {
-        "a sensor of 10^6 x 10^6": all_of(camera("width", 10**6), camera("height", 10**6)),
-        "a sensor of 30000 x 30000": all_of(camera("width", 30000), camera("height", 30000)),
-        "a sensor of 16000 x 16000": all_of(camera("width", 16000), camera("height", 16000)),
-        "frames of 10^9 x 10^9": all_of(native("w", value=10**9), native("h", value=10**9)),
+        "a sensor of 10^6 x 10^6": camera(width=10**6, height=10**6),
+        "a sensor of 30000 x 30000": camera(width=30000, height=30000),
+        "a sensor of 16000 x 16000": camera(width=16000, height=16000),
+        "frames of 10^9 x 10^9": edit_json("transforms.json", lambda meta: meta.update(w=10**9, h=10**9)),
         "HDF5 of 10^12 rows": unallocated("events.h5", _COLUMNS, "events/"),
-        "HDF5 piece of 2 GB": huge_chunk,
-        "png of 30000 x 30000 among views": write_bytes("images/val/00000.png", png(30000, 30000)),
-        "png comment of 64 MB": text_bomb("images/val/00000.png", (6, 4)),
+        "HDF5 piece of 2 GB": edit_hdf5("events.h5", huge_chunk),
+        "png of 30000 x 30000 among views": black(_VAL_IMAGE, 30000),
+        "png comment of 64 MB": with_chunks(_VAL_IMAGE, text_bomb),
         "json of 8 GB": sparse("transforms.json"),
         "json of 50 MB": write_text("transforms.json", '{"frames": [' + "{}, " * 13_000_000 + "{}]}"),
         "poses of 8 GB": sparse("trajectory_estimated.txt"),
-        "timestamp of 1e30 without pose": all_of(
-            native("frames", 0, "timestamp", value="RAW:1e30"),
-            edit_json("transforms.json", lambda m: m["frames"][0].pop("transform_matrix")),
+        "timestamp of 1e30 without pose": edit_json(
+            "transforms.json", lambda meta: meta["frames"][0].update(timestamp="RAW:1e30", transform_matrix=None)
         ),
-        "pose time of 1e30": write_text("trajectory_estimated.txt", "0 0 0 0 0 0 0 1\n1e30 0 0 0 0 0 0 1\n"),
-        "pose time of 1e999999999": write_text(
-            "trajectory_estimated.txt", "0 0 0 0 0 0 0 1\n1e999999999 0 0 0 0 0 0 1\n"
-        ),
-        "pose at 1e300": write_text(
-            "trajectory_estimated.txt", "1600000000 1e300 0 0 0 0 0 1\n1600000009 0 0 0 0 0 0 1\n"
-        ),
+        "pose time of 1e30": poses("0 0 0 0 0 0 0 1\n1e30 0 0 0 0 0 0 1\n"),
+        "pose time of 1e999999999": poses("0 0 0 0 0 0 0 1\n1e999999999 0 0 0 0 0 0 1\n"),
+        "pose at 1e300": poses("1600000000 1e300 0 0 0 0 0 1\n1600000009 0 0 0 0 0 0 1\n"),
         "time offset that overflows": all_of(
             set_attribute("time_offset", np.int64(2**62)), set_attribute("time_unit", "ms")
         ),
-        "times that overflow with their unit": hdf5("events.h5", _late_times),
+        "times that overflow with their unit": all_of(
+            put("events.h5", "events/t", np.arange(200) + (1 << 62)), set_attribute("time_unit", "ms")
+        ),
         "json of depth 100000": write_text("transforms.json", '{"a":' + "[" * 100_000 + "]" * 100_000 + "}"),
         "text that is not UTF-8": write_bytes("transforms.json", b'{"a": "\xff\xfe"}'),
-        "a folder for the poses": lambda folder: (
-            remove("trajectory_estimated.txt")(folder),
-            (folder / "trajectory_estimated.txt").mkdir(),
-        ),
+        "a folder for the poses": folder_for("trajectory_estimated.txt"),
         "a link to itself": link("trajectory_estimated.txt", "trajectory_estimated.txt"),
-        "an image that is a link to itself": link("images/val/00000.png", "00000.png"),
-        "soft links in a circle": hdf5("events.h5", _soft_loop),
-        "named type": hdf5("events.h5", _named_type),
-        "column that is a group": hdf5("events.h5", lambda f: without(f, "events/t").create_group("events/t")),
-        "no group": hdf5("events.h5", lambda f: without(f, "events")),
+        "an image that is a link to itself": link(_VAL_IMAGE, "00000.png"),
+        "soft links in a circle": _SOFT_LOOP,
+        "named type": _NAMED_TYPE,
+        "column that is a group": edit_hdf5("events.h5", lambda f: without(f, "events/t").create_group("events/t")),
+        "no group": put("events.h5", "events", None),
         "half a file": truncated("events.h5"),
-        "a fisheye no pixel survives": all_of(
-            camera("camera_model", "OPENCV_FISHEYE"), camera("k1", "RAW:-1e6"), camera("p1", 0), camera("k3", 0)
-        ),
-        "truncated": noisy_image("images/val/00000.png", (6, 4)),
-        "truncated among the train views": noisy_image("images/train/00001.png", (6, 4)),
-        "EPS": saved_as("EPS", "images/val/00000.png"),
-        "GIF": saved_as("GIF", "images/val/00000.png"),
-        "BMP": saved_as("BMP", "images/val/00000.png"),
-        "TIFF among the train views": saved_as("TIFF", "images/train/00001.png"),
-        "empty": write_text("images/val/00000.png", ""),
-        "text": write_text("images/val/00000.png", "no image"),
-        "16 bits": saved_as("PNG", "images/val/00000.png", mode="I;16"),
-        "another size among the train views": saved_as("PNG", "images/train/00001.png", (3, 2)),
-        "an animation of 2^32 pictures": animation("images/val/00000.png"),
-        "half of a JPEG": all_of(
-            lambda folder: Image.fromarray(np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)).save(
-                folder / "images/val/00000.png", format="JPEG"
-            ),
-            truncated("images/val/00000.png", 0.9),
-        ),
-        "events": lambda folder: (outside_events(folder), camera("file", "../outside.h5")(folder)),
-        "events with a whole path": lambda folder: camera("file", str(outside_events(folder)))(folder),
-        "image": moved_image("transforms.json", "file_path"),
-        "external link to a group": external_link(True),
-        "external link to a column": external_link(False),
+        "a fisheye no pixel survives": camera(camera_model="OPENCV_FISHEYE", k1="RAW:-1e6", p1=0, k3=0),
+        "truncated": cut_image(_VAL_IMAGE, 0.7),
+        "truncated among the train views": cut_image(_TRAIN_IMAGE, 0.7),
+        "EPS": saved_as("EPS", _VAL_IMAGE),
+        "GIF": saved_as("GIF", _VAL_IMAGE),
+        "BMP": saved_as("BMP", _VAL_IMAGE),
+        "TIFF among the train views": saved_as("TIFF", _TRAIN_IMAGE),
+        "empty": write_text(_VAL_IMAGE, ""),
+        "text": write_text(_VAL_IMAGE, "no image"),
+        "16 bits": saved_as("PNG", _VAL_IMAGE, mode="I;16"),
+        "another size among the train views": saved_as("PNG", _TRAIN_IMAGE, (3, 2)),
+        "an animation of 2^32 pictures": with_chunks(_VAL_IMAGE, animation),
+        "half of a JPEG": cut_image(_VAL_IMAGE, 0.9, "JPEG"),
+        "events": lambda folder: (outside_events(folder), camera(file="../outside.h5")(folder)),
+        "events with a whole path": lambda folder: camera(file=str(outside_events(folder)))(folder),
+        "image": outside_image(set_in("transforms.json", "frames", 0, "file_path", value="../outside.png")),
+        "external link to a group": external_link("events"),
+        "external link to a column": external_link("events/t"),
         "external storage": external_storage,
         "virtual column": virtual,
     },
     _ROBUST: {
-        "robust sensor": edit_npz("camera_calibration.npz", img_width=30000, img_height=30000),
+        "robust sensor": calibration(img_width=30000, img_height=30000),
         "npz of 10^13 rows, stored": member("raw_events.npz", "timestamp", npy_header("(10000000000000,)")),
         "npz of 10^13 rows, compressed": member(
-            "raw_events.npz", "timestamp", npy_header("(10000000000000,)") + bytes(64), compressed=True
+            "raw_events.npz", "timestamp", npy_header("(10000000000000,)") + bytes(64), zipfile.ZIP_DEFLATED
         ),
         "npz of 2^70 rows": member("raw_events.npz", "timestamp", npy_header(f"({2**70},)")),
         "poses of 10^13 rows": member(
-            "camera_poses.npz", "T_wc_timestamp", npy_header("(10000000000000,)") + bytes(64), compressed=True
+            "camera_poses.npz", "T_wc_timestamp", npy_header("(10000000000000,)") + bytes(64), zipfile.ZIP_DEFLATED
         ),
         "npz bomb": npz_bomb("raw_events.npz", "timestamp"),
         "npz bomb of one number": npz_bomb("camera_calibration.npz", "img_width"),
@@ -528,78 +411,70 @@ _CHANGES: dict[str, dict[str, Change]] = {
             "camera_calibration.npz", "bayer_pattern", npy_header("()", "'<U1000000000'")
         ),
         "npz of 8 GB": sparse("camera_poses.npz"),
-        "robust width of 1e300": edit_npz("camera_calibration.npz", img_width=np.float64(1e300)),
-        "robust refractory period of 1e300": edit_npz("camera_calibration.npz", refractory_period=np.float64(1e300)),
-        "robust pose times of uint64": edit_npz(
-            "camera_poses.npz", T_wc_timestamp=np.arange(21, dtype=np.uint64) + np.uint64(2**64 - 30)
-        ),
-        "robust file_path of a list": set_in("views/transforms_val.json", "frames", 0, "file_path", value=[]),
-        "robust angle of 0": set_in("views/transforms_val.json", "camera_angle_x", value=0),
-        "robust angle of a list": set_in("views/transforms_val.json", "camera_angle_x", value=[]),
-        "robust name of bytes": edit_npz("camera_calibration.npz", bayer_pattern=np.array(b"RGGB")),
-        "robust objects": edit_npz("camera_calibration.npz", bayer_pattern=np.array({}, dtype=object)),
-        "robust complex positions": edit_npz("camera_poses.npz", T_wc_position=np.zeros((21, 3), np.complex128)),
-        "robust polarity of text": edit_npz("raw_events.npz", polarity=np.full(200, "on")),
-        "robust position of records": edit_npz("raw_events.npz", position=np.zeros(200, [("x", "u2"), ("y", "u2")])),
-        "robust file_path of 5000 letters": set_in(
-            "views/transforms_val.json", "frames", 0, "file_path", value="a" * 5000
-        ),
-        "robust file_path with a null": set_in("views/transforms_val.json", "frames", 0, "file_path", value="a\0b"),
+        "robust width of 1e300": calibration(img_width=np.float64(1e300)),
+        "robust refractory period of 1e300": calibration(refractory_period=np.float64(1e300)),
+        "robust pose times of uint64": robust_poses(T_wc_timestamp=np.arange(21, dtype="u8") + np.uint64(2**64 - 30)),
+        "robust file_path of a list": view("frames", 0, "file_path", value=[]),
+        "robust angle of 0": view("camera_angle_x", value=0),
+        "robust angle of a list": view("camera_angle_x", value=[]),
+        "robust name of bytes": calibration(bayer_pattern=np.array(b"RGGB")),
+        "robust objects": calibration(bayer_pattern=np.array({}, dtype=object)),
+        "robust complex positions": robust_poses(T_wc_position=np.zeros((21, 3), np.complex128)),
+        "robust polarity of text": robust_events(polarity=np.full(200, "on")),
+        "robust position of records": robust_events(position=np.zeros(200, [("x", "u2"), ("y", "u2")])),
+        "robust file_path of 5000 letters": view("frames", 0, "file_path", value="a" * 5000),
+        "robust file_path with a null": view("frames", 0, "file_path", value="a\0b"),
         "unbalanced header in npz": member("raw_events.npz", "timestamp", npy_header("(3", end="")),
         "unbalanced header in compressed npz": member(
-            "camera_poses.npz", "T_wc_timestamp", npy_header("(3", end=""), compressed=True
+            "camera_poses.npz", "T_wc_timestamp", npy_header("(3", end=""), zipfile.ZIP_DEFLATED
         ),
         "half an archive": truncated("raw_events.npz"),
-        "member with a password": lambda folder: (folder / "camera_poses.npz").write_bytes(
-            (folder / "camera_poses.npz")
-            .read_bytes()
-            .replace(b"PK\x01\x02\x2d\x03\x2d\0\0\0", b"PK\x01\x02\x2d\x03\x2d\0\1\0")
+        "member with a password": edit_bytes(
+            "camera_poses.npz", lambda b: b.replace(b"PK\1\2\x2d\3\x2d\0\0\0", b"PK\1\2\x2d\3\x2d\0\1\0")
         ),
-        "objects as events": edit_npz("raw_events.npz", timestamp=np.array([None] * 200)),
-        "no dimensions": edit_npz("raw_events.npz", timestamp=np.int64(3)),
-        "three dimensions": edit_npz("raw_events.npz", timestamp=np.zeros((2, 2, 2), np.int64)),
-        "a threshold of 1e-320 of robust": edit_npz(
-            "camera_calibration.npz", pos_contrast_threshold=np.float64(1e-320)
-        ),
-        "robust width of 60.5": edit_npz("camera_calibration.npz", img_width=60.5),
-        "robust image": lambda folder: (
-            Image.new("RGBA", (50, 30)).save(folder.parent / "outside.png"),
-            set_in("views/transforms_val.json", "frames", 0, "file_path", value="../../outside")(folder),
-        ),
+        "objects as events": robust_events(timestamp=np.array([None] * 200)),
+        "no dimensions": robust_events(timestamp=np.int64(3)),
+        "three dimensions": robust_events(timestamp=np.zeros((2, 2, 2), np.int64)),
+        "a threshold of 1e-320 of robust": calibration(pos_contrast_threshold=np.float64(1e-320)),
+        "robust width of 60.5": calibration(img_width=60.5),
+        "robust image": outside_image(view("frames", 0, "file_path", value="../../outside"), (50, 30), "RGBA"),
     },
     _OWN: {
-        "own sensor": all_of(
-            *(set_in("calibration.json", "event_camera", k, value=10**6) for k in ("width", "height"))
+        "own sensor": edit_json(
+            "calibration.json", lambda meta: meta["event_camera"].update(width=10**6, height=10**6)
         ),
         "calibration of depth 100000": write_text("calibration.json", "[" * 100_000),
         "unreadable camchain": all_of(camchain(CAM0), unreadable("camchain.yaml")),
-        "own soft links in a circle": hdf5("events.h5", _soft_loop),
-        "own named type": hdf5("events.h5", _named_type),
-        "own t_offset that is a group": hdf5("events.h5", lambda f: without(f, "t_offset").create_group("t_offset")),
-        "own references": hdf5("events.h5", lambda f: _with("events/t", np.array([f.ref], h5py.ref_dtype))(f)),
-        "own listed image": lambda folder: (
-            Image.new("L", (60, 40)).save(folder.parent / "outside.png"),
-            (folder / "images.txt").write_text("1600000000.05 ../outside.png\n"),
+        "own soft links in a circle": _SOFT_LOOP,
+        "own named type": _NAMED_TYPE,
+        "own t_offset that is a group": edit_hdf5(
+            "events.h5", lambda f: without(f, "t_offset").create_group("t_offset")
         ),
+        "own references": edit_hdf5(
+            "events.h5", lambda f: without(f, "events/t").update({"events/t": np.array([f.ref], h5py.ref_dtype)})
+        ),
+        "own listed image": outside_image(write_text("images.txt", "1600000000.05 ../outside.png\n"), (60, 40), "L"),
     },
     _ESIM: {
-        "esim sensor": lambda folder: np.save(folder / "poses_bounds.npy", np.full((3, 17), 30000.0)),
+        "esim sensor": bounds(30000.0),
         "npy of 10^13 rows": write_bytes("events/2.npy", npy_header("(10000000000000, 4)", "'<f8'")),
-        "esim focal length of 1e300": lambda folder: np.save(folder / "poses_bounds.npy", np.full((3, 17), 1e300)),
+        "esim focal length of 1e300": bounds(1e300),
         "unbalanced header of events": write_bytes("events/2.npy", npy_header("(3, 4", "'<f8'", "")),
-        "esim width of 64.5": lambda folder: np.save(folder / "poses_bounds.npy", np.full((3, 17), 64.5)),
+        "esim width of 64.5": bounds(64.5),
     },
     _EDS: {
         "HDF5 columns of 10^12 rows": unallocated("events.h5", {**_COLUMNS, "p": "u1"}),
-        "eds enumeration": hdf5(
+        "eds enumeration": edit_hdf5(
             "events.h5", lambda f: without(f, "p").create_dataset("p", (200,), h5py.enum_dtype({"A": 0, "B": 1}, "i1"))
         ),
-        "eds lists": hdf5("events.h5", lambda f: without(f, "p").create_dataset("p", (200,), h5py.vlen_dtype("i1"))),
+        "eds lists": edit_hdf5(
+            "events.h5", lambda f: without(f, "p").create_dataset("p", (200,), h5py.vlen_dtype("i1"))
+        ),
     },
     _PAEV3D: {
-        "HDF5 matrix of 10^12 rows": unallocated("H5_Files/Bunny/event.h5", {"events": "f8"}, shape=(10**12, 4)),
-        "HDF5 matrix of 10^12 columns": hdf5(
-            "H5_Files/Bunny/event.h5", lambda f: without(f, "events").create_dataset("events", (9, 10**9), "f8")
+        "HDF5 matrix of 10^12 rows": unallocated(_PAEV3D_EVENTS, {"events": "f8"}, shape=(10**12, 4)),
+        "HDF5 matrix of 10^12 columns": edit_hdf5(
+            _PAEV3D_EVENTS, lambda f: without(f, "events").create_dataset("events", (9, 10**9), "f8")
         ),
         "pickle of an array of 10^12": poses_pickle(
             _RECONSTRUCT, b"\x8a\x06" + (10**12).to_bytes(6, "little"), b"\x85C\x01b\x87R"
@@ -616,8 +491,8 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "half an archive of poses": truncated("Render_info/Bunny/0003.npz"),
     },
     _ECD: {
-        "png of 30000 x 30000": write_bytes("images/0.png", png(30000, 30000)),
-        "png of 12000 x 12000": write_bytes("images/0.png", png(12000, 12000)),
+        "png of 30000 x 30000": black("images/0.png", 30000),
+        "png of 12000 x 12000": black("images/0.png", 12000),
         "event lines of 8 GB": sparse("events.txt"),
         "pose at 1e200": write_text("groundtruth.txt", "0 1e200 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n"),
         "calibration of 1e300": write_text("calib.txt", "1e300 1e300 2.5 1.5 0 0 0 0 0\n"),
@@ -625,13 +500,10 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "event time of 1e30": write_text("events.txt", "0.01 1 2 1\n1e30 1 2 0\n"),
         "a listed image of 5000 letters": write_text("images.txt", f"0.05 {'a' * 5000}\n"),
         "a listed image with a null": write_text("images.txt", "0.05 a\0b\n"),
-        "events that are a folder": lambda folder: (remove("events.txt")(folder), (folder / "events.txt").mkdir()),
+        "events that are a folder": folder_for("events.txt"),
         "EPS of ECD": saved_as("EPS", "images/0.png"),
         "PPM": saved_as("PPM", "images/1.png"),
-        "listed image": lambda folder: (
-            Image.new("L", (6, 4)).save(folder.parent / "outside.png"),
-            (folder / "images.txt").write_text("0.05 ../outside.png\n"),
-        ),
+        "listed image": outside_image(write_text("images.txt", "0.05 ../outside.png\n"), mode="L"),
     },
     _EVENTNERF: {
         "matrix of 8 GB": sparse("train/pose/r_00003.txt"),
@@ -653,7 +525,7 @@ MALFORMED: dict[str, tuple[str, Change]] = {
         for value in values
     },
     **{
-        f"{kind} {name} = {str(value)[:40]}": (kind, hdf5(file, _with(name, value)))
+        f"{kind} {name} = {str(value)[:40]}": (kind, put(file, name, value))
         for (kind, file, name), values in _HDF5_VALUES.items()
         for value in values
     },

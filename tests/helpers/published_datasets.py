@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.recording.options import EventDataParserConfig
@@ -51,6 +51,10 @@ def make_poses(count: int = N_POSES) -> NDArray[np.float64]:
     poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
     poses[:, :3, 3] = np.stack([0.5 * way, 0.3 * np.sin(3 * way), 0.1 + way**2], 1)
     return poses
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 def make_events(width: int, height: int, start: int = 0) -> dict[str, NDArray]:
@@ -98,7 +102,7 @@ def write_robust_enerf(
     width, height = 60, 40
     events, poses = make_events(width, height), make_poses()
     times = np.linspace(0, DURATION * 1_000, N_POSES).astype(np.int64)
-    matrix = np.array([[50.0, 0, 29.25], [0, 52.0, 20.5], [0, 0, 1]])
+    matrix = pinhole(50.0, 52.0, 29.25, 20.5)
     distortion = np.array([-0.05, 0.01, 0.002, -0.001])
     np.savez(
         folder / "raw_events.npz",
@@ -139,6 +143,14 @@ def write_robust_enerf(
     return Truth(folder, times, poses, events, width, height, matrix, tuple(distortion), model == "equidistant")
 
 
+def tum_vie_matrix(values: dict[str, float]) -> NDArray[np.float64]:
+    """The (4, 4) pose in TUM-VIE's calibration."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat([values[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+    pose[:3, 3] = [values[name] for name in ("px", "py", "pz")]
+    return pose
+
+
 def write_tum_vie(folder: Path, calibration: Path, sequence: str = "mocap-desk2", side: str = "left") -> Truth:
     folder.mkdir(exist_ok=True)
     for file in calibration.glob("*.json"):
@@ -148,16 +160,10 @@ def write_tum_vie(folder: Path, calibration: Path, sequence: str = "mocap-desk2"
     cameras = json.loads((folder / f"camera-calibration{which}.json").read_text())["value0"]
     mocap = json.loads((folder / f"mocap-imu-calibration{which}.json").read_text())["value0"]
 
-    def matrix_of(values: dict[str, float]) -> NDArray[np.float64]:
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_quat([values[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
-        pose[:3, 3] = [values[name] for name in ("px", "py", "pz")]
-        return pose
-
     poses = make_poses(241)
     times = EPOCH * 1_000 + np.linspace(0, DURATION * 1_000, 241).astype(np.int64)
     # T_world_camera = T_world_marker inv(T_imu_marker) T_imu_camera, solved for the marker.
-    imu_camera, imu_marker = matrix_of(cameras["T_imu_cam"][index]), matrix_of(mocap["T_imu_marker"])
+    imu_camera, imu_marker = tum_vie_matrix(cameras["T_imu_cam"][index]), tum_vie_matrix(mocap["T_imu_marker"])
     truth = folder / f"{sequence}-vi_gt_data"
     truth.mkdir(exist_ok=True)
     markers = poses @ np.linalg.inv(imu_camera) @ imu_marker
@@ -172,14 +178,12 @@ def write_tum_vie(folder: Path, calibration: Path, sequence: str = "mocap-desk2"
     stamps = [EPOCH + 100_000, EPOCH + 333_333, EPOCH + 1_900_000]
     (truth / f"{side}_images" / f"image_timestamps_{side}.txt").write_text("\n".join(map(str, stamps)) + "\n")
     lens = cameras["intrinsics"][index]["intrinsics"]
-    matrix = np.array([[lens["fx"], 0, lens["cx"]], [0, lens["fy"], lens["cy"]], [0, 0, 1]])
+    matrix = pinhole(*(lens[name] for name in ("fx", "fy", "cx", "cy")))
     distortion = tuple(lens[name] for name in ("k1", "k2", "k3", "k4"))
     return Truth(folder, times, poses, events, 1280, 720, matrix, distortion, fisheye=True)
 
 
-EDS_MATRIX = np.array(
-    [[560.8520948927032, 0, 313.00733235019237], [0, 560.6295819972383, 217.32858679842997], [0, 0, 1]]
-)
+EDS_MATRIX = pinhole(560.8520948927032, 560.6295819972383, 313.00733235019237, 217.32858679842997)
 EDS_DISTORTION = (-0.09776467241921379, 0.2143738428636279, -0.004710710105172864, -0.004215916089401789)
 
 
@@ -212,7 +216,7 @@ def write_enerf_esim(folder: Path) -> Truth:
     np.save(folder / "poses_bounds.npy", bounds)
     write_images(folder / "images", 3, (width, height))
     (folder / "images" / "image_stamps_ns.txt").write_text("100\n1000000000\n1900000000\n")
-    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    matrix = pinhole(focal, focal, width / 2, height / 2)
     return Truth(folder, times, poses, events, width, height, matrix, ())
 
 
@@ -234,7 +238,7 @@ def write_eventnerf(folder: Path) -> Truth:
     np.savez(folder / "train" / "events" / "test_lego.npz", **events)
     times = np.array([2_000_000_000 * i // 20 for i in range(N_POSES)])
     # Written with the center of the first pixel at 0, as OpenCV has it.
-    matrix = np.array([[400.0, 0, 169.5], [0, 410.0, 128.0], [0, 0, 1]])
+    matrix = pinhole(400.0, 410.0, 169.5, 128.0)
     return Truth(folder, times, poses, events, 346, 260, matrix, (-0.1, 0.02, 0.0, 0.0))
 
 
@@ -252,7 +256,7 @@ def write_paev3d(folder: Path) -> Truth:
         folder / "Intrinsics", np.array([[[500.0, 0, 320, 0], [0, 500, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1]]])
     )
     times = np.array([777_000 + 2_000_000_000 * i // 20 for i in range(N_POSES)])
-    matrix = np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
+    matrix = pinhole(500.0, 500.0, 319.5, 239.5)
     return Truth(folder, times, poses, events, 640, 480, matrix, ())
 
 
@@ -279,7 +283,7 @@ def write_own(folder: Path) -> Truth:
     stamps = seconds(EPOCH * 1_000 + np.array([0, 5 * 10**8, 10**9, 9 * 10**9]))
     lines = [f"{stamp} images/{index:05d}.png\n" for index, stamp in enumerate(stamps)]
     (folder / "images.txt").write_text("".join(lines))
-    matrix = np.array([[50.0, 0, 29.5], [0, 51.0, 20.0], [0, 0, 1]])
+    matrix = pinhole(50.0, 51.0, 29.5, 20.0)
     return Truth(folder, times, poses, events, 60, 40, matrix, (-0.1, 0.0, 0.0, 0.01))
 
 
@@ -341,14 +345,10 @@ def assert_same_poses(actual: torch.Tensor, expected: NDArray[np.float64], toler
 
 def interpolated(truth: Truth, time: int) -> NDArray[np.float64]:
     """The pose (4, 4) at a time in ns: linear in the position, the shortest turn."""
-    after = int(np.searchsorted(truth.times, time))
-    after = max(after, 1)
-    first, last = truth.poses[after - 1], truth.poses[after]
-    weight = (time - truth.times[after - 1]) / (truth.times[after] - truth.times[after - 1])
-    step = Rotation.from_matrix(first[:3, :3].T @ last[:3, :3]).as_rotvec()
+    times, now = truth.times - truth.times[0], time - truth.times[0]
     pose = np.eye(4)
-    pose[:3, :3] = first[:3, :3] @ Rotation.from_rotvec(weight * step).as_matrix()
-    pose[:3, 3] = (1 - weight) * first[:3, 3] + weight * last[:3, 3]
+    pose[:3, :3] = Slerp(times, Rotation.from_matrix(truth.poses[:, :3, :3]))(now).as_matrix()
+    pose[:3, 3] = [np.interp(now, times, values) for values in truth.poses[:, :3, 3].T]
     return pose
 
 

@@ -1,11 +1,9 @@
-"""Small datasets in the native and the ECD format, and ways to damage them."""
+"""Small datasets in the native and the ECD format."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
@@ -70,25 +68,3 @@ AS_RECORDED = {"orientation_method": "none", "center_method": "none", "auto_scal
 
 def parse(config: DataParserConfig, split: str = "train") -> DataparserOutputs:
     return config.setup().get_dataparser_outputs(split)
-
-
-def replace_column(name: str, values: np.ndarray | None) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        with h5py.File(folder / "events.h5", "r+") as file:
-            del file[f"events/{name}"]
-            if values is not None:
-                file[f"events/{name}"] = values
-
-    return change
-
-
-def resize_image(name: str) -> Callable[[Path], None]:
-    return lambda folder: Image.new("RGB", (3, 2)).save(folder / name)
-
-
-def set_attribute(name: str, value: object) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        with h5py.File(folder / "events.h5", "r+") as file:
-            file["events"].attrs[name] = value
-
-    return change

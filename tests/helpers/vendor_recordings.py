@@ -17,7 +17,7 @@ import numpy as np
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.recording.options import EventDataParserConfig
 from helpers.bag_writers import ARRAY, PACKET, array_message, packet_message, write_bag, write_bag2
-from helpers.dataset_faults import read_everything
+from helpers.dataset_faults import Change, all_of, edit_bytes, read_everything, sparse
 from helpers.event_file_writers import (
     HEIGHT,
     WIDTH,
@@ -30,7 +30,7 @@ from helpers.event_file_writers import (
     evt3_words,
     flat_table,
 )
-from helpers.malformed_inputs import FORMAT_WRITERS, all_of
+from helpers.malformed_inputs import FORMAT_WRITERS
 from helpers.published_datasets import config_of, write_own
 
 # From 0.1 to 0.7 s, four events a pixel.
@@ -38,6 +38,7 @@ ROWS: Rows = [(x % 30, 5 + x % 3, 100_000 + 5000 * x, 1 - 2 * (x // 30 % 2)) for
 STAMP = 10**8
 PARTS = [ROWS[begin : begin + 20] for begin in range(0, len(ROWS), 20)]
 NAME = "events"
+_METADATA, _IMAGES = f"{NAME}/metadata.yaml", "colmap/images.bin"
 
 
 def _around(folder: Path, write_events: Callable[[Path], object], suffix: str) -> Path:
@@ -51,7 +52,7 @@ def _around(folder: Path, write_events: Callable[[Path], object], suffix: str) -
     return folder
 
 
-def _bytes(content: Callable[[Rows], bytes]) -> Callable[[Path], object]:
+def _bytes(content: Callable[[Rows], bytes]) -> Change:
     return lambda path: path.write_bytes(content(ROWS))
 
 
@@ -137,45 +138,19 @@ def read_dataset(kind: str, folder: Path) -> None:
     read_everything(config_of_recording(folder) if kind in RECORDINGS else config_of(kind, folder))
 
 
-# Bombs. Each change makes a whole recording of the kind before the colon one that must be refused.
+# Bombs.
 
 
-def _edit(suffix: str, change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
-    def edit(folder: Path) -> None:
-        (path,) = folder.glob(f"**/{suffix}" if "/" in suffix else f"**/*{suffix}")
-        path.write_bytes(change(path.read_bytes()))
+def _bag_chunk(compression: bytes, make_data: Callable[[], bytes], stated: int | None = None) -> Change:
+    """Put other data in the only chunk of a bag of ROS 1, which states to unpack to 4 GB."""
 
-    return edit
-
-
-def _sparse(suffix: str, begin: bytes | None = None, end: bytes = b"", gigabytes: int = 8) -> Callable[[Path], object]:
-    """Put zeros without end, which take no room on the disk, behind the file or behind a beginning."""
-
-    def edit(folder: Path) -> None:
-        (path,) = folder.glob(f"**/{suffix}" if "/" in suffix else f"**/*{suffix}")
-        with path.open("r+b") as file:
-            if begin is not None:
-                file.truncate(0)
-                file.write(begin)
-            # Words and records stay whole.
-            file.truncate(file.seek(0, 2) + (gigabytes << 30))
-            file.seek(0, 2)
-            file.write(end)
-
-    return edit
-
-
-def _bag_chunk(compression: bytes, size: int, data: bytes, stated: int | None = None) -> Callable[[Path], object]:
-    """Put other data in the only chunk of a bag of ROS 1, with their compression, and the sizes that they state."""
-
-    def edit(folder: Path) -> None:
-        (path,) = folder.glob("*.bag")
-        content = path.read_bytes()
+    def change(content: bytes) -> bytes:
+        data = make_data()
         # Behind the magic and the first record.
         begin = len(b"#ROSBAG V2.0\n") + 4096
         header_end = begin + 4 + struct.unpack_from("<I", content, begin)[0]
         end = header_end + 4 + struct.unpack_from("<I", content, header_end)[0]
-        fields = [b"op=\x05", b"compression=" + compression, b"size=" + struct.pack("<I", size)]
+        fields = [b"op=\x05", b"compression=" + compression, b"size=" + b"\xff" * 4]
         header = b"".join(struct.pack("<I", len(field)) + field for field in fields)
         length = len(data) if stated is None else stated
         chunk = struct.pack("<I", len(header)) + header + struct.pack("<I", length) + data
@@ -183,42 +158,36 @@ def _bag_chunk(compression: bytes, size: int, data: bytes, stated: int | None = 
         place = content.index(b"index_pos=") + len(b"index_pos=")
         (index,) = struct.unpack_from("<Q", content, place)
         index = struct.pack("<Q", index + len(chunk) - (end - begin))
-        path.write_bytes(content[:place] + index + content[place + 8 : begin] + chunk + content[end:])
+        return content[:place] + index + content[place + 8 : begin] + chunk + content[end:]
 
-    return edit
-
-
-def _sql(*commands: str) -> Callable[[Path], object]:
-    def edit(folder: Path) -> None:
-        (path,) = folder.glob("*.db3")
-        with closing(sqlite3.connect(path)) as database:
-            for command in commands:
-                database.execute(command)
-            database.commit()
-
-    return edit
+    return edit_bytes("*.bag", change)
 
 
-def _in_every_message(content: Callable[[], bytes]) -> Callable[[Path], object]:
-    """Write other bytes to every message of a database."""
+def _sql(*commands: str, make_data: Callable[[], bytes] | None = None) -> Change:
+    """Run commands in a database; if data are given, as the value of every question mark."""
 
-    def edit(folder: Path) -> None:
+    def change(folder: Path) -> None:
         (path,) = folder.rglob("*.db3")
-        with closing(sqlite3.connect(path)) as database:
-            database.execute("UPDATE messages SET data = ?", [content()])
-            database.commit()
+        with closing(sqlite3.connect(path)) as database, database:
+            for command in commands:
+                database.execute(command, [] if make_data is None else [make_data()])
 
-    return edit
-
-
-def _metadata(old: str, new: str) -> Callable[[Path], object]:
-    return lambda folder: _edit("metadata.yaml", lambda text: text.replace(old.encode(), new.encode()))(folder)
+    return change
 
 
-def _compressed(mode: str) -> Callable[[Path], object]:
+_MCAP = b"\x89MCAP0\r\n"
+_IN_EVERY_MESSAGE = "UPDATE messages SET data = ?"
+_RENAMED = "ALTER TABLE messages RENAME TO others"
+
+
+def _replace(pattern: str, old: bytes, new: bytes) -> Change:
+    return edit_bytes(pattern, lambda content: content.replace(old, new))
+
+
+def _compressed(mode: bytes) -> Change:
     return all_of(
-        _metadata("compression_mode: ''", f"compression_mode: {mode}"),
-        _metadata("compression_format: ''", "compression_format: zstd"),
+        _replace(_METADATA, b"compression_mode: ''", b"compression_mode: " + mode),
+        _replace(_METADATA, b"compression_format: ''", b"compression_format: zstd"),
     )
 
 
@@ -252,22 +221,21 @@ def bz2_bomb() -> bytes:
     return bz2.compress(bytes(1 << 26)) * 64
 
 
-def _mcap_chunk(data: Callable[[], bytes], compression: bytes, size: int) -> Callable[[Path], object]:
+def _mcap_chunk(make_data: Callable[[], bytes], compression: bytes, size: int) -> Change:
     """Write an MCAP file of one chunk, without an index."""
 
     def record(kind: int, content: bytes) -> bytes:
         return struct.pack("<BQ", kind, len(content)) + content
 
-    def edit(folder: Path) -> None:
-        (path,) = folder.glob("*.mcap")
-        packed = data()
+    def change(_: bytes) -> bytes:
+        packed = make_data()
         head = struct.pack("<I4sI4s", 4, b"ros2", 4, b"none")
         chunk = struct.pack("<QQQI", STAMP, 2 * STAMP, size, 0) + struct.pack("<I", len(compression)) + compression
         records = record(1, head) + record(6, chunk + struct.pack("<Q", len(packed)) + packed)
         footer = record(2, struct.pack("<QQI", 0, 0, 0))
-        path.write_bytes(b"\x89MCAP0\r\n" + records + footer + b"\x89MCAP0\r\n")
+        return _MCAP + records + footer + _MCAP
 
-    return edit
+    return edit_bytes("*.mcap", change)
 
 
 _ENDLESS = (
@@ -301,14 +269,14 @@ def _huge_vector(_: bytes) -> bytes:
     return _packet(aedat4_file([]), struct.pack("<I", len(events)) + events)
 
 
-def _bag_number(name: bytes, number: bytes) -> Callable[[Path], object]:
+def _bag_number(name: bytes, number: bytes) -> Change:
     """Put another number into the first record of a bag of ROS 1."""
 
     def change(content: bytes) -> bytes:
         place = content.index(name) + len(name)
         return content[:place] + number + content[place + len(number) :]
 
-    return _edit(".bag", change)
+    return edit_bytes("*.bag", change)
 
 
 def _as_text(folder: Path) -> None:
@@ -316,107 +284,93 @@ def _as_text(folder: Path) -> None:
 
 
 _HEADER = struct.pack("<2I", HEIGHT, WIDTH)
-_LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 12)
+_LAUGHS = (
+    b"a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
+    + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 12)).encode()
 )
+_AEDAT4, _COLMAP_LINE = "*.aedat4", b"1 1 0 0 0 0 0 0 1 a\n"
 _ROS2_HEAD = struct.pack("<BQI4sI", 1, 12, 4, b"ros2", 0)
 
-BOMBS: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "evt2: zeros without end": ("evt2", _sparse(".raw")),
-    "evt2: only zeros": ("evt2", _sparse(".raw", b"% evt 2.0\n% geometry 64x48\n% end\n")),
-    "evt3: zeros without end": ("evt3", _sparse(".raw")),
-    "evt3: only zeros": ("evt3", _sparse(".raw", b"% evt 3.0\n% geometry 64x48\n% end\n")),
-    "evt3: a geometry of 10^9 x 10^9": ("evt3", _edit(".raw", lambda b: b.replace(b"width=64", b"width=999999999"))),
-    "evt2: a header without end": ("evt2", _edit(".raw", lambda b: b"% a b\n" * 10**6 + b)),
-    "dat: zeros without end": ("dat", _sparse(".dat")),
-    "dat: only zeros": ("dat", _sparse(".dat", dat([]))),
-    "dat: records of 255 bytes": ("dat", _edit(".dat", lambda b: b.replace(b"\x0c\x08", b"\x0c\xff"))),
-    "dat: a width of 10^9": ("dat", _edit(".dat", lambda b: b.replace(b"Width 64", b"Width 999999999"))),
-    "aedat4: zeros without end": ("aedat4", _sparse(".aedat4")),
-    "aedat4: zeros in place of packets": ("aedat4", _sparse(".aedat4", aedat4_file([])[:-100])),
-    "aedat4: a packet of 2 GB": (
-        "aedat4",
-        all_of(_edit(".aedat4", lambda b: b + struct.pack("<2i", 0, 2**31 - 1)), _sparse(".aedat4")),
-    ),
-    "aedat4: a header of 4 GB": (
-        "aedat4",
-        all_of(_edit(".aedat4", lambda b: b[:14] + b"\xff" * 4), _sparse(".aedat4")),
-    ),
-    "aedat4: a packet that unpacks to 3 GB": (
-        "aedat4 lz4",
-        lambda folder: _edit(".aedat4", lambda _: _packet(_lz4([]), lz4_bomb(aedat4_packet(ROWS))))(folder),
-    ),
-    "aedat4: zstd that unpacks to 4 GB": (
-        "aedat4",
-        lambda folder: _edit(".aedat4", lambda _: _packet(aedat4_file([], 3, _zstd), zstd_bomb()))(folder),
-    ),
-    "aedat4: packets that unpack to 5 GB": ("aedat4 lz4", lambda folder: _edit(".aedat4", _many_zeros)(folder)),
-    "aedat4: a vector of 4 * 10^9 events": ("aedat4", _edit(".aedat4", _huge_vector)),
-    "bag: a chunk that says to have 4 GB": ("bag", _bag_chunk(b"none", 2**32 - 1, b"", 2**32 - 1)),
-    "bag: lz4 that unpacks to 3 GB": ("bag lz4", lambda f: _bag_chunk(b"lz4", 2**32 - 1, lz4_bomb())(f)),
-    "bag: bz2 that unpacks to 4 GB": ("bag", lambda f: _bag_chunk(b"bz2", 2**32 - 1, bz2_bomb())(f)),
-    "bag: zeros without end": ("bag", all_of(_bag_number(b"index_pos=", struct.pack("<Q", 7 << 30)), _sparse(".bag"))),
-    "bag: 4 * 10^9 topics": ("bag", _bag_number(b"conn_count=", b"\xff" * 4)),
-    "bag: 4 * 10^9 chunks": ("bag", _bag_number(b"chunk_count=", b"\xff" * 4)),
-    "bag: an array of 4 * 10^9 events": ("bag", _edit(".bag", lambda b: b.replace(_HEADER, _HEADER + b"\xff" * 4))),
-    "bag: a sensor of 4 * 10^9 columns": ("bag", _edit(".bag", lambda b: b.replace(_HEADER, b"\xff" * 8))),
-    "db3: a view without end": (
-        "db3",
-        _sql("ALTER TABLE messages RENAME TO others", f"CREATE VIEW messages AS {_ENDLESS}, x'00' AS data FROM n"),
-    ),
-    "db3: a view of 1 GB": (
-        "db3",
-        _sql(
-            "ALTER TABLE messages RENAME TO others",
-            "CREATE VIEW messages AS SELECT id, topic_id, timestamp, zeroblob(999999999) AS data FROM others",
+_BOMBS: dict[str, dict[str, Change]] = {
+    "evt2": {
+        "zeros without end": sparse("*.raw"),
+        "only zeros": sparse("*.raw", b"% evt 2.0\n% geometry 64x48\n% end\n"),
+        "a header without end": edit_bytes("*.raw", lambda b: b"% a b\n" * 10**6 + b),
+    },
+    "evt3": {
+        "zeros without end": sparse("*.raw"),
+        "only zeros": sparse("*.raw", b"% evt 3.0\n% geometry 64x48\n% end\n"),
+        "a geometry of 10^9 x 10^9": _replace("*.raw", b"width=64", b"width=999999999"),
+    },
+    "dat": {
+        "zeros without end": sparse("*.dat"),
+        "only zeros": sparse("*.dat", dat([])),
+        "records of 255 bytes": _replace("*.dat", b"\x0c\x08", b"\x0c\xff"),
+        "a width of 10^9": _replace("*.dat", b"Width 64", b"Width 999999999"),
+    },
+    "aedat4": {
+        "zeros without end": sparse(_AEDAT4),
+        "zeros in place of packets": sparse(_AEDAT4, aedat4_file([])[:-100]),
+        "a packet of 2 GB": all_of(
+            edit_bytes(_AEDAT4, lambda b: b + struct.pack("<2i", 0, 2**31 - 1)), sparse(_AEDAT4)
         ),
-    ),
-    "db3: a computed column": (
-        "db3",
-        _sql(
-            "ALTER TABLE messages RENAME TO others",
+        "a header of 4 GB": all_of(edit_bytes(_AEDAT4, lambda b: b[:14] + b"\xff" * 4), sparse(_AEDAT4)),
+        "zstd that unpacks to 4 GB": edit_bytes(_AEDAT4, lambda _: _packet(aedat4_file([], 3, _zstd), zstd_bomb())),
+        "a vector of 4 * 10^9 events": edit_bytes(_AEDAT4, _huge_vector),
+    },
+    "aedat4 lz4": {
+        "a packet that unpacks to 3 GB": edit_bytes(
+            _AEDAT4, lambda _: _packet(_lz4([]), lz4_bomb(aedat4_packet(ROWS)))
+        ),
+        "packets that unpack to 5 GB": edit_bytes(_AEDAT4, _many_zeros),
+    },
+    "bag": {
+        "a chunk that says to have 4 GB": _bag_chunk(b"none", bytes, 2**32 - 1),
+        "bz2 that unpacks to 4 GB": _bag_chunk(b"bz2", bz2_bomb),
+        "zeros without end": all_of(_bag_number(b"index_pos=", struct.pack("<Q", 7 << 30)), sparse("*.bag")),
+        "4 * 10^9 topics": _bag_number(b"conn_count=", b"\xff" * 4),
+        "4 * 10^9 chunks": _bag_number(b"chunk_count=", b"\xff" * 4),
+        "an array of 4 * 10^9 events": _replace("*.bag", _HEADER, _HEADER + b"\xff" * 4),
+        "a sensor of 4 * 10^9 columns": _replace("*.bag", _HEADER, b"\xff" * 8),
+    },
+    "bag lz4": {"lz4 that unpacks to 3 GB": _bag_chunk(b"lz4", lz4_bomb)},
+    "db3": {
+        "a view without end": _sql(_RENAMED, f"CREATE VIEW messages AS {_ENDLESS}, x'00' AS data FROM n"),
+        "a view of 1 GB": _sql(
+            _RENAMED, "CREATE VIEW messages AS SELECT id, topic_id, timestamp, zeroblob(999999999) AS data FROM others"
+        ),
+        "a computed column": _sql(
+            _RENAMED,
             "CREATE TABLE messages (id INTEGER, topic_id INTEGER, timestamp INTEGER, "
             "data BLOB GENERATED ALWAYS AS (zeroblob(999999999)) VIRTUAL)",
             "INSERT INTO messages (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM others",
         ),
-    ),
-    "db3: messages of zeros": ("db3", _in_every_message(lambda: bytes(1 << 20))),
-    "db3: zeros without end": ("db3", _edit(".db3", lambda b: b[:100] + bytes(len(b) - 100))),
-    "mcap: zeros without end": ("mcap", _sparse(".mcap", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n")),
-    "mcap: zeros with a footer": (
-        "mcap",
-        _sparse(".mcap", b"\x89MCAP0\r\n" + _ROS2_HEAD, struct.pack("<BQQQI", 2, 20, 0, 0, 0) + b"\x89MCAP0\r\n"),
-    ),
-    "mcap: a chunk of 2^62 bytes": ("mcap", _edit(".mcap", _huge_chunk)),
-    "mcap: zstd that unpacks to 4 GB": ("mcap", _mcap_chunk(zstd_bomb, b"zstd", 4 << 30)),
-    "mcap: lz4 that unpacks to 3 GB": ("mcap", _mcap_chunk(lz4_bomb, b"lz4", 3 << 30)),
-    "bag of ROS 2: messages of 4 GB": ("bag of ROS 2", all_of(_compressed("message"), _in_every_message(zstd_bomb))),
-    "bag of ROS 2: a file of 4 GB": (
-        "bag of ROS 2",
-        all_of(_compressed("file"), lambda folder: _edit(".db3", lambda _: zstd_bomb())(folder)),
-    ),
-    "bag of ROS 2: metadata of 1 GB": ("bag of ROS 2", _sparse("metadata.yaml", gigabytes=1)),
-    "bag of ROS 2: nested metadata": ("bag of ROS 2", _edit("metadata.yaml", lambda _: b"[" * 100_000)),
-    "bag of ROS 2: metadata that multiply": (
-        "bag of ROS 2",
-        _edit("metadata.yaml", lambda _: f"{_LAUGHS}rosbag2_bagfile_information: *a11\n".encode()),
-    ),
-    "bag of ROS 2: a file 10^5 times": ("bag of ROS 2", _metadata("  - events.db3\n", "  - events.db3\n" * 5_000)),
-    "colmap: 10^18 images": ("colmap", _edit("images.bin", lambda b: struct.pack("<Q", 10**18) + b[8:])),
-    "colmap: zeros without end": (
-        "colmap",
-        all_of(_edit("images.bin", lambda b: struct.pack("<Q", 10**6) + b[8:]), _sparse("images.bin")),
-    ),
-    "colmap: 10^12 features": (
-        "colmap",
-        _edit(
-            "images.bin", lambda b: b.replace(b".png\0" + struct.pack("<Q", 2), b".png\0" + struct.pack("<Q", 10**12))
-        ),
-    ),
-    "colmap: a name without end": ("colmap", _edit("images.bin", lambda b: b[:80] + b"a" * 10**7)),
-    "colmap: a text without end": ("colmap", all_of(_as_text, _sparse("colmap/images.txt", b"1 1 0 0 0 0 0 0 1 a\n"))),
-    "colmap: a line without end": (
-        "colmap",
-        all_of(_as_text, _sparse("colmap/images.txt", b"1 1 0 0 0 0 0 0 1 a\n", gigabytes=2)),
-    ),
+        "messages of zeros": _sql(_IN_EVERY_MESSAGE, make_data=lambda: bytes(1 << 20)),
+        "zeros without end": edit_bytes("*.db3", lambda b: b[:100] + bytes(len(b) - 100)),
+    },
+    "mcap": {
+        "zeros without end": sparse("*.mcap", _MCAP, _MCAP),
+        "zeros with a footer": sparse("*.mcap", _MCAP + _ROS2_HEAD, struct.pack("<BQQQI", 2, 20, 0, 0, 0) + _MCAP),
+        "a chunk of 2^62 bytes": edit_bytes("*.mcap", _huge_chunk),
+        "zstd that unpacks to 4 GB": _mcap_chunk(zstd_bomb, b"zstd", 4 << 30),
+        "lz4 that unpacks to 3 GB": _mcap_chunk(lz4_bomb, b"lz4", 3 << 30),
+    },
+    "bag of ROS 2": {
+        "messages of 4 GB": all_of(_compressed(b"message"), _sql(_IN_EVERY_MESSAGE, make_data=zstd_bomb)),
+        "a file of 4 GB": all_of(_compressed(b"file"), edit_bytes(f"{NAME}/*.db3", lambda _: zstd_bomb())),
+        "metadata of 1 GB": sparse(_METADATA, gigabytes=1),
+        "nested metadata": edit_bytes(_METADATA, lambda _: b"[" * 100_000),
+        "metadata that multiply": edit_bytes(_METADATA, lambda _: _LAUGHS + b"rosbag2_bagfile_information: *a11\n"),
+        "a file 10^5 times": _replace(_METADATA, b"  - events.db3\n", b"  - events.db3\n" * 5_000),
+    },
+    "colmap": {
+        "10^18 images": edit_bytes(_IMAGES, lambda b: struct.pack("<Q", 10**18) + b[8:]),
+        "zeros without end": all_of(edit_bytes(_IMAGES, lambda b: struct.pack("<Q", 10**6) + b[8:]), sparse(_IMAGES)),
+        "10^12 features": _replace(_IMAGES, b".png\0" + struct.pack("<Q", 2), b".png\0" + struct.pack("<Q", 10**12)),
+        "a name without end": edit_bytes(_IMAGES, lambda b: b[:80] + b"a" * 10**7),
+        "a text without end": all_of(_as_text, sparse("colmap/images.txt", _COLMAP_LINE)),
+        "a line without end": all_of(_as_text, sparse("colmap/images.txt", _COLMAP_LINE, gigabytes=2)),
+    },
 }
+BOMBS = {f"{kind}: {name}": (kind, change) for kind, changes in _BOMBS.items() for name, change in changes.items()}
+"""By a name: the kind of a whole recording, and the change that makes it one that must be refused."""

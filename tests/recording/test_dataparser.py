@@ -140,13 +140,6 @@ def test_images_are_thinned_out_within_the_time_window(tmp_path: Path) -> None:
     assert not isinstance(frames.capture, Recording)
 
 
-def test_a_broken_image_is_one_clear_line(tmp_path: Path) -> None:
-    truth = write_own(tmp_path / "made")
-    (truth.data / "images" / "00001.png").write_bytes(b"no picture")
-    with pytest.raises(DataError, match=r"00001.png: not a PNG or JPEG image that can be read"):
-        parse(config_of("event-recording-data", truth.data), "test")
-
-
 def test_a_pose_gap_must_be_positive(tmp_path: Path) -> None:
     truth = write_own(tmp_path / "made")
     with pytest.raises(DataError, match="max_pose_gap_ns is 0"):
