@@ -10,7 +10,7 @@ from aenerf_ns.events.stream import EventStream
 
 # The image moves by at most this many pixels of the images of warped events from the first event to the last. From one
 # displacement that is tried to the next, events at the ends move by half of the step.
-_FARTHEST, _STEP = 15.0, 1.5
+_MAX_DISPLACEMENT, _STEP = 15.0, 1.5
 
 
 def optical_flow(events: EventStream, seed: int = 0) -> tuple[NDArray[np.float64], int]:
@@ -35,11 +35,11 @@ def optical_flow(events: EventStream, seed: int = 0) -> tuple[NDArray[np.float64
     x, y = (np.stack([events.x, events.y]) + jitter) / binning
     polarity = events.p.astype(np.float32)
 
-    along = np.arange(-_FARTHEST, _FARTHEST + _STEP / 2, _STEP)
+    along = np.arange(-_MAX_DISPLACEMENT, _MAX_DISPLACEMENT + _STEP / 2, _STEP)
     tried = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
     length = np.hypot(*tried.T)
     # Slow ones first, because the first of equally good ones is taken.
-    tried = tried[np.argsort(length, kind="stable")][: (length <= _FARTHEST).sum()]
+    tried = tried[np.argsort(length, kind="stable")][: (length <= _MAX_DISPLACEMENT).sum()]
     net, total = np.zeros((2, height, width), np.float32)
     measured = []
     for across, down in tried:

@@ -249,7 +249,7 @@ class _Table:
         _count_pixels(self._entries[:count], begins[1:])
         np.cumsum(begins, out=begins)
         rows = np.empty((count if length is None else length, 2), np.int64)
-        _place(self._entries[:count], 0, begins[:-1].copy(), rows)
+        _sort_into(self._entries[:count], 0, begins[:-1].copy(), rows)
         rows[count:] = 0
         return rows, begins
 
@@ -261,11 +261,11 @@ class _Table:
             # As many pixels as fit, and at least one.
             last = max(int(np.searchsorted(begins, begins[first] + _ROWS_AT_A_TIME, side="right")) - 1, first + 1)
             rows = np.empty((begins[last] - begins[first], 2), np.int64)
-            places = begins[first:last] - begins[first]
+            next_rows = begins[first:last] - begins[first]
             for run, run_begins in self._runs:
                 begin, end = int(run_begins[first]), int(run_begins[last])
                 run.seek(16 * begin)
-                _place(np.fromfile(run, np.int64, 2 * (end - begin)).reshape(-1, 2), first, places, rows)
+                _sort_into(np.fromfile(run, np.int64, 2 * (end - begin)).reshape(-1, 2), first, next_rows, rows)
             ends.finish(rows)
             rows.tofile(file)
             first = last
@@ -357,14 +357,14 @@ def _count_pixels(entries, counts):
 
 
 @numba.njit(cache=True)
-def _place(entries, first_pixel, places, rows):
-    """Put events into the rows of their pixels, and move the places of the pixels' next events on."""
+def _sort_into(entries, first_pixel, next_rows, rows):
+    """Put events into the rows of their pixels, and move the next rows of the pixels on."""
     for i in range(entries.shape[0]):
         pixel = (entries[i, 1] >> PIXEL_SHIFT) - first_pixel
-        place = places[pixel]
-        rows[place, 0] = entries[i, 0]
-        rows[place, 1] = entries[i, 1]
-        places[pixel] = place + 1
+        row = next_rows[pixel]
+        rows[row, 0] = entries[i, 0]
+        rows[row, 1] = entries[i, 1]
+        next_rows[pixel] = row + 1
 
 
 @numba.njit(cache=True)

@@ -50,7 +50,7 @@ class PolaritySums:
         self._before: list[list[EventStream]] = [[] for _ in times]
         self._after: list[list[EventStream]] = [[] for _ in times]
 
-    def passed(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
+    def watch(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
         """Yield the chunks of a stream, in the order of time, and keep the events near the times."""
         for chunk in chunks:
             for time, before, after in zip(self._times, self._before, self._after, strict=True):

@@ -9,7 +9,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from aenerf_ns.method.kernels.loader import is_float_in_memory, kernels_or_none
+from aenerf_ns.method.kernels.loader import is_float_in_memory, try_load
 
 
 class SharpSoftplus(nn.Softplus):
@@ -26,7 +26,7 @@ class SharpSoftplus(nn.Softplus):
     def forward(self, inputs: Tensor) -> Tensor:
         """Return log(1 + exp(β x)) / β."""
         fits = inputs.device.type == "cpu" and is_float_in_memory(inputs)
-        kernels = kernels_or_none(f"{__package__}.kernels.activation", inputs.device) if fits else None
+        kernels = try_load(f"{__package__}.kernels.activation", inputs.device) if fits else None
         if kernels is None:
             return super().forward(inputs)
         # Outside forward mode, too: there the tangent is None.

@@ -27,7 +27,7 @@ from aenerf_ns.method.hash_grid import HashEncoding, Implementation
 _MAX_LOG_DENSITY = 15.0
 
 ToFieldSpace = Callable[[Tensor], Tensor]
-"""Maps positions (..., 3) in the scene to the places where a field is looked up."""
+"""Maps positions (..., 3) in the scene to those at which a field is looked up."""
 
 # The hidden layer whose output the encoding is joined to (NeRF, https://arxiv.org/abs/2003.08934, fig. 7).
 _SKIP_LAYER = 5
@@ -79,7 +79,7 @@ class DensityField(Field):
         spatial_distortion: contraction of space to a ball or cube of radius 2, or None for a bounded scene.
         encoding: of positions in the contracted space or box, which is scaled to [0, 1] along each axis.
         shape: of the network.
-        to_field_space: see :class:`.comoving.PoseFollowingWarp`, or None for a field that is fixed in the scene.
+        to_field_space: of a :class:`.pose_following_warp.PoseFollowingWarp`; None for a field fixed in the scene.
     """
 
     aabb: Tensor

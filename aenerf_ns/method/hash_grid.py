@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.method.kernels.loader import is_float_in_memory, kernels, kernels_or_none
+from aenerf_ns.method.kernels.loader import is_float_in_memory, load, try_load
 
 # https://arxiv.org/abs/2201.05989, eq. 4; the second is 2654435761 in 32 bits, where products wrap as they should.
 _PRIMES = (1, 2654435761 - 2**32, 805459861)
@@ -108,13 +108,13 @@ class HashEncoding(FrameworkHashEncoding):
             and forward_ad.unpack_dual(self.hash_table).tangent is None
         )
         if self._implementation == "auto":
-            return kernels_or_none(_module(by_device), positions.device) if by_device is not None and fits else None
+            return try_load(_module(by_device), positions.device) if by_device is not None and fits else None
         source = f"hash grid implementation {self._implementation}"
         if self._implementation != by_device or not fits:
             problem = f"cannot compute with these {positions.dtype} tensors on {positions.device}"
             raise DataError(source, problem, "choose auto")
         try:
-            return cast(Kernels, kernels(_module(self._implementation), positions.device))
+            return cast(Kernels, load(_module(self._implementation), positions.device))
         except (ImportError, RuntimeError) as error:
             raise DataError(source, str(error), "install it or choose auto") from error
 

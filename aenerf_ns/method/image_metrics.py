@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from aenerf_ns.errors import DataError
 
 # SSIM's window of 11 pixels is mirrored at the edges.
-_SMALLEST = 6
+_MIN_SIDE = 6
 
 
 class ImageMetrics:
@@ -39,9 +39,9 @@ class ImageMetrics:
             DataError: the image is smaller than SSIM's window.
         """
         height, width = reference.shape[:2]
-        if min(height, width) < _SMALLEST:
+        if min(height, width) < _MIN_SIDE:
             raise DataError(
-                "evaluation", f"images of {width} x {height} pixels", f"give {_SMALLEST} or more, which SSIM needs"
+                "evaluation", f"images of {width} x {height} pixels", f"give {_MIN_SIDE} or more, which SSIM needs"
             )
         # Imported lazily: every ns-* command imports this module, and torchmetrics is slow to import.
         from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure

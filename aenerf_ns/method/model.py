@@ -46,11 +46,11 @@ from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervis
 # ε of the paper's appendix "Model Architecture": the least radiance that is rendered.
 _RADIANCE_EPSILON = 1e-3
 # The error of a display value that has the last color of the error's color map.
-_LARGEST_SHOWN_ERROR = 0.5
+_MAX_SHOWN_ERROR = 0.5
 
-# Share of a run in which the space that moves along with the poses counts rays, and the steps between two of its
-# weighings. A weighing moves the field a little, so the weights must stay for the rest of the run.
-_OBSERVED_SHARE, _WEIGHING_INTERVAL = 0.3, 8
+# Share of a run in which the warp counts rays, and the steps between two updates of its weights. An update moves the
+# field a little, so the weights must stay for the rest of the run.
+_ACCUMULATION_SHARE, _UPDATE_INTERVAL = 0.3, 8
 
 # Room on each side of the scene box, as a share of its longest side, for a field that moves along with the poses. A
 # place that leaves the field's box has no density, so events at the border of a tight box would hold the poses back.
@@ -133,7 +133,7 @@ class AENeRFModel(Model):
             camera_times=scene.camera_times,
             ground_truth=deepcopy(scene.ground_truth),
         )
-        self.space = (
+        self.warp = (
             PoseFollowingWarp(
                 self.camera_optimizer, lambda positions: to_unit_cube(positions, distortion, self.field.aabb)
             )
@@ -144,11 +144,11 @@ class AENeRFModel(Model):
             config.backbone,
             config.field,
             config.proposal,
-            self.scene_box.aabb if self.space is None else _with_room(self.scene_box.aabb),
+            self.scene_box.aabb if self.warp is None else _with_room(self.scene_box.aabb),
             distortion,
             self.sensor.num_channels,
             config.average_init_density,
-            self.space,
+            self.warp,
         )
         self.proposal_networks = nn.ModuleList(proposal_networks)
         self.density_fns = [network.density_fn for network in proposal_networks]
@@ -194,17 +194,17 @@ class AENeRFModel(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return the callbacks that schedule the proposal sampler, as the framework's own methods do, and the space."""
+        """Return the callbacks that schedule the proposal sampler, as the framework's own methods do, and the warp."""
         trainer = training_callback_attributes.trainer
         assert trainer is not None
-        observed_until = _OBSERVED_SHARE * trainer.config.schedule_length
+        last_accumulated = _ACCUMULATION_SHARE * trainer.config.schedule_length
 
-        def weigh(step: int) -> None:
-            if self.space is None:
+        def update_warp(step: int) -> None:
+            if self.warp is None:
                 return
-            self.space.observing = step < observed_until
-            if self.space.observing and step % _WEIGHING_INTERVAL == 0:
-                self.space.weigh()
+            self.warp.accumulating = step < last_accumulated
+            if self.warp.accumulating and step % _UPDATE_INTERVAL == 0:
+                self.warp.update_weights()
 
         def set_anneal(step: int) -> None:
             # https://arxiv.org/pdf/2111.12077.pdf, eq. 18
@@ -215,7 +215,7 @@ class AENeRFModel(Model):
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         return [
             TrainingCallback(before, set_anneal, update_every_num_iters=1),
-            TrainingCallback(before, weigh, update_every_num_iters=1),
+            TrainingCallback(before, update_warp, update_every_num_iters=1),
             TrainingCallback(
                 [TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
                 self.proposal_sampler.step_cb,
@@ -246,8 +246,8 @@ class AENeRFModel(Model):
             display values of the radiance as it was rendered, ``accumulation`` (N, 1) and ``depth`` (N, 1), the median
             distance along the ray in scene units; of a color sensor also ``mean_log_radiance`` (N, 1) of its channels.
         """
-        if self.space is not None:
-            self.space.follow()
+        if self.warp is not None:
+            self.warp.update()
         samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
         outputs: dict[str, Any] = {}
         is_trained_on = self.training and _is_of_batch(ray_bundle)
@@ -265,9 +265,9 @@ class AENeRFModel(Model):
             log_radiance, weights = torch.cat([ends, log_radiance]), torch.cat([weights_of_ends, weights])
         else:
             log_radiance, weights = self._composite(samples)
-        if is_trained_on and self.space is not None and self.space.observing:
+        if is_trained_on and self.warp is not None and self.warp.accumulating:
             assert ray_bundle.times is not None
-            self.space.observe(samples.frustums.get_positions(), weights[..., 0], ray_bundle.times[:, 0])
+            self.warp.accumulate(samples.frustums.get_positions(), weights[..., 0], ray_bundle.times[:, 0])
         weights_list.append(weights)
         samples_list.append(samples)
         if self.training:
@@ -348,7 +348,7 @@ class AENeRFModel(Model):
         error = (predicted - reference).abs().mean(-1, keepdim=True)
         images = {
             "img": torch.cat([reference, predicted], dim=1),
-            "error": colormaps.apply_float_colormap((error / _LARGEST_SHOWN_ERROR).clamp(0, 1)),
+            "error": colormaps.apply_float_colormap((error / _MAX_SHOWN_ERROR).clamp(0, 1)),
             "accumulation": colormaps.apply_colormap(outputs["accumulation"]),
             "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"]),
         }

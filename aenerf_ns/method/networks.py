@@ -72,7 +72,7 @@ def make_networks(
     spatial_distortion: SpatialDistortion | None,
     num_channels: int,
     average_init_density: float,
-    space: PoseFollowingWarp | None,
+    warp: PoseFollowingWarp | None,
 ) -> tuple[EventRadianceField, list[Field]]:
     """Make the field, and the proposal networks in the order in which they are evaluated.
 
@@ -85,10 +85,10 @@ def make_networks(
         spatial_distortion: contraction of space, or None for a bounded scene.
         num_channels: radiance channels of the sensor, 1 or 3.
         average_init_density: density before training.
-        space: that moves along with the corrections of the poses, or None where poses are not corrected.
+        warp: moves the field along with the corrections of the poses, or None where poses are not corrected.
     """
     # The proposal networks only follow the field: poses are learned from the field alone.
-    of_field, of_proposals = (None, None) if space is None else (space.forward, space.without_gradient)
+    field_warp, proposal_warp = (None, None) if warp is None else (warp.forward, warp.without_gradient)
     if backbone == "hash":
         radiance_field = EventRadianceField(
             aabb,
@@ -104,7 +104,7 @@ def make_networks(
                 field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "exp", average_init_density
             ),
             RadianceShape(num_channels, num_hidden_layers=2, hidden_dim=field.hidden_dim),
-            of_field,
+            field_warp,
         )
         return radiance_field, [
             ProposalNetwork(
@@ -114,7 +114,7 @@ def make_networks(
                 max_res=resolution,
                 log2_hashmap_size=proposal.log2_hashmap_size,
                 grid_implementation=field.grid_implementation,
-                to_field_space=of_proposals,
+                to_field_space=proposal_warp,
                 num_layers=proposal.num_hidden_layers + 1,
                 hidden_dim=proposal.hidden_dim,
                 average_init_density=average_init_density,
@@ -139,8 +139,8 @@ def make_networks(
         ),
         # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
         RadianceShape(num_channels, num_hidden_layers=1, hidden_dim=128),
-        of_field,
+        field_warp,
     )
     shape = DensityShape(proposal.num_hidden_layers, proposal.hidden_dim, 0, "softplus", average_init_density)
     # One network, which every round of proposals evaluates again.
-    return radiance_field, [DensityField(aabb, spatial_distortion, encoding, shape, of_proposals)]
+    return radiance_field, [DensityField(aabb, spatial_distortion, encoding, shape, proposal_warp)]

@@ -25,8 +25,8 @@ _MAX_COMPARED = 2000
 # A step of the optimizer changes hundreds of weights behind each number of a network's twist, but few behind a number
 # of a spline's. With this factor on the network's output, both move about as far at one learning rate.
 _NETWORK_OUTPUT_SCALE = 2e-3
-_SMALLEST_EXTENT = 1e-6
-_SMALLEST_SPEED = 1e-6
+_MIN_EXTENT = 1e-6
+_MIN_SPEED = 1e-6
 # Seconds by which a learned clock offset may differ from the value it begins with. Larger errors smear the field so far
 # that it does not lead back.
 _MAX_CLOCK_CHANGE = 0.05
@@ -112,7 +112,7 @@ class PoseCorrection(CameraOptimizer):
         self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
         self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
         # A camera that only turns gives translations no unit. The unit of the scene serves instead.
-        self.translation_unit = extent = trajectory.extent if trajectory.extent > _SMALLEST_EXTENT else 1.0
+        self.translation_unit = extent = trajectory.extent if trajectory.extent > _MIN_EXTENT else 1.0
         # Times in every interval of the spline, at which the size of the corrections is taken.
         count = max(64, math.ceil(trajectory.duration / config.knot_interval))
         sampled = torch.linspace(0, trajectory.duration, count, dtype=torch.float64)
@@ -133,7 +133,7 @@ class PoseCorrection(CameraOptimizer):
             # about as far by the clock as by a twist.
             _, rate = trajectory.pose_and_rate(sampled)
             turning, moving = rate[..., :3].square().sum((1, 2)) / 2, (rate[..., 3] / extent).square().sum(-1)
-            self._clock_unit = 1 / max(float((turning + moving).mean().sqrt()), _SMALLEST_SPEED)
+            self._clock_unit = 1 / max(float((turning + moving).mean().sqrt()), _MIN_SPEED)
         self.twists: TwistNetwork | TwistSpline | None = None
         if config.mode == "network":
             self.twists = TwistNetwork(trajectory, config.num_frequencies)

@@ -35,7 +35,7 @@ class PoseFollowingWarp(nn.Module):
     identity where poses are not corrected.
 
     Times see a place as often as training rays of these times end there, by their rendering weights. The rays are
-    counted in the cells of a coarse grid, by :meth:`observe`.
+    counted in the cells of a coarse grid, by :meth:`accumulate`.
 
     Twists and weights are differentiated, the place at which they are looked up is not: within the span of a gradient,
     neighbors move alike.
@@ -45,7 +45,7 @@ class PoseFollowingWarp(nn.Module):
         unit_positions: maps (N, 3) positions in the scene to the unit cube, as the fields do.
 
     Attributes:
-        observing: whether rays are being counted. The model switches it.
+        accumulating: whether rays are being counted. The model switches it.
     """
 
     _seconds: Tensor
@@ -59,7 +59,7 @@ class PoseFollowingWarp(nn.Module):
         # Not as a submodule: the correction's parameters are the model's already.
         self._correction = (correction,)
         self._unit_positions = unit_positions
-        self.observing = False
+        self.accumulating = False
         duration = correction.trajectory.duration
         count = min(math.ceil(duration / correction.config.knot_interval) + 1, _MAX_TIMES)
         self._interval = duration / (count - 1)
@@ -71,7 +71,7 @@ class PoseFollowingWarp(nn.Module):
         self.register_buffer("_strides", torch.tensor([_RESOLUTION**2, _RESOLUTION, 1]), persistent=False)
         self._twists: Tensor | None = None
 
-    def follow(self) -> None:
+    def update(self) -> None:
         """Take the corrections as they are now, for all positions until the next call."""
         twists = self._correction[0].world_twists(self._seconds, self._base_poses).to(self._weights)
         # Half precision would round the places to a thousandth of the twists' size.
@@ -102,7 +102,7 @@ class PoseFollowingWarp(nn.Module):
         return F.grid_sample(cells, places, padding_mode="border", align_corners=False)[0, :, 0, 0].T
 
     @torch.no_grad()
-    def observe(self, positions: Tensor, weights: Tensor, seconds: Tensor) -> None:
+    def accumulate(self, positions: Tensor, weights: Tensor, seconds: Tensor) -> None:
         """Count rays.
 
         Args:
@@ -123,7 +123,7 @@ class PoseFollowingWarp(nn.Module):
         seen.index_add_(0, (index + 1).flatten(), (counts * share).flatten())
 
     @torch.no_grad()
-    def weigh(self) -> None:
+    def update_weights(self) -> None:
         """Set the weights of the times in each cell by the rays that have been counted in its neighbourhood.
 
         Where no ray has ended near a cell, all rays count.

@@ -101,7 +101,7 @@ class EventDataset(InputDataset):
         events = scene.event_file
         pictures = self._new_pictures()
         pairs = pair_events(
-            pictures.passed(self._chunks(count)),
+            pictures.watch(self._chunks(count)),
             refractory_period=scene.sensor.refractory_period,
             window=scene.window,
             usable=usable,
@@ -122,7 +122,7 @@ class EventDataset(InputDataset):
         scene.event_file.require()
         _, usable = scene.event_camera.pixel_directions()
         pictures = self._new_pictures()
-        chunks = pictures.passed(self._chunks(scene.event_file.count()))
+        chunks = pictures.watch(self._chunks(scene.event_file.count()))
         windows = sort_events(chunks, window=scene.window, usable=usable)
         CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.")
         return windows, pictures.sums(*usable.shape)

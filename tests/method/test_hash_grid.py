@@ -20,7 +20,7 @@ from torch import Tensor
 from aenerf_ns.errors import DataError
 from aenerf_ns.method import hash_grid
 from aenerf_ns.method.hash_grid import HashEncoding
-from aenerf_ns.method.kernels import loader as compiled
+from aenerf_ns.method.kernels import loader
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 
 OPTIONS = {"num_levels": 5, "min_res": 4, "max_res": 200, "log2_hashmap_size": 9}
@@ -324,7 +324,7 @@ def test_torch_func_takes_the_plain_implementation() -> None:
 @pytest.fixture
 def nothing_known() -> Iterator[None]:
     """Which implementations work is not known before the test, and not afterwards."""
-    caches = compiled.kernels_or_none, compiled.kernels, compiled._say
+    caches = loader.try_load, loader.load, loader._warn_once
     for cache in caches:
         cache.cache_clear()
     yield

@@ -51,31 +51,31 @@ def _set(correction: PoseCorrection, twist: Tensor) -> None:
 
 
 def test_a_motion_that_all_times_share_moves_the_field_with_the_cameras(correction: PoseCorrection) -> None:
-    space = PoseFollowingWarp(correction, _unit)
+    warp = PoseFollowingWarp(correction, _unit)
     twist = 1e-2 * torch.tensor([0.3, -0.2, 0.5, 0.4, 0.1, -0.6], dtype=torch.float64)
     _set(correction, twist)
     base = correction.trajectory.pose(torch.tensor([0.7], dtype=torch.float64))
     corrected = correction.pose(torch.tensor([0.7], dtype=torch.float64))
     seen = torch.tensor([0.1, -0.2, 0.4, 1.0], dtype=torch.float64)
-    space.follow()
-    found = space((corrected @ seen).float())
+    warp.update()
+    found = warp((corrected @ seen).float())
     # To first order: the square of the twist is left.
     assert (found - (base @ seen).float()).abs().max() < 3e-4
     assert (corrected @ seen - base @ seen).norm() > 3e-3
 
 
 def test_a_place_moves_with_the_times_that_see_it(correction: PoseCorrection) -> None:
-    space = PoseFollowingWarp(correction, _unit)
+    warp = PoseFollowingWarp(correction, _unit)
     left, right = torch.tensor([-0.8, 0.0, 0.0]), torch.tensor([0.8, 0.0, 0.0])
     early, late = torch.tensor([0.2], dtype=torch.float64), torch.tensor([1.8], dtype=torch.float64)
-    space.observe(left.expand(1, 4, 3), torch.full((1, 4), 0.25), early)
-    space.observe(right.expand(1, 4, 3), torch.full((1, 4), 0.25), late)
-    space.weigh()
+    warp.accumulate(left.expand(1, 4, 3), torch.full((1, 4), 0.25), early)
+    warp.accumulate(right.expand(1, 4, 3), torch.full((1, 4), 0.25), late)
+    warp.update_weights()
     with torch.no_grad():
         # Only the late half of the recording is corrected.
         correction.twists.control_twists[14:, 0] = 0.02
-        space.follow()
-        moved = torch.stack([left, right]) - space(torch.stack([left, right]))
+        warp.update()
+        moved = torch.stack([left, right]) - warp(torch.stack([left, right]))
     expected = correction.world_twists(late, correction.trajectory.pose(late))[0]
     shift = expected[:3] + torch.linalg.cross(expected[3:], right.double())
     assert moved[0].norm() < 1e-3 * shift.norm()
@@ -83,38 +83,38 @@ def test_a_place_moves_with_the_times_that_see_it(correction: PoseCorrection) ->
 
 
 def test_without_corrections_nothing_moves(correction: PoseCorrection) -> None:
-    space = PoseFollowingWarp(correction, _unit)
-    space.follow()
+    warp = PoseFollowingWarp(correction, _unit)
+    warp.update()
     positions = torch.randn(50, 3)
-    assert torch.equal(space(positions), positions)
+    assert torch.equal(warp(positions), positions)
 
 
 def test_a_position_that_is_not_a_number_stays_one(correction: PoseCorrection) -> None:
-    space = PoseFollowingWarp(correction, _unit)
-    space.follow()
-    found = space(torch.tensor([[math.nan, math.inf, -math.inf], [0.0, 0.0, 0.0]]))
+    warp = PoseFollowingWarp(correction, _unit)
+    warp.update()
+    found = warp(torch.tensor([[math.nan, math.inf, -math.inf], [0.0, 0.0, 0.0]]))
     assert found[0, 0].isnan()
     assert found[1].isfinite().all()
 
 
 def test_positions_that_move_have_rates(correction: PoseCorrection) -> None:
-    space = PoseFollowingWarp(correction, _unit)
+    warp = PoseFollowingWarp(correction, _unit)
     correction.twists.control_twists.data.fill_(0.01)
-    space.follow()
+    warp.update()
     positions, rates = torch.zeros(3, 3), torch.eye(3)
     with forward_ad.dual_level():
-        moved = forward_ad.unpack_dual(space(forward_ad.make_dual(positions, rates)))
+        moved = forward_ad.unpack_dual(warp(forward_ad.make_dual(positions, rates)))
         tangent = moved.tangent
     step = 1e-3
-    difference = (space(positions + step * rates) - space(positions - step * rates)) / (2 * step)
+    difference = (warp(positions + step * rates) - warp(positions - step * rates)) / (2 * step)
     torch.testing.assert_close(tangent, difference, rtol=1e-2, atol=1e-2)
 
 
 def test_the_proposals_teach_the_poses_nothing(correction: PoseCorrection) -> None:
-    space = PoseFollowingWarp(correction, _unit)
-    space.follow()
-    assert space(torch.rand(4, 3)).requires_grad
-    assert not space.without_gradient(torch.rand(4, 3)).requires_grad
+    warp = PoseFollowingWarp(correction, _unit)
+    warp.update()
+    assert warp(torch.rand(4, 3)).requires_grad
+    assert not warp.without_gradient(torch.rand(4, 3)).requires_grad
 
 
 def test_the_times_of_a_long_recording_are_bounded() -> None:
@@ -122,6 +122,6 @@ def test_the_times_of_a_long_recording_are_bounded() -> None:
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 1
     correction = PoseCorrection(PoseCorrectionConfig(mode="spline"), 1, "cpu", Trajectory(times, poses), times)
-    space = PoseFollowingWarp(correction, _unit)
-    assert len(space._seconds) == 256
-    assert math.isclose(float(space._seconds[-1]), 3600)
+    warp = PoseFollowingWarp(correction, _unit)
+    assert len(warp._seconds) == 256
+    assert math.isclose(float(warp._seconds[-1]), 3600)

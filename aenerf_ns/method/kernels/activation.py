@@ -19,7 +19,7 @@ _BLOCK = 4096
 _F = np.float32
 _ZERO, _HALF, _ONE, _TWO = _F(0), _F(0.5), _F(1), _F(2)
 # exp(-40) vanishes beside 1. Processors are slow at smaller numbers, whose squares are too small for normal float32.
-_LARGEST = _F(40)
+_MAX_EXPONENT = _F(40)
 _LOG2_E = _F(1.4426950408889634)
 # ln 2 in two parts. The first has few bits, so its products with whole numbers are exact.
 _LN_2, _LN_2_REST = _F(0.693145751953125), _F(1.42860677e-06)
@@ -46,7 +46,7 @@ def gradients(
     return to_inputs, to_tangents
 
 
-def probe(device: torch.device) -> None:
+def self_test(device: torch.device) -> None:
     """Compute one value."""
     values(torch.zeros(1, device=device), None, 1.0)
 
@@ -65,7 +65,7 @@ def _run(kernel: Callable[..., None], beta: float, first_tensor: Tensor, *tensor
 @compiled
 def _exponential_of_minus(a):
     """Return exp(-a) for a >= 0, at least exp(-40)."""
-    a = _LARGEST if a > _LARGEST else a
+    a = _MAX_EXPONENT if a > _MAX_EXPONENT else a
     n = np.floor(_HALF - a * _LOG2_E)
     r = -a - n * _LN_2 - n * _LN_2_REST
     p = _F(1 / 720)

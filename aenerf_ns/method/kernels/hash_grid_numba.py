@@ -69,14 +69,14 @@ def _sum_of_levels(parts: Tensor | None) -> Tensor | None:
     return None if parts is None else torch.from_numpy(parts.numpy().sum(0))
 
 
-def probe(device: torch.device) -> None:
+def self_test(device: torch.device) -> None:
     """Encode one point."""
     features(torch.zeros(1, 3, device=device), None, torch.zeros(1, 2, device=device), torch.ones(1, device=device))
 
 
 @compiled
 def _cell(positions, i, scale, mask):
-    """Return a point's distances from the lower corner of its cell, and the places of the 8 corners in the table.
+    """Return a point's distances from the lower corner of its cell, and the indices of the 8 corners in the table.
 
     The first axis changes fastest from corner to corner.
     """
@@ -95,8 +95,8 @@ def _cell(positions, i, scale, mask):
 
 
 @compiled
-def _corner_values(rows, places, feature):
-    a, b, c, d, e, f, g, h = places
+def _corner_values(rows, indices, feature):
+    a, b, c, d, e, f, g, h = indices
     return (
         rows[a, feature], rows[b, feature], rows[c, feature], rows[d, feature],
         rows[e, feature], rows[f, feature], rows[g, feature], rows[h, feature],
@@ -104,9 +104,9 @@ def _corner_values(rows, places, feature):
 
 
 @compiled
-def _corner_products(rows, places, first, second):
+def _corner_products(rows, indices, first, second):
     """Return the dot products of the corners' features with a gradient."""
-    a, b, c, d, e, f, g, h = places
+    a, b, c, d, e, f, g, h = indices
     return (
         rows[a, 0] * first + rows[a, 1] * second, rows[b, 0] * first + rows[b, 1] * second,
         rows[c, 0] * first + rows[c, 1] * second, rows[d, 0] * first + rows[d, 1] * second,
@@ -174,14 +174,14 @@ def _mixed_slopes(offsets, values):
 
 
 @compiled
-def _add(rows, place, first, second):
-    rows[place, 0] += first
-    rows[place, 1] += second
+def _add(rows, index, first, second):
+    rows[index, 0] += first
+    rows[index, 1] += second
 
 
 @compiled
-def _add_to_corners(rows, places, weights, first, second):
-    a, b, c, d, e, f, g, h = places
+def _add_to_corners(rows, indices, weights, first, second):
+    a, b, c, d, e, f, g, h = indices
     k, l, m, n, o, p, q, r = weights  # noqa: E741
     _add(rows, a, k * first, k * second)
     _add(rows, b, l * first, l * second)
@@ -201,10 +201,10 @@ def _fill_features(first, last, positions, tangents, table, scales, out, rates):
         for level in range(table.shape[0]):
             rows, scale = table[level], scales[level]
             for i in range(begin, min(begin + _BLOCK, last)):
-                offsets, places = _cell(positions, i, scale, mask)
+                offsets, indices = _cell(positions, i, scale, mask)
                 weights = _weights(offsets)
                 for feature in range(2):
-                    values = _corner_values(rows, places, feature)
+                    values = _corner_values(rows, indices, feature)
                     out[i, 2 * level + feature] = _value(weights, values)
                     if tangents is not None:
                         x, y, z = _slopes(offsets, values)
@@ -220,17 +220,17 @@ def _add_gradients(
     mask = np.uint32(table.shape[1] - 1)
     rows, row_gradients, scale = table[level], to_table[level], scales[level]
     for i in range(positions.shape[0]):
-        offsets, places = _cell(positions, i, scale, mask)
+        offsets, indices = _cell(positions, i, scale, mask)
         first, second = grad[i, 2 * level], grad[i, 2 * level + 1]
-        _add_to_corners(row_gradients, places, _weights(offsets), first, second)
+        _add_to_corners(row_gradients, indices, _weights(offsets), first, second)
         if tangents is not None:
             moving = scale * tangents[i, 0], scale * tangents[i, 1], scale * tangents[i, 2]
             first_rate, second_rate = grad_rates[i, 2 * level], grad_rates[i, 2 * level + 1]
-            _add_to_corners(row_gradients, places, _weight_rates(offsets, moving), first_rate, second_rate)
+            _add_to_corners(row_gradients, indices, _weight_rates(offsets, moving), first_rate, second_rate)
         if to_positions is not None:
-            x, y, z = _slopes(offsets, _corner_products(rows, places, first, second))
+            x, y, z = _slopes(offsets, _corner_products(rows, indices, first, second))
             if tangents is not None:
-                products = _corner_products(rows, places, first_rate, second_rate)
+                products = _corner_products(rows, indices, first_rate, second_rate)
                 tx, ty, tz = _slopes(offsets, products)
                 to_tangents[level, i, 0], to_tangents[level, i, 1], to_tangents[level, i, 2] = (
                     scale * tx, scale * ty, scale * tz,

@@ -20,7 +20,7 @@ _BLOCK = 128
 def features(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor) -> tuple[Tensor, Tensor | None]:
     """Return features (N, 2 levels), and their rates where the positions move. See :class:`.hash_grid.Kernels`."""
     num_points, num_levels = len(positions), len(scales)
-    # Level after level, as the programs run; a warp then writes to neighboring places.
+    # Level after level, as the programs run; a warp then writes to neighboring addresses.
     out = positions.new_empty(num_levels, num_points, 2)
     rates = None if tangents is None else torch.empty_like(out)
     # Triton launches on the current GPU, which Nerfstudio's processes do not set.
@@ -56,7 +56,7 @@ def gradients(
     return to_table, None if parts is None else parts.sum(0), None if tangent_parts is None else tangent_parts.sum(0)
 
 
-def probe(device: torch.device) -> None:
+def self_test(device: torch.device) -> None:
     """Encode one point."""
     features(torch.zeros(1, 3, device=device), None, torch.zeros(1, 2, device=device), torch.ones(1, device=device))
 
@@ -86,17 +86,17 @@ def _store_vectors(pointer, point, x, y, z, inside):
 
 
 @triton.jit
-def _load_features(pointer, place, inside):
+def _load_features(pointer, index, inside):
     return (
-        tl.load(pointer + 2 * place, mask=inside, other=0.0),
-        tl.load(pointer + 2 * place + 1, mask=inside, other=0.0),
+        tl.load(pointer + 2 * index, mask=inside, other=0.0),
+        tl.load(pointer + 2 * index + 1, mask=inside, other=0.0),
     )
 
 
 @triton.jit
-def _store_features(pointer, place, first, second, inside):
-    tl.store(pointer + 2 * place, first, mask=inside)
-    tl.store(pointer + 2 * place + 1, second, mask=inside)
+def _store_features(pointer, index, first, second, inside):
+    tl.store(pointer + 2 * index, first, mask=inside)
+    tl.store(pointer + 2 * index + 1, second, mask=inside)
 
 
 @triton.jit
@@ -117,18 +117,18 @@ def _cell(x, y, z, scale):
 
 @triton.jit
 def _corner(low_x, low_y, low_z, x, y, z, mask, corner: tl.constexpr):
-    """Return the corners' places in the table, their weights along the axes, and the weights' slopes (1 or -1)."""
+    """Return the corners' indices in the table, their weights along the axes, and the weights' slopes (1 or -1)."""
     far_x: tl.constexpr = corner & 1
     far_y: tl.constexpr = (corner >> 1) & 1
     far_z: tl.constexpr = (corner >> 2) & 1
-    place = (low_x + far_x) ^ ((low_y + far_y) * 2654435761) ^ ((low_z + far_z) * 805459861)
+    index = (low_x + far_x) ^ ((low_y + far_y) * 2654435761) ^ ((low_z + far_z) * 805459861)
     weight_x = x if far_x else 1.0 - x
     weight_y = y if far_y else 1.0 - y
     weight_z = z if far_z else 1.0 - z
     slope_x: tl.constexpr = 1.0 if far_x else -1.0
     slope_y: tl.constexpr = 1.0 if far_y else -1.0
     slope_z: tl.constexpr = 1.0 if far_z else -1.0
-    return (place & mask).to(tl.int32), weight_x, weight_y, weight_z, slope_x, slope_y, slope_z
+    return (index & mask).to(tl.int32), weight_x, weight_y, weight_z, slope_x, slope_y, slope_z
 
 
 @triton.jit
@@ -148,8 +148,8 @@ def _fill_features(positions, tangents, table, scales, out, rates, num_points, s
         first_rate = tl.zeros([block], tl.float32)
         second_rate = tl.zeros([block], tl.float32)
     for corner in tl.static_range(8):
-        place, wx, wy, wz, sx, sy, sz = _corner(low_x, low_y, low_z, x, y, z, size - 1, corner)
-        a, b = _load_features(table + 2 * level * size, place, inside)
+        index, wx, wy, wz, sx, sy, sz = _corner(low_x, low_y, low_z, x, y, z, size - 1, corner)
+        a, b = _load_features(table + 2 * level * size, index, inside)
         weight = wx * wy * wz
         first += weight * a
         second += weight * b
@@ -188,7 +188,7 @@ def _add_gradients(
             hy = tl.zeros([block], tl.float32)
             hz = tl.zeros([block], tl.float32)
     for corner in tl.static_range(8):
-        place, wx, wy, wz, sx, sy, sz = _corner(low_x, low_y, low_z, x, y, z, size - 1, corner)
+        index, wx, wy, wz, sx, sy, sz = _corner(low_x, low_y, low_z, x, y, z, size - 1, corner)
         weight = wx * wy * wz
         to_first, to_second = weight * first, weight * second
         if tangents is not None:
@@ -196,10 +196,10 @@ def _add_gradients(
             to_first += weight_rate * first_rate
             to_second += weight_rate * second_rate
         rows = to_table + 2 * level * size
-        tl.atomic_add(rows + 2 * place, to_first, mask=inside, sem="relaxed")
-        tl.atomic_add(rows + 2 * place + 1, to_second, mask=inside, sem="relaxed")
+        tl.atomic_add(rows + 2 * index, to_first, mask=inside, sem="relaxed")
+        tl.atomic_add(rows + 2 * index + 1, to_second, mask=inside, sem="relaxed")
         if to_positions is not None:
-            a, b = _load_features(table + 2 * level * size, place, inside)
+            a, b = _load_features(table + 2 * level * size, index, inside)
             product = first * a + second * b
             gx += sx * wy * wz * product
             gy += sy * wx * wz * product
@@ -213,7 +213,7 @@ def _add_gradients(
                 hy += sy * wx * wz * product
                 hz += sz * wx * wy * product
     if to_positions is not None:
-        place = level * num_points + point
-        _store_vectors(to_positions, place, gx * scale, gy * scale, gz * scale, inside)
+        index = level * num_points + point
+        _store_vectors(to_positions, index, gx * scale, gy * scale, gz * scale, inside)
         if tangents is not None:
-            _store_vectors(to_tangents, place, hx * scale, hy * scale, hz * scale, inside)
+            _store_vectors(to_tangents, index, hx * scale, hy * scale, hz * scale, inside)

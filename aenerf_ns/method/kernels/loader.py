@@ -20,8 +20,8 @@ def is_float_in_memory(tensor: Tensor) -> bool:
 
 
 @lru_cache
-def kernels(module: str, device: torch.device) -> ModuleType:
-    """Return a module whose function ``probe`` has computed something on a device.
+def load(module: str, device: torch.device) -> ModuleType:
+    """Return a module whose function ``self_test`` has computed something on a device.
 
     Raises:
         ImportError: the library that compiles the module is not installed.
@@ -29,21 +29,21 @@ def kernels(module: str, device: torch.device) -> ModuleType:
     """
     # Imported lazily: every ns-* command imports the model, and numba is slow to import.
     loaded = import_module(module)
-    loaded.probe(device)
+    loaded.self_test(device)
     return loaded
 
 
 @lru_cache
-def kernels_or_none(module: str, device: torch.device) -> ModuleType | None:
-    """Return a module as `kernels` does. If it does not work, say why and return None."""
+def try_load(module: str, device: torch.device) -> ModuleType | None:
+    """Return a module as :func:`load` does. If it does not work, say why and return None."""
     try:
-        return kernels(module, device)
+        return load(module, device)
     except (ImportError, RuntimeError) as error:
-        _say(f"[yellow]Plain torch computes what compiled kernels compute faster: {error}.")
+        _warn_once(f"[yellow]Plain torch computes what compiled kernels compute faster: {error}.")
         return None
 
 
 # Modules that need the same library fail for the same reason, which is said once.
 @lru_cache
-def _say(line: str) -> None:
+def _warn_once(line: str) -> None:
     CONSOLE.print(line, soft_wrap=True)
