@@ -8,7 +8,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -20,8 +20,8 @@ from aenerf_ns.files.output_paths import creating, require_run, require_writable
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
+    from aenerf_ns.report.comparison import Protocol
     from aenerf_ns.report.measuring import RunReport
-    from aenerf_ns.report.protocol import Protocol
 
 
 @dataclass
@@ -43,10 +43,16 @@ class ReportCommand:
         require_writable(self.output / "report.html")
         for run in self.runs:
             require_run(run)
-        from aenerf_ns.report.comparison import paired_differences, views_left_out
+        from aenerf_ns.report.comparison import (
+            paired_differences,
+            protocol_differences,
+            read_protocol,
+            shared_views,
+            views_left_out,
+        )
         from aenerf_ns.report.measuring import measure_run
         from aenerf_ns.report.page import make_page
-        from aenerf_ns.report.protocol import protocol_differences, read_protocol, shared_views
+        from aenerf_ns.report.sections import VIEW_COLUMNS, view_rows
 
         # Measuring takes long, and only one run at a time is sure to fit in the memory. So the runs are opened twice.
         opened: list[tuple[TrainerConfig, Protocol]] = []
@@ -78,7 +84,10 @@ class ReportCommand:
         page = make_page(reports, paired, left_out, mixed, shared)
         with creating(self.output / "report.html"):
             (self.output / "report.html").write_text(page, "utf8")
-            _write_views(self.output / "views.csv", reports)
+            with (self.output / "views.csv").open("w", encoding="utf8", newline="") as file:
+                table = csv.DictWriter(file, ("run", "file", *VIEW_COLUMNS), lineterminator="\n")
+                table.writeheader()
+                table.writerows(view_rows(reports))
             figures = {
                 "runs": [report.as_json() for report in reports],
                 "paired_differences": paired,
@@ -98,20 +107,3 @@ def _names(configs: Sequence[TrainerConfig]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [f"{number}: {'/'.join(map(str, part))}" for number, part in enumerate(parts, start=1)]
-
-
-def _write_views(path: Path, reports: Sequence[RunReport]) -> None:
-    """Write a line for each view of each run."""
-    metrics = ("psnr", "ssim", "lpips")
-    protocols = ("placed", "refined")
-    with path.open("w", encoding="utf8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(
-            ["run", "file", "time_ns", "camera_speed", "camera_turn_rate_degrees"]
-            + [f"{metric}_{protocol}" for protocol in protocols for metric in metrics]
-        )
-        for report in reports:
-            for view in report.views:
-                figures: list[Any] = [view.get(protocol, {}).get(name) for protocol in protocols for name in metrics]
-                known = [view[name] for name in ("file", "time_ns", "camera_speed", "camera_turn_rate_degrees")]
-                rows.writerow([report.name, *known, *figures])

@@ -18,7 +18,14 @@ from plotly.offline import get_plotlyjs
 
 from aenerf_ns.report import plots
 from aenerf_ns.report.measuring import RunReport
-from aenerf_ns.report.sections import METRIC_DIGITS, describe_events, describe_run, state_verdict, view_columns
+from aenerf_ns.report.sections import (
+    METRIC_DIGITS,
+    VIEW_COLUMNS,
+    describe_events,
+    describe_run,
+    state_verdict,
+    view_rows,
+)
 from aenerf_ns.report.view_pictures import ERROR_RANGE
 
 # Maximum width of a picture in pixels, and JPEG quality.
@@ -46,6 +53,7 @@ def make_page(
     )
     environment.filters |= {"plot": _plot, "picture": _picture, "digits": lambda value, digits: f"{value:.{digits}f}"}
     template = environment.from_string(files("aenerf_ns.report").joinpath("page.html").read_text("utf8"))
+    rows = view_rows(reports)
     different_data: dict[tuple, RunReport] = {}
     for report in reports:
         different_data.setdefault((report.config["data"], *report.config["window_ns"]), report)
@@ -55,7 +63,8 @@ def make_page(
         different_data=different_data.values(),
         # Runs without a view in common are shown one after the other.
         view_groups=[reports] if shared else [[report] for report in reports],
-        view_columns=view_columns(reports),
+        view_rows=rows,
+        view_columns={name: VIEW_COLUMNS[name] for name in VIEW_COLUMNS if any(row[name] is not None for row in rows)},
         paired=paired,
         left_out=left_out,
         mixed=mixed,

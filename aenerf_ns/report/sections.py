@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from aenerf_ns.report.measuring import RunReport
 
 METRIC_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
 """Decimals of the image metrics."""
+VIEW_COLUMNS = {
+    "time_ns": ("time (s)", 3, 1e-9),
+    "camera_speed": ("camera speed (units/s)", 3, 1),
+    "camera_turn_rate_degrees": ("turn rate (°/s)", 1, 1),
+    **{f"{name}_placed": (name.upper(), digits, 1) for name, digits in METRIC_DIGITS.items()},
+    **{f"{name}_refined": (f"{name.upper()}, refined", digits, 1) for name, digits in METRIC_DIGITS.items()},
+}
+"""Figures of a view: the heading of their column, their decimals, and the factor that they are shown with."""
 _UNKNOWN = "not recorded"
 
 
@@ -97,36 +103,14 @@ def describe_events(report: RunReport) -> str:
     return f"{events.num_events:,} events in {seconds:.3f} s, {share:.1%} positive. {described}"
 
 
-@dataclass(frozen=True)
-class ViewColumn:
-    """A column of numbers in the table of views.
-
-    Attributes:
-        name: the heading.
-        digits: decimals.
-        value: reads the number of a view, None where it is not known.
-    """
-
-    name: str
-    digits: int
-    value: Callable[[Mapping[str, Any]], float | None]
-
-
-def view_columns(reports: Sequence[RunReport]) -> list[ViewColumn]:
-    """Return the columns of the table of views, but those that are empty in every line."""
-    columns = [
-        ViewColumn("time (s)", 3, lambda view: None if view["time_ns"] is None else view["time_ns"] * 1e-9),
-        *(
-            ViewColumn(f"{metric.upper()}{heading}", digits, partial(_read_metric, protocol, metric))
-            for protocol, heading in (("placed", ""), ("refined", ", refined"))
-            for metric, digits in METRIC_DIGITS.items()
-        ),
-        ViewColumn("camera speed (units/s)", 3, lambda view: view["camera_speed"]),
-        ViewColumn("turn rate (°/s)", 1, lambda view: view["camera_turn_rate_degrees"]),
-    ]
-    views = [view for report in reports for view in report.views]
-    return [column for column in columns if any(column.value(view) is not None for view in views)]
-
-
-def _read_metric(protocol: str, metric: str, view: Mapping[str, Any]) -> float | None:
-    return view.get(protocol, {}).get(metric)
+def view_rows(reports: Sequence[RunReport]) -> list[dict[str, Any]]:
+    """List the test views of all runs with their figures, None where one is not known."""
+    rows = []
+    for report in reports:
+        for view in report.views:
+            row = {"run": report.name}
+            row |= {name: view[name] for name in ("file", "time_ns", "camera_speed", "camera_turn_rate_degrees")}
+            for protocol in ("placed", "refined"):
+                row |= {f"{name}_{protocol}": view.get(protocol, {}).get(name) for name in METRIC_DIGITS}
+            rows.append(row)
+    return rows

@@ -22,13 +22,18 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
-from aenerf_ns.report.comparison import confidence_interval, paired_differences, views_left_out
+from aenerf_ns.report.comparison import (
+    Protocol,
+    confidence_interval,
+    paired_differences,
+    protocol_differences,
+    shared_views,
+    views_left_out,
+)
 from aenerf_ns.report.measuring import RunReport
 from aenerf_ns.report.pair_residuals import average_by_length, average_by_tile
-from aenerf_ns.report.poses import RunPoses, measure_poses
-from aenerf_ns.report.protocol import Protocol, protocol_differences, shared_views
+from aenerf_ns.report.poses import RunPoses, correction_components, evo_errors, measure_poses
 from aenerf_ns.report.run_files import TrainingRecord, read_record, read_scalars
-from aenerf_ns.report.trajectory_errors import correction_components, evo_errors
 from aenerf_ns.report.view_pictures import choose_views
 
 SECOND = 10**9
