@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import ast
 import graphlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers.source_files import imported_names
 
 ROOT = Path(__file__).parents[1]
 PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 
 # The floors, bottom up, and what each stands on. A folder may also use itself.
-MAY_USE = {
+MAY_USE: dict[str, set[str]] = {
     "errors": set(),
     "atomic_write": set(),
     "progress": set(),
@@ -44,25 +44,11 @@ MAY_USE = {
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},
     "cli": {
-        "errors",
-        "progress",
-        "open3d_import",
-        "events",
-        "reconstruction",
-        "camera",
-        "files",
-        "recording",
-        "poses_from_frames",
-        "method",
-        "evaluation",
-        "training",
-        "checking",
-        "export",
-        "report",
-        "simulator",
+        "errors", "progress", "open3d_import", "events", "reconstruction", "camera", "files", "recording",
+        "poses_from_frames", "method", "evaluation", "training", "checking", "export", "report", "simulator",
         "dataparsers",
     },
-}
+}  # fmt: skip
 
 
 def _modules() -> Iterator[tuple[str, Path]]:
@@ -75,24 +61,12 @@ def _modules() -> Iterator[tuple[str, Path]]:
             yield place, path
 
 
-def _imported(path: Path) -> set[str]:
-    """The folders and top-level files of the package that a source file imports."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.module == "aenerf_ns":
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("aenerf_ns."):
-            names.add(node.module.split(".")[1])
-        elif isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("aenerf_ns.")}
-    return names
-
-
 @pytest.mark.parametrize("place", MAY_USE)
 def test_imports_are_allowed(place: str) -> None:
     for own, path in _modules():
         if own == place:
-            assert _imported(path) - {place} <= MAY_USE[place], path
+            used = {name.split(".")[1] for name in imported_names(path) if name.startswith("aenerf_ns.")}
+            assert used - {place} <= MAY_USE[place], path
 
 
 def test_floors_are_ordered_and_complete() -> None:
@@ -108,26 +82,17 @@ def test_modules_form_no_circle() -> None:
     for _, path in _modules():
         parts = path.relative_to(ROOT).with_suffix("").parts
         paths[".".join(parts[parts[0] == "aenerf_ns" :]).removesuffix(".__init__")] = path
-    imported: dict[str, set[str]] = {}
-    for name, path in paths.items():
-        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-        named = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-        for node in nodes:
-            if isinstance(node, ast.ImportFrom):
-                named |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
-        imported[name] = {module.removeprefix("aenerf_ns.") for module in named} & paths.keys() - {name}
+    imported = {
+        name: {module.removeprefix("aenerf_ns.") for module in imported_names(path)} & paths.keys() - {name}
+        for name, path in paths.items()
+    }
     # Raises a CycleError that names the modules of the circle.
     graphlib.TopologicalSorter(imported).prepare()
 
 
 def test_benchmarks_are_not_imported() -> None:
     for _, path in _modules():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            else:
-                names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            assert "benchmarks" not in {name.split(".")[0] for name in names}, path
+        assert "benchmarks" not in {name.split(".")[0] for name in imported_names(path)}, path
 
 
 def test_dataparsers_holds_formats_only() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import email.message
 import os
 import re
@@ -14,6 +13,7 @@ from importlib.metadata import entry_points, packages_distributions
 from pathlib import Path
 
 import pytest
+from helpers.source_files import imported_names
 
 import aenerf_ns
 from aenerf_ns.dataparsers.formats import FORMATS
@@ -35,21 +35,20 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     return zipfile.ZipFile(next(folder.glob("*.whl")))
 
 
+def _sources(*folders: str) -> list[Path]:
+    return [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+
+
 def test_wheel_holds_the_package_only(wheel: zipfile.ZipFile) -> None:
     names = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert {name.split("/")[0] for name in names} == {"aenerf_ns"}
-    sources = {
-        f"aenerf_ns/{path.relative_to(ROOT / folder).as_posix()}"
-        if folder == "aenerf_ns"
-        else f"aenerf_ns/{folder}/{path.relative_to(ROOT / folder).as_posix()}"
-        for folder in ("aenerf_ns", "dataparsers", "method_configs")
-        for path in (ROOT / folder).rglob("*.py")
-    }
+    sources = {path.relative_to(ROOT).as_posix() for path in _sources("aenerf_ns")}
+    sources |= {f"aenerf_ns/{path.relative_to(ROOT).as_posix()}" for path in _sources("dataparsers", "method_configs")}
     assert names == sources | {"aenerf_ns/py.typed", "aenerf_ns/report/page.html"}
     assert any(name.endswith("LICENSE") for name in wheel.namelist())
 
 
-def test_the_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
+def test_entry_points_exist_in_the_wheel(wheel: zipfile.ZipFile) -> None:
     text = next(wheel.read(name).decode() for name in wheel.namelist() if name.endswith("entry_points.txt"))
     targets = [line.split("=")[1].strip() for line in text.splitlines() if "=" in line]
     assert len(targets) == 24
@@ -62,14 +61,8 @@ def _imported(paths: Iterable[Path]) -> set[str]:
     """The distributions that source files import, outside the standard library and this repository."""
     paths = list(paths)
     own = {"aenerf_ns", "benchmarks", "helpers", *(path.stem for path in paths)}
-    modules = set()
-    for path in paths:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                modules |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and not node.level:
-                modules.add(node.module or "")
-    tops = {module.split(".")[0] for module in modules} - own - set(sys.stdlib_module_names)
+    tops = {name.split(".")[0] for path in paths for name in imported_names(path)}
+    tops -= own | set(sys.stdlib_module_names)
     by_module = packages_distributions()
     # Some modules are shared: cv2 by two distributions, backports by any number.
     return {"/".join(sorted({_normal(name) for name in by_module.get(top, [top])})) for top in tops}
@@ -94,27 +87,27 @@ def _normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def test_every_package_that_is_imported_is_declared(wheel: zipfile.ZipFile) -> None:
-    package = [path for name in ("aenerf_ns", "dataparsers", "method_configs") for path in (ROOT / name).rglob("*.py")]
-    around = [path for name in ("benchmarks", "scripts", "tests") for path in (ROOT / name).rglob("*.py")]
+def test_imported_packages_are_declared(wheel: zipfile.ZipFile) -> None:
+    package = _sources("aenerf_ns", "dataparsers", "method_configs")
+    around = _sources("benchmarks", "scripts", "tests")
     for paths, declared in ((package, _declared(wheel, ("test", "docs", "dev"))), (around, _declared(wheel))):
         undeclared = {imported for imported in _imported(paths) if not set(imported.split("/")) & declared}
         assert not undeclared, f"imported but not in pyproject.toml: {undeclared}"
 
 
-def test_the_version_is_stated_alike(wheel: zipfile.ZipFile) -> None:
+def test_version_is_stated_alike(wheel: zipfile.ZipFile) -> None:
     version = aenerf_ns.__version__
     assert _metadata(wheel)["Version"] == version
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert f"\n## {version} " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
-def test_the_dataparsers_are_registered() -> None:
+def test_dataparsers_are_registered() -> None:
     names = {point.name for point in entry_points(group="nerfstudio.dataparser_configs")}
     assert {"event-data", *FORMATS} <= names
 
 
-def test_importing_the_package_costs_nothing() -> None:
+def test_importing_costs_nothing() -> None:
     # Nerfstudio imports it at every command, whatever the method; so it must bring in none of the heavy packages.
     code = "import sys, aenerf_ns; print({'torch', 'numba', 'numpy', 'cv2', 'h5py', 'nerfstudio'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd="/")
@@ -132,14 +125,14 @@ def test_registered_modules_defer_heavy_imports() -> None:
     assert done.stdout.strip().splitlines()[-1] == "set()"
 
 
-def test_a_missing_ffmpeg_package_breaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ffmpeg_package_breaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     provide_ffmpeg()
     assert os.environ["PATH"] == ""
 
 
-def test_ffmpeg_is_provided_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ffmpeg_is_provided(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     provide_ffmpeg()
     done = subprocess.run(["ffmpeg", "-version"], capture_output=True, text=True, check=True, env=dict(os.environ))

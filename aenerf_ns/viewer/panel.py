@@ -28,9 +28,9 @@ from aenerf_ns.viewer.recording_view import RecordingView, png
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
 
-# While training, drawing takes at most this share of the time, and happens at most once in so many seconds: a browser
-# is then sent at most 25 KB a second.
-_SHARE_OF_TIME, _SHORTEST_INTERVAL = 0.01, 2.0
+# Maximum share of the training time that drawing takes, and minimum seconds between two drawings: a browser is sent at
+# most 25 KB a second.
+_MAX_TIME_SHARE, _MIN_INTERVAL = 0.01, 2.0
 _COLORS = {"estimated": (255, 140, 30), "corrected": (60, 220, 90), "true": (255, 255, 255)}
 # Steps in which the slider goes through the recording by itself, and the seconds between two of them.
 _PLAYED_STEPS, _PLAYED_INTERVAL = 120, 0.5
@@ -42,14 +42,17 @@ class RecordingPanel(nn.Module):
     It is a module without parameters, because Nerfstudio looks for elements in modules only.
 
     Args:
-        view: of the run.
+        view: what to show of the run.
+
+    Attributes:
+        next_draw_time: the monotonic clock's seconds from which on a training step may draw.
     """
 
     def __init__(self, view: RecordingView) -> None:
         super().__init__()
-        self._view = view
+        self.view = view
         self._viewer: Viewer | None = None
-        self._due = 0.0
+        self.next_draw_time = 0.0
         # State that the picture and the points were last made for, so that a slider's moves do not queue up.
         self._drawn: tuple[Any, ...] | None = None
         # Not the middle of the recording: a camera of the training cameras, evenly spread, would hide the scene.
@@ -112,7 +115,7 @@ class RecordingPanel(nn.Module):
             SystemExit: with one clear line, when the events cannot be used.
         """
         with errors_as_one_line():
-            self._view.prepare()
+            self.view.prepare()
         self._viewer = viewer
         viewer.viser_server.on_client_connect(self._welcome)
         self._show_trajectories()
@@ -123,11 +126,11 @@ class RecordingPanel(nn.Module):
         if self._viewer is None or not self._viewer.render_statemachines:
             return
         began = time.monotonic()
-        if began < self._due:
+        if began < self.next_draw_time:
             return
         self.draw()
         ended = time.monotonic()
-        self._due = ended + max(_SHORTEST_INTERVAL, (ended - began) * (1 / _SHARE_OF_TIME - 1))
+        self.next_draw_time = ended + max(_MIN_INTERVAL, (ended - began) * (1 / _MAX_TIME_SHARE - 1))
 
     def draw(self) -> None:
         """Draw everything for the run's present state."""
@@ -147,21 +150,21 @@ class RecordingPanel(nn.Module):
             return
         self._drawn = wanted
         seconds, count, in_scene, follows = wanted
-        pose = self._view.pose(seconds)
+        pose = self.view.pose(seconds)
         if follows and is_new:
             for client in self._viewer.viser_server.get_clients().values():
                 self._place(client, pose)
-                client.camera.fov = self._view.vertical_field_of_view
-        events = self._view.events(seconds, count)
+                client.camera.fov = self.view.vertical_field_of_view
+        events = self.view.events(seconds, count)
         if is_new:
             # Training changes no events.
-            self.events_picture.content = self._view.described_picture(events, seconds)
+            self.events_picture.content = self.view.described_picture(events, seconds)
         scene = self._viewer.viser_server.scene
-        camera = self._view.camera
+        camera = self.view.camera
         wxyz, position = self._in_viewer(pose)
         scene.add_camera_frustum(
             "/recording/event_camera",
-            fov=self._view.vertical_field_of_view,
+            fov=self.view.vertical_field_of_view,
             aspect=camera.width / camera.height * camera.fy / camera.fx,
             scale=3 * self._viewer.config.camera_frustum_scale,
             color=_COLORS["corrected"],
@@ -170,7 +173,7 @@ class RecordingPanel(nn.Module):
             # A view from within it is hidden by its lines. The first view is.
             visible=not follows and seconds != self._first_time,
         )
-        points, colors = self._view.points(events) if in_scene else (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        points, colors = self.view.points(events) if in_scene else (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
         scene.add_point_cloud(
             "/recording/events",
             points * self._scale(),
@@ -198,8 +201,8 @@ class RecordingPanel(nn.Module):
 
     def _welcome(self, client: ClientHandle) -> None:
         """Show a browser the scene from a trained pose, and draw for it what has changed while none looked on."""
-        self._place(client, self._view.pose(self.at_time.value))
-        self._due = 0.0
+        self._place(client, self.view.pose(self.at_time.value))
+        self.next_draw_time = 0.0
         # In a thread, because a training step may run, and viser holds a lock here that the step's end may wait for.
         threading.Thread(target=self._draw_between_steps, daemon=True).start()
         # It ended if no browser looked on for a moment, as while a page is loaded anew.
@@ -218,24 +221,24 @@ class RecordingPanel(nn.Module):
         if self._viewer is None:
             return
         visible = self.trajectories.value
-        for name, places in self._view.lines().items():
-            state = (visible, places.tobytes())
+        for name, points in self.view.lines().items():
+            state = (visible, points.tobytes())
             if self._lines.get(name) == state:
                 continue
             self._lines[name] = state
             self._viewer.viser_server.scene.add_spline_catmull_rom(
                 f"/recording/trajectory_{name}",
-                places * self._scale(),
+                points * self._scale(),
                 line_width=2.0,
                 color=_COLORS[name],
-                segments=2 * len(places),
+                segments=2 * len(points),
                 visible=visible,
             )
 
     def _show_figures(self) -> None:
         if self._viewer is not None:
             # Nerfstudio's own line of the step stands still where rendering takes long.
-            self.accuracy.content = f"**Step** {self._viewer.step:,}\n\n{self._view.figures()}"
+            self.accuracy.content = f"**Step** {self._viewer.step:,}\n\n{self.view.figures()}"
 
     def _follow(self) -> None:
         """Begin or end to look through the event camera."""
@@ -254,9 +257,9 @@ class RecordingPanel(nn.Module):
 
     def _run_on(self) -> None:
         while self.camera_plays.value and self._viewer is not None and self._viewer.render_statemachines:
-            later = self.at_time.value + self._view.duration / _PLAYED_STEPS
+            later = self.at_time.value + self.view.duration / _PLAYED_STEPS
             # The element's hook, called by this, draws.
-            self.at_time.value = later if later <= self._view.duration else 0.0
+            self.at_time.value = later if later <= self.view.duration else 0.0
             time.sleep(_PLAYED_INTERVAL)
 
     def _snapshot(self, client: ClientHandle) -> tuple[str, bytes]:
@@ -279,7 +282,7 @@ class RecordingPanel(nn.Module):
 
     def _trajectory_file(self, _: ClientHandle) -> tuple[str, bytes]:
         assert self._viewer is not None
-        return f"trajectory_{self._viewer.step:06}.txt", self._view.trajectory_file()
+        return f"trajectory_{self._viewer.step:06}.txt", self.view.trajectory_file()
 
 
 class _Control(ViewerControl):

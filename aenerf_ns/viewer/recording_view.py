@@ -23,12 +23,12 @@ from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import world_rays
 from aenerf_ns.recording.dataset import EventDataset
 
-# A line of so many places looks smooth and takes 5 KB.
-_MOST_PLACES = 200
-# As many points take 30 KB, and a fraction of a training step to place.
-_MOST_POINTS = 2000
-# Events whose ray meets less than this much matter hang nowhere.
-_LEAST_ACCUMULATION = 0.5
+# A line of 200 points looks smooth and takes 5 KB.
+_MAX_LINE_POINTS = 200
+# 2000 points take 30 KB, and a fraction of a training step to compute.
+_MAX_POINTS = 2000
+# Events whose ray is less opaque have no point.
+_MIN_OPACITY = 0.5
 # Points this much nearer than the surface are not half hidden by it.
 _IN_FRONT = 0.99
 _PICTURE_WIDTH = 280
@@ -67,7 +67,7 @@ class RecordingView:
 
     @torch.no_grad()
     def lines(self) -> dict[str, NDArray[np.float64]]:
-        """Return places (N, 3) along the ``estimated``, ``corrected`` and, where it is known, ``true`` trajectory.
+        """Return points (N, 3) along the ``estimated``, ``corrected`` and, where it is known, ``true`` trajectory.
 
         They are in the scene, whose frame is that of the corrected poses: the true trajectory is mapped there.
         """
@@ -76,7 +76,7 @@ class RecordingView:
         lines = {"estimated": estimated, "corrected": corrected}
         if correction.has_ground_truth:
             lines["true"] = correction.alignment().inverse()(reference)
-        count = min(len(estimated), _MOST_PLACES)
+        count = min(len(estimated), _MAX_LINE_POINTS)
         index = torch.linspace(0, len(estimated) - 1, count, dtype=torch.float64).round().long()
         return {name: poses[index.to(poses.device), :, 3].cpu().numpy() for name, poses in lines.items()}
 
@@ -127,11 +127,11 @@ class RecordingView:
 
     @torch.no_grad()
     def points(self, events: EventStream) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return places (N, 3) in the scene of at most 2000 of the events, and their colors (N, 3).
+        """Return points (N, 3) in the scene of at most 2000 of the events, and their colors (N, 3).
 
         An event lies on the surface that its pixel sees from the corrected pose of its time, 1 % nearer to the camera.
         """
-        shown = events.subsample(_MOST_POINTS)
+        shown = events.subsample(_MAX_POINTS)
         device = self._model.device
         seconds = self._model.camera_optimizer.trajectory.seconds(torch.from_numpy(shown.t).to(device))
         pixels = torch.from_numpy(shown.y.astype(np.int64) * self.camera.width + shown.x).to(device)
@@ -146,32 +146,29 @@ class RecordingView:
             camera_indices=torch.zeros((count, 1), dtype=torch.long, device=device),
         )
         depth, accumulation = self._model.render_rays(rays, "depth", "accumulation")
-        seen = (accumulation[:, 0] > _LEAST_ACCUMULATION).cpu().numpy()
-        places = (rays.origins + _IN_FRONT * depth * rays.directions).cpu().numpy()
+        seen = (accumulation[:, 0] > _MIN_OPACITY).cpu().numpy()
+        points = (rays.origins + _IN_FRONT * depth * rays.directions).cpu().numpy()
         colors = np.where(shown.p[:, None] > 0, _POSITIVE_COLOR, _NEGATIVE_COLOR).astype(np.uint8)
-        return places[seen], colors[seen]
+        return points[seen], colors[seen]
 
     def figures(self) -> str:
         """Return pose errors, contrast thresholds and the state of the color correction, in Markdown."""
-        return "\n\n".join([self._pose_figures(), self._threshold_figures(), self._color_figures()])
+        color = f"**Color correction** {self._model.color_correction.description}"
+        return "\n\n".join([self._pose_figures(), self._threshold_figures(), color])
 
     def _pose_figures(self) -> str:
         correction = self._model.camera_optimizer
         errors = compare_with_ground_truth(correction, self._dataset.scene)
         if errors is not None:
-            rows = [
-                "| pose error | given | corrected |",
-                "|---|---|---|",
-                *(
-                    f"| {label} | {errors['estimated'][name]:{form}} | {errors['corrected'][name]:{form}} |"
-                    for label, name, form in (
-                        ("rotation (°)", "rotation_error_degrees", ".3f"),
-                        ("translation", "translation_error", ".4g"),
-                        ("ATE, Sim(3)", "ate_rmse_sim3", ".4g"),
-                    )
-                ),
-            ]
-            return "\n".join(rows)
+            lines = ["| pose error | given | corrected |", "|---|---|---|"]
+            for label, name, form in (
+                ("rotation (°)", "rotation_error_degrees", ".3f"),
+                ("translation", "translation_error", ".4g"),
+                ("ATE, Sim(3)", "ate_rmse_sim3", ".4g"),
+            ):
+                before, after = errors["estimated"][name], errors["corrected"][name]
+                lines.append(f"| {label} | {before:{form}} | {after:{form}} |")
+            return "\n".join(lines)
         if not correction.is_learned:
             return "**Poses** as given; the true ones are not known."
         sizes: dict[str, Tensor | float] = {}
@@ -188,9 +185,6 @@ class RecordingView:
         text = f"**Thresholds** C⁺ {positive:.4g}{' (learned)' if ratio is not None else ''}, C⁻ {negative:.4g}"
         period = learned.get("refractory_period_ns")
         return text if period is None else f"{text}; refractory period {period / 1e3:.4g} µs (learned)"
-
-    def _color_figures(self) -> str:
-        return f"**Color correction** {self._model.color_correction.description}"
 
     @torch.no_grad()
     def trajectory_file(self) -> bytes:

@@ -73,7 +73,7 @@ def assert_same(one: Recording, other: Recording) -> None:
 
 
 @pytest.mark.parametrize("box", [None, np.array([[-1.0, -2.0, 0.0], [3.0, 4.0, 5.0]])])
-def test_a_native_dataset_converts_to_itself(box: np.ndarray | None, tmp_path: Path) -> None:
+def test_native_dataset_converts_to_itself(box: np.ndarray | None, tmp_path: Path) -> None:
     data = write_native(tmp_path / "made", box)
     noisy = perturb(make_trajectory(), 1.0, 0.02, 0.2, 0)
     write_tum_trajectory(data / "trajectory_estimated.txt", noisy)
@@ -105,7 +105,7 @@ def test_text_files_convert(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*"))
 
 
-def test_the_real_recording_converts(slider_depth: Path, tmp_path: Path) -> None:
+def test_real_recording_converts(slider_depth: Path, tmp_path: Path) -> None:
     before = EcdDataParserConfig(data=slider_depth).setup().read_recording()
     assert_same(before, convert(slider_depth, tmp_path / "converted"))
 
@@ -129,7 +129,7 @@ def test_frame_camera_and_images_are_carried_over(tmp_path: Path) -> None:
     assert_same(before, convert(data, tmp_path / "converted"))
 
 
-def test_an_image_with_alpha_is_put_on_its_background(tmp_path: Path) -> None:
+def test_alpha_is_composed_with_the_background(tmp_path: Path) -> None:
     recording = NativeDataParserConfig(data=write_native(tmp_path / "made")).setup().read_recording()
     pixels = np.zeros((4, 6, 4), np.uint8)
     pixels[:, 3:] = (255, 0, 0, 255)
@@ -149,7 +149,7 @@ def test_an_image_with_alpha_is_put_on_its_background(tmp_path: Path) -> None:
     assert written[0, 0].tolist() == [204, 102, 204]
 
 
-def test_filters_cut_events_camera_poses_and_images(tmp_path: Path) -> None:
+def test_filters_cut_everything(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
     before = NativeDataParserConfig(data=data).setup().read_recording()
     start, end = START + 100_000_000, START + 1_450_000_000
@@ -246,7 +246,7 @@ def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
         ({"poses": "colmap", "end_time_ns": START + 1}, "1 frames; poses can be estimated from two"),
     ],
 )
-def test_options_that_cannot_be_met_are_one_clear_line(options: dict, message: str, tmp_path: Path) -> None:
+def test_impossible_options_are_one_line(options: dict, message: str, tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
     with pytest.raises(DataError, match=message) as error:
         convert(data, tmp_path / "converted", **options)
@@ -275,24 +275,25 @@ def test_malformed_datasets_leave_nothing(change: Callable[[Path], object], tmp_
 def test_impossible_outputs_are_refused(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
     before = sorted((path, path.stat().st_mtime_ns) for path in data.rglob("*"))
-    with pytest.raises(DataError, match="the folder exists already; remove it"):
-        convert(data, data)
+    for source, output, problem in (
+        (data, data, "the folder exists already"),
+        (data, data / "transforms.json" / "below", "it cannot be created"),
+        (tmp_path, tmp_path / "converted", "no known format of recordings"),
+    ):
+        with pytest.raises(DataError, match=problem):
+            convert(source, output)
     assert sorted((path, path.stat().st_mtime_ns) for path in data.rglob("*")) == before
-    with pytest.raises(DataError, match="it cannot be created"):
-        convert(data, data / "transforms.json" / "below")
-    with pytest.raises(DataError, match="no known format of recordings"):
-        convert(tmp_path, tmp_path / "converted")
 
 
 def test_real_command_converts(tmp_path: Path) -> None:
-    data = write_ecd(tmp_path / "made")
-    options = ("--format-options", "refractory-period-ns=7")
-    printed = run("aenerf", "convert", "--data", data, "--output", "good", *options, cwd=tmp_path)
+    write_ecd(tmp_path / "made")
+    command = "aenerf convert --data made --output good --format-options refractory-period-ns=7"
+    printed = run(*command.split(), cwd=tmp_path)
     assert "4 of 4 events, 5 poses, images: 4 train, 2 val, 2 test." in printed
     assert NativeDataParserConfig(data=tmp_path / "good").setup().read_recording().sensor.refractory_period == 7
 
 
-def test_commands_print_one_command_to_train_with(tmp_path: Path) -> None:
+def test_print_the_command_to_train_with(tmp_path: Path) -> None:
     metric, scaled = write_ecd(tmp_path / "metric"), write_native(tmp_path / "scaled")
     for source, scale in ((metric, False), (scaled, True)):
         folder = tmp_path / f"made {source.name}"
@@ -305,7 +306,7 @@ def test_commands_print_one_command_to_train_with(tmp_path: Path) -> None:
         assert parser.config.auto_scale_poses is scale
 
 
-def test_a_killed_command_leaves_no_dataset(tmp_path: Path) -> None:
+def test_killed_command_leaves_no_dataset(tmp_path: Path) -> None:
     small, data = write_native(tmp_path / "small"), write_native(tmp_path / "made")
     n = 8_000_000
     with Hdf5EventWriter(data / "events.h5") as writer:

@@ -175,7 +175,7 @@ def test_video_without_poses_becomes_a_recording(frames: Path, camchain: Path, t
     assert sorted(path.name for path in (tmp_path / "no_lens").iterdir()) == ["events.h5", "images", "images.txt"]
 
 
-def test_a_frame_of_another_size_leaves_nothing_behind(frames: Path, tmp_path: Path) -> None:
+def test_frame_of_another_size_leaves_nothing(frames: Path, tmp_path: Path) -> None:
     Image.fromarray(np.zeros((5, 5), np.uint8)).save(frames / "7.png")
     with pytest.raises(DataError, match="frame 7 has 5 x 5 pixels"):
         simulate(tmp_path / "made" / "dataset", video=frames)
@@ -196,20 +196,13 @@ LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
         ((), {"intrinsics": (0.0, 21.0, 11.5, 7.5)}, "--intrinsics: fx must be from"),
         ((), {"pose_noise_degrees": 1.0}, "without poses to add it to; give --trajectory"),
         ((), {"positive_contrast_threshold": 0.0}, "positive_contrast_threshold must be from"),
-        ((), {"max_displacement": 0.0}, "--max-displacement: 0.0 is out of range"),
         ((), {"positive_contrast_threshold": 9.0, "negative_contrast_threshold": 9.0}, "no pixel changes by a"),
-        ((), {"frame_rate": 0.0}, "--frame-rate: 0.0 is out of range"),
     ],
 )
 def test_contradicting_options_are_refused(
-    files: tuple[str, ...],
-    options: dict[str, Any],
-    message: str,
-    frames: Path,
-    poses: Path,
-    camchain: Path,
+    files: tuple[str, ...], options: dict[str, Any], message: str, frames: Path, poses: Path, camchain: Path,
     tmp_path: Path,
-) -> None:
+) -> None:  # fmt: skip
     paths = {"trajectory": poses, "calibration": camchain}
     with pytest.raises(DataError, match=message) as told:
         simulate(tmp_path / "out", video=frames, **{name: paths[name] for name in files}, **options)

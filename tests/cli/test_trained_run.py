@@ -32,13 +32,13 @@ def report_of_one(run: Path, output: Path) -> ReportCommand:
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.config.method_name)
-def test_the_configurations_of_the_methods_are_known(method: object, tmp_path: Path) -> None:
+def test_configurations_of_methods_are_known(method: object, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(yaml.dump(replace(method.config, data=tmp_path)))
     require_known_names(tmp_path / "config.yml")
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_configurations_of_the_formats_are_known(name: str, tmp_path: Path) -> None:
+def test_configurations_of_formats_are_known(name: str, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(yaml.dump(type(FORMATS[name])(data=tmp_path)))
     require_known_names(tmp_path / "config.yml")
 
@@ -84,7 +84,7 @@ def test_foreign_names_are_refused(
 @pytest.mark.parametrize(
     "text", ["!!python/object:aenerf_ns.trainer.Config {}", "a: !!python/name:aenerf_ns.model.Model"]
 )
-def test_a_run_of_another_version_is_told_as_such(text: str, tmp_path: Path) -> None:
+def test_run_of_another_version_is_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(text)
     with pytest.raises(
         DataError, match=r"line 1 names aenerf_ns\S+, which this version does not have; open it with the version"
@@ -105,7 +105,7 @@ def test_a_run_of_another_version_is_told_as_such(text: str, tmp_path: Path) -> 
         (b"a: !!int many", "not the config.yml of a run"),
     ],
 )
-def test_what_is_no_configuration_is_one_line(contents: bytes, problem: str, tmp_path: Path) -> None:
+def test_other_files_are_one_line(contents: bytes, problem: str, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_bytes(contents)
     with pytest.raises(DataError, match=problem) as refused:
         require_known_names(tmp_path / "config.yml")
@@ -121,7 +121,7 @@ def damaged(run: Path, name: str, old: str, new: str) -> Path:
     return run
 
 
-def test_a_run_with_values_of_a_wrong_kind_is_one_line(tmp_path: Path) -> None:
+def test_values_of_a_wrong_kind_are_one_line(tmp_path: Path) -> None:
     run = train_small_model(tmp_path, "run", 2).base_dir
     (checkpoint,) = run.glob("nerfstudio_models/*")
     for old, new, problem in (

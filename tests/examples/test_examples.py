@@ -45,17 +45,10 @@ def test_written_datasets_are_read(
 def test_smallest_transforms(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     camera = json.loads((folder / "transforms.json").read_text())["event_camera"]
-    required = [
-        "file",
-        "width",
-        "height",
-        "fl_x",
-        "fl_y",
-        "cx",
-        "cy",
-        "positive_contrast_threshold",
+    required = (
+        "file", "width", "height", "fl_x", "fl_y", "cx", "cy", "positive_contrast_threshold",
         "negative_contrast_threshold",
-    ]
+    )  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps({"event_camera": {name: camera[name] for name in required}}))
     assert len(EventDataset(parse(NativeDataParserConfig(data=folder))).pairs)
 

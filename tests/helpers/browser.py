@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import shutil
 import subprocess
@@ -91,20 +90,6 @@ class Page:
     def save_downloads_in(self, folder: Path) -> None:
         self.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
 
-    def screenshot(self, path: Path, selector: str | None = None) -> None:
-        """Saves a picture of the whole page, or of the first element that a selector names."""
-        box = (
-            f"document.querySelector({selector!r}).getBoundingClientRect()"
-            if selector
-            else ("document.documentElement.getBoundingClientRect()")
-        )
-        x, y, width, height = self.evaluate(
-            f"(() => {{ const b = {box}; return [b.x + scrollX, b.y + scrollY, b.width, b.height]; }})()"
-        )
-        clip = {"x": x, "y": y, "width": width, "height": height, "scale": 1}
-        taken = self.send("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
-        path.write_bytes(base64.b64decode(taken["data"]))
-
 
 def eventually(condition: Callable[[], Any]) -> Any:
     """Waits for a condition, and returns what it gives."""
@@ -128,11 +113,8 @@ def chromium(folder: Path) -> Iterator[Page]:
         )
         try:
             port_file = profile / "DevToolsActivePort"
-            deadline = time.monotonic() + 60
-            while not (port_file.exists() and port_file.read_text().count("\n")):
-                assert browser.poll() is None, (folder / "chromium.log").read_text()[-2000:]
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
+            eventually(lambda: browser.poll() is not None or (port_file.exists() and "\n" in port_file.read_text()))
+            assert browser.poll() is None, (folder / "chromium.log").read_text()[-2000:]
             port = port_file.read_text().split()[0]
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=30) as answer:
                 address = next(one for one in json.load(answer) if one["type"] == "page")["webSocketDebuggerUrl"]

@@ -19,23 +19,14 @@ from nerfstudio.engine.trainer import TrainerConfig
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
+from aenerf_ns.method_configs import peers
 from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
-from aenerf_ns.method_configs.peers import (
-    e2vid_nerf,
-    e2vid_nerf_small,
-    eventnerf,
-    eventnerf_small,
-    evnerf,
-    evnerf_small,
-    paev3d,
-    paev3d_small,
-    robust_enerf,
-    robust_enerf_small,
-)
+from aenerf_ns.method_configs.peers import robust_enerf, robust_enerf_small
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
-SMALL = [robust_enerf_small, eventnerf_small, evnerf_small, paev3d_small, e2vid_nerf_small]
-PEERS = [*SMALL, robust_enerf, eventnerf, evnerf, paev3d, e2vid_nerf]
+NAMES = ("robust_enerf", "eventnerf", "evnerf", "paev3d", "e2vid_nerf")
+SMALL = [getattr(peers, f"{name}_small") for name in NAMES]
+PEERS = SMALL + [getattr(peers, name) for name in NAMES]
 
 
 @pytest.fixture
@@ -103,13 +94,13 @@ AS_ROBUST = (
 
 
 @pytest.mark.parametrize(("robust", "ours"), [(robust_enerf, aenerf), (robust_enerf_small, aenerf_small)])
-def test_robust_enerf_is_a_configuration_of_aenerf(robust: Any, ours: Any) -> None:
+def test_robust_enerf_is_aenerf_with_options(robust: Any, ours: Any) -> None:
     as_robust = with_options(ours.config, *AS_ROBUST)
     as_robust.method_name = robust.config.method_name
     assert asdict(as_robust) == asdict(robust.config)
 
 
-def test_robust_enerf_trains_as_aenerf_does_with_its_options_to_the_bit(data: Path) -> None:
+def test_robust_enerf_trains_as_aenerf_to_the_bit(data: Path) -> None:
     robust = train(shrunk(deepcopy(robust_enerf_small.config)), data, 5)
     assert same(robust, train(shrunk(with_options(aenerf_small.config, *AS_ROBUST)), data, 5))
     assert not same(robust, train(shrunk(with_options(aenerf_small.config, *AS_ROBUST[2:])), data, 5))
@@ -117,7 +108,7 @@ def test_robust_enerf_trains_as_aenerf_does_with_its_options_to_the_bit(data: Pa
 
 @pytest.mark.parametrize("mode", ["off", "spline"])
 @pytest.mark.parametrize("method", PEERS, ids=lambda method: method.config.method_name)
-def test_every_peer_trains_with_and_without_pose_correction(method: Any, mode: str, data: Path) -> None:
+def test_peers_train_with_and_without_correction(method: Any, mode: str, data: Path) -> None:
     config = with_options(method.config, "--pipeline.model.camera-optimizer.mode", mode)
     history, weights = train(shrunk(config), data, 3)
     assert len({losses["reconstruction_loss"] for losses in history}) == 3
@@ -130,25 +121,16 @@ def test_every_peer_trains_with_and_without_pose_correction(method: Any, mode: s
 def simulated(tmp_path_factory: pytest.TempPathFactory, small_work: None) -> Path:
     """The built-in object, with poses that are a little wrong."""
     folder = tmp_path_factory.mktemp("simulated") / "object"
-    Simulate(
-        output=folder,
-        scene="object",
-        width=64,
-        height=48,
-        max_displacement=1.0,
-        train_images=16,
-        validation_views=8,
-        test_views=2,
-        pose_noise_degrees=0.5,
-        pose_noise_translation=0.02,
-    ).main()
+    images = {"train_images": 16, "validation_views": 8, "test_views": 2}
+    noise = {"pose_noise_degrees": 0.5, "pose_noise_translation": 0.02}
+    Simulate(folder, scene="object", width=64, height=48, max_displacement=1.0, **images, **noise).main()
     return folder
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["off", "spline"])
 @pytest.mark.parametrize("method", SMALL, ids=lambda method: method.config.method_name)
-def test_every_peer_reconstructs_a_simulated_scene(method: Any, mode: str, simulated: Path) -> None:
+def test_peers_reconstruct_a_simulated_scene(method: Any, mode: str, simulated: Path) -> None:
     # E2VID + NeRF trains on the dataset's true images, because this is a test of the training.
     config = with_options(method.config, "--pipeline.model.camera-optimizer.mode", mode)
     psnr = []

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.browser import eventually
 from helpers.small_viewers import (
     DURATION,
-    NUM_EVENTS,
     SIZE,
     Browser,
     browser_of,
@@ -55,28 +55,17 @@ def browser(viewer: Viewer) -> Iterator[Browser]:
         yield browser
 
 
-def test_nerfstudio_collects_the_elements_in_the_order_of_their_use(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
-    assert [(path, element.name) for path, element in viewer.viewer_elements] == [
-        (f"Custom Elements/recording/{attribute}", name)
-        for attribute, name in (
-            ("accuracy", "Accuracy"),
-            ("at_time", "Time (s)"),
-            ("camera_follows", "Follow"),
-            ("camera_plays", "Play"),
-            ("events_in_scene", "Events in scene"),
-            ("events_number", "Events"),
-            ("events_picture", "Picture"),
-            ("trajectories", "Trajectories"),
-            ("trajectories_legend", "Legend"),
-            ("write_snapshot", "Export snapshot"),
-            ("write_trajectory", "Export trajectory"),
-        )
-    ]
+def test_elements_are_in_the_order_of_their_use(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
+    assert all(path.startswith("Custom Elements/recording/") for path, _ in viewer.viewer_elements)
+    assert [element.name for _, element in viewer.viewer_elements] == [
+        "Accuracy", "Time (s)", "Follow", "Play", "Events in scene", "Events", "Picture", "Trajectories", "Legend",
+        "Export snapshot", "Export trajectory",
+    ]  # fmt: skip
     # The viewer's panel adds nothing to checkpoints.
     assert not any("recording" in name for name in pipeline.state_dict())
 
 
-def test_a_browser_first_sees_the_scene_from_a_corrected_pose(browser: Browser, pipeline: AENeRFPipeline) -> None:
+def test_browser_first_looks_from_a_corrected_pose(browser: Browser, pipeline: AENeRFPipeline) -> None:
     seconds = pipeline.recording.at_time.value
     pose = pipeline.model.camera_optimizer.pose(torch.tensor([seconds], dtype=torch.float64))[0].detach().numpy()
     *before, placed = browser.until("SetCameraPositionMessage")
@@ -88,7 +77,7 @@ def test_a_browser_first_sees_the_scene_from_a_corrected_pose(browser: Browser, 
     np.testing.assert_allclose(forward / np.linalg.norm(forward), -pose[:, 2], atol=1e-3)
 
 
-def test_trajectories_are_lines_that_move_with_the_correction(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
+def test_trajectories_move_with_the_correction(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     def lines() -> dict[str, np.ndarray]:
         found = sent(viewer, "CatmullRomSplineMessage")
         return {line.name.removeprefix("/recording/trajectory_"): np.array(line.positions) for line in found}
@@ -113,15 +102,15 @@ def test_trajectories_are_lines_that_move_with_the_correction(viewer: Viewer, pi
     # What has not moved is not sent again.
     assert sent(viewer, "CatmullRomSplineMessage", "/recording/trajectory_estimated") == first
     pipeline.recording.trajectories.value = False
-    wait_until(lambda: all(not m.visible for m in sent(viewer, "SetSceneNodeVisibilityMessage")[-3:]))
+    eventually(lambda: all(not m.visible for m in sent(viewer, "SetSceneNodeVisibilityMessage")[-3:]))
     pipeline.recording.trajectories.value = True
 
 
-def test_the_picture_holds_the_events_around_the_time(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
+def test_picture_holds_the_events_around_the_time(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     panel = pipeline.recording
     panel.events_number.value = 100
     panel.at_time.value = 1.5
-    wait_until(lambda: "100 events" in panel.events_picture.content)
+    eventually(lambda: "100 events" in panel.events_picture.content)
     content = panel.events_picture.content
     begin, end = map(float, re.search(r"from ([-+][\d.]+) to ([-+][\d.]+) ms", content).groups())
     # 500 events a second.
@@ -139,7 +128,7 @@ def test_the_picture_holds_the_events_around_the_time(viewer: Viewer, pipeline: 
     assert red > blue
     # The event camera stands at the corrected pose of the time.
     expected = SCALE * pipeline.model.camera_optimizer.pose(torch.tensor([1.5], dtype=torch.float64))[0, :, 3].detach()
-    wait_until(
+    eventually(
         lambda: np.allclose(
             sent(viewer, "SetPositionMessage", "/recording/event_camera")[-1].position, expected, atol=1e-6
         )
@@ -151,11 +140,11 @@ def test_events_are_points_at_the_rendered_depth(viewer: Viewer, pipeline: AENeR
     panel.events_number.value = 400
     panel.at_time.value = 0.8
     panel.events_in_scene.value = True
-    wait_until(lambda: len(sent(viewer, "PointCloudMessage", "/recording/events")[-1].points) > 0)
+    eventually(lambda: len(sent(viewer, "PointCloudMessage", "/recording/events")[-1].points) > 0)
     cloud = sent(viewer, "PointCloudMessage", "/recording/events")[-1]
     assert len(cloud.points) == len(cloud.colors)
     # In the event camera of each event's time, its point lies behind its pixel, 1 % nearer than what is rendered there.
-    view = panel._view
+    view = panel.view
     events = view.events(0.8, 400)
     with viewer.train_lock:
         points, colors = view.points(events)
@@ -177,18 +166,15 @@ def test_events_are_points_at_the_rendered_depth(viewer: Viewer, pipeline: AENeR
     positive = colors[:, 0] > colors[:, 2]
     np.testing.assert_array_equal(positive, events.p > 0)
     panel.events_in_scene.value = False
-    wait_until(lambda: len(sent(viewer, "PointCloudMessage", "/recording/events")[-1].points) == 0)
-
-
-def test_points_are_limited_for_slow_links(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
+    eventually(lambda: len(sent(viewer, "PointCloudMessage", "/recording/events")[-1].points) == 0)
+    # Their number is limited for slow links.
     timeline = pipeline.datamanager.train_dataset.timeline
-    many = timeline[np.sort(np.random.default_rng(0).integers(len(timeline), size=9000))]
     with viewer.train_lock:
-        points, _ = pipeline.recording._view.points(many)
+        points, _ = view.points(timeline[np.sort(np.random.default_rng(0).integers(len(timeline), size=9000))])
     assert len(points) <= 2000
 
 
-def test_figures_tell_errors_thresholds_and_colors(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
+def test_figures_of_errors_thresholds_and_colors(viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     panel = pipeline.recording
     with viewer.train_lock:
         pipeline.color_fit.fit()
@@ -205,25 +191,25 @@ def test_figures_tell_errors_thresholds_and_colors(viewer: Viewer, pipeline: AEN
 def test_figures_without_true_poses(tmp_path: Path) -> None:
     data = make_recording(tmp_path / "data", true_poses=False)
     pipeline = make_pipeline_of(data, learn_contrast_threshold_ratio=True)
-    text = pipeline.recording._view.figures()
+    text = pipeline.recording.view.figures()
     assert "the true ones are not known. pose correction translation 0, pose correction degrees 0." in text
     assert "C⁺ 0.2 (learned), C⁻ 0.3" in text
-    assert pipeline.recording._view.lines().keys() == {"estimated", "corrected"}
+    assert pipeline.recording.view.lines().keys() == {"estimated", "corrected"}
     off = make_pipeline_of(data, pose_correction="off")
-    assert "as given" in off.recording._view.figures()
+    assert "as given" in off.recording.view.figures()
 
 
-def test_a_run_without_its_events_says_where_they_should_be(tmp_path: Path) -> None:
+def test_run_without_events_names_their_file(tmp_path: Path) -> None:
     pipeline = make_pipeline_of(make_recording(tmp_path / "data"))
     (tmp_path / "data" / "events.h5").unlink()
-    view = pipeline.recording._view
+    view = pipeline.recording.view
     view.prepare()
     events = view.events(1.0, 100)
     assert view.described_picture(events, 1.0) == f"There are no events at {tmp_path / 'data' / 'events.h5'}."
     assert view.points(events)[0].shape == (0, 3)
 
 
-def test_buttons_send_files_to_the_browser_that_clicks(
+def test_buttons_send_files_to_their_browser(
     browser: Browser, viewer: Viewer, pipeline: AENeRFPipeline, tmp_path: Path
 ) -> None:
     browser.click(pipeline.recording.write_trajectory)
@@ -247,11 +233,11 @@ def test_buttons_send_files_to_the_browser_that_clicks(
     np.testing.assert_allclose(np.asarray(picture, float), expected, atol=0.51)
 
 
-def test_following_looks_through_the_event_camera(browser: Browser, viewer: Viewer, pipeline: AENeRFPipeline) -> None:
+def test_follow_looks_through_the_event_camera(browser: Browser, viewer: Viewer, pipeline: AENeRFPipeline) -> None:
     panel = pipeline.recording
     panel.camera_follows.value = True
     assert browser.wait_for("SetCameraFovMessage")["fov"] == pytest.approx(2 * np.arctan(8 / 20))
-    wait_until(lambda: not any(handle.visible for handle in viewer.camera_handles.values()))
+    eventually(lambda: not any(handle.visible for handle in viewer.camera_handles.values()))
     panel.at_time.value = 1.0
     pose = pipeline.model.camera_optimizer.pose(torch.tensor([1.0], dtype=torch.float64))[0].detach()
     while not np.allclose(browser.wait_for("SetCameraPositionMessage")["position"], SCALE * pose[:, 3], atol=1e-6):
@@ -259,14 +245,14 @@ def test_following_looks_through_the_event_camera(browser: Browser, viewer: View
     # The time runs on by itself, and begins anew at the end.
     panel.at_time.value = DURATION
     panel.camera_plays.value = True
-    wait_until(lambda: panel.at_time.value == 0.0)
-    wait_until(lambda: panel.at_time.value > 0)
+    eventually(lambda: panel.at_time.value == 0.0)
+    eventually(lambda: panel.at_time.value > 0)
     panel.camera_plays.value = False
     panel.camera_follows.value = False
-    wait_until(lambda: all(handle.visible for handle in viewer.camera_handles.values()))
+    eventually(lambda: all(handle.visible for handle in viewer.camera_handles.values()))
 
 
-def test_training_draws_rarely_and_only_for_a_browser(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_draws_rarely_and_for_a_browser(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline = make_pipeline_of(workspace / "data")
     panel = pipeline.recording
     # Without a viewer, nothing happens.
@@ -279,23 +265,12 @@ def test_training_draws_rarely_and_only_for_a_browser(workspace: Path, monkeypat
         assert drawn == []
         with browser_of(viewer) as browser:
             browser.wait_for("SetCameraPositionMessage")
-            wait_until(lambda: len(drawn) == 1)
+            eventually(lambda: len(drawn) == 1)
             began = time.monotonic()
             panel.after_step()
             took = time.monotonic() - began
             assert len(drawn) == 2
             # Drawing took at least 0.03 s, a hundredth of the time until it is next allowed.
-            assert 0.03 * 99 <= panel._due - began - 0.03 <= took * 100
+            assert 0.03 * 99 <= panel.next_draw_time - began - 0.03 <= took * 100
             panel.after_step()
             assert len(drawn) == 2
-
-
-def test_the_panel_counts_all_events(pipeline: AENeRFPipeline) -> None:
-    assert 0 < NUM_EVENTS - len(pipeline.datamanager.train_dataset.timeline) <= SIZE[0] * SIZE[1]
-
-
-def wait_until(condition) -> None:
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
