@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files.event_reader import EventReader
 from aenerf_ns.files.event_table import FORMATS_REMEDY, EventLayout, EventTableFile
-from aenerf_ns.files.limits import MAX_TIME, bounded, require_unpacked_size
+from aenerf_ns.files.limits import bounded, require_unpacked_size
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
 if TYPE_CHECKING:
@@ -27,97 +26,17 @@ _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 _UNITS: tuple[TimeUnit, ...] = ("ns", "us", "ms")
 # The number of the HDF5 filter of Prophesee's compression of events.
 _ECF = 0x8ECF
-# Events read at once: 50 MB.
-_CHUNK = 1 << 22
 # Events collected before they are written: many small writes are slow.
 _WRITE_CHUNK = 1 << 18
 # More than HDF5 holds back: pieces of four columns that are not full, and its tables.
 _HELD_BYTES = 1 << 22
 
 
-class Hdf5EventFile(EventReader):
-    """Read the native file: /events/{x u16, y u16, t i64, p i8}.
-
-    The group /events may have the attributes ``time_unit`` ("ns", "us" or "ms") and ``time_offset`` (an integer in that
-    unit, added to every time).
-
-    Args:
-        path, width, height: see :class:`EventFile`.
-        time_unit: of the times where the file does not state it; "ns" by default.
-    """
-
-    kind = "HDF5 file"
-
-    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
-        super().__init__(path, width, height)
-        self._time_unit = time_unit
-
-    def _columns(self, file: h5py.File) -> tuple[dict[str, h5py.Dataset], int, int]:
-        """Return the four columns, the nanoseconds of a tick, and the offset in nanoseconds."""
-        columns = _require_datasets(self.path, file, {name: f"events/{name}" for name in _DTYPES})
-        for name, column in columns.items():
-            if column.dtype != _DTYPES[name] or column.ndim != 1:
-                raise DataError(
-                    self.path,
-                    f"/events/{name} has type {column.dtype} and {column.ndim} dimensions",
-                    f"store one row of {np.dtype(_DTYPES[name]).name}",
-                )
-        lengths = {name: len(column) for name, column in columns.items()}
-        if len(set(lengths.values())) > 1:
-            raise DataError(self.path, f"its columns have lengths {lengths}", "store all four with the same length")
-        attributes = file["events"].attrs
-        default = self._time_unit or "ns"
-        unit, offset = (_scalar(attributes.get(*item)) for item in (("time_unit", default), ("time_offset", 0)))
-        unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
-        if not isinstance(unit, str) or unit not in _UNITS:
-            raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
-        if self._time_unit not in (None, unit):
-            raise DataError(
-                self.path, f"it states its time unit, {unit!r}, but {self._time_unit} was given", "leave it out"
-            )
-        tick = NANOSECONDS[unit]
-        if not isinstance(offset, (int, np.integer)) or abs(int(offset)) * tick > MAX_TIME:
-            raise DataError(self.path, f"its time offset is {offset!r}", "use an integer in the unit of the times")
-        return columns, tick, int(offset) * tick
-
-    def _times(self, times: NDArray[np.int64], tick: int, offset: int) -> NDArray[np.int64]:
-        """Return the nanoseconds of the times of a column."""
-        limit = (MAX_TIME - abs(offset)) // tick
-        bad = (times < -limit) | (times > limit)
-        if bad.any():
-            raise DataError(
-                self.path,
-                f"an event has the time {times[np.argmax(bad)]}",
-                "check the unit and the offset of the times",
-            )
-        return times * tick + offset
-
-    def _chunks(self) -> Iterator[EventStream]:
-        with _open(self.path) as file:
-            columns, tick, offset = self._columns(file)
-            for begin in range(0, len(columns["t"]), _CHUNK):
-                x, y, t, p = (_read(self.path, columns[name], slice(begin, begin + _CHUNK)) for name in "xytp")
-                yield self._stream((x, y, self._times(t, tick, offset), p))
-
-    def _time_span(self) -> tuple[int, int] | None:
-        with _open(self.path) as file:
-            columns, tick, offset = self._columns(file)
-            times = columns["t"]
-            if len(times) == 0:
-                return None
-            ends = [_read(self.path, times, slice(i, i + 1)) for i in (0, len(times) - 1)]
-            start, end = self._times(np.concatenate(ends), tick, offset).tolist()
-            return start, end
-
-    def _count(self) -> int:
-        with _open(self.path) as file:
-            return len(self._columns(file)[0]["t"])
-
-
 def _columns_of(group: str) -> dict[str, tuple[str, None]]:
     return {name: (f"{group}{name}", None) for name in _DTYPES}
 
 
+_NATIVE = EventLayout(_columns_of("events/"), "ns", time_offset="time_offset")
 # DSEC, and TUM-VIE, which has no offset.
 COLUMNS_IN_GROUP = EventLayout(_columns_of("events/"), time_offset="t_offset")
 # EDS.
@@ -138,18 +57,67 @@ class Hdf5TableFile(EventTableFile):
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, Any]]:
         with _open(self.path) as file:
-            arrays: dict[str, Any] = _require_datasets(self.path, file, {name: name for name in self._layout.arrays})
-            offset_name = self._layout.time_offset
-            if offset_name is not None and offset_name in file:
-                offset = _dataset(self.path, file, offset_name)
-                value = None if offset is None or offset.size != 1 else _scalar(offset[()])
-                if not isinstance(value, (int, np.integer)):
-                    raise DataError(self.path, f"its {offset_name} is {value!r}", "store an integer")
-                arrays[offset_name] = int(value)
-            yield arrays
+            arrays: dict[str, Any] = {name: _require_dataset(self.path, file, name) for name in self._layout.arrays}
+            # NumPy's sizes overflow.
+            size = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays.values())
+            packed = sum(array.id.get_storage_size() for array in arrays.values())
+            require_unpacked_size(self.path, "its events", size, packed)
+            offset = _scalar(self._time_offset(file))
+            if not isinstance(offset, (int, np.integer)):
+                raise DataError(self.path, f"its {self._layout.time_offset} is {offset!r}", "store an integer")
+            yield {**arrays, "time_offset": int(offset)}
 
-    def read_array(self, array: h5py.Dataset, piece: slice) -> NDArray:
-        return _read(self.path, array, piece)
+    def _time_offset(self, file: h5py.File) -> Any:
+        name = self._layout.time_offset
+        if name is None or name not in file:
+            return 0
+        offset = _dataset(self.path, file, name)
+        return None if offset is None else offset[()]
+
+
+class Hdf5EventFile(Hdf5TableFile):
+    """Read the native file: /events/{x u16, y u16, t i64, p i8}, with p = ±1.
+
+    The group /events may have the attributes ``time_unit`` ("ns", "us" or "ms") and ``time_offset`` (an integer in that
+    unit, added to every time).
+
+    Args:
+        path, width, height: see :class:`EventFile`.
+        time_unit: of the times where the file does not state it; "ns" by default.
+    """
+
+    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
+        super().__init__(path, width, height, _NATIVE)
+        self._given_unit = time_unit
+
+    def _time_offset(self, file: h5py.File) -> Any:
+        return file["events"].attrs.get("time_offset", 0)
+
+    def _length(self, arrays: Mapping[str, Any]) -> int:
+        for name, dtype in _DTYPES.items():
+            column = arrays[f"events/{name}"]
+            if column.dtype != dtype:
+                raise DataError(
+                    self.path, f"/events/{name} has type {column.dtype}", f"store one row of {np.dtype(dtype).name}"
+                )
+        return super()._length(arrays)
+
+    def _columns(self, arrays: Mapping[str, Any], first: int, last: int) -> dict[str, NDArray]:
+        columns = super()._columns(arrays, first, last)
+        if not columns["p"].all():
+            raise DataError(self.path, "an event has polarity 0", "store polarities as -1 and +1")
+        return columns
+
+    def _tick(self, arrays: Mapping[str, Any]) -> int:
+        unit = _scalar(arrays["events/t"].parent.attrs.get("time_unit", self._given_unit or "ns"))
+        unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
+        if not isinstance(unit, str) or unit not in _UNITS:
+            raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
+        if self._given_unit not in (None, unit):
+            raise DataError(
+                self.path, f"it states its time unit, {unit!r}, but {self._given_unit} was given", "leave it out"
+            )
+        return NANOSECONDS[unit]
 
 
 def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
@@ -207,49 +175,34 @@ def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
     return dataset
 
 
-def _require_datasets(path: Path, file: h5py.File, names: Mapping[str, str]) -> dict[str, h5py.Dataset]:
-    """Return datasets by their keys in a mapping to their names.
+def _require_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """Return a dataset of a file.
 
     Raises:
-        DataError: one is missing, or has no values here, or all are larger than the file can explain.
+        DataError: it is missing, has no values here, or is compressed by a filter that is not installed.
     """
-    datasets = {}
-    for key, name in names.items():
-        dataset = _dataset(path, file, name)
-        if dataset is None:
-            raise DataError(path, f"there is no dataset /{name}", FORMATS_REMEDY)
-        datasets[key] = dataset
-    # NumPy's sizes overflow.
-    size = sum(math.prod(dataset.shape) * dataset.dtype.itemsize for dataset in datasets.values())
-    require_unpacked_size(path, "its events", size, sum(d.id.get_storage_size() for d in datasets.values()))
-    return datasets
-
-
-def _read(path: Path, array: h5py.Dataset, index: slice) -> NDArray:
-    try:
-        return array[index]
-    except (OSError, RuntimeError) as error:
-        raise DataError(path, f"{array.name} cannot be read ({error})", _filter_remedy(array)) from None
-
-
-def _filter_remedy(array: h5py.Dataset) -> str:
-    """Return the remedy for a dataset that cannot be read, from its compression filters."""
     import h5py
 
-    settings = array.id.get_create_plist()
-    missing = {settings.get_filter(i)[0] for i in range(settings.get_nfilters())}
-    missing = {code for code in missing if not h5py.h5z.filter_avail(code)}
-    if _ECF in missing:
-        return (
-            "it is compressed by Prophesee's ECF filter: install that plugin of HDF5 "
-            "(github.com/prophesee-ai/hdf5_ecf) and set HDF5_PLUGIN_PATH to its folder, or record or export to RAW"
-        )
-    return "pip install 'aenerf-ns[hdf5-filters]' for its compression filter" if missing else "copy it again"
+    dataset = _dataset(path, file, name)
+    if dataset is None:
+        raise DataError(path, f"there is no dataset /{name}", FORMATS_REMEDY)
+    settings = dataset.id.get_create_plist()
+    filters = {settings.get_filter(index)[0] for index in range(settings.get_nfilters())}
+    missing = {code for code in filters if not h5py.h5z.filter_avail(code)}
+    if missing:
+        remedy = "pip install 'aenerf-ns[hdf5-filters]' for its compression filter"
+        if _ECF in missing:
+            remedy = (
+                "it is compressed by Prophesee's ECF filter: install that plugin of HDF5 "
+                "(github.com/prophesee-ai/hdf5_ecf) and set HDF5_PLUGIN_PATH to its folder, or record or export to RAW"
+            )
+        raise DataError(path, f"{dataset.name} cannot be read without filter {min(missing)} of HDF5", remedy)
+    return dataset
 
 
-def _scalar(attribute: Any) -> Any:
-    """Return the value of an attribute. Some writers store it as an array of one value."""
-    return attribute.item() if isinstance(attribute, np.ndarray) and attribute.size == 1 else attribute
+def _scalar(value: Any) -> Any:
+    """Return a number or text. Some writers store it as an array of one value."""
+    return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
 
 
 class Hdf5EventWriter:
@@ -281,13 +234,13 @@ class Hdf5EventWriter:
         """Take room on the disk for what HDF5 is about to write, and for all that it holds until the file is closed.
 
         HDF5 can neither go on nor close a file after a write that failed, and the process ends with a segmentation
-        fault. So a full disk is found here, where the system can reserve room: macOS and Windows cannot.
+        fault. So a full disk is found here.
 
         Raises:
             OSError: there is no such room.
         """
         end = self._file.id.get_filesize() + num_bytes + _HELD_BYTES
-        if end > self._reserved and hasattr(os, "posix_fallocate"):
+        if end > self._reserved:
             os.posix_fallocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
             self._reserved = end
 

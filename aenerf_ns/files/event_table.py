@@ -64,17 +64,13 @@ class EventTableFile(EventReader):
 
     @abstractmethod
     def open_arrays(self) -> AbstractContextManager[Mapping[str, Any]]:
-        """Open the arrays of the layout, by their names, and its time offset where there is one.
+        """Open the arrays of the layout, by their names, and the time offset, an integer, as "time_offset".
 
         Arrays are sliced along their first dimension.
 
         Raises:
             DataError: the file or an array is missing, or cannot be read.
         """
-
-    def read_array(self, array: Any, piece: slice) -> NDArray:
-        """Read a piece of an array."""
-        return array[piece]
 
     def _chunks(self) -> Iterator[EventStream]:
         with self.open_arrays() as arrays:
@@ -120,7 +116,7 @@ class EventTableFile(EventReader):
         return next(iter(lengths.values()))
 
     def _columns(self, arrays: Mapping[str, Any], first: int, last: int) -> dict[str, NDArray]:
-        pieces = {name: self.read_array(arrays[name], slice(first, last)) for name in self._layout.arrays}
+        pieces = {name: arrays[name][first:last] for name in self._layout.arrays}
         columns = {}
         for column, (name, part) in self._layout.columns.items():
             piece = pieces[name]
@@ -134,13 +130,12 @@ class EventTableFile(EventReader):
         return NANOSECONDS[self._time_unit]
 
     def _read(self, arrays: Mapping[str, Any], first: int, last: int, tick: int) -> EventStream:
-        offset = 0 if self._layout.time_offset is None else arrays.get(self._layout.time_offset, 0)
         return events_from_columns(
             self._columns(arrays, first, last),
             width=self.width,
             height=self.height,
             tick=tick,
-            offset=offset,
+            offset=arrays.get("time_offset", 0),
             source=self.path,
             describe_event=lambda index: f"event {first + index}",
         )
