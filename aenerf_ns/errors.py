@@ -62,6 +62,13 @@ def reading(source: str | Path) -> Iterator[None]:
         raise DataError(place, f"it cannot be read ({reason})", "check its name and its rights") from None
 
 
+def require_file(path: Path) -> None:
+    """Raise a DataError if a file of a dataset does not exist."""
+    with reading(path):
+        if not path.is_file():
+            raise DataError(path, "there is no such file", "check the path of the dataset")
+
+
 @contextmanager
 def value_errors_as_data_error(source: str | Path, remedy: str = "correct it there") -> Iterator[None]:
     """Turn a ValueError within the context, such as that of an impossible camera, into a :class:`DataError`.

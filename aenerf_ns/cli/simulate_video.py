@@ -13,9 +13,8 @@ from aenerf_ns.cli.console import say
 from aenerf_ns.cli.dataset import training_command
 from aenerf_ns.cli.simulation import SimulationCommand
 from aenerf_ns.cli.termination import exclusive_output
-from aenerf_ns.errors import DataError, reading, value_errors_as_data_error
+from aenerf_ns.errors import DataError, reading, require_file, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
-from aenerf_ns.files.limits import require_file
 from aenerf_ns.simulator.options import Interpolation
 
 if TYPE_CHECKING:

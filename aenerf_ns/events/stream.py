@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.errors import DataError, require_file
 from aenerf_ns.events.sensor import require_event_sensor_size
 
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
@@ -127,13 +127,6 @@ def _unsorted(source: str | Path, index: int, time: int, previous: int) -> DataE
     )
 
 
-def require_event_file(path: Path) -> None:
-    """Raise a DataError if the file does not exist."""
-    with reading(path):
-        if not path.is_file():
-            raise DataError(path, "there is no such file", "check the path of the dataset")
-
-
 class EventFile(ABC):
     """A file of events, opened only when its events are needed.
 
@@ -192,7 +185,7 @@ class EventFile(ABC):
 
     def require(self) -> None:
         """Raise a DataError if the file does not exist."""
-        require_event_file(self.path)
+        require_file(self.path)
 
     def empty_error(self) -> DataError:
         """Return the error for a file without events."""

@@ -135,7 +135,7 @@ class Aedat4File(EventReader):
             yield self._stream((x, y, self._nanoseconds(events["time"]), polarity))
 
     def _nanoseconds(self, time: NDArray) -> NDArray[np.int64]:
-        if (np.abs(time) > _MAX_MICROSECONDS).any() or (time == np.iinfo(np.int64).min).any():
+        if not ((time >= -_MAX_MICROSECONDS) & (time <= _MAX_MICROSECONDS)).all():
             self._fail("an event has a time of more than 292 years")
         return time * 1000
 
@@ -177,14 +177,10 @@ def _event_streams(header: _Table) -> dict[str, tuple[int, int] | None]:
 
 
 class _Table:
-    """A table of a FlatBuffer. It begins with the distance to the list of the places of its fields.
-
-    Args:
-        data: the buffer.
-        begin: position of the distance to the table.
+    """A table of a FlatBuffer: at ``begin`` is the distance to it, and it begins with that to the list of its fields.
 
     Raises:
-        struct.error: a place lies outside the buffer, here and in the methods.
+        struct.error: a position lies outside the buffer, here and in the methods.
     """
 
     def __init__(self, data: bytes, begin: int) -> None:

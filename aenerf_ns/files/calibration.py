@@ -48,7 +48,11 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
         DataError: the file is missing or malformed, or it holds several cameras and none is named.
     """
     if path.suffix == ".json":
-        return _read_json(path)
+        meta, lens = read_transforms(path)
+        with value_errors_as_data_error(path):
+            sensor = SensorModel(**meta.event_camera.sensor_values())
+        frame_from_event = rigid_motion(path, "event_camera.T_frame_event", meta.event_camera.T_frame_event)
+        return Calibration(meta.event_camera.intrinsics(), lens, frame_from_event, sensor, meta.image_encoding)
     cameras = read_camchain(path)
     if event_camera is None and len(cameras) > 1:
         raise DataError(path, f"its cameras are {', '.join(cameras)}", "name that of the events as --event-camera")
@@ -60,12 +64,3 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
     event, event_from_first = cameras[event_name]
     frame, frame_from_first = cameras[frame_name]
     return Calibration(event, frame, frame_from_first @ torch.linalg.inv(event_from_first), SensorModel(), "linear")
-
-
-def _read_json(path: Path) -> Calibration:
-    """Read calibration.json, which has the names of the native dataset's transforms.json."""
-    meta, frame_camera = read_transforms(path)
-    with value_errors_as_data_error(path):
-        sensor = SensorModel(**meta.event_camera.sensor_values())
-    frame_from_event = rigid_motion(path, "event_camera.T_frame_event", meta.event_camera.T_frame_event)
-    return Calibration(meta.event_camera.intrinsics(), frame_camera, frame_from_event, sensor, meta.image_encoding)

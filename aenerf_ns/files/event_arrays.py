@@ -7,7 +7,6 @@ import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal
 
@@ -52,7 +51,7 @@ class NpyEventFile(EventTableFile):
 
 
 def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
-    """Open an .npz or .npy file of events. The names of its arrays tell the layout.
+    """Open an .npz or .npy file of events.
 
     An .npz file holds x, y, t and p, or position, timestamp and polarity as Robust e-NeRF has them. An .npy file holds
     a matrix whose first four columns are x, y, t and p, or records with fields of these names.
@@ -87,17 +86,18 @@ def read_npz_member(path: Path, name: str) -> NDArray:
             larger than the file can explain.
     """
     with open_npz_member(path, name) as (member, entry):
-        header = _NpyHeader.read(member, entry.file_size)
+        shape, order, dtype = _read_plain_header(member, entry.file_size)
         if entry.compress_type == zipfile.ZIP_STORED:
             with path.open("rb") as file:
                 # The local header has a name and an extra field of other lengths (PKZIP's APPNOTE, 4.3.7).
                 file.seek(entry.header_offset + 26)
-                start = entry.header_offset + 30 + sum(struct.unpack("<HH", file.read(4)))
-            return header.map(path, start)
-        values = np.frombuffer(member.read(header.num_bytes), np.uint8)
-        if len(values) < header.num_bytes:
+                begin = entry.header_offset + 30 + sum(struct.unpack("<HH", file.read(4)))
+            return _map(path, begin + member.tell(), shape, order, dtype)
+        num_bytes = math.prod(shape) * dtype.itemsize
+        values = np.frombuffer(member.read(num_bytes), np.uint8)
+        if len(values) < num_bytes:
             raise ValueError("it ends too early")
-        return np.ndarray(header.shape, header.dtype, values, order=header.order)
+        return np.ndarray(shape, dtype, values, order=order)
 
 
 @contextmanager
@@ -117,42 +117,15 @@ def open_npz_member(path: Path, name: str) -> Iterator[tuple[IO[bytes], zipfile.
             yield member, entry
 
 
-@dataclass(frozen=True)
-class _NpyHeader:
-    """The form of an array in an .npy file, and the position of its values in bytes."""
+def load_npy(path: Path) -> NDArray:
+    """Map the array of an .npy file into memory.
 
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    order: Literal["C", "F"]
-    end: int
-
-    @classmethod
-    def read(cls, file: IO[bytes], file_size: int) -> _NpyHeader:
-        """Read a header, and check that its array holds plain values and is as small as the file.
-
-        Raises:
-            ValueError, or another error: the header is malformed, or the array larger or of Python objects.
-        """
-        shape, is_fortran, dtype = read_npy_header(file)
-        if dtype.hasobject:
-            raise ValueError("it holds Python objects")
-        if not all(type(side) is int and side >= 0 for side in shape):
-            raise ValueError(f"its shape is {shape}")
-        header = cls(shape, dtype, "F" if is_fortran else "C", file.tell())
-        # NumPy's size of an item overflows.
-        if not 0 <= header.num_bytes <= file_size - header.end:
-            raise ValueError(f"its shape is {shape}, but it has {file_size:,} bytes")
-        return header
-
-    @property
-    def num_bytes(self) -> int:
-        return math.prod(self.shape) * self.dtype.itemsize
-
-    def map(self, path: Path, start: int = 0) -> NDArray:
-        """Map the array into memory, from an .npy file that begins at a position of a file."""
-        if not self.num_bytes:
-            return np.zeros(self.shape, self.dtype)
-        return np.memmap(path, self.dtype, "r", start + self.end, self.shape, self.order)
+    Raises:
+        DataError: the file is missing or malformed, or its array holds Python objects.
+    """
+    with bounded(path, ".npy file"), path.open("rb") as file:
+        shape, order, dtype = _read_plain_header(file, path.stat().st_size)
+        return _map(path, file.tell(), shape, order, dtype)
 
 
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -163,11 +136,18 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     return np.lib.format.read_array_header_2_0(file)
 
 
-def load_npy(path: Path) -> NDArray:
-    """Map the array of an .npy file into memory.
+def _read_plain_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], Literal["C", "F"], np.dtype]:
+    """Read the header of an array, and check that it holds plain values and is as small as the file."""
+    shape, is_fortran, dtype = read_npy_header(file)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    # NumPy's size of an item overflows.
+    is_valid = all(type(side) is int and side >= 0 for side in shape)
+    if not is_valid or not 0 <= math.prod(shape) * dtype.itemsize <= size - file.tell():
+        raise ValueError(f"its shape is {shape}, but it has {size:,} bytes")
+    return shape, "F" if is_fortran else "C", dtype
 
-    Raises:
-        DataError: the file is missing or malformed, or its array holds Python objects.
-    """
-    with bounded(path, ".npy file"), path.open("rb") as file:
-        return _NpyHeader.read(file, path.stat().st_size).map(path)
+
+def _map(path: Path, begin: int, shape: tuple[int, ...], order: Literal["C", "F"], dtype: np.dtype) -> NDArray:
+    is_empty = math.prod(shape) * dtype.itemsize == 0
+    return np.zeros(shape, dtype) if is_empty else np.memmap(path, dtype, "r", begin, shape, order)

@@ -73,12 +73,6 @@ def resolve_sensor_size(
 ) -> tuple[int, int]:
     """Return the width and height in pixels that a file states, or else the given ones.
 
-    Args:
-        path: the event file, for messages.
-        stated: width and height that the file states, or None.
-        width: the given width, or None.
-        height: the given height, or None.
-
     Raises:
         DataError: neither is known, the two differ, or no sensor has such a size.
     """

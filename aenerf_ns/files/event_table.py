@@ -142,14 +142,8 @@ class EventTableFile(EventReader):
 
 
 def guess_time_unit(times: NDArray) -> TimeUnit:
-    """Return microseconds, which event cameras count, for whole numbers, and seconds for decimals.
-
-    Args:
-        times: (N,) the first times of a file.
-    """
-    if times.dtype.kind == "f" and (times != np.floor(times)).any():
-        return "s"
-    return "us"
+    """Return microseconds, which event cameras count, for whole numbers, and seconds for decimals."""
+    return "s" if times.dtype.kind == "f" and (times != np.floor(times)).any() else "us"
 
 
 def events_from_columns(
@@ -168,8 +162,7 @@ def events_from_columns(
 
     Args:
         columns: x, y, t and p, (N,) each. Polarities are 0 and 1, or −1 and 1.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
+        width, height: size of the sensor in pixels.
         tick: nanoseconds of the unit of the times.
         offset: added to the times, in their unit.
         fraction: (N,) added to the times, in their unit, where the times are integers; between −1 and 1.

@@ -47,13 +47,9 @@ _WHOLE, _DECIMALS, _POWER = range(3)
 
 @dataclass(frozen=True)
 class _Lines:
-    """Parsed lines of a file.
+    """Parsed lines of a file: the (4, N) integer and fractional parts of x, y, t and p.
 
-    Attributes:
-        text: the lines.
-        num_before: number of lines ahead of them, or None for the last line of a file.
-        whole: (4, N) integer parts of x, y, t and p.
-        fraction: (4, N) fractional parts.
+    ``num_before`` lines are ahead of them; None for the last line of a file.
     """
 
     text: bytes
@@ -88,11 +84,7 @@ class _EventLines(EventReader):
 
     @abstractmethod
     def _tick(self, time_fractions: NDArray[np.float64]) -> int:
-        """Return the nanoseconds of the unit of the times.
-
-        Args:
-            time_fractions: (N,) fractional parts of the first times.
-        """
+        """Return the nanoseconds of the unit of the times, given the (N,) fractional parts of the first ones."""
 
     def _chunks(self) -> Iterator[EventStream]:
         tick = None

@@ -33,11 +33,7 @@ _EVT3_BEHIND = 16
 
 
 def initial_state(offset: int = 0) -> NDArray[np.int64]:
-    """Return the state of a decoder that has seen nothing.
-
-    Args:
-        offset: nanoseconds to add to every time.
-    """
+    """Return the state of a decoder that has seen nothing, and adds an offset in nanoseconds to every time."""
     state = np.full(6, _UNKNOWN, dtype=np.int64)
     state[_OFFSET] = offset
     return state

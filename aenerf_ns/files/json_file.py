@@ -27,7 +27,7 @@ from typing import Any, NoReturn, TypeVar
 import msgspec
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.limits import MAX_TIME, read_text, require_file
+from aenerf_ns.files.limits import MAX_TIME, read_text
 
 DATASET_REMEDY = "see the dataset format in the docs"
 
@@ -57,7 +57,6 @@ def read_json(path: Path, kind: type[T], remedy: str = DATASET_REMEDY) -> T:
         DataError: the file is missing or too large, is not JSON, has a key twice or a number that is too large, or
             holds something else than ``kind``.
     """
-    require_file(path)
     try:
         values = json.loads(
             read_text(path, _MAX_BYTES),

@@ -12,7 +12,6 @@ from torch import Tensor
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.json_file import convert
-from aenerf_ns.files.limits import require_file
 from aenerf_ns.files.plain_yaml import read_plain_yaml
 from aenerf_ns.files.transforms import Matrix, Row, rigid_motion
 
@@ -49,7 +48,6 @@ def read_camchain(path: Path) -> dict[str, tuple[CameraIntrinsics, Tensor]]:
     Raises:
         DataError: the file is missing or malformed, or a camera model is not supported.
     """
-    require_file(path)
     chain = convert(path, read_plain_yaml(path), dict[str, Any], _REMEDY)
     # Some datasets add matrices beside the cameras, such as MVSEC its T_cam0_lidar.
     chain = {name: value for name, value in chain.items() if isinstance(value, dict)}

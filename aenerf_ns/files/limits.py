@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import TypeVar
 
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.errors import DataError, reading, require_file
 
 Item = TypeVar("Item")
 
@@ -127,13 +127,9 @@ def _max_unpacked(packed: int) -> int:
 
 
 def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> None:
-    """Raise a DataError for data that states to be much larger than the bytes that hold it explain.
+    """Raise a DataError for data of a size in bytes that its size in the file, packed, does not explain.
 
-    Args:
-        path: the file.
-        name: names the data in the file, for the message.
-        unpacked: size of the data in bytes.
-        packed: size of the compressed data in the file in bytes.
+    ``name`` is what the message calls the data.
     """
     if unpacked > _max_unpacked(packed):
         raise DataError(
@@ -141,13 +137,6 @@ def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> 
             f"{name} unpacks to {unpacked:,} bytes or more, from {packed:,} in the file",
             "it is damaged, or made to fill the memory: copy it again",
         )
-
-
-def require_file(path: Path) -> None:
-    """Raise a DataError if a file of a dataset does not exist."""
-    with reading(path):
-        if not path.is_file():
-            raise DataError(path, "there is no such file", "check the path of the dataset")
 
 
 def list_files(folder: Path, pattern: str) -> list[Path]:
@@ -163,11 +152,11 @@ def list_files(folder: Path, pattern: str) -> list[Path]:
 
 
 def require_one(paths: list[Path], source: Path, what: str, remedy: str) -> Path:
-    """Return the only one of the paths.
+    """Return the only one of the paths that were found in a folder.
 
     Args:
         paths: what was found.
-        source: the folder that was searched.
+        source: the folder.
         what: names the paths, in the plural.
         remedy: how to choose one of several.
 
@@ -181,15 +170,12 @@ def require_one(paths: list[Path], source: Path, what: str, remedy: str) -> Path
 
 
 def read_text(path: Path, max_bytes: int) -> str:
-    """Read a small file of text.
-
-    Args:
-        path: the file.
-        max_bytes: the largest size that such a file can have.
+    """Read a file of text.
 
     Raises:
-        DataError: the file is missing, cannot be read, is larger, or is not UTF-8.
+        DataError: the file is missing, cannot be read, has more than ``max_bytes``, or is not UTF-8.
     """
+    require_file(path)
     with reading(path):
         require_at_most(path, max_bytes)
         content = path.read_bytes()
@@ -207,14 +193,9 @@ def require_at_most(path: Path, max_bytes: int) -> None:
 
 
 def file_inside(folder: Path, name: str, source: Path) -> Path:
-    """Return the path of a file that a dataset names, which must lie in the dataset's folder.
+    """Return the path of a file that another file (``source``) of a dataset names, relative to a folder.
 
     A link in the folder may lead anywhere: the user made it or unpacked it.
-
-    Args:
-        folder: the folder that the name is relative to.
-        name: the name in the dataset.
-        source: the file that holds the name, for the message.
 
     Raises:
         DataError: the name is empty, holds a null, or leads out of the folder.

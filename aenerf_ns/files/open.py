@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.aedat4 import Aedat4File
 from aenerf_ns.files.event_arrays import open_array_events
 from aenerf_ns.files.event_hdf5 import open_hdf5_events
@@ -62,7 +60,8 @@ def open_event_file(
     """
     with bounded(path, "event file"):
         if not path.exists() and width is not None and height is not None:
-            return _MissingEventFile(path, width, height)
+            # Of whatever format: every method says that there is no such file.
+            return TextEventFile(path, width, height)
         beginning = _read_beginning(path)
     name = _format(path, beginning)
     if time_unit is not None and name not in _WITH_TIME_UNIT:
@@ -84,18 +83,6 @@ def open_event_file(
         if name == "NumPy":
             return open_array_events(path, *size, time_unit)
         return CsvEventFile(path, *size, time_unit) if name == "CSV" else TextEventFile(path, *size)
-
-
-class _MissingEventFile(EventFile):
-    def _fail(self) -> NoReturn:
-        self.require()
-        raise DataError(self.path, "there was no such event file when it was opened", "start again")
-
-    def read_chunks(self) -> Iterator[EventStream]:
-        self._fail()
-
-    def time_span(self) -> tuple[int, int]:
-        self._fail()
 
 
 def _read_beginning(path: Path) -> bytes:

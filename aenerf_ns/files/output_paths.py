@@ -32,12 +32,7 @@ def require_run(run: Path) -> Path:
 
 
 def require_absent(output: Path, option: str = "--output") -> None:
-    """Raise a DataError if the folder that a command will write exists, or cannot have this name.
-
-    Args:
-        output: the folder.
-        option: the option that names the folder.
-    """
+    """Raise a DataError if the folder that a command will write, and an option names, exists or cannot be created."""
     try:
         exists = output.exists()
     except (OSError, ValueError) as error:
@@ -47,11 +42,9 @@ def require_absent(output: Path, option: str = "--output") -> None:
 
 
 def require_writable(output: Path, option: str = "--output") -> None:
-    """Raise a DataError if a file that a command will write cannot be created.
+    """Raise a DataError if a file that a command will write, and an option names, cannot be created.
 
-    Args:
-        output: the file. A file that exists is overwritten, and folders that are missing are made.
-        option: the option that names the file.
+    A file that exists is overwritten, and folders that are missing are made.
     """
     try:
         if output.is_dir():

@@ -100,10 +100,7 @@ class PropheseeHeader:
 class PropheseeRawFile(EventReader):
     """Read a RAW file: a header, then the words that the camera sent, in EVT 2.0 or EVT 3.0.
 
-    Args:
-        path: the file.
-        header: its header.
-        width, height: size of the sensor in pixels; None where the header states it.
+    The size of the sensor is None where the header states it.
 
     Raises:
         DataError: the encoding is not one that is read, or a size is not known.
@@ -113,8 +110,7 @@ class PropheseeRawFile(EventReader):
 
     def __init__(self, path: Path, header: PropheseeHeader, width: int | None, height: int | None) -> None:
         super().__init__(path, *resolve_sensor_size(path, header.size, width, height))
-        self._encoding = _encoding_name(path, header)
-        self._begin = header.end
+        self._encoding, self._begin = _encoding_name(path, header), header.end
 
     def _chunks(self) -> Iterator[EventStream]:
         # Imported lazily: every command of every method imports this module, and numba is slow to import.
@@ -162,10 +158,7 @@ def _encoding_name(path: Path, header: PropheseeHeader) -> str:
 class PropheseeDatFile(EventReader):
     """Read a DAT file of version 2: a header, the type and size of a record, then records of 8 bytes.
 
-    Args:
-        path: the file.
-        header: its header.
-        width, height: size of the sensor in pixels; None where the header states it.
+    The size of the sensor is None where the header states it.
 
     Raises:
         DataError: the version or the records are not those that are read, or a size is not known.
@@ -218,11 +211,9 @@ class PropheseeDatFile(EventReader):
 
 
 def _unwrap(time: NDArray[np.uint32], previous: int | None) -> NDArray[np.int64]:
-    """Return the (N,) microseconds of times whose upper bits are cut off. Each time is the nearest to its predecessor.
+    """Return the (N,) microseconds of times of which only the lower 32 bits are known.
 
-    Args:
-        time: (N,) lower 32 bits of times.
-        previous: the whole time before the first one, or None at the beginning.
+    Each time is the nearest to its predecessor. The one before the first is None at the beginning of a file.
     """
     begin = int(time[0]) if previous is None else previous
     steps = np.diff(time.astype(np.int64), prepend=begin)

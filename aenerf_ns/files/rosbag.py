@@ -65,15 +65,10 @@ _TAIL_SECONDS = (1, 10, 100)
 
 @dataclass(frozen=True)
 class _Message:
-    """A message of either type.
+    """A message of either type, with its time in nanoseconds.
 
-    Attributes:
-        stamp: time in nanoseconds.
-        width: pixel columns of the sensor.
-        height: pixel rows of the sensor.
-        sequence: number of a packet, or None for an array.
-        encoding: encoding of the words of a packet.
-        content: the events of an array, or the bytes of a packet.
+    The number (``sequence``) and the encoding are those of a packet. The content is the events of an array, or the
+    bytes of a packet.
     """
 
     stamp: int
@@ -93,9 +88,8 @@ class RosbagEventFile(EventReader):
 
     Args:
         path: a bag of ROS 1; or of ROS 2, as a folder with metadata.yaml or as a single .db3 or .mcap file.
-        width: pixel columns of the sensor. By default the messages tell them. With both sizes given, the bag is not
+        width, height: size of the sensor in pixels; by default the messages tell it. With both given, the bag is not
             opened before its events are asked for.
-        height: pixel rows of the sensor; by default the messages tell them.
         topic: the topic, or None when only one holds events.
 
     Raises:
@@ -109,16 +103,14 @@ class RosbagEventFile(EventReader):
         self, path: Path, width: int | None = None, height: int | None = None, topic: str | None = None
     ) -> None:
         self.path = path
-        self._topic = topic
+        self._topic, self._size = topic, (width, height)
         self._is_ros2 = path.is_dir() or not _begins(path, _ROS1_MAGIC)
         self.kind = f"bag of ROS {2 if self._is_ros2 else 1}"
-        if width is None or height is None:
+        if None in self._size:
             with bounded(path, self.kind, self.extra):
-                first = next(self._messages(), None)
-            if first is None:
-                raise self.empty_error()
-            width, height = resolve_sensor_size(path, (first.width, first.height), width, height)
-        super().__init__(path, width, height)
+                if next(self._messages(), None) is None:
+                    raise self.empty_error()
+        super().__init__(path, *resolve_sensor_size(path, None, *self._size))
 
     def require(self) -> None:
         """Raise a DataError when the bag does not exist. A bag of ROS 2 may be a folder."""
@@ -153,16 +145,13 @@ class RosbagEventFile(EventReader):
                 total += len(data)
                 require_unpacked_size(self.path, f"the topic {topic}", total, packed)
                 try:
-                    yield _parse(data, connection.msgtype == _PACKET_TYPE, self._is_ros2)
+                    message = _parse(data, connection.msgtype == _PACKET_TYPE, self._is_ros2)
                 except struct.error:
                     raise DataError(
                         self.path, f"a message of {topic} does not have the parts of its type", "copy it again"
                     ) from None
-
-    def _sized_messages(self, start: int | None) -> Iterator[_Message]:
-        for message in self._messages(start):
-            resolve_sensor_size(self.path, (message.width, message.height), self.width, self.height)
-            yield message
+                self._size = resolve_sensor_size(self.path, (message.width, message.height), *self._size)
+                yield message
 
     def _columns(self, start: int | None = None) -> Iterator[Columns]:
         """Yield columns of the messages received from a time in nanoseconds on."""
@@ -170,7 +159,7 @@ class RosbagEventFile(EventReader):
         if first is not None and first.sequence is not None:
             yield from self._columns_of_packets(start)
         elif first is not None:
-            for events in batches(message.content for message in self._sized_messages(start)):
+            for events in batches(message.content for message in self._messages(start)):
                 x, y = (events[name].astype(np.uint16) for name in "xy")
                 t = events["seconds"].astype(np.int64) * 1_000_000_000 + events["nanoseconds"]
                 yield x, y, t, np.where(events["polarity"], 1, -1).astype(np.int8)
@@ -183,7 +172,7 @@ class RosbagEventFile(EventReader):
 
         def blocks() -> Iterator[NDArray]:
             expected = None
-            for message in self._sized_messages(start):
+            for message in self._messages(start):
                 words = self._words(message)
                 if message.sequence != expected:
                     # At the first packet, and after lost packets, the state of the decoder is of no use.
@@ -289,9 +278,7 @@ def _choose(path: Path, types: dict[str, str], topic: str | None) -> str:
 class _Fields:
     """Read the fields of a serialized message, one after the other.
 
-    Args:
-        data: the message.
-        is_aligned: whether each number is aligned to its size, as in ROS 2, or follows without padding, as in ROS 1.
+    In ROS 2 each number is aligned to its size, in ROS 1 it follows without padding.
 
     Raises:
         struct.error: the message ends too early, or has another byte order.

@@ -115,12 +115,7 @@ def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
 
 
 def rigid_motion(path: Path, name: str, matrix: Matrix | None) -> Tensor:
-    """Return the (4, 4) float64 matrix of a rotation and a translation, the identity for None.
-
-    Args:
-        path: the file.
-        name: the matrix' key in it.
-        matrix: the value.
+    """Return the (4, 4) float64 matrix that a file has under a name, the identity for None.
 
     Raises:
         DataError: it is not a rotation and a translation.

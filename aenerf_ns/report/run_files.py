@@ -9,9 +9,9 @@ from typing import Literal
 
 import msgspec
 
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.errors import DataError, reading, require_file
 from aenerf_ns.files.json_file import read_json
-from aenerf_ns.files.limits import require_at_most, require_file
+from aenerf_ns.files.limits import require_at_most
 from aenerf_ns.training.run_record import RUN_FILE, SCALARS_FILE
 
 # Points of a curve. More are not seen, and make the page large.
