@@ -19,7 +19,7 @@ from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.text import parse_numbers, read_rows
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
-from aenerf_ns.recording.images import image_size_and_mode
+from aenerf_ns.recording.images import open_image
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_trajectory
@@ -49,8 +49,8 @@ class EcdDataParser(EventDataParser):
     def read_recording(self) -> Recording:
         capture, images = self._read_all_but_poses()
         reference = read_tum_trajectory(Path(self.config.data) / "groundtruth.txt")
-        trajectory, ground_truth = self.config.estimated(reference)
-        return capture.with_poses(trajectory, views_on_trajectory(images, reference), ground_truth)
+        views = views_on_trajectory(images, reference)
+        return self.config.make_recording(reference, **vars(capture), reference_views=views, max_views=None)
 
     def read_frames(self) -> FrameSequence:
         capture, images = self._read_all_but_poses()
@@ -64,7 +64,10 @@ class EcdDataParser(EventDataParser):
             raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
         images = read_image_list(folder / IMAGE_LIST) if (folder / IMAGE_LIST).exists() else []
         stated = (self.config.width, self.config.height)
-        size = image_size_and_mode(images[0][1])[0] if images else _DAVIS240C
+        size = _DAVIS240C
+        if images:
+            with open_image(images[0][1]) as image:
+                size = image.size
         width, height = (own if given is None else given for given, own in zip(stated, size, strict=True))
         camera = _read_calibration(folder / "calib.txt", (width, height))
         remedy = _GUESSED if not images and None in stated else CHECK_SIZE

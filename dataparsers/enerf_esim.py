@@ -81,7 +81,6 @@ class ENeRFEsimDataParser(EventDataParser):
             SensorModel(),
             event_file=EsimEventFolder(folder / "events", camera.width, camera.height),
             event_camera=camera,
-            frame_camera=camera,
             reference_views=views_on_trajectory(
                 read_image_times(folder / "images", folder / "images" / "image_stamps_ns.txt", "ns"), reference
             ),

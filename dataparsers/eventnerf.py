@@ -107,7 +107,6 @@ class EventNeRFDataParser(EventDataParser):
             SensorModel(bayer_pattern="RGGB" if self.config.color else ""),
             event_file=event_file,
             event_camera=camera,
-            frame_camera=camera,
             reference_views={**views_on_trajectory(list(images), reference), **_held_out_views(split.parent)},
             image_encoding="srgb",
             scene_box=self.config.scene_box(UNIT_SPHERE),

@@ -23,7 +23,7 @@ from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
-from aenerf_ns.recording.views import IMAGE_LIST, MAX_VIEWS, read_image_list, views_on_trajectory
+from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_trajectory
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml")
 
@@ -85,11 +85,10 @@ class OwnRecordingDataParser(EventDataParser):
             reference = _read_colmap(model, timed, images, frame_from_event)
         else:
             reference = read_tum_trajectory(poses)
-        trajectory, ground_truth = config.estimated(reference)
         views = views_on_trajectory(
             timed, reference, torch.linalg.inv(frame_from_event), max_pose_gap=config.max_pose_gap_ns
         )
-        return capture.with_poses(trajectory, views, ground_truth, MAX_VIEWS)
+        return config.make_recording(reference, **vars(capture), reference_views=views)
 
     def read_frames(self) -> FrameSequence:
         folder, config = Path(self.config.data), self.config

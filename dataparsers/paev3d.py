@@ -61,7 +61,6 @@ class PAEv3DDataParser(EventDataParser):
             SensorModel(),
             event_file=event_file,
             event_camera=camera,
-            frame_camera=camera,
             reference_views=views_on_trajectory(list(images), reference),
             image_encoding="srgb",
             scene_box=self.config.scene_box(UNIT_SPHERE),

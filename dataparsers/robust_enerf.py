@@ -5,30 +5,48 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
-from numpy.typing import NDArray
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.errors import DataError, value_errors_as_data_error
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.files.event_arrays import POSITION_TIMESTAMP_POLARITY, NpzEventFile, read_npz_member
-from aenerf_ns.files.json_file import read_json
+from aenerf_ns.files.json_file import convert, read_json
 from aenerf_ns.files.limits import file_inside
 from aenerf_ns.files.transforms import Matrix, Vector, rigid_motion
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions
 from aenerf_ns.recording.dataparser import EventDataParser
-from aenerf_ns.recording.images import image_size_and_mode
+from aenerf_ns.recording.images import open_image
 from aenerf_ns.recording.options import ObjectDataParserConfig
 from aenerf_ns.recording.recording import Recording, ReferenceView, Split
 from aenerf_ns.recording.views import IMAGE_SUFFIXES
 
 # Half the side of the box around the synthetic scenes, in the authors' configuration.
 _HALF_EXTENT = 1.5
+
+
+Matrix3 = tuple[Vector, Vector, Vector]
+# Far more than any array of a calibration has.
+_MAX_VALUES = 100
+
+
+class _Calibration(msgspec.Struct):
+    """The arrays of camera_calibration.npz that are read."""
+
+    intrinsics: Matrix3
+    distortion_params: list[float]
+    img_width: float
+    img_height: float
+    pos_contrast_threshold: float
+    neg_contrast_threshold: float
+    refractory_period: Annotated[float, msgspec.Meta(ge=0, le=1e12)]
+    bayer_pattern: BayerPattern
+    distortion_model: str = "none"
 
 
 class _View(msgspec.Struct):
@@ -41,7 +59,7 @@ class _Views(msgspec.Struct):
 
     frames: list[_View]
     camera_angle_x: Annotated[float, msgspec.Meta(gt=0, lt=math.pi)] | None = None
-    intrinsics: tuple[Vector, Vector, Vector] | None = None
+    intrinsics: Matrix3 | None = None
 
 
 @dataclass
@@ -80,69 +98,52 @@ class RobustENeRFDataParser(EventDataParser):
         )
 
 
-def _numbers(path: Path, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the array ``name`` as float64. It must hold numbers and have ``shape``, in which -1 means any size."""
-    array = read_npz_member(path, name)
-    fitting = tuple(size if wanted < 0 else wanted for size, wanted in zip(array.shape, shape, strict=False))
-    if array.dtype.kind not in "iufb" or array.shape != fitting or array.ndim != len(shape):
-        raise DataError(
-            path,
-            f"{name} has type {array.dtype} and shape {array.shape}",
-            f"store {' x '.join('N' if size < 0 else str(size) for size in shape) or 'one'} number(s)",
-        )
-    return array.astype(np.float64)
-
-
-def _word(path: Path, name: str) -> str:
-    array = read_npz_member(path, name)
-    if array.dtype.kind != "U" or array.shape:
-        raise DataError(path, f"{name} has type {array.dtype} and shape {array.shape}", "store one string")
-    return str(array)
-
-
 def _read_calibration(path: Path) -> tuple[CameraIntrinsics, SensorModel]:
-    matrix = _numbers(path, "intrinsics", (3, 3))
-    distortion = _numbers(path, "distortion_params", (-1,)).tolist()
-    single = {
-        name: float(_numbers(path, name, ()))
-        for name in ("img_width", "img_height", "pos_contrast_threshold", "neg_contrast_threshold", "refractory_period")
-    }
-    if not all(map(math.isfinite, single.values())):
-        raise DataError(path, f"a value of {single} is not finite", "calibrate the camera")
+    values: dict[str, Any] = {}
+    for name in _Calibration.__struct_fields__:
+        if name == "distortion_model" and not values["distortion_params"]:
+            continue
+        array = read_npz_member(path, name)
+        if array.size > _MAX_VALUES:
+            raise DataError(path, f"{name} has shape {array.shape}", "store the calibration of one camera")
+        values[name] = array.tolist()
+    stated = convert(path, values, _Calibration)
     with value_errors_as_data_error(path):
         camera = CameraIntrinsics.from_opencv(
-            (single["img_width"], single["img_height"]),
-            _pinhole(matrix),
-            distortion,
-            _word(path, "distortion_model") if distortion else "none",
+            (stated.img_width, stated.img_height),
+            _pinhole(stated.intrinsics),
+            stated.distortion_params,
+            stated.distortion_model,
         )
         sensor = SensorModel(
-            single["pos_contrast_threshold"],
-            single["neg_contrast_threshold"],
-            round(single["refractory_period"]),
-            _word(path, "bayer_pattern"),  # type: ignore[arg-type]
+            stated.pos_contrast_threshold,
+            stated.neg_contrast_threshold,
+            round(stated.refractory_period),
+            stated.bayer_pattern,
         )
     return camera, sensor
 
 
-def _pinhole(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx and cy of a (3, 3) matrix."""
-    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+def _pinhole(matrix: Matrix3) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx and cy."""
+    return matrix[0][0], matrix[1][1], matrix[0][2], matrix[1][2]
 
 
 def _read_poses(path: Path) -> Trajectory:
-    positions = _numbers(path, "T_wc_position", (-1, 3))
-    quaternions = _numbers(path, "T_wc_orientation", (-1, 4))
-    times = read_npz_member(path, "T_wc_timestamp")
-    if times.dtype.kind not in "iu" or times.ndim != 1:
-        raise DataError(path, f"T_wc_timestamp has type {times.dtype} and shape {times.shape}", "store nanoseconds")
-    if not len(positions) == len(quaternions) == len(times):
-        raise DataError(
-            path,
-            f"it has {len(positions)} positions, {len(quaternions)} orientations and {len(times)} times",
-            "store as many of each",
-        )
-    return Trajectory(times.astype(np.int64), poses_from_quaternions(path, positions, quaternions), path)
+    arrays = {name: read_npz_member(path, f"T_wc_{name}") for name in ("position", "orientation", "timestamp")}
+    length = arrays["timestamp"].size
+    for (name, array), shape, kinds in zip(
+        arrays.items(), ((length, 3), (length, 4), (length,)), ("iuf", "iuf", "iu"), strict=True
+    ):
+        if array.shape != shape or array.dtype.kind not in kinds:
+            raise DataError(
+                path,
+                f"T_wc_{name} has type {array.dtype} and shape {array.shape}",
+                f"it must hold {' x '.join(map(str, shape))} numbers, for {length} integer times in nanoseconds",
+            )
+    positions, quaternions, times = arrays.values()
+    poses = poses_from_quaternions(path, positions.astype(np.float64), quaternions.astype(np.float64))
+    return Trajectory(times.astype(np.int64), poses, path)
 
 
 def _read_views(folder: Path) -> tuple[CameraIntrinsics | None, dict[Split, list[ReferenceView]]]:
@@ -176,14 +177,15 @@ def _read_view(path: Path, key: str, view: _View) -> ReferenceView:
 
 
 def _view_camera(path: Path, meta: _Views, image: Path) -> CameraIntrinsics:
-    width, height = image_size_and_mode(image)[0]
+    with open_image(image) as opened:
+        width, height = opened.size
     with value_errors_as_data_error(path):
         if meta.camera_angle_x is not None:
             focal = width / 2 / math.tan(meta.camera_angle_x / 2)
             return CameraIntrinsics(width, height, focal, focal, width / 2, height / 2)
         if meta.intrinsics is None:
             raise DataError(path, "it has neither camera_angle_x nor intrinsics", "give one of them")
-        return CameraIntrinsics.from_opencv((width, height), _pinhole(np.array(meta.intrinsics)))
+        return CameraIntrinsics.from_opencv((width, height), _pinhole(meta.intrinsics))
 
 
 robust_enerf_dataparser = DataParserSpecification(

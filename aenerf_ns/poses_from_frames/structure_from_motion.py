@@ -248,7 +248,7 @@ class _Workspace:
                         f"the frame has {image.width} x {image.height} pixels, its camera {size[0]} x {size[1]}",
                         "give the intrinsics of the frames as they are",
                     )
-                require_8_bits(image.mode, origin)
+                require_8_bits(image, origin)
                 image.convert("L" if image.mode == "L" else "RGB").save(self._images / name)
 
     def find_features(self, camera: CameraIntrinsics | None) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.limits import MAX_TIME
-from aenerf_ns.recording.images import image_size_and_mode, read_image, require_8_bits
+from aenerf_ns.recording.images import open_image, read_image, require_8_bits
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list
 
 
@@ -99,10 +99,11 @@ def _open_folder(source: Path) -> Video:
     def read() -> Iterator[NDArray[np.uint8]]:
         for _, file in images:
             image = read_image(file)
-            require_8_bits(image.mode, file)
+            require_8_bits(image, file)
             yield np.asarray(image.convert("RGB"))
 
-    (width, height), _ = image_size_and_mode(images[0][1])
+    with open_image(images[0][1]) as image:
+        width, height = image.size
     return Video(source, width, height, np.array([time for time, _ in images], np.int64), read)
 
 

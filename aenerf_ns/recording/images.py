@@ -18,52 +18,49 @@ _FORMATS = ("PNG", "JPEG")
 
 def check_image(file: Path, camera: CameraIntrinsics) -> None:
     """Raise a DataError for an image that Nerfstudio cannot read, or would read wrongly."""
-    size, mode = image_size_and_mode(file)
-    if size != (camera.width, camera.height):
-        raise DataError(
-            file,
-            f"the image has {size[0]} x {size[1]} pixels, its camera {camera.width} x {camera.height}",
-            "give the intrinsics of the images as they are",
-        )
-    require_8_bits(mode, file)
-    read_image(file)
+    with open_image(file) as image:
+        if image.size != (camera.width, camera.height):
+            raise DataError(
+                file,
+                f"the image has {image.width} x {image.height} pixels, its camera {camera.width} x {camera.height}",
+                "give the intrinsics of the images as they are",
+            )
+        require_8_bits(image, file)
+        image.load()
 
 
-def require_8_bits(mode: str, source: str | Path) -> None:
-    """Raise a DataError unless PIL's mode of an image is 8 bits of gray or RGB, with or without an alpha channel."""
-    if mode not in ("L", "RGB", "RGBA"):
-        raise DataError(source, f"the image is of PIL's mode {mode}", "store 8 bits of gray or RGB")
+def require_8_bits(image: Image.Image, source: str | Path) -> None:
+    """Raise a DataError unless an image has 8 bits of gray or RGB, with or without an alpha channel."""
+    if image.mode not in ("L", "RGB", "RGBA"):
+        raise DataError(source, f"the image is of PIL's mode {image.mode}", "store 8 bits of gray or RGB")
 
 
 def read_image(file: Path) -> Image.Image:
-    """Return an image with its pixels.
+    """Read an image with its pixels.
 
     Raises:
         DataError: the file is missing, incomplete, or not a PNG or JPEG image.
     """
-    with _opened(file) as image:
+    with open_image(file) as image:
         image.load()
         return image
 
 
-def image_size_and_mode(file: Path) -> tuple[tuple[int, int], str]:
-    """Return width and height in pixels, and PIL's name of the pixels' format (such as "RGB").
+@contextmanager
+def open_image(file: Path) -> Iterator[Image.Image]:
+    """Open an image, whose pixels are not read. Errors of reading it within the context become a DataError.
 
     Raises:
         DataError: the file is missing or is not a PNG or JPEG image.
     """
-    with _opened(file) as image:
-        return image.size, image.mode
-
-
-@contextmanager
-def _opened(file: Path) -> Iterator[Image.Image]:
     try:
         with warnings.catch_warnings():
             # A warning of PIL is either harmless, or an error a moment later.
             warnings.simplefilter("ignore")
             with Image.open(file, formats=_FORMATS) as image:
                 yield image
+    except DataError:
+        raise
     # PIL's readers raise whatever they stumble over.
     except Exception as error:
         raise DataError(file, f"not a PNG or JPEG image that can be read ({error})", "copy it again") from None

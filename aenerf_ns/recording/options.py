@@ -106,28 +106,25 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
         with value_errors_as_data_error(str(self.data), "correct it among the options"):
             return replace(stated, **self.given_sensor_values())
 
-    def estimated(self, reference: Trajectory) -> tuple[Trajectory, Trajectory | None]:
-        """Return the estimated and the true trajectory, given the dataset's own.
-
-        The dataset's own is the estimated one, and none is true, unless the options give another estimated one.
-        """
-        return (reference, None) if self.trajectory is None else (read_tum_trajectory(self.trajectory), reference)
-
     def make_recording(self, reference: Trajectory, sensor: SensorModel, **content: Any) -> Recording:
         """Make a recording, with what the options state in place of the dataset's own poses and sensor.
+
+        Poses that the options give are the estimated ones, and the dataset's own are then true.
 
         Args:
             reference: the dataset's poses.
             sensor: the dataset's sensor, or the one assumed.
-            content: further attributes of :class:`~aenerf_ns.recording.recording.Recording`. By default images are
-                linear, and as many of them are used as of other published formats.
+            content: further attributes of :class:`~aenerf_ns.recording.recording.Recording`. By default the event
+                camera took the images, they are linear, and as many of them are used as of other published formats.
 
         Raises:
             DataError: a value among the options is impossible.
         """
-        trajectory, ground_truth = self.estimated(reference)
-        content = {"image_encoding": "linear", "max_views": MAX_VIEWS, **content}
-        return Recording(trajectory=trajectory, ground_truth=ground_truth, sensor=self.sensor(sensor), **content)
+        poses: dict[str, Any] = {"trajectory": reference}
+        if self.trajectory is not None:
+            poses = {"trajectory": read_tum_trajectory(self.trajectory), "ground_truth": reference}
+        defaults = {"frame_camera": content["event_camera"], "image_encoding": "linear", "max_views": MAX_VIEWS}
+        return Recording(sensor=self.sensor(sensor), **poses, **{**defaults, **content})
 
 
 @dataclass

@@ -54,22 +54,10 @@ class Capture:
     frame_camera: CameraIntrinsics
     image_encoding: ImageEncoding
 
-    def with_poses(
-        self,
-        trajectory: Trajectory,
-        reference_views: dict[Split, list[ReferenceView]],
-        ground_truth: Trajectory | None = None,
-        max_views: int | None = None,
-    ) -> Recording:
-        """Make the recording of this capture with poses. The arguments are the attributes of :class:`Recording`."""
+    def with_poses(self, trajectory: Trajectory, reference_views: dict[Split, list[ReferenceView]]) -> Recording:
+        """Make the recording of this capture with estimated poses, in place of any that it has."""
         known = {field.name: getattr(self, field.name) for field in fields(Capture)}
-        return Recording(
-            **known,
-            trajectory=trajectory,
-            reference_views=reference_views,
-            ground_truth=ground_truth,
-            max_views=max_views,
-        )
+        return Recording(**known, trajectory=trajectory, reference_views=reference_views)
 
 
 @dataclass(frozen=True)

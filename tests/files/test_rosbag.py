@@ -144,7 +144,7 @@ def test_a_trained_run_opens_without_its_bag_of_ros2(folder: Path) -> None:
     file = open_event_file(path, WIDTH, HEIGHT)
     assert len(read(file)) == 1
     (path / "metadata.yaml").unlink()
-    with pytest.raises(DataError, match="metadata.yaml: there is no such file"):
+    with pytest.raises(DataError, match=r"metadata.yaml: there is no such file"):
         file.time_span()
 
 
