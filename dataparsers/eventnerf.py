@@ -20,7 +20,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
 from aenerf_ns.files.limits import list_files, read_text, require_one
-from aenerf_ns.files.text import TimeUnit
+from aenerf_ns.files.text import TimeUnit, parse_numbers
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import ObjectDataParserConfig
 from aenerf_ns.recording.recording import Recording, ReferenceView, Split
@@ -138,14 +138,11 @@ def _read_poses(split: Path) -> Tensor:
 
 
 def read_matrix(path: Path, *num_rows: int) -> np.ndarray:
-    """Read a text file that holds a matrix of four columns.
+    """Read the (rows, 4) float64 matrix in a text file.
 
     Args:
         path: the file.
         num_rows: the numbers of rows that the matrix may have.
-
-    Returns:
-        (rows, 4) float64.
 
     Raises:
         DataError: the file is missing or malformed, or a number is not finite.
@@ -155,10 +152,7 @@ def read_matrix(path: Path, *num_rows: int) -> np.ndarray:
         raise DataError(
             path, f"it holds {len(fields)} numbers", f"it must hold {' or '.join(f'{rows} x 4' for rows in num_rows)}"
         )
-    try:
-        matrix = np.array(fields, dtype=np.float64).reshape(-1, 4)
-    except ValueError as error:
-        raise DataError(path, f"not a number ({error})", "write plain decimal numbers") from None
+    matrix = parse_numbers(path, [fields]).reshape(-1, 4)
     if not np.isfinite(matrix).all():
         raise DataError(path, "a number is not finite", "drop it, and its image")
     return matrix

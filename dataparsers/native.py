@@ -15,7 +15,7 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.files.limits import file_inside
-from aenerf_ns.files.transforms import EventCamera, Transforms, read_transforms, rigid_motion
+from aenerf_ns.files.transforms import EventCamera, Transforms, read_transforms, rigid_motion, sensor_values
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig, SensorOptions
@@ -70,7 +70,7 @@ class NativeDataParser(EventDataParser):
 
     def _sensor(self, path: Path, stated: EventCamera) -> SensorModel:
         """Return the sensor with the values of the options, and the dataset's values where the options give none."""
-        values = {**stated.sensor_values(), **self.config.given_sensor_values()}
+        values = {**sensor_values(stated), **sensor_values(self.config)}
         for name in ("positive_contrast_threshold", "negative_contrast_threshold"):
             if name not in values:
                 raise DataError(path, f"event_camera: missing field {name}", "state it there or among the options")

@@ -95,12 +95,9 @@ class WarpedSlice:
 class _SliceGeometry:
     """Where the events of a slice were seen, under a hypothesis.
 
-    Attributes:
-        points: (N, 2) directions of the events on the plane at depth 1.
-        pose_indices: (N,) the events' poses.
-        poses: (P, 3, 4) relative to the reference.
-        reference: (4, 4) the pose in the middle of the slice.
-        intrinsics: (4,) fx fy cx cy of the images.
+    ``points`` are (N, 2) directions on the plane at depth 1, ``pose_indices`` (N,) the events' poses, and ``poses``
+    (P, 3, 4) relative to the ``reference`` (4, 4), which is the pose in the middle of the slice. ``intrinsics`` are
+    fx fy cx cy of the images.
     """
 
     points: NDArray[np.float64]
@@ -178,10 +175,6 @@ class WarpedEvents:
 
     def compare(self, hypothesis: Hypothesis, slices: slice = slice(None)) -> Comparison | None:
         """Compare the contrast under a hypothesis with the given contrast, over the same events.
-
-        Args:
-            hypothesis: the hypothesis.
-            slices: which slices of events to compare; by default all.
 
         Returns:
             The comparison, or None if too few events have a pose and a direction under the hypothesis.
@@ -325,7 +318,6 @@ def contrast_of(slices: Sequence[WarpedSlice]) -> float:
 
 
 def _compare(hypothesis: Hypothesis, given: list[WarpedSlice], alternative: list[WarpedSlice]) -> Comparison:
-    """Compare slices that are warped under a hypothesis with the same slices warped as given."""
     # The standard error of the difference of two ratios of sums, over the tiles.
     error = np.sqrt(
         sum(

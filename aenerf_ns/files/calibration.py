@@ -13,7 +13,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.kalibr import read_camchain
-from aenerf_ns.files.transforms import read_transforms, rigid_motion
+from aenerf_ns.files.transforms import read_transforms, rigid_motion, sensor_values
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
     if path.suffix == ".json":
         meta, lens = read_transforms(path)
         with value_errors_as_data_error(path):
-            sensor = SensorModel(**meta.event_camera.sensor_values())
+            sensor = SensorModel(**sensor_values(meta.event_camera))
         frame_from_event = rigid_motion(path, "event_camera.T_frame_event", meta.event_camera.T_frame_event)
         return Calibration(meta.event_camera.intrinsics(), lens, frame_from_event, sensor, meta.image_encoding)
     cameras = read_camchain(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import require_rigid
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
 
 Vector = tuple[float, float, float]
@@ -61,15 +63,13 @@ class EventCamera(_Camera, kw_only=True):
     bayer_pattern: str = ""
     T_frame_event: Matrix | None = None
 
-    def sensor_values(self) -> dict[str, Any]:
-        """Return the stated values by their names in :class:`~aenerf_ns.events.sensor.SensorModel`."""
-        values = {
-            "positive_contrast_threshold": self.positive_contrast_threshold,
-            "negative_contrast_threshold": self.negative_contrast_threshold,
-            "refractory_period": self.refractory_period_ns,
-            "bayer_pattern": self.bayer_pattern,
-        }
-        return {name: value for name, value in values.items() if value is not None}
+
+def sensor_values(stated: object) -> dict[str, Any]:
+    """Return by their names in :class:`~aenerf_ns.events.sensor.SensorModel` the values that an event camera, or the
+    options, state: those attributes of the same names, and ``refractory_period_ns``, that are not None."""
+    names = {field.name: field.name for field in fields(SensorModel)} | {"refractory_period": "refractory_period_ns"}
+    values = {name: getattr(stated, key, None) for name, key in names.items()}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 class Frame(msgspec.Struct, kw_only=True):

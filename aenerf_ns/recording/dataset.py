@@ -38,10 +38,8 @@ class EventDataset(InputDataset):
 
     @property
     def reference_seconds(self) -> Tensor:
-        """When the images of a split of reference views were taken, also after their cameras are placed elsewhere.
-
-        They are (N,) float64 seconds since the start of the estimated trajectory, NaN of images off the trajectory.
-        """
+        """When the images of a split of reference views were taken, wherever their cameras are now: (N,) float64
+        seconds since the start of the estimated trajectory, NaN for images off the trajectory."""
         seconds: Tensor = self._dataparser_outputs.cameras.metadata[REFERENCE_SECONDS]
         return seconds[:, 0]
 
@@ -128,7 +126,7 @@ class EventDataset(InputDataset):
         return windows, pictures.sums(*usable.shape)
 
     def _new_pictures(self) -> PolaritySums:
-        """Return what adds up the events around the times of the cameras."""
+        """Make an accumulator of the events around each camera's time."""
         camera = self.scene.event_camera
         half = max(int(_PICTURE_DENSITY * camera.width * camera.height) // 2, 1)
         return PolaritySums(self.scene.camera_times.tolist(), half)

@@ -14,6 +14,7 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.limits import MAX_TIME
+from aenerf_ns.files.transforms import sensor_values
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import MAX_VIEWS
@@ -76,15 +77,6 @@ class SensorOptions:
     refractory_period_ns: int | None = None
     """Time for which a pixel is blind after each event, in nanoseconds, in place of the dataset's value."""
 
-    def given_sensor_values(self) -> dict[str, Any]:
-        """Return the values that are given, by their names in :class:`~aenerf_ns.events.sensor.SensorModel`."""
-        values = {
-            "positive_contrast_threshold": self.positive_contrast_threshold,
-            "negative_contrast_threshold": self.negative_contrast_threshold,
-            "refractory_period": self.refractory_period_ns,
-        }
-        return {name: value for name, value in values.items() if value is not None}
-
 
 @dataclass
 class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
@@ -104,7 +96,7 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
             DataError: a value is impossible.
         """
         with value_errors_as_data_error(str(self.data), "correct it among the options"):
-            return replace(stated, **self.given_sensor_values())
+            return replace(stated, **sensor_values(self))
 
     def make_recording(self, reference: Trajectory, sensor: SensorModel, **content: Any) -> Recording:
         """Make a recording, with what the options state in place of the dataset's own poses and sensor.

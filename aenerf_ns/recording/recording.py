@@ -71,7 +71,7 @@ class Recording(Capture):
             without bounds.
         ground_truth: the true trajectory, camera-to-world, OpenCV camera axes, or None where it is not known. Its
             world may have any position, orientation and scale. It serves evaluation only.
-        max_pose_gap: nanoseconds. Between poses that are further apart, the camera's way is not known. None: poses
+        max_pose_gap: nanoseconds. Between poses that are further apart, the camera's path is not known. None: poses
             are interpolated however far apart they are.
         max_views: the largest number of timed views of a split that are used, evenly spread over the time window.
             None: all are used.

@@ -21,20 +21,16 @@ SCENE_KEY = "scene"
 
 @dataclass(frozen=True)
 class SceneRecording:
-    """The part of a recording that the dataparser hands on.
+    """The part of a recording that the dataparser hands on. What has a name of
+    :class:`~aenerf_ns.recording.recording.Recording` is the same, but for the world of the poses.
 
     Attributes:
         frame: maps the recording's world, in the units of its poses, to the scene's.
         trajectory: the estimated trajectory of the event camera, camera-to-world, OpenGL camera axes, scene units.
-        ground_truth: the true trajectory, with the same conventions, or None where it is not known. It serves
-            evaluation only.
-        event_camera: the event camera's lens.
-        event_file: the events, not yet read.
-        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
+        ground_truth: the true trajectory, with the same conventions, or None where it is not known.
         window: the time that is used: the time that both events and poses cover, without the gaps of the poses.
         camera_times: (N,) times of the training cameras in nanoseconds; none for the other splits.
         has_image: whether each camera of the split has an image.
-        image_encoding: whether the images' values are sRGB or linear in radiance.
         bounded: whether the dataset states a box that holds the whole scene.
         frames: times in nanoseconds within the window, and files, of the train split's images that the event camera's
             lens took at known times; none for the other splits. Only a method that says so trains on them.
@@ -59,14 +55,8 @@ class SceneRecording:
         return float(self.frame.scale)
 
     def to_scene(self, poses: Tensor) -> Tensor:
-        """Map poses of the recording to the scene.
-
-        Args:
-            poses: (..., 3 or 4, 4) float64 camera-to-world, OpenCV camera axes, in the recording's world.
-
-        Returns:
-            (..., 3, 4) float64 camera-to-world, OpenGL camera axes, in the scene's frame and units.
-        """
+        """Map (..., 3 or 4, 4) float64 camera-to-world poses of the recording, OpenCV camera axes, to (..., 3, 4)
+        poses in the scene's frame and units, OpenGL camera axes."""
         return self.frame(poses[..., :3, :].cpu() @ OPENCV_TO_OPENGL)
 
     def to_recording(self, poses: Tensor) -> Tensor:

@@ -50,10 +50,7 @@ def image_files_of_poses(folder: Path, num_poses: int) -> list[Path]:
 
 
 def read_image_list(path: Path) -> list[tuple[int, Path]]:
-    """Read a list of images: on each line the time in seconds and the file, relative to the list's folder.
-
-    Returns:
-        Times in nanoseconds, and files.
+    """Read times in nanoseconds and files from a list: on each line seconds, and the file relative to its folder.
 
     Raises:
         DataError: the list or an image is missing, or a line does not hold the two.
@@ -69,15 +66,12 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
 
 
 def read_image_times(folder: Path, path: Path, unit: TimeUnit) -> list[tuple[int, Path]]:
-    """Read the times of a folder's images, which another file lists in the order of the images' names.
+    """Read times in nanoseconds and files of a folder's images; none if it holds none.
 
     Args:
         folder: the images.
-        path: the list: a time on each line. It is not read if the folder holds no images.
+        path: the list of the times, one on each line, in the order of the images' names.
         unit: of the times in the list.
-
-    Returns:
-        Times in nanoseconds, and files; none if the folder holds no images.
 
     Raises:
         DataError: the list is missing, or there are not as many times as images.
@@ -106,7 +100,7 @@ def views_on_trajectory(
         trajectory: of the event camera, camera-to-world, OpenCV camera axes.
         event_from_frame: (4, 4) float64, takes points from the frame camera's to the event camera's coordinates. None:
             one sensor takes both.
-        max_pose_gap: nanoseconds. An image between poses that are further apart is left out. None: none is.
+        max_pose_gap: nanoseconds; an image between poses that are further apart is left out.
 
     Returns:
         All views as train views, and the same alternating between the validation and the test split.
@@ -117,11 +111,8 @@ def views_on_trajectory(
         CONSOLE.print(
             f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses."
         )
-    if event_from_frame is None:
-        event_from_frame = torch.eye(4, dtype=torch.float64)
-    views = [
-        ReferenceView(file, homogeneous(trajectory.interpolate(time)) @ event_from_frame, time) for time, file in kept
-    ]
+    mount = torch.eye(4, dtype=torch.float64) if event_from_frame is None else event_from_frame
+    views = [ReferenceView(file, homogeneous(trajectory.interpolate(time)) @ mount, time) for time, file in kept]
     return {"train": views, "val": views[::2], "test": views[1::2]}
 
 
@@ -137,12 +128,7 @@ def views_within(views: list[ReferenceView], window: TimeWindow) -> list[Referen
 
 
 def thinned(views: list[ReferenceView], max_views: int | None) -> list[ReferenceView]:
-    """Return at most ``max_views`` of the timed views, evenly spread, and all views without a time.
-
-    Args:
-        views: in any order; the timed ones in the order of time.
-        max_views: None: all views are kept.
-    """
+    """Return at most ``max_views`` of the timed views, evenly spread in their order, and all views without a time."""
     timed = [view for view in views if view.time is not None]
     if max_views is None or len(timed) <= max_views:
         return views
@@ -150,11 +136,8 @@ def thinned(views: list[ReferenceView], max_views: int | None) -> list[Reference
 
 
 def viewer_cameras(trajectory: Trajectory, views: list[ReferenceView]) -> tuple[Tensor, dict[int, Path]]:
-    """Choose the times at which the viewer shows the camera: at knots and where images were taken, evenly thinned out.
-
-    Returns:
-        (N,) int64 times in nanoseconds, and the images among them by index.
-    """
+    """Choose knots and times of images at which the viewer shows the camera: (N,) int64 nanoseconds, and the images
+    among them by index."""
     taken = {v.time: v.file for v in views if v.time is not None and trajectory.start <= v.time <= trajectory.end}
     shown = evenly_spread(sorted(taken), _MAX_SHOWN)
     times = sorted({*evenly_spread(trajectory.times.tolist(), _MAX_SHOWN), *shown})
@@ -169,7 +152,7 @@ def seconds_on_trajectory(views: list[ReferenceView], trajectory: Trajectory) ->
     return seconds
 
 
-def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
-    """Return at most so many of the items, evenly spread from the first to the last."""
-    count = min(len(items), most)
+def evenly_spread(items: Sequence[Item], max_items: int) -> list[Item]:
+    """Return at most ``max_items`` of the items, evenly spread from the first to the last."""
+    count = min(len(items), max_items)
     return [items[round(i * (len(items) - 1) / max(count - 1, 1))] for i in range(count)]

@@ -95,12 +95,8 @@ class NativeDatasetWriter(_FolderWriter):
 
     Args:
         folder: the dataset folder to create, or the lock on it that the caller holds.
-        event_camera: the event camera's lens.
-        sensor: its contrast thresholds, refractory period and Bayer pattern.
-        image_encoding: whether the images' values are sRGB or linear in radiance.
+        event_camera, sensor, image_encoding, max_pose_gap: see :class:`~aenerf_ns.recording.recording.Recording`.
         scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
-        max_pose_gap: nanoseconds. Between poses that are further apart, the camera's way is not known. None: it is
-            known everywhere.
         frame_camera: the lens of the camera that took the images; by default the event camera's.
         auto_scale_poses: whether training scales the poses by default.
     """
@@ -138,10 +134,7 @@ class NativeDatasetWriter(_FolderWriter):
     def _finish(self) -> None:
         if not (self._partial / "trajectory_estimated.txt").exists():
             raise ValueError("the dataset has no trajectory: call add_trajectories before leaving the block")
-        # A JSON number may have any number of digits, but Python's json cannot write an exact decimal: times are stored
-        # as strings, and their quotes are removed here.
-        text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(self._meta, indent=2))
-        (self._partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
+        _write_json(self._partial / "transforms.json", self._meta)
 
     def add_trajectories(self, estimated: Trajectory, ground_truth: Trajectory | None = None) -> None:
         """Write the estimated and, if it is known, the true trajectory (OpenCV camera axes)."""
@@ -151,8 +144,7 @@ class NativeDatasetWriter(_FolderWriter):
 
     def add_poses_report(self, report: dict[str, Any]) -> None:
         """Write how the estimated trajectory was made and what is known of its errors, for people to read."""
-        text = json.dumps(report, indent=2)
-        (self._partial / "poses_report.json").write_text(text + "\n", encoding="utf-8")
+        _write_json(self._partial / "poses_report.json", report)
 
     def other_file(self, name: str) -> Path:
         """Return the path at which another file of the folder can be written until the block ends."""
@@ -204,13 +196,8 @@ class NativeDatasetWriter(_FolderWriter):
     ) -> None:
         """Add a reference image by copying its file. A file that is added to several splits is copied once.
 
-        Args:
-            split: the split that the image belongs to.
-            file: the image.
-            camera_to_world: (4, 4) pose, OpenCV camera axes; one file has one pose.
-            time: nanoseconds at which the image was taken on the trajectory, or None.
-            background: RGB in [0, 1], in the image's encoding. An image with an alpha channel is composed with it,
-                because the dataset format has no such channel. None: the channel is ignored.
+        ``background``, RGB in [0, 1] in the image's encoding, is composed with an image that has an alpha channel,
+        because the dataset format has none. The other arguments are those of :meth:`add_image`.
         """
         if file in self._files:
             self._meta[f"{split}_filenames"].append(self._files[file]["file_path"])
@@ -244,13 +231,8 @@ class NativeDatasetWriter(_FolderWriter):
 class PoselessRecordingWriter(_FolderWriter):
     """Write a folder of events and images without poses, completely or not at all, as a context manager.
 
-    With a trajectory.txt beside them, the files are a recording of the format ``event-recording-data``.
-
-    Args:
-        folder: the folder to create, or the lock on it that the caller holds.
-        camera: the lens of the sensor that took events and images, or None where it is not known. The folder then has
-            no calibration.json.
-        sensor: its contrast thresholds, refractory period and Bayer pattern.
+    With a trajectory.txt beside them, the files are a recording of the format ``event-recording-data``. Where the lens
+    of the sensor that took events and images is not known, there is no calibration.json.
     """
 
     def __init__(self, folder: Path | OutputLock, camera: CameraIntrinsics | None, sensor: SensorModel) -> None:
@@ -263,8 +245,7 @@ class PoselessRecordingWriter(_FolderWriter):
         (self._partial / IMAGE_LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
         if self._camera is not None:
             calibration = {"image_encoding": "srgb", "event_camera": _event_camera(self._camera, self._sensor)}
-            text = json.dumps(calibration, indent=2)
-            (self._partial / "calibration.json").write_text(text + "\n", encoding="utf-8")
+            _write_json(self._partial / "calibration.json", calibration)
 
     def add_image(self, image: NDArray[np.uint8], time: int) -> None:
         """Add an sRGB image (height, width, 3) that was taken at a time in nanoseconds, later than the one before."""
@@ -272,6 +253,13 @@ class PoselessRecordingWriter(_FolderWriter):
         (self._partial / "images").mkdir(exist_ok=True)
         Image.fromarray(image).save(self._partial / name)
         self._images.append(f"{format_seconds(time)} {name}")
+
+
+def _write_json(path: Path, values: dict[str, Any]) -> None:
+    # A JSON number may have any number of digits, but Python's json cannot write an exact decimal: times are stored as
+    # strings, and their quotes are removed here.
+    text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(values, indent=2))
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
