@@ -20,7 +20,7 @@ from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
 
 
-def test_a_guessed_size_is_told_and_can_be_given(tmp_path: Path) -> None:
+def test_guessed_size_can_be_given(tmp_path: Path) -> None:
     folder = write_ecd(tmp_path / "made")
     (folder / "images.txt").unlink()
     (folder / "events.txt").write_text("0.01 300 2 1\n0.02 300 2 0\n0.31 1 2 1\n")
@@ -73,7 +73,7 @@ def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     assert taken == pytest.approx(0.15 - 1e-9 * outputs.metadata[SCENE_KEY].trajectory.start)
 
 
-def test_the_real_recording_reads(slider_depth: Path) -> None:
+def test_read_the_real_recording(slider_depth: Path) -> None:
     config = EcdDataParserConfig(data=slider_depth)
     dataset = EventDataset(parse(config))
     pairs = dataset.pairs

@@ -40,7 +40,7 @@ def test_eventnerf_splits_and_images(tmp_path: Path) -> None:
     assert (len(split.reference_views["val"]), len(split.reference_views["test"])) == (11, 10)
 
 
-def test_a_unit_of_time_may_be_given_for_poses_without_times(tmp_path: Path) -> None:
+def test_poses_without_times_take_a_unit(tmp_path: Path) -> None:
     truth = write_eventnerf(tmp_path / "made")
     recording = recording_of(config_of("eventnerf-data", truth.data, time_unit="ns"))
     assert recording.trajectory.end == recording.event_file.time_span()[1] == DURATION

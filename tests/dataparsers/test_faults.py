@@ -146,11 +146,7 @@ ROBUST: dict[str, Fault] = {
     "no events": (remove("raw_events.npz"), "raw_events.npz", "no such file"),
     "no intrinsics": (edit_npz(CALIBRATION, intrinsics=None), CALIBRATION, "no array intrinsics"),
     "flat intrinsics": (edit_npz(CALIBRATION, intrinsics=np.ones(9)), CALIBRATION, "intrinsics: expected `array`"),
-    "words": (
-        edit_npz(CALIBRATION, intrinsics=np.full((3, 3), "f")),
-        CALIBRATION,
-        "intrinsics[0][0]: ",
-    ),
+    "words": (edit_npz(CALIBRATION, intrinsics=np.full((3, 3), "f")), CALIBRATION, "intrinsics[0][0]: "),
     "unknown lens": (edit_npz(CALIBRATION, distortion_model="fov"), CALIBRATION, "the lens model is 'fov'"),
     "six distortions": (edit_npz(CALIBRATION, distortion_params=np.zeros(6)), CALIBRATION, "takes 5 numbers, not 6"),
     "no focal length": (edit_npz(CALIBRATION, intrinsics=np.zeros((3, 3))), CALIBRATION, "fx must be from 0.01"),

@@ -38,7 +38,7 @@ def whole() -> Iterator[Path]:
 # A warning of a library would print a second line.
 @pytest.mark.filterwarnings("error::RuntimeWarning", "error::UserWarning")
 @pytest.mark.parametrize("name", sorted(CASES.keys() - MEANINGFUL), ids=lambda name: name.replace(" ", "_"))
-def test_a_malformed_dataset_is_one_line(name: str, whole: Path) -> None:
+def test_malformed_dataset_is_one_line(name: str, whole: Path) -> None:
     kind, change = CASES[name]
     folder = Path(shutil.copytree(whole / kind, whole / "case" / "made"))
     try:

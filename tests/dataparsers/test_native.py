@@ -22,7 +22,7 @@ from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
 
 
-def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
+def test_written_dataset_reads_back(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     outputs = parse(NativeDataParserConfig(data=folder, **AS_RECORDED))
     metadata = outputs.metadata
@@ -46,7 +46,7 @@ def test_a_written_dataset_reads_back(tmp_path: Path) -> None:
     assert metadata[SCENE_KEY].event_file.time_span() == (events[0].t[0], events[-1].t[-1])
 
 
-def test_a_frame_without_a_pose_gets_that_of_its_time(tmp_path: Path) -> None:
+def test_frame_without_pose_gets_that_of_its_time(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     meta = json.loads((folder / "transforms.json").read_text())
     time = START + 150_000_000
@@ -67,7 +67,7 @@ def test_a_frame_without_a_pose_gets_that_of_its_time(tmp_path: Path) -> None:
     torch.testing.assert_close(pose, (expected @ OPENCV_TO_OPENGL)[:3].float(), rtol=0, atol=1e-6)
 
 
-def test_options_take_the_place_of_the_sensors_values(tmp_path: Path) -> None:
+def test_options_replace_values_of_the_sensor(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     options = {"positive_contrast_threshold": 0.7, "refractory_period_ns": 0}
     assert parse(NativeDataParserConfig(data=folder, **options)).metadata[SCENE_KEY].sensor == SensorModel(
@@ -77,7 +77,7 @@ def test_options_take_the_place_of_the_sensors_values(tmp_path: Path) -> None:
         parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
 
 
-def test_times_in_other_units_with_an_offset(tmp_path: Path) -> None:
+def test_read_other_units_with_an_offset(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "events.h5", "w") as file:
         for name, dtype in (("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
             file[f"events/{name}"] = np.ones(3, dtype)
@@ -91,7 +91,7 @@ def test_times_in_other_units_with_an_offset(tmp_path: Path) -> None:
     assert events.time_span() == (1_001_000, 1_005_000)
 
 
-def test_events_are_written_in_order_only(tmp_path: Path) -> None:
+def test_refuse_to_write_events_out_of_order(tmp_path: Path) -> None:
     with Hdf5EventWriter(tmp_path / "events.h5") as writer:
         writer.append(make_stream([(0, 0, 5, 1)]))
         with pytest.raises(DataError, match="4 ns is before 5 ns"):

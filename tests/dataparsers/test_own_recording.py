@@ -38,7 +38,7 @@ def test_own_recordings_have_views_at_their_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(view.camera_to_world.numpy(), truth.poses[5], rtol=0, atol=1e-9)
 
 
-def test_own_recordings_may_be_put_together_from_anywhere(tmp_path: Path) -> None:
+def test_own_recording_from_files_anywhere(tmp_path: Path) -> None:
     truth = write_own(tmp_path / "made")
     (tmp_path / "parts").mkdir()
     renamed = {"events": "record.hdf5", "calibration": "cameras.json", "poses": "mocap.txt", "images": "stamps.txt"}
@@ -57,7 +57,7 @@ def test_own_recordings_may_be_put_together_from_anywhere(tmp_path: Path) -> Non
     assert recording.event_file.time_span()[0] == EPOCH * 1_000
 
 
-def test_kalibrs_camchain_places_both_cameras(tmp_path: Path) -> None:
+def test_camchain_places_both_cameras(tmp_path: Path) -> None:
     truth = write_own(tmp_path / "made")
     (truth.data / "calibration.json").unlink()
     (truth.data / "camchain.yaml").write_text(yaml.dump(CAMCHAIN))
@@ -80,9 +80,7 @@ def test_kalibrs_camchain_places_both_cameras(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["colmap", "colmap/sparse/0"])
-def test_a_colmap_model_gives_poses_at_the_times_of_its_images(
-    place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_colmap_model_gives_poses_of_its_images(place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = write_own(tmp_path / "made")
     (truth.data / "trajectory.txt").unlink()
     shift = make_poses(3)[1]

@@ -15,7 +15,7 @@ from aenerf_ns.dataparsers.paev3d import PAEv3DDataParserConfig
 from aenerf_ns.errors import DataError
 
 
-def test_poses_of_paev3d_run_no_code(tmp_path: Path) -> None:
+def test_poses_run_no_code(tmp_path: Path) -> None:
     truth = write_paev3d(tmp_path / "made")
     file = truth.data / "Render_info" / "Bunny" / "0003.npz"
 
@@ -29,7 +29,7 @@ def test_poses_of_paev3d_run_no_code(tmp_path: Path) -> None:
     assert not (tmp_path / "harm").exists()
 
 
-def test_scenes_of_paev3d_are_told_apart(tmp_path: Path) -> None:
+def test_choose_one_of_several_scenes(tmp_path: Path) -> None:
     truth = write_paev3d(tmp_path / "made")
     for part in ("H5_Files", "Render_info"):
         shutil.copytree(truth.data / part / "Bunny", truth.data / part / "Car")

@@ -301,7 +301,7 @@ def lenses_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CameraIntrinsics, "pixel_directions", lru_cache(maxsize=16)(CameraIntrinsics.pixel_directions))
 
 
-def test_a_broken_dataset_is_read_or_refused() -> None:
+def test_broken_dataset_is_read_or_refused() -> None:
     with readable_folder() as folder:
         assert search(folder, SHORT) > 20
 

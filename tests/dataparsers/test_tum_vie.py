@@ -59,7 +59,7 @@ def test_tum_vie_views_are_those_of_the_frame_camera(tmp_path: Path, tum_vie_cal
     assert [len(recording.reference_views[split]) for split in ("train", "val", "test")] == [3, 2, 1]
 
 
-def test_events_in_a_gap_of_the_poses_are_left_out_also_after_conversion(
+def test_gap_of_poses_is_left_out_after_conversion_too(
     tmp_path: Path, tum_vie_calibration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth = write_tum_vie(tmp_path / "made", tum_vie_calibration)
@@ -94,7 +94,7 @@ def test_events_in_a_gap_of_the_poses_are_left_out_also_after_conversion(
     assert parse(replace(config, max_pose_gap_ns=2 * 10**9)).metadata[SCENE_KEY].window.gaps == ()
 
 
-def test_several_sequences_in_a_folder_are_told_apart(tmp_path: Path, tum_vie_calibration: Path) -> None:
+def test_choose_one_of_several_sequences(tmp_path: Path, tum_vie_calibration: Path) -> None:
     for sequence in ("mocap-desk2", "office-maze"):
         write_tum_vie(tmp_path / "made", tum_vie_calibration, sequence)
     with pytest.raises(DataError, match=r"it holds 2 sequences .*/mocap-desk2-events_left.h5"):

@@ -32,7 +32,7 @@ def test_compressed_packets_of_aedat4(
         read(file)
 
 
-def test_one_of_several_streams_of_aedat4(folder: Path) -> None:
+def test_choose_a_stream_of_aedat4(folder: Path) -> None:
     path = folder / "stereo.aedat4"
     path.write_bytes(aedat4_file([(1, 2, 3, 1)], streams={0: "EVTS", 4: "EVTS"}))
     with pytest.raises(DataError, match="several streams hold events; choose one of 0, 4"):

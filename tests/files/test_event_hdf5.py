@@ -9,13 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.event_table_writers import (
-    HEIGHT,
-    WIDTH,
-    made_columns,
-    signed,
-    write_tum_vie,
-)
+from helpers.event_table_writers import HEIGHT, WIDTH, made_columns, signed, write_tum_vie
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
@@ -27,7 +21,7 @@ def open_events(path: Path) -> EventFile:
     return open_hdf5_events(path, WIDTH, HEIGHT)
 
 
-def test_a_native_file_is_told_from_others(tmp_path: Path) -> None:
+def test_native_file_is_recognized(tmp_path: Path) -> None:
     columns = signed(made_columns())
     with Hdf5EventWriter(tmp_path / "events.h5") as writer:
         writer.append(EventStream(**columns, width=WIDTH, height=HEIGHT))
@@ -40,7 +34,7 @@ def test_a_native_file_is_told_from_others(tmp_path: Path) -> None:
     assert open_events(tmp_path / "events.h5").time_span()[0] == columns["t"][0] * 1_000
 
 
-def test_a_stated_unit_counts_where_the_file_states_none(tmp_path: Path) -> None:
+def test_given_unit_counts_where_none_is_stated(tmp_path: Path) -> None:
     columns = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
     with h5py.File(tmp_path / "events.h5", "w") as file:
         for name, dtype in columns.items():
@@ -57,7 +51,7 @@ def test_a_stated_unit_counts_where_the_file_states_none(tmp_path: Path) -> None
         open_event_file(tmp_path / "events.txt", WIDTH, HEIGHT, time_unit="us")
 
 
-def test_blosc_without_its_filter_names_the_extra(tmp_path: Path) -> None:
+def test_missing_filter_names_the_extra(tmp_path: Path) -> None:
     write_tum_vie(tmp_path / "events.h5", made_columns())
     # In a process of its own, for a filter that is loaded stays.
     code = (

@@ -16,6 +16,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.event_text import CsvEventFile, TextEventFile, parse_lines
 from aenerf_ns.files.open import open_event_file
+from aenerf_ns.files.text import TimeUnit
 
 
 def open_events(path: Path) -> EventFile:
@@ -27,21 +28,21 @@ def written(path: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["events.csv", "EVENTS.CSV"])
-def test_decimals_behind_a_whole_number_in_csv_are_kept(tmp_path: Path, name: str) -> None:
-    path = written(tmp_path / name, "x,y,t,p\n1,2,0,1\n3,2,0.000123,0\n3,2,0.25,1\n1,2,1.5,0\n")
-    file = open_event_file(path, WIDTH, HEIGHT)
+@pytest.mark.parametrize(
+    ("rows", "unit", "times"),
+    [
+        ("1,2,0,1\n3,2,0.000123,0\n3,2,0.25,1\n1,2,1.5,0\n", None, [0, 123_000, 250_000_000, 1_500_000_000]),
+        ("1,2,1600000000123456789,1\n", "ns", [1_600_000_000_123_456_789]),
+    ],
+)
+def test_times_in_csv_are_exact(rows: str, unit: TimeUnit | None, times: list[int], tmp_path: Path) -> None:
+    file = open_event_file(written(tmp_path / "EVENTS.CSV", f"x,y,t,p\n{rows}"), WIDTH, HEIGHT, time_unit=unit)
     (events,) = file.chunks()
-    assert events.t.tolist() == [0, 123_000, 250_000_000, 1_500_000_000]
-    assert file.time_span() == (0, 1_500_000_000)
+    assert events.t.tolist() == times
+    assert file.time_span() == (times[0], times[-1])
 
 
-def test_whole_numbers_in_csv_are_exact_beyond_float64(tmp_path: Path) -> None:
-    path = written(tmp_path / "events.csv", "x,y,t,p\n1,2,1600000000123456789,1\n")
-    assert CsvEventFile(path, WIDTH, HEIGHT, "ns").time_span()[0] == 1_600_000_000_123_456_789
-
-
-def test_seconds_since_1970_keep_their_nanoseconds(tmp_path: Path) -> None:
+def test_seconds_since_1970_are_exact(tmp_path: Path) -> None:
     times = [1_600_000_000_000_000_001 + 3 * i for i in range(50)]
     seconds = [f"{t // 10**9}.{t % 10**9:09d}" for t in times]
     path = written(tmp_path / "events.txt", "".join(f"{t} 1 2 1\n" for t in seconds))
@@ -52,7 +53,7 @@ def test_seconds_since_1970_keep_their_nanoseconds(tmp_path: Path) -> None:
     assert events.t.tolist() == times
 
 
-def test_blanks_comments_and_empty_lines_are_passed_over(tmp_path: Path) -> None:
+def test_skip_blanks_comments_and_empty_lines(tmp_path: Path) -> None:
     text = "# t x y p\n\n \t0.5\t1   2 1 # one\r\n   # none\n\r\n-0.25e+1 +3 4. 0"
     path = written(tmp_path / "events.txt", text.replace("0.5", "-3.5"))
     (events,) = open_events(path).chunks()
@@ -65,7 +66,7 @@ def test_blanks_comments_and_empty_lines_are_passed_over(tmp_path: Path) -> None
     assert (events.x[0], events.y[0], events.t[0], events.p[0]) == (3, 4, 8000, 1)
 
 
-def test_a_real_recording_is_read_to_the_nanosecond(slider_depth: Path) -> None:
+def test_real_recording_is_exact(slider_depth: Path) -> None:
     events = next(TextEventFile(slider_depth / "events.txt", 240, 180).chunks())
     lines = (slider_depth / "events.txt").read_text().splitlines()[: len(events)]
     assert events.t.tolist() == [int(Decimal(line.split()[0]) * 10**9) for line in lines]

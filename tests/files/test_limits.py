@@ -33,7 +33,7 @@ def write(path: Path) -> object:
         (lambda path: (path.parent / "none").read_bytes(), "none: there is no such file"),
     ],
 )
-def test_what_goes_wrong_is_one_line_and_limits_end(read: object, message: str, tmp_path: Path) -> None:
+def test_failure_is_one_line_and_ends_limits(read: object, message: str, tmp_path: Path) -> None:
     path = tmp_path / "small"
     path.write_text("x")
     before = [resource.getrlimit(kind) for kind in LIMITS]
@@ -42,7 +42,7 @@ def test_what_goes_wrong_is_one_line_and_limits_end(read: object, message: str, 
     assert [resource.getrlimit(kind) for kind in LIMITS] == before
 
 
-def test_limits_hold_while_an_item_is_read_only(tmp_path: Path) -> None:
+def test_limits_hold_while_an_item_is_read(tmp_path: Path) -> None:
     path = tmp_path / "small"
     path.write_text("x")
     before = resource.getrlimit(resource.RLIMIT_DATA)

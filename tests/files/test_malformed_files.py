@@ -8,8 +8,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.bag_writers import ARRAY, PACKET, START, array_message, packet_message, write_bag
 from helpers.event_file_checks import assert_one_line, attempt
-from helpers.event_file_writers import HEADER2, HEADER3, ROWS, aedat4_file, dat, evt2, evt3, sized, words
+from helpers.event_file_writers import HEADER2, HEADER3, ROWS, aedat4_file, dat, evt2, evt3, evt3_words, sized, words
 from helpers.event_table_writers import HEIGHT, WIDTH, ZEROS, N, T, made_columns, records, replaced, write_dsec
 
 from aenerf_ns.errors import DataError
@@ -37,6 +38,19 @@ def set_offset(path: Path, value: object) -> None:
     with h5py.File(path, "a") as file:
         del file["t_offset"]
         file["t_offset"] = value
+
+
+def bag(*messages: bytes, kind: str = ARRAY) -> Callable[[Path], object]:
+    """Write a bag of messages that were received one nanosecond after another."""
+    timed = [(START + index, message) for index, message in enumerate(messages)]
+    return lambda path: write_bag(path, {"/events": (kind, timed)})
+
+
+def packets(*payloads: bytes, encoding: str = "evt3") -> Callable[[Path], object]:
+    return bag(*(packet_message(i, START, payload, encoding) for i, payload in enumerate(payloads)), kind=PACKET)
+
+
+ARRAYS = array_message(ROWS)
 
 
 # By the suffix of the file and a name: its content, or how it is written, and a part of the message.
@@ -99,6 +113,17 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "raw: unknown": (b"RIFF....WAVE", "its format is not known"),
     "bag: with its magic alone": (b"#ROSBAG V2.0\n", "not a readable bag"),
     "bag: of version 1": (b"#ROSBAG V1.2\n", "not a readable bag"),
+    "bag: no events": (bag(array_message([])), "holds no events"),
+    "bag: cut": (bag(ARRAYS[:-1]), "does not have the parts"),
+    "bag: cut in its header": (bag(ARRAYS[:10]), "does not have the parts"),
+    "bag: of another length": (bag(ARRAYS + b"\0"), "does not have the parts"),
+    "bag: of two sizes": (bag(ARRAYS, array_message(ROWS, (9, 9))), "has 9 x 9 pixels, but 64 x 48"),
+    "bag: out of order": (bag(ARRAYS, ARRAYS), "before the event ahead of it"),
+    "bag: of another encoding": (packets(b"", encoding="libcaer"), "encoded as 'libcaer'"),
+    "bag: within a word": (packets(b"\1\2\3"), "ends within a word"),
+    "bag: of no time": (packets(words("<u2", 1, 0x2001)), "holds no events"),
+    "bag: of garbage": (packets(evt3_words(ROWS).tobytes(), b"\0\x90"), "0x9000"),
+    "bag: of nothing we know": (bag(b"", kind="sensor_msgs/msg/Image"), "the bag holds sensor_msgs/Image"),
     "npz: missing": (None, "there is no such file"),
     "npy: missing": (None, "there is no such file"),
     "npz: of text": (b"x y", "not a readable .npz file"),
@@ -180,7 +205,7 @@ READERS: dict[str, Callable[..., EventFile]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS, ids=lambda name: name.replace(" ", "_"))
-def test_a_malformed_event_file_is_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_malformed_event_file_is_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content, message = FAULTS[name]
     suffix = name.split(":")[0]
     path = tmp_path / f"e.{suffix}"

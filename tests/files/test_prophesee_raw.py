@@ -13,7 +13,7 @@ from aenerf_ns.files import prophesee
 from aenerf_ns.files.open import open_event_file
 
 
-def test_a_long_recording_in_evt3_keeps_its_time_over_many_wraps(folder: Path) -> None:
+def test_evt3_keeps_time_over_many_wraps(folder: Path) -> None:
     rng = np.random.default_rng(0)
     # Six hours, with breaks of up to 16 s without a word.
     times = np.cumsum(rng.integers(0, 16_000_000, 2700))
@@ -24,7 +24,7 @@ def test_a_long_recording_in_evt3_keeps_its_time_over_many_wraps(folder: Path) -
     np.testing.assert_array_equal(read(open_event_file(path)), lapless(rows, 1 << 24))
 
 
-def test_words_before_the_first_time_are_left_out(folder: Path) -> None:
+def test_skip_words_before_the_first_time(folder: Path) -> None:
     path = folder / "late.raw"
     words = [0x2005, 0x0007, 0x2006, 0x8001, 0x2007, 0x3008, 0x4FFF, 0x6002, 0x2009]
     path.write_bytes(b"% evt 3.0\n% geometry 64x48\n" + np.array(words, "<u2").tobytes())
@@ -32,9 +32,7 @@ def test_words_before_the_first_time_are_left_out(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("block", [1, 100])
-def test_the_upper_bits_of_a_time_take_effect_before_the_lower_ones_follow(
-    block: int, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_upper_bits_of_time_take_effect_alone(block: int, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prophesee, "BLOCK", block)
     path = folder / "upper.raw"
     words = [0x8001, 0x6FFF, 0x0007, 0x2001, 0x8002, 0x2002, 0x8002, 0x6003, 0x8002, 0x2003]

@@ -25,7 +25,7 @@ from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.scene import SCENE_KEY
 
 
-def test_all_splits_share_one_world_and_the_transform_is_the_one_reported(tmp_path: Path) -> None:
+def test_all_splits_share_the_reported_world(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     config = NativeDataParserConfig(data=folder)
     train, test = parse(config), parse(config, "test")
@@ -39,7 +39,7 @@ def test_all_splits_share_one_world_and_the_transform_is_the_one_reported(tmp_pa
     )
 
 
-def test_a_scene_box_sets_the_scale_and_bounds_the_scene(tmp_path: Path) -> None:
+def test_scene_box_sets_scale_and_bounds(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made", np.array([[-1.0, -2.0, 0.0], [3.0, 4.0, 1.0]]))
     outputs = parse(NativeDataParserConfig(data=folder))
     assert outputs.metadata[SCENE_KEY].bounded
@@ -48,7 +48,7 @@ def test_a_scene_box_sets_the_scale_and_bounds_the_scene(tmp_path: Path) -> None
     torch.testing.assert_close(first, torch.tensor([-1.0, -1.0, 1.5], dtype=torch.float64) / 3)
 
 
-def test_training_cameras_show_images_where_they_were_taken_and_events_elsewhere(tmp_path: Path) -> None:
+def test_training_cameras_show_images_or_events(tmp_path: Path) -> None:
     dataset = EventDataset(parse(NativeDataParserConfig(data=write_native(tmp_path / "made"))))
     has_image = dataset.metadata[SCENE_KEY].has_image
     # The 21 knots, two of them image times, and one image between two knots.
@@ -60,7 +60,7 @@ def test_training_cameras_show_images_where_they_were_taken_and_events_elsewhere
     assert (picture.max(-1) != picture.min(-1)).any()
 
 
-def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> None:
+def test_time_window_leaves_out_the_rest(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     start, end = START + 500_000_000, START + 1_050_000_000
     dataset = EventDataset(parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end)))
@@ -78,22 +78,7 @@ def test_the_time_window_leaves_out_events_poses_and_images(tmp_path: Path) -> N
         parse(NativeDataParserConfig(data=folder, start_time_ns=9, end_time_ns=9))
 
 
-def test_opening_again_with_the_resolved_window_needs_no_events(tmp_path: Path) -> None:
-    folder = write_native(tmp_path / "made")
-    config = NativeDataParserConfig(data=folder)
-    parser = config.setup()
-    before = parser.get_dataparser_outputs("train")
-    resolved = parser.resolved_config()
-    # The given configuration stays as it was.
-    assert (config.start_time_ns, resolved.start_time_ns) == (None, before.metadata[SCENE_KEY].window.start)
-    (folder / "events.h5").unlink()
-    after = parse(resolved)
-    assert torch.equal(before.cameras.camera_to_worlds, after.cameras.camera_to_worlds)
-    # The viewer shows plain pictures then.
-    assert EventDataset(after).get_numpy_image(10).std() == 0
-
-
-def test_reference_views_far_from_the_estimated_poses_are_refused(tmp_path: Path) -> None:
+def test_refuse_reference_views_far_away(tmp_path: Path) -> None:
     # True poses in a geodetic frame: single precision, which the framework's cameras have, would displace them.
     folder = write_native(tmp_path / "scene")
     truth = make_trajectory()
@@ -111,7 +96,7 @@ def test_reference_views_far_from_the_estimated_poses_are_refused(tmp_path: Path
         parse(config, "test")
 
 
-def test_a_camera_that_only_turns_gives_no_scale(tmp_path: Path) -> None:
+def test_refuse_scale_of_turning_camera(tmp_path: Path) -> None:
     folder = write_ecd(tmp_path / "made")
     (folder / "groundtruth.txt").write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n")
     parse(EcdDataParserConfig(data=folder))
@@ -119,7 +104,7 @@ def test_a_camera_that_only_turns_gives_no_scale(tmp_path: Path) -> None:
         parse(EcdDataParserConfig(data=folder, auto_scale_poses=True))
 
 
-def test_images_are_thinned_out_within_the_time_window(tmp_path: Path) -> None:
+def test_images_are_thinned_within_the_window(tmp_path: Path) -> None:
     truth = write_own(tmp_path / "made")
     write_images(truth.data / "images", 200, (60, 40))
     start, length = EPOCH * 1_000, DURATION * 1_000
@@ -140,7 +125,7 @@ def test_images_are_thinned_out_within_the_time_window(tmp_path: Path) -> None:
     assert not isinstance(frames.capture, Recording)
 
 
-def test_a_pose_gap_must_be_positive(tmp_path: Path) -> None:
+def test_refuse_pose_gap_of_zero(tmp_path: Path) -> None:
     truth = write_own(tmp_path / "made")
     with pytest.raises(DataError, match="max_pose_gap_ns is 0"):
         parse(config_of("event-recording-data", truth.data, max_pose_gap_ns=0))
@@ -148,13 +133,13 @@ def test_a_pose_gap_must_be_positive(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("option", ["start_time_ns", "end_time_ns", "max_pose_gap_ns", "refractory_period_ns"])
 @pytest.mark.parametrize("value", [10**19, -(10**400)])
-def test_a_time_beyond_64_bits_is_one_line(option: str, value: int, tmp_path: Path) -> None:
+def test_refuse_times_beyond_64_bits(option: str, value: int, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=f"--{option.replace('_', '-')} is -?1000.*; give nanoseconds") as refused:
         config_of("event-recording-data", tmp_path, **{option: value}).setup()
     assert "\n" not in str(refused.value)
 
 
-def test_windows_hold_the_events_of_the_time_window_and_read_the_file_once(
+def test_windows_read_the_events_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = write_native(tmp_path / "made")

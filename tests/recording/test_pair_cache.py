@@ -64,7 +64,7 @@ def assert_same(first: EventPairs, second: EventPairs) -> None:
         assert np.array_equal(getattr(first, field.name), getattr(second, field.name)), field.name
 
 
-def test_pairs_in_a_file_are_those_in_memory_and_are_found_again(
+def test_pairs_in_file_equal_those_in_memory(
     data: Path, reads: list[Path], monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     in_memory = opened(data)
@@ -96,7 +96,7 @@ def test_pairs_in_a_file_are_those_in_memory_and_are_found_again(
     assert all(torch.equal(value, vars(mapped_batch)[name]) for name, value in vars(batch).items())
 
 
-def test_pairs_are_made_again_when_events_or_options_change(
+def test_changed_events_or_options_make_new_pairs(
     data: Path, long_recording: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = len(opened(data).pairs)
@@ -128,7 +128,7 @@ def test_pairs_are_made_again_when_events_or_options_change(
         lambda content: content[:4200] + bytes([content[4200] ^ 1]) + content[4201:],
     ],
 )
-def test_a_broken_file_is_made_again(
+def test_broken_file_is_made_again(
     data: Path, long_recording: list[Path], damage: Callable[[bytes], bytes], capsys: pytest.CaptureFixture[str]
 ) -> None:
     pairs = opened(data).pairs
@@ -143,9 +143,7 @@ def test_a_broken_file_is_made_again(
     assert (data / KEPT).read_bytes() == content
 
 
-def test_an_interrupted_making_leaves_no_file(
-    data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interruption_leaves_no_file(data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     # As if an earlier process had been killed.
     (data / (KEPT + ".part")).write_bytes(b"half")
     with monkeypatch.context() as patch:
@@ -157,7 +155,7 @@ def test_an_interrupted_making_leaves_no_file(
     assert sorted(path.name for path in data.glob("events*")) == ["events.h5", KEPT]
 
 
-def test_a_folder_that_cannot_be_written_to_is_left_alone(
+def test_unwritable_folder_is_left_alone(
     data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     original = Path.open
@@ -176,7 +174,7 @@ def test_a_folder_that_cannot_be_written_to_is_left_alone(
     assert len(long_recording) == 2
 
 
-def test_a_full_disk_is_one_clear_line(data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_one_line(data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -186,7 +184,7 @@ def test_a_full_disk_is_one_clear_line(data: Path, long_recording: list[Path], m
     assert [path.name for path in data.glob("events*")] == ["events.h5"]
 
 
-def test_a_short_recording_takes_the_place_of_a_long_one(
+def test_short_recording_removes_the_file(
     data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start = opened(data).scene.window.start + 10**9

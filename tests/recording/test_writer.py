@@ -21,7 +21,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
 
-def test_nothing_is_left_of_a_dataset_that_could_not_be_completed(tmp_path: Path) -> None:
+def test_incomplete_dataset_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError), NativeDatasetWriter(tmp_path / "made", CAMERA, SENSOR, "srgb"):
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
@@ -87,11 +87,11 @@ def write_as_simulated(folder: Path) -> None:
             writer.add_image(split, picture, pose, linear=linear, depth=np.ones((4, 6), np.float32))
 
 
-def test_a_full_disk_leaves_nothing_of_a_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_leaves_nothing_of_a_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert fails_at_every_write(tmp_path, write_as_simulated, monkeypatch) > 12
 
 
-def test_a_full_disk_leaves_nothing_of_a_conversion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_leaves_nothing_of_a_conversion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = write_native(tmp_path / "source")
     (tmp_path / "to").mkdir()
     assert fails_at_every_write(tmp_path / "to", lambda folder: Convert(source, folder).main(), monkeypatch) > 8
