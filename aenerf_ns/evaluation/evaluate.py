@@ -7,18 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
-
 from aenerf_ns.errors import DataError
-from aenerf_ns.evaluation.pose_refinement import NUM_STEPS, RefinedViews
+from aenerf_ns.evaluation.pose_refinement import NUM_STEPS
 from aenerf_ns.evaluation.poses import compare_with_ground_truth, describe_test_poses
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import (
     IMAGE_METRICS,
     average_metrics,
     describe_views,
-    measure_views,
-    picture_names,
+    measure_reference_views,
 )
 
 
@@ -64,30 +61,6 @@ def evaluate(run: TrainedRun, output: Path | None = None, with_deviations: bool 
         metrics["lpips_absent"] = model.image_metrics.lpips_absent
     metrics["views"] = describe_views(run, placed, refined) if placed else []
     return metrics
-
-
-def measure_reference_views(
-    run: TrainedRun, output: Path | None = None, refine: bool = False
-) -> list[dict[str, float]]:
-    """Compute the metrics of each reference view.
-
-    Args:
-        run: with its views.
-        output: folder for pictures, which are named as ns-eval names them, or None.
-        refine: render from photometrically refined poses.
-
-    Raises:
-        DataError: there are no reference views.
-    """
-    if run.views is None:
-        raise DataError(run.data, "it has no reference images to evaluate on", "ns-render shows what was reconstructed")
-    was_training = run.model.training
-    run.model.eval()
-    loader = FixedIndicesEvalDataloader(input_dataset=run.views, device=run.device)
-    names = picture_names(run.views.image_filenames)
-    measured = measure_views(run.model, RefinedViews(run.model, loader) if refine else loader, names, output, "eval")
-    run.model.train(was_training)
-    return measured
 
 
 def _describe_refined(run: TrainedRun, refined: Sequence[dict[str, float]], with_deviations: bool) -> dict[str, Any]:

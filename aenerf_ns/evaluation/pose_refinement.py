@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from torch import Tensor
 
 from aenerf_ns.camera.rotation import motion_from_twist
@@ -20,7 +17,7 @@ _NUM_RAYS = 1024
 # Relative to the diagonal of the normal equations (Marquardt), and what an accepted and a rejected step multiply it by.
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 10.0
 # Added to the diagonal, which is zero where nothing changes with the pose, as in a picture that clips everywhere.
-_LEAST_DIAGONAL = 1e-9
+_MIN_DIAGONAL = 1e-9
 
 
 def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras:
@@ -52,7 +49,7 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
                 jacobian = fitted.jacobian(pose, residuals, rays)
                 matrix = jacobian.mT @ jacobian
                 gradient = jacobian.mT @ residuals.detach().flatten().double()
-            diagonal = damping * matrix.diagonal() + _LEAST_DIAGONAL
+            diagonal = damping * matrix.diagonal() + _MIN_DIAGONAL
             step = -torch.linalg.solve(matrix + torch.diag(diagonal), gradient)
             tried = pose @ motion_from_twist(step)
             residuals_there, rays_there = fitted.residuals(tried)
@@ -68,26 +65,6 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
     if after < before:
         camera.camera_to_worlds = pose[None, :3].to(camera.camera_to_worlds)
     return camera
-
-
-class RefinedViews:
-    """Reference views whose cameras are refined when it is their turn, as a loader of the framework's evaluation.
-
-    Args:
-        model: in evaluation mode by then.
-        views: loader of single cameras (1,) and their batches.
-    """
-
-    def __init__(self, model: AENeRFModel, views: FixedIndicesEvalDataloader) -> None:
-        self._model = model
-        self._views = views
-
-    def __len__(self) -> int:
-        return len(self._views)
-
-    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        for camera, batch in self._views:
-            yield refine_camera(self._model, camera, batch["image"][..., :3]), batch
 
 
 class _Pixels:

@@ -2,61 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from PIL import Image
 from torch import Tensor
 
+from aenerf_ns.errors import DataError
+from aenerf_ns.evaluation.pose_refinement import refine_camera
 from aenerf_ns.evaluation.poses import camera_speeds
 from aenerf_ns.evaluation.run import TrainedRun
-from aenerf_ns.method.model import AENeRFModel
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 
 IMAGE_METRICS = ("psnr", "ssim", "lpips")
 """Image-quality metrics. All others are timings."""
 
 
 @torch.no_grad()
-def measure_views(
-    model: AENeRFModel,
-    views: Iterable[tuple[Cameras, dict[str, Any]]],
-    names: Sequence[str],
-    output: Path | None = None,
-    prefix: str = "",
+def measure_reference_views(
+    run: TrainedRun, output: Path | None = None, refine: bool = False
 ) -> list[dict[str, float]]:
-    """Render reference views and compare them with their images.
+    """Render the reference views and compare them with their images.
 
     Args:
-        model: in evaluation mode.
-        views: single cameras (1,) with their batches.
-        names: of the views, in their order. The pictures are named after them.
-        output: folder for pictures, or None.
-        prefix: of the pictures' names.
+        run: with its views.
+        output: folder for pictures, which are named as ns-eval names them, or None.
+        refine: render from photometrically refined poses.
 
     Returns:
         The metrics of each view, and ``num_rays_per_sec`` and ``fps`` as the framework has them.
+
+    Raises:
+        DataError: there are no reference views.
     """
+    model = run.model
+    if run.views is None:
+        raise DataError(run.data, "it has no reference images to evaluate on", "ns-render shows what was reconstructed")
     if output is not None:
         output.mkdir(exist_ok=True, parents=True)
+    was_training = model.training
+    model.eval()
+    names = picture_names(run.views.image_filenames)
+    views = FixedIndicesEvalDataloader(input_dataset=run.views, device=run.device)
     measured = []
-    with progress_bar() as progress:
-        task = progress.add_task("Evaluating views", total=len(names))
-        for name, (camera, batch) in zip(names, views, strict=True):
-            began = perf_counter()
-            outputs = model.get_outputs_for_camera(camera)
-            metrics, pictures = model.get_image_metrics_and_images(outputs, batch)
-            if output is not None:
-                for kind, picture in pictures.items():
-                    to_image(picture).save(output / f"{prefix}_{kind}_{name}.png")
-            seconds = perf_counter() - began
-            num_rays = int(camera.height) * int(camera.width)
-            measured.append({**metrics, "num_rays_per_sec": num_rays / seconds, "fps": 1 / seconds})
-            progress.advance(task)
+    for name, (camera, batch) in zip(track(names, "Evaluating views"), views, strict=True):
+        if refine:
+            camera = refine_camera(model, camera, batch["image"][..., :3])
+        began = perf_counter()
+        outputs = model.get_outputs_for_camera(camera)
+        metrics, pictures = model.get_image_metrics_and_images(outputs, batch)
+        if output is not None:
+            for kind, picture in pictures.items():
+                to_image(picture).save(output / f"eval_{kind}_{name}.png")
+        seconds = perf_counter() - began
+        num_rays = int(camera.height) * int(camera.width)
+        measured.append({**metrics, "num_rays_per_sec": num_rays / seconds, "fps": 1 / seconds})
+    model.train(was_training)
     return measured
 
 
@@ -108,31 +113,25 @@ def describe_views(
         refined: the same from photometrically refined poses, or None where they were not refined.
 
     Returns:
-        Of each view its ``file`` (:func:`view_files`), and its metrics ``placed`` and
-        ``refined``. Of a view on the trajectory also ``time_ns``, on the clock of the events, and of the corrected
-        trajectory then ``camera_speed``, in units of the recording per second, and
-        ``camera_turn_rate_degrees``, per second. They are None of a view off the trajectory.
+        Of each view its ``file`` (:func:`view_files`), and its image metrics ``placed`` and ``refined``. Of a view on
+        the trajectory ``time_ns``, on the clock of the events, and of the corrected trajectory then ``camera_speed``,
+        in units of the recording per second, and ``camera_turn_rate_degrees``, per second; else they are None.
     """
     assert run.views is not None
     seconds = run.views.reference_seconds
-    on_trajectory = seconds.isfinite()
     speeds, turn_rates = camera_speeds(run.model.camera_optimizer, run.scene, seconds.nan_to_num(0.0))
     start = run.scene.trajectory.start
     views = []
     for index, file in enumerate(view_files(run)):
-        timed = bool(on_trajectory[index])
+        timed = bool(seconds[index].isfinite())
         view: dict[str, Any] = {
             "file": file,
             "time_ns": start + round(float(seconds[index]) * 1e9) if timed else None,
             "camera_speed": float(speeds[index]) if timed else None,
             "camera_turn_rate_degrees": float(turn_rates[index]) if timed else None,
-            "placed": _image_metrics(placed[index]),
         }
-        if refined is not None:
-            view["refined"] = _image_metrics(refined[index])
+        for name, metrics in (("placed", placed), ("refined", refined)):
+            if metrics is not None:
+                view[name] = {metric: metrics[index][metric] for metric in metrics[index] if metric in IMAGE_METRICS}
         views.append(view)
     return views
-
-
-def _image_metrics(metrics: dict[str, float]) -> dict[str, float]:
-    return {name: value for name, value in metrics.items() if name in IMAGE_METRICS}

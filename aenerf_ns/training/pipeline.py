@@ -18,11 +18,11 @@ from torch import Tensor
 
 from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.evaluation.color_fit import ColorFit
-from aenerf_ns.evaluation.evaluate import evaluate, measure_reference_views
+from aenerf_ns.evaluation.evaluate import evaluate
 from aenerf_ns.evaluation.pose_diagnosis import diagnose
 from aenerf_ns.evaluation.poses import compare_with_ground_truth
 from aenerf_ns.evaluation.run import TrainedRun
-from aenerf_ns.evaluation.view_metrics import average_metrics
+from aenerf_ns.evaluation.view_metrics import average_metrics, measure_reference_views
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.supervision.base import Batch, ChangeBatch
 from aenerf_ns.training.datamanager import EventDataManager
