@@ -11,7 +11,7 @@ import tyro
 
 from aenerf_ns.errors import DataError
 
-_COMMANDS = {
+COMMANDS = {
     "simulate": "simulate:Simulate",
     "simulate-video": "simulate_video:SimulateVideo",
     "convert": "convert:Convert",
@@ -25,6 +25,7 @@ _COMMANDS = {
     "export-mesh": "export:ExportMesh",
     "export-video": "export:ExportVideo",
 }
+"""Modules and classes of the commands by name. Only the chosen one is imported."""
 _POSITIONAL = ("--data", "--video", "--load-config")
 
 
@@ -34,9 +35,9 @@ def main() -> None:
     Bad arguments end the process with exit status 2, bad data with one line and exit status 1, or 2 for ``check``.
     """
     words = _with_positional_first(sys.argv[1:])
-    names = words[:1] if words and words[0] in _COMMANDS else _COMMANDS
+    names = words[:1] if words and words[0] in COMMANDS else COMMANDS
     command = tyro.extras.subcommand_cli_from_dict(
-        {name: _load_command(name) for name in names},
+        {name: load_command(name) for name in names},
         prog="aenerf",
         description="AE-NeRF tools; train with ns-train aenerf.",
         args=words,
@@ -48,8 +49,9 @@ def main() -> None:
         sys.exit(getattr(command, "error_status", 1))
 
 
-def _load_command(name: str) -> Any:
-    module, _, attribute = _COMMANDS[name].partition(":")
+def load_command(name: str) -> type[Any]:
+    """Import the class of a command."""
+    module, _, attribute = COMMANDS[name].partition(":")
     return getattr(importlib.import_module(f"aenerf_ns.cli.{module}"), attribute)
 
 
