@@ -131,14 +131,7 @@ def copy_images(writer: NativeDatasetWriter, recording: Recording, views: Mappin
 def training_command(
     data: Path, method: str = "aenerf", options: Mapping[str, object] | None = None, format_words: Sequence[str] = ()
 ) -> str:
-    """Write the whole command that trains on a dataset.
-
-    Args:
-        data: the dataset.
-        method: name of the method.
-        options: options of the method, by name.
-        format_words: name and options of the dataset's format, where it is not recognized or has options.
-    """
+    """Write the command that trains on a dataset, with options of the method and words of the dataset's format."""
     words = ["ns-train", method]
     for name, value in (options or {}).items():
         words += [f"--{name}", str(value)]

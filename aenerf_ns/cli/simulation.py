@@ -85,11 +85,7 @@ class SimulationCommand:
         require_seed(self.seed)
 
     def make_sensor(self) -> SensorModel:
-        """Make the sensor.
-
-        Raises:
-            DataError: a value is impossible.
-        """
+        """Make the sensor. A DataError is raised if a value is impossible."""
         with value_errors_as_data_error("aenerf simulate", "see aenerf simulate --help"):
             return SensorModel(
                 self.positive_contrast_threshold,

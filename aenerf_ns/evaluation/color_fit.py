@@ -41,7 +41,7 @@ class ColorFit:
     Without such views, the percentiles of the training cameras' renderings are stretched over the display's range.
 
     Args:
-        model: whose color correction is fitted.
+        model: holds the color correction.
         dataset: the training cameras.
         read_reference_views: reads the reference views of a split; None where there are none.
     """
@@ -65,11 +65,7 @@ class ColorFit:
 
     @torch.no_grad()
     def fit(self, share: float = 1.0) -> None:
-        """Fit the color correction.
-
-        Args:
-            share: share of the configured number of pixels to fit on. A share below 1 makes a rough fit.
-        """
+        """Fit the color correction on a share of the configured number of pixels. A share below 1 makes a rough fit."""
         model, correction = self._model, self._model.color_correction
         if isinstance(correction, NoColorCorrection):
             return

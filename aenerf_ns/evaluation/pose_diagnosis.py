@@ -58,11 +58,7 @@ def diagnose(model: AENeRFModel, dataset: EventDataset, sampler: Sampler | None)
 
 
 def summarize(figures: dict[str, Any]) -> str:
-    """Say in one line how large the corrections are, and name every sign of failure.
-
-    Args:
-        figures: see :func:`diagnose`.
-    """
+    """Say in one line how large the corrections are, and name every sign of failure in :func:`diagnose`'s figures."""
     degrees, length = figures["correction_rotation_degrees"], figures["correction_translation_recording_units"]
     line = f"Pose correction: {degrees:.2f} degrees and {round(length, 6):.2g} units of the recording on average"
     before, after = figures["contrast_estimated"], figures["contrast_corrected"]

@@ -68,14 +68,7 @@ def refine_camera(model: AENeRFModel, camera: Cameras, image: Tensor) -> Cameras
 
 
 class _Pixels:
-    """Random pixels of an image, and what a camera at any pose renders there.
-
-    Args:
-        model: that renders.
-        camera: (1,) of the image. Its pose does not matter.
-        image: (H, W, 3) reference values in [0, 1].
-        generator: that draws the pixels.
-    """
+    """Random pixels of an (H, W, 3) image in [0, 1], and what a camera with its lens renders there at any pose."""
 
     def __init__(self, model: AENeRFModel, camera: Cameras, image: Tensor, generator: torch.Generator) -> None:
         self._model = model

@@ -13,11 +13,9 @@ from aenerf_ns.recording.scene import SceneRecording
 
 
 def compare_with_ground_truth(correction: PoseCorrection, scene: SceneRecording) -> dict[str, dict[str, float]] | None:
-    """Compute the errors of the ``estimated`` and of the ``corrected`` poses, in the units of the recording.
+    """Compute the :func:`~aenerf_ns.camera.alignment.pose_errors` of the ``estimated`` and of the ``corrected`` poses.
 
-    Returns:
-        For each the figures of :func:`~aenerf_ns.camera.alignment.pose_errors`, or None where the true poses are not
-        known.
+    They are in units of the recording, and None where the true poses are not known.
     """
     if not correction.has_ground_truth:
         return None
@@ -27,12 +25,7 @@ def compare_with_ground_truth(correction: PoseCorrection, scene: SceneRecording)
 
 @torch.no_grad()
 def camera_speeds(correction: PoseCorrection, scene: SceneRecording, seconds: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute how fast the corrected camera moves and turns.
-
-    Args:
-        correction: of the poses.
-        scene: that the poses are in.
-        seconds: (N,) float64 since the trajectory's start.
+    """Compute how fast the corrected camera moves and turns at (N,) float64 seconds since the trajectory's start.
 
     Returns:
         (N,) units of the recording per second, and (N,) degrees per second.

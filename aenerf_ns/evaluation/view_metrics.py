@@ -105,17 +105,12 @@ def view_files(run: TrainedRun) -> list[str]:
 def describe_views(
     run: TrainedRun, placed: Sequence[dict[str, float]], refined: Sequence[dict[str, float]] | None
 ) -> list[dict[str, Any]]:
-    """Describe each reference view in plain values.
-
-    Args:
-        run: with its views.
-        placed: metrics of each view from where its camera is placed.
-        refined: the same from photometrically refined poses, or None where they were not refined.
+    """Describe each reference view, of which the metrics ``placed`` and perhaps ``refined`` are given, in plain values.
 
     Returns:
-        Of each view its ``file`` (:func:`view_files`), and its image metrics ``placed`` and ``refined``. Of a view on
-        the trajectory ``time_ns``, on the clock of the events, and of the corrected trajectory then ``camera_speed``,
-        in units of the recording per second, and ``camera_turn_rate_degrees``, per second; else they are None.
+        Of each view its ``file`` (:func:`view_files`), and its image metrics. Of a view on the trajectory ``time_ns``,
+        on the clock of the events, and of the corrected trajectory then ``camera_speed``, in units of the recording per
+        second, and ``camera_turn_rate_degrees``, per second; else they are None.
     """
     assert run.views is not None
     seconds = run.views.reference_seconds

@@ -65,10 +65,7 @@ def write_cameras(folder: Path, images: Sequence[PlacedImage], points: ObservedP
 def _write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
     """Write a COLMAP model in binary form, and the lists of images that Nerfstudio's ``colmap`` dataparser splits by.
 
-    Args:
-        folder: gets the model's folder ``sparse/0`` and the lists.
-        images: in the order of their numbers in the model, which begin with 1.
-        points: of the model; each has a track of one image.
+    Images have the numbers of their order from 1 on, and each point has a track of one image.
     """
     # Imported lazily, because few commands need it.
     import pycolmap

@@ -13,11 +13,9 @@ from aenerf_ns.progress import tracked
 
 
 def sum_recorded_events(events: EventFile, times: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Yield the (height, width) sums of polarities between each two consecutive times, the earlier one included.
+    """Yield the (height, width) sums of polarities between each two of (N,) times in nanoseconds, the earlier included.
 
-    Args:
-        events: read once, in pieces.
-        times: (N,) in nanoseconds, increasing. There are N - 1 sums.
+    The events are read once, in pieces.
     """
     shape = (events.height, events.width)
     net = np.zeros(shape, np.int64)
@@ -41,13 +39,7 @@ def sum_recorded_events(events: EventFile, times: NDArray[np.int64]) -> Iterator
 
 
 class RenderedEvents:
-    """Trigger events as the sensor's model does (paper, eq. 5), from consecutive renderings.
-
-    Args:
-        sensor: its thresholds and its filters. Its refractory period plays no part.
-        width: pixel columns.
-        height: pixel rows.
-    """
+    """Trigger events of consecutive renderings as the sensor does (paper, eq. 5), but without a refractory period."""
 
     def __init__(self, sensor: SensorModel, width: int, height: int) -> None:
         self._sensor = sensor
@@ -58,8 +50,7 @@ class RenderedEvents:
     def __call__(self, log_radiance: NDArray[np.floating]) -> NDArray[np.int64]:
         """Return the (height, width) sums of polarities since the call before; none at the first call.
 
-        Args:
-            log_radiance: (height, width, channels).
+        ``log_radiance`` is (height, width, channels).
         """
         seen = np.take_along_axis(log_radiance.astype(np.float64), self._channel, -1)[..., 0]
         if self._reference is None:

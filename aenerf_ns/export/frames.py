@@ -31,16 +31,11 @@ _MAX_DEPTH = 2**16 - 1
 
 @torch.no_grad()
 def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int) -> None:
-    """Render frames and depths at times along the trajectory, and write them with their cameras.
+    """Render frames and depths at (N,) times in nanoseconds, and write them with their cameras to a new folder.
 
     Depth pictures have 16 bits and hold the distance along the optical axis, in thousandths of the recording's unit,
-    0 where no surface is seen or where it is too far.
-
-    Args:
-        run: in evaluation mode.
-        folder: to create.
-        times: (N,) in nanoseconds.
-        num_points: the most points of the scene.
+    0 where no surface is seen or where it is too far. At most ``num_points`` points of the scene are written. The run
+    is in evaluation mode.
     """
     camera = run.recording.event_camera
     directions, _ = camera.pixel_directions()

@@ -36,8 +36,8 @@ def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Tr
     Args:
         run: in evaluation mode.
         num_views: evenly spread over the time of the run.
-        resolution: voxels along the longest side of the box that is meshed: the scene's own box where the dataset
-            states one, else a box that holds nearly all that the views see.
+        resolution: voxels along the longest side of the box that is meshed: the dataset's scene box where it states
+            one, else a box that holds nearly all that the views see.
 
     Returns:
         A mesh with vertex colors, in the recording's world and units.

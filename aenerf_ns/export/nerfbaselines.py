@@ -36,7 +36,7 @@ def export_predictions(run: TrainedRun, folder: Path, config: TrainerConfig, vie
 
     Args:
         run: as it is opened to be tested.
-        folder: to create.
+        folder: the folder to create.
         config: of the run.
         views: one or more; see :func:`~aenerf_ns.evaluation.view_metrics.describe_views`.
     """
@@ -62,13 +62,7 @@ def _render_views(run: TrainedRun, names: list[str]) -> Iterator[tuple[str, Imag
 
 
 def describe_run(method: str, scene: str, num_steps: int) -> dict[str, Any]:
-    """Describe how predictions came about, as ``nb_info`` of nerfbaselines does.
-
-    Args:
-        method: name of the method.
-        scene: name of the scene.
-        num_steps: steps of the training.
-    """
+    """Describe how predictions came about, as ``nb_info`` of nerfbaselines does."""
     return {
         "method": method,
         "num_iterations": num_steps,
@@ -85,13 +79,7 @@ def describe_run(method: str, scene: str, num_steps: int) -> dict[str, Any]:
 def write_predictions(
     folder: Path, views: Iterable[tuple[str, Image.Image, Image.Image]], info: Mapping[str, Any]
 ) -> None:
-    """Write renderings beside their truth.
-
-    Args:
-        folder: to create.
-        views: name, rendering and truth of each view, of one size.
-        info: see :func:`describe_run`.
-    """
+    """Write the rendering and the truth of each named view to a new folder, with :func:`describe_run`'s ``info``."""
     for kind in (_RENDERED, _TRUE):
         (folder / kind).mkdir(parents=True)
     for name, rendering, truth in views:
@@ -108,14 +96,7 @@ def write_predictions(
 def write_results(
     path: Path, predictions: Path, info: Mapping[str, Any], metrics: Mapping[str, Sequence[float]]
 ) -> None:
-    """Write the metrics of predictions.
-
-    Args:
-        path: JSON file to write.
-        predictions: folder that :func:`write_predictions` wrote.
-        info: see :func:`describe_run`.
-        metrics: each metric's values, in the order of the views' names.
-    """
+    """Write the metrics of predictions in a folder as JSON, each metric's values in the order of the views' names."""
     encoded = {
         name: base64.b64encode(np.asarray(values, "<f4").tobytes()).decode("ascii") for name, values in metrics.items()
     }

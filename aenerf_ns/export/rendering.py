@@ -26,12 +26,7 @@ def _make_cameras(run: TrainedRun, camera: CameraIntrinsics, poses: Tensor) -> C
 
 @torch.no_grad()
 def render(run: TrainedRun, camera: CameraIntrinsics, pose: Tensor) -> dict[str, Tensor]:
-    """Render a view.
-
-    Args:
-        run: in evaluation mode.
-        camera: its intrinsics.
-        pose: (4, 4) or (3, 4) in the recording's world, OpenCV axes.
+    """Render a view from a pose (3, 4) or (4, 4) in the recording's world, OpenCV axes. The run is in evaluation mode.
 
     Returns:
         The model's outputs (height, width, channels). ``depth`` is the distance along the ray in units of the
@@ -46,10 +41,7 @@ def render(run: TrainedRun, camera: CameraIntrinsics, pose: Tensor) -> dict[str,
 def observe_points(run: TrainedRun, images: Sequence[PlacedImage], max_points: int) -> ObservedPoints:
     """Render points on the surfaces that images see, in the recording's world, at pixels spread over the images.
 
-    Args:
-        run: in evaluation mode.
-        images: with their poses.
-        max_points: rays that see no surface give no point.
+    A ray that sees no surface gives no point. The run is in evaluation mode.
     """
     to_recording = run.scene.frame.inverse()
     generator = torch.Generator().manual_seed(0)

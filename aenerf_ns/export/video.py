@@ -29,14 +29,11 @@ _MIN_HEIGHT, _LABEL, _GAP = 240, 16, 4
 
 @torch.no_grad()
 def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]:
-    """Render the pictures (height, width, 3) of a video, one for each time but the first.
+    """Render the pictures (height, width, 3) of a video, one for each of the (N,) times in nanoseconds but the first.
 
     The panels are the recorded events since the time before, the events that the rendering triggers meanwhile, the
     rendering, its depth, and the last image that was taken until then, where there are images on the trajectory.
-
-    Args:
-        run: in evaluation mode.
-        times: (N,) in nanoseconds, increasing, at least two.
+    The run is in evaluation mode.
     """
     recording = run.recording
     camera = recording.event_camera

@@ -21,10 +21,7 @@ from aenerf_ns.report.measuring import RunReport
 class Protocol:
     """How a run is measured, which is known before anything is measured.
 
-    Attributes:
-        color_correction: how the colors of the renderings are corrected.
-        test_poses: how the test cameras are placed.
-        truths: a checksum of each test view's image, by the view's file.
+    ``truths`` holds a checksum of each test view's image, by the view's file.
     """
 
     color_correction: str
@@ -74,10 +71,8 @@ def views_left_out(reports: Sequence[RunReport], shared: Sequence[str]) -> dict[
 def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> list[dict[str, Any]]:
     """Compare the metrics of each later run with the first run's on the views that all runs have.
 
-    Returns:
-        For each later run, each protocol ("placed", "refined") and each metric that both runs have: the mean
-        difference, its 95 % confidence interval by Student's t over the views (None with fewer than two), and the
-        number of views.
+    Each row holds the mean difference of a metric from ``placed`` or ``refined`` test poses, and its
+    :func:`confidence_interval` over the views.
     """
     first, *others = reports
     ours = {view["file"]: view for view in first.views}

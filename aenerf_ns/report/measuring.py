@@ -102,12 +102,12 @@ def measure_run(
     candidates: Sequence[str] = (),
     shown: dict[str, str] | None = None,
 ) -> RunReport:
-    """Measure a trained run.
+    """Measure a trained run that is opened to be tested.
 
     Args:
-        name: of the run.
+        name: by which the page tells the run apart.
         config: of the run.
-        run: opened to be tested.
+        run: the run.
         candidates: the files of the views that may be shown; none means that all may.
         shown: the files of the views to show, and why; None chooses among the candidates by this run's metrics.
     """

@@ -39,14 +39,14 @@ def make_page(
     mixed: Sequence[str],
     shared: Sequence[str],
 ) -> str:
-    """Make the HTML of a report.
+    """Make the HTML of a report of one or more runs.
 
     Args:
-        reports: of one or more runs.
+        reports: of the runs.
         paired: see :func:`~aenerf_ns.report.comparison.paired_differences`.
         left_out: see :func:`~aenerf_ns.report.comparison.views_left_out`.
-        mixed: how the runs were measured differently, in words.
-        shared: the files of the views that all runs have.
+        mixed: see :func:`~aenerf_ns.report.comparison.protocol_differences`.
+        shared: see :func:`~aenerf_ns.report.comparison.shared_views`.
     """
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -50,11 +50,7 @@ class PairResiduals:
 def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
     """Render newly drawn pairs that end at events, the same in every call, and compare their changes.
 
-    Args:
-        run: in evaluation mode. Its events are there.
-
-    Returns:
-        The comparison; None for a run whose batches are not pairs.
+    None for a run whose batches are not pairs. The run is in evaluation mode, and its events are there.
     """
     drawn = None if run.sampler is None else run.sampler.residual_batch(2 * _NUM_PAIRS)
     if drawn is None:

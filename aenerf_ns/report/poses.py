@@ -50,11 +50,7 @@ class RunPoses:
 
 @torch.no_grad()
 def measure_poses(run: TrainedRun) -> RunPoses:
-    """Compute the errors of a run's poses, and where the camera was.
-
-    Args:
-        run: in evaluation mode.
-    """
+    """Compute the errors of a run's poses, and where the camera was. The run is in evaluation mode."""
     psi, scene = run.model.camera_optimizer, run.scene
     given, true = scene.trajectory, scene.ground_truth
     times = given.times if true is None else given.knots_covered_by(true)
@@ -113,8 +109,8 @@ def evo_errors(poses: Tensor, reference: Tensor) -> dict[str, dict[str, float]]:
         reference: (N, 3, 4) of the same cameras at the same times.
 
     Returns:
-        The :func:`error_statistics` of the absolute errors ``ate``, of the relative errors from a pose to the next
-        ``rpe_translation``, both in units of the reference, and ``rpe_rotation_degrees``.
+        The :func:`error_statistics` of the absolute errors ``ate``, and of the relative errors from a pose to the next:
+        ``rpe_translation``, in units of the reference, and ``rpe_rotation_degrees``.
     """
     aligned = homogeneous(align(poses, reference, with_orientations=False)(poses.double()))
     reference = homogeneous(reference.double())
@@ -137,14 +133,9 @@ def errors_over_time(poses: Tensor, reference: Tensor) -> dict[str, list[float]]
 
 
 def correction_components(estimated: Tensor, corrected: Tensor) -> dict[str, list[float]]:
-    """Compute the six components of the motion from estimated to corrected poses, in the camera's frame.
+    """Compute the motion from estimated to corrected poses (N, 3, 4), in the camera's frame, by component.
 
-    Args:
-        estimated: (N, 3, 4) camera-to-world.
-        corrected: (N, 3, 4) at the same times.
-
-    Returns:
-        By name: translations in the units of the poses, and the rotation's vector in degrees.
+    Translations are in the units of the poses, the rotation's vector in degrees.
     """
     motion = torch.linalg.solve(homogeneous(estimated.double()), homogeneous(corrected.double()))
     vectors = Rotation.from_matrix(motion[:, :3, :3].cpu().numpy()).as_rotvec(degrees=True)

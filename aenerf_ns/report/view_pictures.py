@@ -24,12 +24,10 @@ _MAX_CHOSEN = 9
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """Pictures of a view.
+    """Pictures of a view: the error is black at 0 and brightest at :data:`ERROR_RANGE`.
 
-    Attributes:
-        truth, rendering, error, depth: of one size. The error is black at 0 and brightest at :data:`ERROR_RANGE`.
-        depth_range: the nearest and the farthest distance that the colors of the depth tell apart, in units of the
-            recording.
+    ``depth_range`` holds the nearest and the farthest distance that the depth's colors tell apart, in units of the
+    recording.
     """
 
     truth: Image.Image
@@ -40,10 +38,7 @@ class ViewPictures:
 
 
 def choose_views(psnr: Sequence[float]) -> dict[int, str]:
-    """Choose the views to show, and say why, by index: the worst, the median and the best one, and every n-th.
-
-    Args:
-        psnr: of each view.
+    """Choose the views to show by their PSNR, and say why: the worst, the median and the best one, and every n-th.
 
     Example:
         >>> choose_views([20.0, 22.0, 21.0])
@@ -62,11 +57,7 @@ def choose_views(psnr: Sequence[float]) -> dict[int, str]:
 
 @torch.no_grad()
 def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPictures], list[float]]:
-    """Render reference views from where they are placed.
-
-    Args:
-        run: in evaluation mode.
-        indices: of the views.
+    """Render reference views, by their indices, from where they are placed. The run is in evaluation mode.
 
     Returns:
         The pictures of each view; and the contrast of each channel over all pixels of these views: the standard

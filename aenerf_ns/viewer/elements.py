@@ -9,12 +9,7 @@ from viser import ClientHandle, GuiMarkdownHandle, ViserServer
 
 
 class ViewerMarkdown(ViewerElement[str]):
-    """A text in Markdown, which may hold tables and pictures.
-
-    Args:
-        name: of the element. It is not shown.
-        content: the text.
-    """
+    """A text in Markdown, which may hold tables and pictures. The element's name is not shown."""
 
     def __init__(self, name: str, content: str) -> None:
         super().__init__(name)
@@ -40,12 +35,7 @@ class ViewerMarkdown(ViewerElement[str]):
 
 
 class DownloadButton(ViewerElement[bool]):
-    """A button that sends a file to the browser in which it was clicked.
-
-    Args:
-        name: the text on the button.
-        make: makes the file's name and content for the browser.
-    """
+    """A button that sends a file to the browser in which it was clicked. ``make`` gives the file's name and content."""
 
     def __init__(self, name: str, make: Callable[[ClientHandle], tuple[str, bytes]]) -> None:
         super().__init__(name, cb_hook=self._send)

@@ -286,11 +286,7 @@ class RecordingPanel(nn.Module):
 
 
 class _Control(ViewerControl):
-    """Tells the panel that a viewer has started.
-
-    Args:
-        panel: that is told.
-    """
+    """Tells the panel that a viewer has started."""
 
     def __init__(self, panel: RecordingPanel) -> None:
         self._panel = panel

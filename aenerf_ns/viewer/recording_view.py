@@ -36,12 +36,7 @@ _POSITIVE_COLOR, _NEGATIVE_COLOR = (230, 60, 40), (60, 110, 255)
 
 
 class RecordingView:
-    """Events, trajectories and figures of a run at its present state.
-
-    Args:
-        model: with the poses as corrected so far.
-        dataset: the training data.
-    """
+    """Events, trajectories and figures of a run at its present state, with the poses as corrected so far."""
 
     def __init__(self, model: AENeRFModel, dataset: EventDataset) -> None:
         self._model = model
