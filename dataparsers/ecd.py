@@ -21,7 +21,7 @@ from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.images import open_image
 from aenerf_ns.recording.options import PublishedDataParserConfig
-from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
+from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_trajectory
 
 # The camera that recorded the dataset.
@@ -52,10 +52,10 @@ class EcdDataParser(EventDataParser):
         views = views_on_trajectory(images, reference)
         return self.config.make_recording(reference, **vars(capture), reference_views=views, max_views=None)
 
-    def read_frames(self) -> FrameSequence:
+    def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
         capture, images = self._read_all_but_poses()
         has_poses = (Path(self.config.data) / "groundtruth.txt").exists()
-        return FrameSequence(self.recording if has_poses else capture, images)
+        return self.recording if has_poses else capture, images
 
     def _read_all_but_poses(self) -> tuple[Capture, list[tuple[int, Path]]]:
         """Read the cameras, and the times in nanoseconds and the files of the images."""

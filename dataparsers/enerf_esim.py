@@ -14,7 +14,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files.event_arrays import XYTP_MATRIX, NpyEventFile, load_npy
+from aenerf_ns.files.event_arrays import XYTP_MATRIX, ArrayEventFile, load_npy
 from aenerf_ns.files.limits import list_files, require_one
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
@@ -26,11 +26,11 @@ from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 class EsimEventFolder(EventFile):
     """A folder of .npy files with rows of x, y, t in nanoseconds and p: one stream, in the order of the names."""
 
-    def _files(self) -> list[NpyEventFile]:
+    def _files(self) -> list[ArrayEventFile]:
         # The order is that of the numbers in the names, which may lack leading zeros.
         paths = list_files(self.path, "*.npy")
         paths.sort(key=lambda path: [int(number) for number in re.findall(r"\d+", path.name)])
-        return [NpyEventFile(path, self.width, self.height, XYTP_MATRIX, "ns") for path in paths]
+        return [ArrayEventFile(path, self.width, self.height, XYTP_MATRIX, "ns") for path in paths]
 
     def require(self) -> None:
         if not self.path.is_dir():

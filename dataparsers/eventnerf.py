@@ -18,7 +18,7 @@ from aenerf_ns.camera.trajectory import Trajectory, require_rigid
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.files.event_arrays import XYTP_MEMBERS, NpzEventFile
+from aenerf_ns.files.event_arrays import XYTP_MEMBERS, ArrayEventFile
 from aenerf_ns.files.limits import list_files, read_text, require_one
 from aenerf_ns.files.text import TimeUnit, parse_numbers
 from aenerf_ns.recording.dataparser import EventDataParser
@@ -96,7 +96,7 @@ class EventNeRFDataParser(EventDataParser):
         # A trained run is opened without its events.
         events = sorted((split / "events").glob("*.npz")) or [split / "events" / "events.npz"]
         file = require_one(events, split / "events", "files *.npz", "leave the events of the scene only")
-        event_file = NpzEventFile(file, _WIDTH, _HEIGHT, XYTP_MEMBERS, self.config.time_unit)
+        event_file = ArrayEventFile(file, _WIDTH, _HEIGHT, XYTP_MEMBERS, self.config.time_unit)
         poses = _read_poses(split)
         # Pose i of N is at i / (N - 1) of the time of the last event.
         reference = self.config.spread(poses, event_file, split / "pose", first=0)

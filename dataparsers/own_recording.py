@@ -22,7 +22,7 @@ from aenerf_ns.files.text import TimeUnit
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
-from aenerf_ns.recording.recording import Capture, FrameSequence, Recording
+from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_trajectory
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml")
@@ -90,12 +90,12 @@ class OwnRecordingDataParser(EventDataParser):
         )
         return config.make_recording(reference, **vars(capture), reference_views=views)
 
-    def read_frames(self) -> FrameSequence:
+    def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
         folder, config = Path(self.config.data), self.config
         if config.poses or config.colmap or (folder / "trajectory.txt").is_file() or (folder / "colmap").is_dir():
             return super().read_frames()
         capture, _, timed = self._read_all_but_poses()
-        return FrameSequence(capture, timed)
+        return capture, timed
 
     def _read_all_but_poses(self) -> tuple[Capture, Tensor, list[tuple[int, Path]]]:
         """Read the cameras, the (4, 4) motion from the event camera's to the frame camera's coordinates, and the times

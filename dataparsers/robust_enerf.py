@@ -15,7 +15,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
-from aenerf_ns.files.event_arrays import POSITION_TIMESTAMP_POLARITY, NpzEventFile, read_npz_member
+from aenerf_ns.files.event_arrays import POSITION_TIMESTAMP_POLARITY, ArrayEventFile, read_npz_member
 from aenerf_ns.files.json_file import convert, read_json
 from aenerf_ns.files.limits import file_inside
 from aenerf_ns.files.transforms import Matrix, Vector, rigid_motion
@@ -87,7 +87,7 @@ class RobustENeRFDataParser(EventDataParser):
         return self.config.make_recording(
             _read_poses(folder / "camera_poses.npz"),
             stated,
-            event_file=NpzEventFile(
+            event_file=ArrayEventFile(
                 folder / "raw_events.npz", camera.width, camera.height, POSITION_TIMESTAMP_POLARITY
             ),
             event_camera=camera,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from aenerf_ns.events.stream import EventFile, EventStream
     from aenerf_ns.recording.dataparser import EventDataParser
     from aenerf_ns.recording.output_lock import OutputLock
-    from aenerf_ns.recording.recording import FrameSequence, Recording
+    from aenerf_ns.recording.recording import Capture, Recording
     from aenerf_ns.recording.writer import NativeDatasetWriter
 
 # Takes exactly four words. As an optional tuple, the option would also take the dataset if it follows.
@@ -96,7 +96,7 @@ class Convert(DatasetCommand):
 
         report = None
         if self.poses == "colmap":
-            recording, report = _with_estimated_poses(parser.read_frames(), filters.window, self.data, self.seed)
+            recording, report = _with_estimated_poses(*parser.read_frames(), filters.window, self.data, self.seed)
         else:
             recording = parser.recording
         events = FilteredEventFile(recording.event_file, filters)
@@ -172,7 +172,7 @@ def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDat
 
 
 def _with_estimated_poses(
-    frames: FrameSequence, window: TimeWindow, source: Path, seed: int
+    capture: Capture, images: list[tuple[int, Path]], window: TimeWindow, source: Path, seed: int
 ) -> tuple[Recording, dict[str, Any]]:
     """Estimate poses with COLMAP, and return the recording with them and COLMAP's report."""
     from aenerf_ns.camera.trajectory import Trajectory
@@ -180,14 +180,13 @@ def _with_estimated_poses(
     from aenerf_ns.recording.recording import Recording
     from aenerf_ns.recording.views import views_on_trajectory
 
-    capture = frames.capture
     if capture.frame_camera != capture.event_camera:
         raise DataError(
             source,
             "its frames are of another camera than its events, and COLMAP finds the poses of the frames only",
             "estimate poses elsewhere, convert them to poses of the event camera, and give them as the trajectory",
         )
-    kept = [(time, file) for time, file in frames.images if window.contains(time)]
+    kept = [(time, file) for time, file in images if window.contains(time)]
     found = estimate_poses([file for _, file in kept], [time for time, _ in kept], capture.frame_camera, source, seed)
     trajectory, report = found.trajectory, found.report()
     say(found.summary())
@@ -209,4 +208,5 @@ def _with_estimated_poses(
         # The scene box is in the world of the given poses, and the longest gap is about the given poses.
         return replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None), report
     placed = [(time, file) for time, file in kept if trajectory.start <= time <= trajectory.end]
-    return capture.with_poses(trajectory, views_on_trajectory(placed, trajectory)), report
+    views = views_on_trajectory(placed, trajectory)
+    return Recording(**vars(capture), trajectory=trajectory, reference_views=views), report

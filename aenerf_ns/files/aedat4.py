@@ -39,8 +39,7 @@ class Aedat4File(EventReader):
 
     Args:
         path: the file.
-        width: pixel columns of the sensor; needed where the file does not state them.
-        height: pixel rows of the sensor; needed where the file does not state them.
+        width, height: size of the sensor in pixels; needed where the file does not state it.
         stream: number of the stream, or None when only one holds events.
 
     Raises:

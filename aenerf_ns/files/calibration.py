@@ -18,15 +18,10 @@ from aenerf_ns.files.transforms import read_transforms, rigid_motion, sensor_val
 
 @dataclass(frozen=True)
 class Calibration:
-    """Both cameras and the sensor.
+    """The lens and the sensor of the event camera, and the lens of the camera that took the images.
 
-    Attributes:
-        event_camera: the event camera's lens.
-        frame_camera: the lens of the camera that took the images.
-        frame_from_event: (4, 4) float64, takes points from the event camera's to the frame camera's coordinates, OpenCV
-            axes in both.
-        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
-        image_encoding: whether the images' values are sRGB or linear in radiance.
+    ``frame_from_event`` (4, 4) float64 takes points from the event camera's to the frame camera's coordinates, OpenCV
+    axes in both.
     """
 
     event_camera: CameraIntrinsics

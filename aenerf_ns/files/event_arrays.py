@@ -30,24 +30,18 @@ XYTP_MATRIX = EventLayout({name: ("", index) for index, name in enumerate("xytp"
 _XYTP_RECORDS = EventLayout({name: ("", name) for name in "xytp"}, time_unit=None)
 
 
-class NpzEventFile(EventTableFile):
-    """Read an .npz file. Members that are not compressed are mapped into memory, others are read as a whole."""
+class ArrayEventFile(EventTableFile):
+    """Read the members of an .npz file, or the one array of an .npy file, whose name is empty.
 
-    kind = ".npz file"
+    Arrays are mapped into memory, but for compressed members, which are read as a whole.
+    """
 
-    @contextmanager
-    def open_arrays(self) -> Iterator[dict[str, NDArray]]:
-        yield {name: read_npz_member(self.path, name) for name in self._layout.arrays}
-
-
-class NpyEventFile(EventTableFile):
-    """Read an .npy file: a matrix or an array of records, mapped into memory."""
-
-    kind = ".npy file"
+    kind = "NumPy file"
 
     @contextmanager
     def open_arrays(self) -> Iterator[dict[str, NDArray]]:
-        yield {"": load_npy(self.path)}
+        names = self._layout.arrays
+        yield {name: read_npz_member(self.path, name) if name else load_npy(self.path) for name in names}
 
 
 def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
@@ -65,12 +59,12 @@ def open_array_events(path: Path, width: int, height: int, time_unit: TimeUnit |
     """
     if path.suffix.lower() == ".npy":
         layout = XYTP_MATRIX if load_npy(path).dtype.names is None else _XYTP_RECORDS
-        return NpyEventFile(path, width, height, layout, time_unit)
+        return ArrayEventFile(path, width, height, layout, time_unit)
     with bounded(path, ".npz file"), zipfile.ZipFile(path) as archive:
         names = {name.removesuffix(".npy") for name in archive.namelist()}
     for layout in (XYTP_MEMBERS, POSITION_TIMESTAMP_POLARITY):
         if layout.arrays <= names:
-            return NpzEventFile(path, width, height, layout, time_unit)
+            return ArrayEventFile(path, width, height, layout, time_unit)
     raise DataError(
         path,
         f"its arrays are {', '.join(sorted(names)) or 'none'}",

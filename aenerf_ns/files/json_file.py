@@ -46,12 +46,7 @@ class Nanoseconds(int):
 
 
 def read_json(path: Path, kind: type[T], remedy: str = DATASET_REMEDY) -> T:
-    """Read a JSON file.
-
-    Args:
-        path: the file.
-        kind: what it must hold: a struct, or any other type that msgspec knows.
-        remedy: what the errors advise where a value is wrong.
+    """Read a JSON file that holds a struct, or any other type (``kind``) that msgspec knows.
 
     Raises:
         DataError: the file is missing or too large, is not JSON, has a key twice or a number that is too large, or
@@ -78,8 +73,8 @@ def convert(path: Path, values: Any, kind: type[T], remedy: str = DATASET_REMEDY
     Args:
         path: the file that they were read from, for the errors.
         values: what was read. Decimals give floats or, without rounding, nanoseconds.
-        kind: see :func:`read_json`.
-        remedy: see :func:`read_json`.
+        kind: a struct, or any other type that msgspec knows.
+        remedy: what the errors advise.
         name: the key in the file that ``values`` belongs to, for the errors.
 
     Raises:

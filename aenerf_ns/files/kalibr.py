@@ -39,11 +39,8 @@ class _Camera(msgspec.Struct, kw_only=True):
 
 
 def read_camchain(path: Path) -> dict[str, tuple[CameraIntrinsics, Tensor]]:
-    """Read the cameras of a camchain, by their names.
-
-    Returns:
-        For each camera its lens, and the (4, 4) float64 matrix that takes points from the first camera's coordinates to
-        its own.
+    """Read the cameras of a camchain by name: each lens, and the (4, 4) float64 matrix that takes points from the
+    first camera's coordinates to its own.
 
     Raises:
         DataError: the file is missing or malformed, or a camera model is not supported.

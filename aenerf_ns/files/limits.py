@@ -96,10 +96,7 @@ def bounded_items(items: Iterator[Item], path: Path, kind: str, extra: str = "")
 @contextmanager
 def _little_memory(path: Path) -> Iterator[None]:
     """Within the context, let the process take only as much more memory, and write only files as large, as the size
-    of a file explains. Linux alone holds such limits."""
-    if not _STATUS.exists():
-        yield
-        return
+    of a file explains."""
     files = list(path.iterdir()) if path.is_dir() else [path]
     allowed = _max_unpacked(sum(file.stat().st_size for file in files if file.is_file()))
     available = re.search(r"MemAvailable:\s*(\d+)", _MEMORY.read_text())
@@ -155,8 +152,6 @@ def require_one(paths: list[Path], source: Path, what: str, remedy: str) -> Path
     """Return the only one of the paths that were found in a folder.
 
     Args:
-        paths: what was found.
-        source: the folder.
         what: names the paths, in the plural.
         remedy: how to choose one of several.
 

@@ -40,8 +40,7 @@ def open_event_file(
 
     Args:
         path: the file, or the folder of a bag of ROS 2.
-        width: pixel columns of the sensor; needed where the file does not state them.
-        height: pixel rows of the sensor; needed where the file does not state them.
+        width, height: size of the sensor in pixels; needed where the file does not state it.
         topic: the topic of a bag, or the number of the stream of an AEDAT4 file, where several hold events.
         time_unit: of the times of HDF5, npz, npy and csv, where the file states none.
 

@@ -23,12 +23,9 @@ POSE_COLUMNS = "t tx ty tz qx qy qz qw"
 def read_rows(path: Path, columns: str) -> list[list[str]]:
     """Read rows of fields between white space. Leave out empty lines and comments after #.
 
-    Args:
-        path: the file.
-        columns: names of the columns, for the check and the message.
-
     Raises:
-        DataError: the file is missing, cannot be read or has too many rows, or a row has another number of fields.
+        DataError: the file is missing, cannot be read or has too many rows, or a row does not have the fields that
+            ``columns`` names.
     """
     expected = len(columns.split())
     rows: list[list[str]] = []

@@ -19,14 +19,9 @@ _MAX_NORM_ERROR = 1e-3
 
 
 def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
-    """Read a trajectory.
+    """Read camera-to-world poses, with the axes of the file, from lines of t tx ty tz qx qy qz qw.
 
-    Args:
-        path: text file of t tx ty tz qx qy qz qw; # starts a comment.
-        unit: of the times. Some datasets have the same rows with other units.
-
-    Returns:
-        Camera-to-world poses with the axes of the file.
+    Some datasets have the same rows with other units of the times. # starts a comment.
 
     Raises:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do

@@ -22,7 +22,7 @@ from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneou
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.options import EventDataParserConfig
-from aenerf_ns.recording.recording import FrameSequence, Recording, Split
+from aenerf_ns.recording.recording import Capture, Recording, Split
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.recording.views import seconds_on_trajectory, thinned, viewer_cameras, views_within
 
@@ -55,17 +55,21 @@ class EventDataParser(DataParser):
             DataError: a file is missing or its content cannot be used.
         """
 
-    def read_frames(self) -> FrameSequence:
+    def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
         """Read the frames that poses can be estimated from: the timed reference views.
 
         A format whose poses may be missing overrides this method.
+
+        Returns:
+            The recording, or its capture alone where it has no poses, and the frames in the order of time: nanoseconds
+            on the clock of the events, and files.
 
         Raises:
             DataError: a file is missing or its content cannot be used.
         """
         views = [view for split in self.recording.reference_views.values() for view in split]
         timed = {view.time: view.file for view in views if view.time is not None}
-        return FrameSequence(self.recording, sorted(timed.items()))
+        return self.recording, sorted(timed.items())
 
     @cached_property
     def recording(self) -> Recording:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -54,11 +54,6 @@ class Capture:
     frame_camera: CameraIntrinsics
     image_encoding: ImageEncoding
 
-    def with_poses(self, trajectory: Trajectory, reference_views: dict[Split, list[ReferenceView]]) -> Recording:
-        """Make the recording of this capture with estimated poses, in place of any that it has."""
-        known = {field.name: getattr(self, field.name) for field in fields(Capture)}
-        return Recording(**known, trajectory=trajectory, reference_views=reference_views)
-
 
 @dataclass(frozen=True)
 class Recording(Capture):
@@ -90,16 +85,3 @@ class Recording(Capture):
     def reference_trajectory(self) -> Trajectory:
         """The trajectory to compare with: the true one where it is known, else the estimated one."""
         return self.trajectory if self.ground_truth is None else self.ground_truth
-
-
-@dataclass(frozen=True)
-class FrameSequence:
-    """Frames that poses can be estimated from.
-
-    Attributes:
-        capture: the recording that the frames belong to, or its capture alone where it has no poses.
-        images: times in nanoseconds on the clock of the events, and files, in the order of time.
-    """
-
-    capture: Capture
-    images: list[tuple[int, Path]]

@@ -30,7 +30,7 @@ from hypothesis import strategies as st
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.files import event_table, event_text
-from aenerf_ns.files.event_arrays import NpzEventFile
+from aenerf_ns.files.event_arrays import ArrayEventFile
 from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.files.open import open_event_file
 from aenerf_ns.files.text import TimeUnit
@@ -91,7 +91,7 @@ def test_unit_of_times_may_be_given(unit: TimeUnit | None, end: int, tmp_path: P
 def test_uncompressed_members_are_mapped(tmp_path: Path) -> None:
     write_robust_enerf(tmp_path / "raw_events.npz", made_columns())
     events = open_event_file(tmp_path / "raw_events.npz", WIDTH, HEIGHT)
-    assert isinstance(events, NpzEventFile)
+    assert isinstance(events, ArrayEventFile)
     with events.open_arrays() as arrays:
         assert all(isinstance(array, np.memmap) for array in arrays.values())
 
