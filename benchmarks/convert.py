@@ -25,12 +25,9 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.recording.writer import NativeDatasetWriter
+from benchmarks.pairing import HEIGHT, WIDTH, stream
 from benchmarks.runs import in_own_process, peak_mib, run_benchmark, write_result
 
-_WIDTH, _HEIGHT = 1280, 720
-_CHUNK = 1 << 22
-# Nanoseconds between events, on average.
-_STEP = 100
 _VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "filtered": {"shortest_interval_ns": 1_000_000, "pixel_share": 0.5, "drop_hot_pixels": True},
@@ -39,29 +36,21 @@ _VARIANTS: dict[str, dict[str, Any]] = {
 
 def make_dataset(folder: Path, num_events: int) -> None:
     """Write a dataset of random events."""
-    camera = CameraIntrinsics(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2)
+    camera = CameraIntrinsics(WIDTH, HEIGHT, 1000.0, 1000.0, WIDTH / 2, HEIGHT / 2)
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 1
     with NativeDatasetWriter(folder, camera, SensorModel(), "srgb") as writer:
-        writer.add_trajectories(Trajectory([0, 2 * _STEP * num_events], poses))
+        writer.add_trajectories(Trajectory([0, 200 * num_events], poses))
         zero = np.zeros(1, np.uint16)
-        writer.events.append(EventStream(zero, zero, zero.astype(np.int64), np.ones(1, np.int8), _WIDTH, _HEIGHT))
-    rng = np.random.default_rng(0)
-    start = 0
+        writer.events.append(EventStream(zero, zero, zero.astype(np.int64), np.ones(1, np.int8), WIDTH, HEIGHT))
+    dtypes = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
     with h5py.File(folder / "events.h5", "w") as file:
-        columns = {
-            name: file.create_dataset(f"events/{name}", (num_events,), dtype)
-            for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.int8))
-        }
-        for begin in range(0, num_events, _CHUNK):
-            part = slice(begin, min(begin + _CHUNK, num_events))
-            count = part.stop - begin
-            t = start + np.cumsum(rng.integers(0, 2 * _STEP, count))
-            start = int(t[-1])
-            columns["t"][part] = t
-            columns["x"][part] = rng.integers(0, _WIDTH, count, dtype=np.uint16)
-            columns["y"][part] = rng.integers(0, _HEIGHT, count, dtype=np.uint16)
-            columns["p"][part] = 2 * rng.integers(0, 2, count, dtype=np.int8) - 1
+        columns = {name: file.create_dataset(f"events/{name}", (num_events,), dtypes[name]) for name in dtypes}
+        begin = 0
+        for chunk in stream(num_events):
+            for name, column in columns.items():
+                column[begin : begin + len(chunk)] = getattr(chunk, name)
+            begin += len(chunk)
 
 
 def measure(what: str, folder: Path) -> dict[str, float]:
@@ -71,7 +60,7 @@ def measure(what: str, folder: Path) -> dict[str, float]:
     if what != "nothing":
         output = folder.parent / what
         Convert(folder, output, **_VARIANTS[what]).main()
-        written = Hdf5EventFile(output / "events.h5", _WIDTH, _HEIGHT).count() or 0
+        written = Hdf5EventFile(output / "events.h5", WIDTH, HEIGHT).count() or 0
     return {
         "seconds": time.perf_counter() - wall,
         "cpu_seconds": time.process_time() - cpu,
@@ -109,7 +98,7 @@ class ConvertBenchmark:
                     "peak_gib_of_the_process_without_conversion": idle["peak_gib"],
                 }
                 rows.append(row)
-        write_result(self.output, {"sensor": [_WIDTH, _HEIGHT], "rows": rows})
+        write_result(self.output, {"sensor": [WIDTH, HEIGHT], "rows": rows})
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.events.pair_store import EventPairs, pixel_index
+from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.pairing import EVENTS_IN_MEMORY, pair_events
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
@@ -37,7 +37,7 @@ from aenerf_ns.supervision.event_pairs import (
 )
 from benchmarks.runs import in_own_process, peak_mib, run_benchmark, write_result
 
-_WIDTH, _HEIGHT = 1280, 720
+WIDTH, HEIGHT = 1280, 720
 _CHUNK = 1 << 22
 _BATCHES, _PAIRS = 100, 4096
 
@@ -50,10 +50,10 @@ def stream(num_events: int) -> Iterator[EventStream]:
         count = min(_CHUNK, num_events - begin)
         t = start + np.cumsum(rng.integers(0, 200, count))
         start = int(t[-1])
-        x = rng.integers(0, _WIDTH, count, dtype=np.uint16)
-        y = rng.integers(0, _HEIGHT, count, dtype=np.uint16)
+        x = rng.integers(0, WIDTH, count, dtype=np.uint16)
+        y = rng.integers(0, HEIGHT, count, dtype=np.uint16)
         p = (2 * rng.integers(0, 2, count, dtype=np.int8) - 1).astype(np.int8)
-        yield EventStream(x, y, t, p, _WIDTH, _HEIGHT)
+        yield EventStream(x, y, t, p, WIDTH, HEIGHT)
 
 
 def with_numpy(num_events: int) -> int:
@@ -61,13 +61,13 @@ def with_numpy(num_events: int) -> int:
     chunks = list(stream(num_events))
     x, y, t, p = (np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in "xytp")
     del chunks
-    pixel = y.astype(np.int64) * _WIDTH + x
+    pixel = y.astype(np.int64) * WIDTH + x
     # A stable sort by pixel is enough, because the events are sorted by time.
     order = np.argsort(pixel, kind="stable")
     same = pixel[order][1:] == pixel[order][:-1]
-    previous, time, polarity = t[order][:-1][same], t[order][1:][same], p[order][1:][same]
-    assert len(previous) == len(time) == len(polarity)
-    return len(time)
+    previous, later, polarity = t[order][:-1][same], t[order][1:][same], p[order][1:][same]
+    assert len(previous) == len(later) == len(polarity)
+    return len(later)
 
 
 def sampler(pairs: EventPairs) -> PairSampler:
@@ -78,7 +78,7 @@ def sampler(pairs: EventPairs) -> PairSampler:
         frame=Similarity(torch.ones(()), torch.eye(3), torch.zeros(3)),
         trajectory=Trajectory([0, end], torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)),
         ground_truth=None,
-        event_camera=CameraIntrinsics(_WIDTH, _HEIGHT, 1000.0, 1000.0, _WIDTH / 2, _HEIGHT / 2),
+        event_camera=CameraIntrinsics(WIDTH, HEIGHT, 1000.0, 1000.0, WIDTH / 2, HEIGHT / 2),
         event_file=SimpleNamespace(),  # type: ignore[arg-type]
         sensor=sensor,
         window=TimeWindow(),
@@ -105,19 +105,10 @@ def sample(pairs: EventPairs) -> dict[str, float]:
         source.sample(2 * _PAIRS)
         wall.append(time.perf_counter() - begin)
         cpu.append(time.thread_time() - begin_cpu)
-    # Where uniform pairs end: the share of them in each tenth of the recording and of the pixels.
-    rows = torch.cat([source._table.draw(0, _PAIRS, 1)[:, 0] for _ in range(_BATCHES)])
-    times = rows[:, 0].double() / rows[:, 0].max()
-    places = pixel_index(rows[:, 1]).double() / (_WIDTH * _HEIGHT)
-    shares = torch.stack([torch.histc(parts, 10, 0, 1) for parts in (times, places)]) / len(rows)
     return {
         "batch_ms": 1e3 * float(np.median(wall)),
         "batch_cpu_ms": 1e3 * float(np.median(cpu)),
         "batch_ms_of_the_fastest_tenth": 1e3 * float(np.quantile(wall, 0.1)),
-        "smallest_share_of_a_tenth_of_the_time": float(shares[0].min()),
-        "largest_share_of_a_tenth_of_the_time": float(shares[0].max()),
-        "smallest_share_of_a_tenth_of_the_pixels": float(shares[1].min()),
-        "largest_share_of_a_tenth_of_the_pixels": float(shares[1].max()),
     }
 
 
@@ -217,7 +208,7 @@ class Pairing:
                 row["in_memory"] = own | {"million_events_per_second": rates[0]}
                 row["numpy"] = numpy | {"million_events_per_second": rates[1]}
             rows.append(row)
-        write_result(self.output, {"sensor": [_WIDTH, _HEIGHT], "pairs_in_a_batch": _PAIRS, "rows": rows})
+        write_result(self.output, {"sensor": [WIDTH, HEIGHT], "pairs_in_a_batch": _PAIRS, "rows": rows})
 
 
 if __name__ == "__main__":

@@ -14,19 +14,19 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
+import faery
 import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
+from benchmarks.pairing import HEIGHT, WIDTH
 from benchmarks.runs import in_own_process, peak_mib, run_benchmark, write_result
 
-_WIDTH, _HEIGHT = 1280, 720
 _START = 1_600_000_000_000_000
-_FAERY = (".raw", ".dat", ".aedat4")
+_VENDORS = (".raw", ".dat", ".aedat4")
 # Slow to write, and therefore measured at the smallest size only.
 _TEXT = (".csv", ".txt")
 
@@ -35,17 +35,15 @@ def events(count: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return x, y, t (microseconds from zero) and p (0 or 1): one event a microsecond on average, at random pixels."""
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.integers(0, 3, count))
-    return rng.integers(0, _WIDTH, count), rng.integers(0, _HEIGHT, count), t, rng.integers(0, 2, count)
+    return rng.integers(0, WIDTH, count), rng.integers(0, HEIGHT, count), t, rng.integers(0, 2, count)
 
 
-def write_evt2(path: Path, count: int) -> None:
-    """Write EVT 2.0, with the upper bits of the time whenever they change."""
-    x, y, t, p = events(count)
-    words = (p << 28 | (t & 0x3F) << 22 | x << 11 | y).astype("<u4")
-    high = t >> 6
-    places = np.flatnonzero(np.diff(high, prepend=-1))
-    words = np.insert(words, places, (0x8 << 28 | high[places]).astype("<u4"))
-    path.write_bytes(f"% evt 2.0\n% geometry {_WIDTH}x{_HEIGHT}\n% end\n".encode() + words.tobytes())
+def write_vendor(path: Path, count: int) -> None:
+    """Write a vendor's format, in pieces of about 10 ms."""
+    table = np.zeros(count, faery.EVENTS_DTYPE)
+    table["x"], table["y"], table["t"], table["on"] = events(count)
+    pieces = np.array_split(table, -(-count // 10_000))
+    faery.file_encoder.events_to_file(pieces, path, (WIDTH, HEIGHT), "evt2" if path.suffix == ".raw" else None)
 
 
 def evt3_words(count: int) -> NDArray[np.uint16]:
@@ -53,45 +51,14 @@ def evt3_words(count: int) -> NDArray[np.uint16]:
     x, y, t, p = events(count)
     words = np.stack([0x6000 | t & 0xFFF, y, 0x2000 | p << 11 | x], -1).astype("<u2").reshape(-1)
     high = t >> 12
-    places = np.flatnonzero(np.diff(high, prepend=-1))
-    return np.insert(words, 3 * places, (0x8000 | high[places] & 0xFFF).astype("<u2"))
+    changes = np.flatnonzero(np.diff(high, prepend=-1))
+    return np.insert(words, 3 * changes, (0x8000 | high[changes] & 0xFFF).astype("<u2"))
 
 
 def write_evt3(path: Path, count: int) -> None:
     """Write EVT 3.0."""
-    header = f"% evt 3.0\n% geometry {_WIDTH}x{_HEIGHT}\n% end\n".encode()
+    header = f"% evt 3.0\n% geometry {WIDTH}x{HEIGHT}\n% end\n".encode()
     path.write_bytes(header + evt3_words(count).tobytes())
-
-
-def write_dat(path: Path, count: int) -> None:
-    """Write DAT of version 2."""
-    x, y, t, p = events(count)
-    words = np.stack([t, p << 28 | y << 14 | x], -1).astype("<u4")
-    header = f"% Data file containing CD events\n% Version 2\n% Width {_WIDTH}\n% Height {_HEIGHT}\n".encode()
-    path.write_bytes(header + b"\x0c\x08" + words.tobytes())
-
-
-def write_aedat4(path: Path, count: int) -> None:
-    """Write LZ4 packets of 10 ms, without a table."""
-    from lz4.frame import compress
-
-    x, y, t, p = events(count)
-    records = np.zeros(count, [("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("padding", "V3")])
-    records["t"], records["x"], records["y"], records["p"] = t + _START, x, y, p
-    info = (
-        '<dv version="2.0"><node name="outInfo" path="/"><node name="0" path="/0/"><attr key="compression" '
-        'type="string">LZ4</attr><attr key="typeIdentifier" type="string">EVTS</attr><node name="info" path="/0/info/">'
-        f'<attr key="sizeX" type="int">{_WIDTH}</attr><attr key="sizeY" type="int">{_HEIGHT}</attr></node></node>'
-        "</node></dv>"
-    ).encode()
-    # FlatBuffers: offset of the table, identifier, offsets of the table's fields, table.
-    header = struct.pack("<I4s5H2xiiqII", 20, b"IOHE", 10, 24, 4, 8, 16, 12, 1, -1, 4, len(info)) + info + b"\0"
-    with path.open("wb") as file:
-        file.write(b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header)
-        for part in np.split(records, np.searchsorted(t, np.arange(10_000, t[-1], 10_000))):
-            table = struct.pack("<I4sHHHHiII", 16, b"EVTS", 0, 6, 8, 4, 6, 4, len(part)) + part.tobytes()
-            packet = compress(struct.pack("<I", len(table)) + table)
-            file.write(struct.pack("<2i", 0, len(packet)) + packet)
 
 
 def _write_bag(path: Path, kind: str, messages: list[tuple[int, bytes]]) -> None:
@@ -101,7 +68,7 @@ def _write_bag(path: Path, kind: str, messages: list[tuple[int, bytes]]) -> None
         connection = writer.add_connection("/events", kind, msgdef="# see the type's package", md5sum="0" * 32)
         for stamp, data in messages:
             seconds, nanoseconds = divmod(stamp, 10**9)
-            header = struct.pack("<4I", 0, seconds, nanoseconds, 0) + struct.pack("<2I", _HEIGHT, _WIDTH)
+            header = struct.pack("<4I", 0, seconds, nanoseconds, 0) + struct.pack("<2I", HEIGHT, WIDTH)
             writer.write(connection, stamp, header + data)
 
 
@@ -122,15 +89,11 @@ def write_arrays(path: Path, count: int) -> None:
 
 def write_packets(path: Path, count: int) -> None:
     """Write event_camera_msgs/EventPacket messages of 60,000 bytes of EVT 3.0, about 10 ms."""
-    parts = np.split(evt3_words(count), range(30_000, 3 * count, 30_000))
-    messages = [
-        (
-            _START * 1000 + 10_000_000 * i,
-            struct.pack("<2QI", i, 0, 4) + b"evt3\0" + struct.pack("<I", part.nbytes) + part.tobytes(),
-        )
-        for i, part in enumerate(parts)
-        if len(part)
-    ]
+    words = evt3_words(count)
+    messages = []
+    for i, part in enumerate(np.split(words, range(30_000, len(words), 30_000))):
+        data = struct.pack("<2QI", i, 0, 4) + b"evt3\0" + struct.pack("<I", part.nbytes) + part.tobytes()
+        messages.append((_START * 1000 + 10_000_000 * i, data))
     _write_bag(path, "event_camera_msgs/msg/EventPacket", messages)
 
 
@@ -143,7 +106,7 @@ def write_native(path: Path, count: int) -> None:
     x, y, t, p = events(count)
     with Hdf5EventWriter(path) as writer:
         columns = x.astype(np.uint16), y.astype(np.uint16), t * 1000, (2 * p - 1).astype(np.int8)
-        writer.append(EventStream(*columns, _WIDTH, _HEIGHT))
+        writer.append(EventStream(*columns, WIDTH, HEIGHT))
 
 
 def write_blosc(path: Path, count: int) -> None:
@@ -182,10 +145,10 @@ def write_text(path: Path, count: int) -> None:
 
 
 WRITERS: dict[str, Callable[[Path, int], None]] = {
-    "evt2.raw": write_evt2,
+    "evt2.raw": write_vendor,
     "evt3.raw": write_evt3,
-    "cd.dat": write_dat,
-    "lz4.aedat4": write_aedat4,
+    "cd.dat": write_vendor,
+    "lz4.aedat4": write_vendor,
     "arrays.bag": write_arrays,
     "packets.bag": write_packets,
     "native.h5": write_native,
@@ -203,9 +166,7 @@ def count_events(reader: str, path: Path) -> int:
     if reader == "aenerf":
         from aenerf_ns.files.open import open_event_file
 
-        return sum(map(len, open_event_file(path, _WIDTH, _HEIGHT).chunks()))
-    import faery
-
+        return sum(map(len, open_event_file(path, WIDTH, HEIGHT).chunks()))
     return sum(map(len, faery.events_stream_from_file(path)))
 
 
@@ -226,7 +187,7 @@ def measure(reader: str, small: Path, path: Path) -> dict[str, float]:
         from aenerf_ns.files.open import open_event_file
 
         begin = time.process_time()
-        open_event_file(path, _WIDTH, _HEIGHT).time_span()
+        open_event_file(path, WIDTH, HEIGHT).time_span()
         row["seconds_of_time_span"] = time.process_time() - begin
     return row
 
@@ -250,13 +211,11 @@ class Readers:
                 for size in self.sizes if path.suffix not in _TEXT else (min(self.sizes),):
                     path.unlink(missing_ok=True)
                     in_own_process(WRITERS[name], path, size)
-                    for reader in ("aenerf", "faery"):
-                        if reader == "faery" and (path.suffix not in _FAERY or not find_spec("faery")):
-                            continue
+                    for reader in ("aenerf", "faery") if path.suffix in _VENDORS else ("aenerf",):
                         measured = in_own_process(measure, reader, small, path)
                         row = {"file": name, "reader": reader, "mib": path.stat().st_size / 2**20, **measured}
                         rows.append(row)
-        write_result(self.output, {"sensor": [_WIDTH, _HEIGHT], "rows": rows})
+        write_result(self.output, {"sensor": [WIDTH, HEIGHT], "rows": rows})
 
 
 if __name__ == "__main__":

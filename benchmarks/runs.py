@@ -99,6 +99,27 @@ def exclusive(path: Path, timeout: float = -1) -> Iterator[None]:
         yield
 
 
+def make_dataset(
+    folder: Path, log: Path, command: str, arguments: Sequence[str], work: Path = Path(), **variables: str
+) -> Path:
+    """Make a dataset by a command of aenerf, unless it has been made, and return its folder.
+
+    Args:
+        folder: of the dataset. If another process is making it, this one waits.
+        log, work, variables: see :func:`run_command`.
+        command: of aenerf.
+        arguments: of the command, without the output.
+
+    Raises:
+        DataError: the command failed.
+    """
+    with exclusive(folder):
+        if not folder.exists():
+            words = (script("aenerf"), command, *arguments, "--output", str(folder.resolve()))
+            run_command(words, log, work, **variables)
+    return folder
+
+
 def train(folder: Path, name: str, method: str, steps: int, options: Sequence[str], data: Sequence[str]) -> float:
     """Train with ns-train, on a GPU where there is one.
 

@@ -1,7 +1,7 @@
 """Simulate an event sensor: ESIM (Rebecq et al., CoRL 2018) with the corrections of Robust e-NeRF (Low and Lee, 2023).
 
-Between two frames the log-intensity of every pixel is linear in time. Every threshold crossing is solved for its time,
-so the frame rate does not limit the number of events that a pixel fires between two frames.
+Between two frames the log-intensity of every pixel is linear in time, and every threshold crossing is solved for its
+time. So a pixel may fire any number of events between two frames.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from aenerf_ns.camera.image_encoding import LUMINANCE
 from aenerf_ns.events.sensor import RGGB, SensorModel
 from aenerf_ns.simulator.options import SensorNoise
 
-MINIMUM_CONTRAST_THRESHOLD = 0.01
+_MIN_CONTRAST_THRESHOLD = 0.01
 _BRIGHT_REDUCTION = 0.75
 
 NOISELESS = SensorNoise()
@@ -37,13 +37,10 @@ def _fire(time, positive, packing, keys, position):
 def _linear_events(interval, reference_log, reference_time, sensor, packing, keys, position):
     """Fire the events of one pixel while its log-intensity is linear.
 
-    ``reference_time`` lies before the interval if the pixel already has its reference. Otherwise the pixel takes its
-    reference at that time, in this interval or in a later one: the initial reference, or the one after a refractory
-    period.
-
     Args:
         interval: log-intensity at its start and at its end, and these times.
-        reference_log, reference_time: state of the pixel.
+        reference_log, reference_time: state of the pixel. The pixel has its reference if the time lies before the
+            interval. Otherwise it takes its reference at that time, which may lie in a later interval.
         sensor: positive and negative threshold, and refractory period.
         packing, keys, position: see `_fire`.
 
@@ -113,8 +110,7 @@ def _frame_events(frames, times, references, thresholds, refractory_period, nois
     """Fire the events of all pixels in one frame interval: count them in one pass and write them in a second one.
 
     Args:
-        frames: log-intensity (H, W) at the start and at the end.
-        times: of the start and of the end.
+        frames, times: log-intensity (H, W) and time at the start and at the end.
         references: log-intensity and time (H, W) of the pixels' references, changed in place.
         thresholds: positive and negative (H, W).
         refractory_period: of all pixels.
@@ -158,23 +154,19 @@ class EventSimulator:
     """Turn a sequence of linear-radiance frames into events.
 
     The sensor sees log(I + log_epsilon), which is linear in time between frames. A pixel fires when this signal differs
-    from the pixel's reference by the contrast threshold. Without a refractory period, the reference then moves by
-    exactly the threshold. With a refractory period, the pixel is blind until the period ends and takes the
-    log-intensity of that moment as its new reference, as in Robust e-NeRF.
+    from the pixel's reference by the contrast threshold. The reference then moves by exactly the threshold. With a
+    refractory period, the pixel is blind until the period ends and takes the log-intensity of that moment as its new
+    reference instead, as in Robust e-NeRF.
 
     Args:
-        width: pixel columns.
-        height: pixel rows.
-        sensor: contrast thresholds, refractory period and Bayer pattern. If the period is not zero, the initial
-            reference times are random, uniform in [0, refractory period) after the first frame.
+        width, height: pixel columns and rows, at most 65536.
+        sensor: contrast thresholds, refractory period and Bayer pattern. Initial reference times are random, uniform in
+            [0, refractory period) after the first frame.
         noise: thresholds of single pixels are drawn once from N(C, contrast_threshold_spread) and clipped at 0.01. The
             leak makes the log-intensity rise by leak_rate · C+ a second. Shot noise falls with the intensity, to a
             quarter at 1 and above (v2e, Hu et al. 2021), and moves the reference as any event does.
         log_epsilon: added to the intensity before the logarithm.
-        seed: seed of the thresholds, of the initial reference times, and of the noise.
-
-    Raises:
-        ValueError: a size, an epsilon or a value of the noise is out of range.
+        seed: of the thresholds, of the initial reference times, and of the noise.
 
     Example:
         One pixel whose radiance doubles in a millisecond: log-radiance rises by 0.69, and by 0.25 twice.
@@ -198,13 +190,6 @@ class EventSimulator:
         log_epsilon: float = 1e-3,
         seed: int = 0,
     ) -> None:
-        if not (0 < width <= 65536 and 0 < height <= 65536):
-            raise ValueError(f"width and height must be in 1..65536, got {width} x {height}")
-        if not 0.0 < log_epsilon < math.inf:
-            raise ValueError(f"log_epsilon must be positive, got {log_epsilon}")
-        for name, value in vars(noise).items():
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{name} must not be negative, got {value}")
         self.width, self.height = width, height
         self.sensor = sensor
         self.log_epsilon = log_epsilon
@@ -226,8 +211,8 @@ class EventSimulator:
         """Show the sensor the next frame.
 
         Args:
-            image: linear radiance, (H, W) for a monochrome sensor, or (H, W, 3) linear RGB. A monochrome sensor takes
-                the Rec. 709 luminance of RGB. A color sensor needs RGB.
+            image: linear radiance (H, W), or linear RGB (H, W, 3), of which a monochrome sensor takes the Rec. 709
+                luminance. A color sensor needs RGB.
             time_ns: time of the frame in nanoseconds, later than the previous frame's.
 
         Returns:
@@ -276,13 +261,10 @@ class EventSimulator:
 
     def _draw_thresholds(self, mean: float, spread: float) -> NDArray[np.float64]:
         thresholds = self._rng.normal(mean, spread, (self.height, self.width))
-        return np.maximum(thresholds, MINIMUM_CONTRAST_THRESHOLD)
+        return np.maximum(thresholds, _MIN_CONTRAST_THRESHOLD)
 
     def _shot_noise(self, intensity: NDArray[np.float64], time_ns: int) -> tuple[NDArray[np.int64], ...]:
         """Draw the shot-noise events of a frame interval: pixels, row by row, times and polarities."""
-        if self.shot_noise_rate == 0:
-            nothing = np.empty(0, np.int64)
-            return nothing, nothing, nothing
         seconds = (time_ns - self._time_ns) * 1e-9
         count = self._rng.poisson(self.shot_noise_rate * seconds * intensity.size)
         pixels = self._rng.integers(0, intensity.size, count)

@@ -28,14 +28,13 @@ def frame_displacement(
 ) -> float:
     """Return the 99th percentile of how far pixels move from one view to another, in pixels.
 
+    It is 0 if nothing is seen, and inf if a point lies behind the second camera.
+
     Args:
         depth: (H, W) of the first view along its optical axis, inf where there is no surface.
         first_camera_to_world, second_camera_to_world: (4, 4), OpenCV axes.
         intrinsics: (fx, fy, cx, cy) of the depth map, pixel centers at +0.5.
         sees_infinity: whether pixels of depth inf show something, which then moves as the camera turns.
-
-    Returns:
-        the percentile. It is 0 if nothing is seen, and inf if a point lies behind the second camera.
     """
     depth = np.asarray(depth, np.float64)
     fx, fy, cx, cy = intrinsics
@@ -57,27 +56,18 @@ def frame_displacement(
 
 
 def frame_parameters(
-    scene: SimulationScene,
-    intrinsics: Sequence[float],
-    width: int,
-    height: int,
-    maximum_displacement: float = 0.5,
+    scene: SimulationScene, intrinsics: Sequence[float], width: int, height: int, max_displacement: float = 0.5
 ) -> Array:
-    """Return path parameters (N,), 0 to 1, between which 99 % of the picture moves at most ``maximum_displacement``.
+    """Return path parameters (N,), 0 to 1, between which 99 % of the picture moves at most ``max_displacement``.
 
     The displacement, in pixels of the full picture, is the `frame_displacement` of a coarse depth map. Frames lie as
     far apart as the limit allows. An environment counts; a uniform background does not, because its motion is
     invisible. The parameters do not depend on the camera's speed.
-
-    Raises:
-        ValueError: the displacement is not positive.
     """
-    if not maximum_displacement > 0:
-        raise ValueError(f"maximum_displacement must be positive, got {maximum_displacement}")
     shrink = _PROBE_WIDTH / width
     rows = int(np.ceil(height * shrink))
     probe = tuple(shrink * np.asarray(intrinsics, np.float64))
-    target = _MARGIN * maximum_displacement
+    target = _MARGIN * max_displacement
     # A probe is too small to share among threads: synchronizing them takes longer than rendering.
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
@@ -89,7 +79,7 @@ def frame_parameters(
                 step = min(step, _MAX_STEP, 1.0 - parameters[-1])
                 next_pose = scene.path(parameters[-1] + step)
                 displacement = frame_displacement(depth, pose, next_pose, probe, scene.background is None) / shrink
-                if displacement <= maximum_displacement:
+                if displacement <= max_displacement:
                     break
                 step *= max(target / displacement, 0.1)
             # Rounding may leave the sum just below 1.

@@ -25,4 +25,4 @@ def open_scene(name: str, seed: int = 0) -> SimulationScene:
     if name == "room":
         return SimulationScene(name, room_scene(seed), RoomPath(), focal_ratio=0.62, aabb=None, background=None)
     renderer, box = locomotive_scene(seed, shiny=name == "shiny_object"), np.array([[-1.2] * 3, [1.2] * 3])
-    return SimulationScene(name, renderer, ObjectPath(), focal_ratio=1.2, aabb=box, background=np.array(BACKGROUND))
+    return SimulationScene(name, renderer, ObjectPath(), focal_ratio=1.2, aabb=box, background=BACKGROUND)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.errors import DataError
+from aenerf_ns.files.limits import require_file
 
 BUILT_IN = ("room", "object", "shiny_object")
 """Names of the built-in scenes."""
@@ -22,9 +23,7 @@ def require_scene_file(path: Path) -> None:
     """Raise a DataError unless a path leads to a file that may be a mesh or a scene.json."""
     if path.suffix.lower() not in (*MESH_SUFFIXES, ".json"):
         raise DataError(path, "an unknown scene", "give a built-in scene, a .glb, .obj or .ply file, or a scene.json")
-    with reading(path):
-        if not path.is_file():
-            raise DataError(path, "the file does not exist", "check the name")
+    require_file(path)
 
 
 @dataclass(frozen=True)

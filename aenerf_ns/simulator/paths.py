@@ -6,9 +6,10 @@ The world's z axis points up. Lengths are in meters.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,16 +24,14 @@ from aenerf_ns.simulator.rendering.embree import RayCaster
 HARD_SPEED_RATIO = 8.0
 HARD_MEAN_SPEED = float(i0(np.log(HARD_SPEED_RATIO)))
 """Mean of 8 ** sin(2 pi t) over a period: 2.411."""
-
 ORIGIN = (0.0, 0.0, 0.0)
 _MAX_TRIES = 200
-_FINE = np.linspace(0, 1, 2001)
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), roll: float = 0.0) -> Array:
-    """Return the camera-to-world matrix (4, 4) of a camera at ``eye`` that looks at ``target``.
+    """Return the camera-to-world matrix (4, 4) of a camera that looks from ``eye`` at ``target``.
 
-    The camera is turned by ``roll`` radians about its optical axis. ``up`` must not lie along the gaze.
+    It is turned by ``roll`` radians about its optical axis. ``up`` must not lie along the gaze.
     """
     forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
     forward = forward / np.linalg.norm(forward)
@@ -46,43 +45,51 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), 
     return pose
 
 
-class CameraPath(Protocol):
-    """A camera's path through a scene, and the held-out views beside it."""
+class CameraPath(ABC):
+    """A camera's path through a scene, and held-out views around it."""
 
+    @abstractmethod
     def __call__(self, s: float) -> Array:
         """Return the pose (4, 4) at a parameter in [0, 1]."""
 
+    @abstractmethod
+    def _validation_view(self, k: int, count: int) -> Array:
+        """Return the k-th of the validation views."""
+
+    @abstractmethod
+    def _test_view(self, rng: np.random.Generator) -> Array:
+        """Draw a test view."""
+
     def validation_views(self, count: int) -> Array:
-        """Return views (count, 4, 4) spread evenly around the path."""
+        """Return views (count, 4, 4) spread evenly around the path, clear of the mesh.
+
+        Raises:
+            DataError: no position is clear of the mesh.
+        """
+        return np.array([self._validation_view(k, count) for k in range(count)]).reshape(-1, 4, 4)
 
     def test_views(self, count: int, seed: int) -> Array:
-        """Return random views (count, 4, 4) around the path."""
+        """Return random views (count, 4, 4) around the path, clear of the mesh.
+
+        Raises:
+            DataError: no position is clear of the mesh.
+        """
+        rng = np.random.default_rng(seed)
+        return np.array([self._test_view(rng) for _ in range(count)]).reshape(-1, 4, 4)
 
 
-def _stack(poses: Sequence[Array]) -> Array:
-    """Stack poses to (n, 4, 4); n may be 0."""
-    return np.array(poses).reshape(-1, 4, 4)
-
-
-class RoomPath:
+class RoomPath(CameraPath):
     """A closed loop around the middle of the room. The camera looks across the room, high and low, slightly rolled."""
 
     def __call__(self, s: float) -> Array:
         return self._pose(2 * np.pi * s, 0.0, 0.0, 0.0)
 
-    def validation_views(self, count: int) -> Array:
-        """Return views (count, 4, 4) spread evenly along the path, by turns inside, outside, above and below it."""
-        return _stack(
-            [
-                self._pose(2 * np.pi * (k + 0.5) / count, 0.12 * np.cos(2.4 * k), 0.12 * np.sin(2.4 * k), 0.0)
-                for k in range(count)
-            ]
-        )
+    def _validation_view(self, k: int, count: int) -> Array:
+        # By turns inside, outside, above and below the path.
+        return self._pose(2 * np.pi * (k + 0.5) / count, 0.12 * np.cos(2.4 * k), 0.12 * np.sin(2.4 * k), 0.0)
 
-    def test_views(self, count: int, seed: int) -> Array:
-        """Return random views (count, 4, 4) near the path, with random gazes."""
-        low, high = [0, -0.15, -0.15, -0.5], [2 * np.pi, 0.15, 0.15, 0.5]
-        return _stack([self._pose(*draw) for draw in np.random.default_rng(seed).uniform(low, high, (count, 4))])
+    def _test_view(self, rng: np.random.Generator) -> Array:
+        return self._pose(*rng.uniform([0, -0.15, -0.15, -0.5], [2 * np.pi, 0.15, 0.15, 0.5]))
 
     @staticmethod
     def _pose(angle: float, outwards: float, upwards: float, gaze: float) -> Array:
@@ -95,12 +102,12 @@ class RoomPath:
         return look_at(eye, target, roll=0.08 * np.sin(2 * angle + 1.0))
 
 
-class ObjectPath:
+class ObjectPath(CameraPath):
     """A spiral from the equator to the pole of a hemisphere, as in Robust e-NeRF's scenes.
 
     Args:
         turns: of the spiral.
-        radius, center: radius and center (3,) of the hemisphere, in meters.
+        radius, center: of the hemisphere, in meters.
         caster: casts rays against the mesh that cameras must not come near to; None if there is no such mesh.
 
     Raises:
@@ -111,50 +118,33 @@ class ObjectPath:
         self, turns: float = 4.0, radius: float = 4.0, center: ArrayLike = ORIGIN, caster: RayCaster | None = None
     ) -> None:
         self._turns, self._radius, self._center = turns, radius, np.asarray(center, np.float64)
-        self._space = None if caster is None else FreeSpace(caster, radius)
-        if self._space is not None:
-            self._space.check_path(self)
+        self._space = FreeSpace(caster, radius)
+        self._space.require_clear(self)
 
     def __call__(self, s: float) -> Array:
         return self._pose(2 * np.pi * self._turns * s, 0.5 * np.pi * s, self._radius, ORIGIN)
 
-    def validation_views(self, count: int) -> Array:
-        """Return views (count, 4, 4) all over the hemisphere, on a golden-angle spiral.
+    def _validation_view(self, k: int, count: int) -> Array:
+        # On a golden-angle spiral all over the hemisphere. A view turns about the vertical until it is clear.
+        elevation = np.arcsin((k + 0.5) / count)
+        return self._first_free(
+            self._pose(2.399963 * k + 0.1 * i, elevation, self._radius, ORIGIN) for i in range(_MAX_TRIES)
+        )
 
-        A view is turned about the vertical until its camera is clear of the mesh.
-
-        Raises:
-            DataError: there is no such turn.
-        """
-
-        def candidates(k: int, z: float) -> Iterator[Array]:
-            for i in range(_MAX_TRIES):
-                yield self._pose(2.399963 * k + 0.1 * i, np.arcsin(z), self._radius, ORIGIN)
-
-        heights = (np.arange(count) + 0.5) / count
-        return _stack([self._first_free(candidates(k, z)) for k, z in enumerate(heights)])
-
-    def test_views(self, count: int, seed: int) -> Array:
-        """Return random views (count, 4, 4) over the hemisphere, at other distances and off-center, clear of the mesh.
-
-        Raises:
-            DataError: no place is clear of the mesh.
-        """
-        rng = np.random.default_rng(seed)
-
+    def _test_view(self, rng: np.random.Generator) -> Array:
         def candidates() -> Iterator[Array]:
             for _ in range(_MAX_TRIES):
                 azimuth, elevation = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(0, 1))
                 distance, target = rng.uniform(3.6, 4.4), rng.uniform(-0.15, 0.15, 3)
                 yield self._pose(azimuth, elevation, self._radius / 4.0 * distance, self._radius / 4.0 * target)
 
-        return _stack([self._first_free(candidates()) for _ in range(count)])
+        return self._first_free(candidates())
 
     def _first_free(self, candidates: Iterator[Array]) -> Array:
         for pose in candidates:
-            if self._space is None or self._space.is_free(pose[:3, 3]):
+            if self._space.is_free(pose[:3, 3]):
                 return pose
-        raise DataError("views around the scene", "no place is free of the mesh", "give its path a larger radius")
+        raise DataError("views around the scene", "no position is clear of the mesh", "give its path a larger radius")
 
     def _pose(self, azimuth: float, elevation: float, radius: float, target: ArrayLike) -> Array:
         """Return a pose on a hemisphere that looks at ``target``, which is relative to the center."""
@@ -165,11 +155,12 @@ class ObjectPath:
         return look_at(eye + self._center, np.add(target, self._center), up)
 
 
-class WalkPath:
+class WalkPath(CameraPath):
     """A closed smooth walk through given positions, looking at given targets.
 
     Positions and targets are periodic cubic splines. Their parameter is the distance between neighboring positions, so
-    that the speed hardly varies.
+    that the speed hardly varies. A held-out view moves towards the path until its camera is clear of the mesh and on
+    the same side of all walls.
 
     Args:
         positions: (N, 3) that the camera passes, N at least 4. The camera returns to the first.
@@ -177,8 +168,8 @@ class WalkPath:
         caster: see `ObjectPath`.
 
     Raises:
-        ValueError: there are too few points, neighbors in one place, or a gaze that is vertical or has no direction, or
-            the path comes too near to the mesh.
+        ValueError: there are too few points, neighbors in one position, or a gaze that is vertical or has no direction,
+            or the path comes too near to the mesh.
     """
 
     def __init__(self, positions: ArrayLike, targets: ArrayLike, caster: RayCaster | None = None) -> None:
@@ -192,42 +183,31 @@ class WalkPath:
         knots = np.append(0, np.cumsum(lengths)) / lengths.sum()
         self._eye = CubicSpline(knots, closed, bc_type="periodic")
         self._target = CubicSpline(knots, np.concatenate([looked_at, looked_at[:1]]), bc_type="periodic")
-        gaze = self._target(_FINE) - self._eye(_FINE)
+        fine = np.linspace(0, 1, 2001)
+        gaze = self._target(fine) - self._eye(fine)
         if (np.linalg.norm(gaze[:, :2], axis=1) < 0.02 * np.linalg.norm(gaze, axis=1) + 1e-9).any():
-            raise ValueError("the camera looks straight up or down, or at the place it is in; move the targets")
+            raise ValueError("the camera looks straight up or down, or at its own position; move the targets")
         # Root mean square distance of the positions from their mean.
         size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
         # In proportion to the built-in room's.
         self._spread = min(0.13 * size, 0.5)
-        self._space = None if caster is None else FreeSpace(caster, size)
-        if self._space is not None:
-            self._space.check_path(self)
+        self._space = FreeSpace(caster, size)
+        self._space.require_clear(self)
 
     def __call__(self, s: float) -> Array:
         return self._pose(s, np.zeros(3), 0.0)
 
-    def validation_views(self, count: int) -> Array:
-        """Return views (count, 4, 4) spread along the walk, beside, above and below it.
+    def _validation_view(self, k: int, count: int) -> Array:
+        shift = np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) * (0.8 * self._spread)
+        return self._free_pose((k + 0.5) / count, shift, 0.0)
 
-        A view moves towards the path until its camera is clear of the mesh and on the same side of all walls.
-        """
-        shifts = [np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) * (0.8 * self._spread) for k in range(count)]
-        return _stack([self._free_pose((k + 0.5) / count, shift, 0.0) for k, shift in enumerate(shifts)])
-
-    def test_views(self, count: int, seed: int) -> Array:
-        """Return random views (count, 4, 4) around the walk with random gazes, clear as in `validation_views`."""
-        rng, spread = np.random.default_rng(seed), self._spread
-        return _stack(
-            [
-                self._free_pose(rng.uniform(), rng.uniform(-spread, spread, 3), rng.uniform(-0.5, 0.5))
-                for _ in range(count)
-            ]
-        )
+    def _test_view(self, rng: np.random.Generator) -> Array:
+        return self._free_pose(rng.uniform(), rng.uniform(-self._spread, self._spread, 3), rng.uniform(-0.5, 0.5))
 
     def _free_pose(self, s: float, shift: Array, gaze: float) -> Array:
         for part in np.linspace(1, 0, 11):
             pose = self._pose(s, part * shift, gaze)
-            if self._space is None or self._space.is_reached(pose[:3, 3], self._eye(s % 1.0)):
+            if self._space.is_reached(pose[:3, 3], self._eye(s % 1.0)):
                 break
         return pose  # at last on the path itself, which is free
 
@@ -251,22 +231,11 @@ class SpeedProfile:
     The speed of `easy` is constant. The speed of `hard` is the easy speed times 8 ** sin(2 pi t), t in seconds: between
     an eighth and eight times as fast. These are the AE-NeRF paper's two settings.
 
-    Attributes:
-        name: "easy" or "hard".
-        easy_duration: seconds that the whole path takes at the easy speed, for both profiles.
-
-    Raises:
-        ValueError: the name is neither, or the duration is not positive.
+    ``easy_duration`` is the seconds that the whole path takes at the easy speed, for both profiles.
     """
 
-    name: str
+    name: Literal["easy", "hard"]
     easy_duration: float
-
-    def __post_init__(self) -> None:
-        if self.name not in ("easy", "hard"):
-            raise ValueError(f'speed must be "easy" or "hard", got {self.name!r}')
-        if not 0 < self.easy_duration < np.inf:
-            raise ValueError(f"duration must be positive, got {self.easy_duration}")
 
     @property
     def duration(self) -> float:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import astuple
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.json_file import read_json
@@ -111,11 +112,7 @@ class _SceneFile(Struct, forbid_unknown_fields=True, frozen=True):
 
 
 def load_scene(path: Path, seed: int = 0) -> SimulationScene:
-    """Read and light a mesh, with a scene.json or by itself.
-
-    Args:
-        path: a .json, .glb, .obj or .ply file.
-        seed: seed of the sampling of light.
+    """Read and light a mesh, with a scene.json or by itself. The seed is that of the sampling of light.
 
     Raises:
         DataError: a file is missing or malformed, or the camera's path runs into the mesh.
@@ -125,15 +122,14 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
     values = _SceneFile(path.name) if is_bare else read_json(path, _SceneFile, "see docs/simulator.md")
     file = file_inside(path.parent, values.mesh, path)
     up = values.up or ("y" if file.suffix.lower() == ".glb" else "z")
-    coats = {name: Gloss(coat.specular, coat.roughness) for name, coat in values.materials.items()}
-    environment, lamps = None, []
+    coats = {name: Gloss(*astuple(coat)) for name, coat in values.materials.items()}
+    environment = None
     if isinstance(values.light, _Light):
         if values.light.sky is not None:
             environment = sky(*values.light.sky)
         elif values.light.environment is not None:
             panorama = file_inside(path.parent, values.light.environment, path)
             environment = load_environment(panorama, values.light.turn_degrees, values.light.gain)
-        lamps = [AreaLight(lamp.center, lamp.half_u, lamp.half_v, lamp.radiance) for lamp in values.light.lamps]
     background = None if values.background == "environment" else np.array(values.background)
 
     mesh, scale = load_mesh(file, up == "y", coats), values.scale
@@ -166,9 +162,10 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
     except ValueError as error:
         raise DataError(path, f"path: {error}", "change the path or the scale, see docs/simulator.md") from error
     behind = np.zeros(3) if background is None else background
-    if environment is None:
+    if environment is None or values.light == "baked":
         renderer = baked_mesh(mesh, caster, behind)
     else:
+        lamps = [AreaLight(*astuple(lamp)) for lamp in values.light.lamps]
         renderer = light_mesh(mesh, caster, environment, lamps, behind, show_environment=background is None, seed=seed)
     scene = SimulationScene(
         path.stem,
@@ -184,7 +181,6 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
 
 
 def _make_path(values: _Around | _Walk, bounds: Array, caster: RayCaster) -> CameraPath:
-    """Build the camera's path. It is checked to keep clear of the mesh."""
     if isinstance(values, _Walk):
         return WalkPath(values.positions, values.targets, caster)
     center = bounds.mean(axis=0) if values.center is None else values.center

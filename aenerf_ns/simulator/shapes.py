@@ -24,6 +24,8 @@ _MAX_SAGITTA = 5e-4
 _MIN_SIDES = 12
 """The faces of a prism with fewer than 10 sides would meet at creases."""
 
+_NO_GLOSS: Mapping[str, Gloss] = {}
+
 Surface = tuple[Array, NDArray[np.int64], Array]
 """Vertices (V, 3) in meters, faces (F, 3) counterclockwise from outside, and texture coordinates (V, 2) in tiles."""
 
@@ -33,10 +35,8 @@ class Shape:
     """A textured surface.
 
     Attributes:
-        surface: returns the surface in local coordinates, given the longest side of its cells in meters. A cell is two
-            triangles.
-        center: (3,) in meters.
-        rotation: (3, 3) world-from-local.
+        surface: makes the surface, in local coordinates, of cells of two triangles, given their longest side in meters.
+        center, rotation: (3,) in meters and (3, 3), world-from-local.
         texture: name of the texture.
         texture_offset: (u, v) in tiles.
         tint: (3,) factor of the texture's albedo.
@@ -55,7 +55,7 @@ class Shape:
 
 
 def mesh_of(
-    shapes: Sequence[Shape], textures: Mapping[str, Texture], spacing: float, gloss: Mapping[str, Gloss] | None = None
+    shapes: Sequence[Shape], textures: Mapping[str, Texture], spacing: float, gloss: Mapping[str, Gloss] = _NO_GLOSS
 ) -> Mesh:
     """Join shapes to one mesh of cells with sides of at most ``spacing`` meters.
 
@@ -74,7 +74,7 @@ def mesh_of(
         uv.append(tiles + shape.texture_offset)
         color.append(np.tile(np.asarray(shape.tint, np.float64), (len(local), 1)))
         count += len(local)
-    sizes, coats = [len(part) for part in faces], gloss or {}
+    sizes = [len(part) for part in faces]
     mesh = Mesh(
         np.concatenate(vertices),
         np.concatenate(faces),
@@ -82,7 +82,7 @@ def mesh_of(
         np.concatenate(color),
         np.repeat([index[shape.texture] for shape in shapes], sizes),
         np.repeat([shape.emission for shape in shapes], sizes).astype(np.float64),
-        np.repeat([coats.get(shape.texture, DIFFUSE) for shape in shapes], sizes, axis=0),
+        np.repeat([gloss.get(shape.texture, DIFFUSE) for shape in shapes], sizes, axis=0),
         tuple(textures.values()),
     )
     return scaled(mesh, 1.0)
@@ -98,16 +98,9 @@ def light_shapes(
     spacing: float,
     ambient: float,
     seed: int,
-    gloss: Mapping[str, Gloss] | None = None,
+    gloss: Mapping[str, Gloss] = _NO_GLOSS,
 ) -> Renderer:
-    """Join and light shapes.
-
-    Args:
-        shapes, textures: the scene.
-        spacing: largest distance in meters of the points at which light is computed.
-        environment, lamps, background, ambient, seed: see `light_mesh`.
-        gloss: coats by the names of textures, see `mesh_of`.
-    """
+    """Join shapes, see `mesh_of`, and light them, see `light_mesh`. Light is computed at points ``spacing`` m apart."""
     mesh, _ = repair(mesh_of(shapes, textures, spacing, gloss), math.inf)
     caster = RayCaster(mesh.vertices, mesh.faces)
     return light_mesh(mesh, caster, environment, lamps, background, ambient=ambient, seed=seed)
@@ -140,21 +133,17 @@ def rotated_box(center: ArrayLike, size: ArrayLike, degrees: float, texture: str
     """Make a box turned about the vertical.
 
     Args:
-        center: (3,) in meters.
-        size: (3,) sides in meters.
+        center, size: (3,) in meters.
         degrees: angle of the turn, counterclockwise seen from above.
         texture: name of the texture. Its origin lies in the middle of each side.
         scale: side of one tile of the texture, in meters.
-        rest: ``texture_offset``, ``tint``, ``emission`` and ``spacing`` of the `Shape`.
+        rest: more attributes of the `Shape`.
     """
     return Shape(partial(_box, np.asarray(size, float), scale), center, vertical_rotation(degrees), texture, **rest)
 
 
 def sphere(center: ArrayLike, radius: float, texture: str, scale: float, **rest: Any) -> Shape:
-    """Make a sphere. A tilted axis keeps the poles of the texture at the sides, away from views from above.
-
-    For the other arguments see `rotated_box`.
-    """
+    """Make a sphere, its texture's poles at the sides. For the other arguments see `rotated_box`."""
     return Shape(partial(_sphere, radius, scale), center, axes((0, 0.6, 0.8), (1, 0, 0)), texture, **rest)
 
 
@@ -179,10 +168,7 @@ def panel(
     scale: float,
     **rest: Any,
 ) -> Shape:
-    """Make a rectangle (width, height) that faces a viewer to whom ``right`` and ``up`` look so.
-
-    For the other arguments see `rotated_box`.
-    """
+    """Make a rectangle (width, height) with these local axes. For the other arguments see `rotated_box`."""
     return Shape(partial(_rectangle, size, scale), center, axes(right, up), texture, **rest)
 
 

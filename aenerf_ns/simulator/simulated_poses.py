@@ -22,12 +22,10 @@ def poses_from_frames(
     The truth provides only what pictures cannot: the position, orientation and scale of the world.
 
     Args:
-        simulation: the pass of the camera.
-        camera: the lens.
-        truth: the true trajectory.
+        simulation, camera, truth: the pass of the camera, its lens and its true trajectory.
         frame_rate: frames a second.
         exposure: seconds for which a frame is exposed. Motion blurs the frame meanwhile.
-        seed: seed of COLMAP.
+        seed: of COLMAP.
 
     Returns:
         the estimated trajectory, a report of its making and its errors, and a summary in words.

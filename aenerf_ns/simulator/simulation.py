@@ -31,17 +31,13 @@ _RAYS_OF_EXPOSURES = 4
 
 
 class ReferencePicture(NamedTuple):
-    """The picture from a pose, gray for a monochrome sensor.
+    """The picture from a pose, gray for a monochrome sensor."""
 
-    Attributes:
-        display: (height, width, 3) uint8, sRGB.
-        linear: (height, width, 3) uint16, linear radiance; 65535 stands for 1, which is display white.
-        depth: (height, width) float32 along the optical axis at the pixels' centers, inf where nothing is hit.
-    """
-
-    display: NDArray[np.uint8]
-    linear: NDArray[np.uint16]
-    depth: NDArray[np.float32]
+    display: NDArray[np.uint8]  # (height, width, 3), sRGB
+    linear: NDArray[np.uint16]  # (height, width, 3), linear radiance; 65535 stands for 1, which is display white
+    depth: NDArray[
+        np.float32
+    ]  # (height, width) along the optical axis at the pixels' centers, inf where nothing is hit
 
 
 class Simulation:
@@ -50,15 +46,12 @@ class Simulation:
     Args:
         scene: the scene and the path.
         camera: the lens, which must be free of distortion.
-        sensor: thresholds, refractory period and Bayer pattern.
-        speed: "easy" for constant speed, "hard" for 8^sin(2πt) times that speed.
-        easy_duration: seconds that the path takes at constant speed.
+        sensor, noise, seed: see :class:`~aenerf_ns.simulator.esim.EventSimulator`.
+        speed, easy_duration: see :class:`~aenerf_ns.simulator.paths.SpeedProfile`.
         max_displacement: pixels that 99 % of the picture may move between two rendered frames.
-        seed: seed of the sensor's thresholds and noise.
-        noise: see :class:`~aenerf_ns.simulator.esim.EventSimulator`.
 
     Raises:
-        ValueError: an argument is out of range.
+        ValueError: the duration is too short.
     """
 
     def __init__(
@@ -72,32 +65,17 @@ class Simulation:
         seed: int,
         noise: SensorNoise = NOISELESS,
     ) -> None:
-        self._scene = scene
-        self._camera = camera
-        self._sensor = sensor
+        self._scene, self._camera, self._sensor = scene, camera, sensor
+        self._intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
         self._profile = SpeedProfile(speed, easy_duration)
-        width, height = camera.width, camera.height
-        self._simulator = EventSimulator(width, height, sensor, noise, seed=seed)
-        self._frames = frame_parameters(scene, self._intrinsics, width, height, max_displacement)
+        self._simulator = EventSimulator(camera.width, camera.height, sensor, noise, seed=seed)
+        self._frames = frame_parameters(scene, self._intrinsics, camera.width, camera.height, max_displacement)
         self._times = _nanoseconds(self._profile.time(self._frames))
         if (np.diff(self._times) <= 0).any():
             raise ValueError(f"duration must be long enough to tell its frames apart, not {easy_duration} s")
 
-    @property
-    def _intrinsics(self) -> tuple[float, float, float, float]:
-        return self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy
-
     def trajectory(self, pose_rate: float) -> Trajectory:
-        """Return the true trajectory from the start to the end, camera-to-world, OpenCV axes, in meters.
-
-        Args:
-            pose_rate: poses a second.
-
-        Raises:
-            ValueError: the rate is not positive.
-        """
-        if not 0 < pose_rate < np.inf:
-            raise ValueError(f"pose_rate must be positive, not {pose_rate}")
+        """Return the true trajectory, ``pose_rate`` poses a second, camera-to-world, OpenCV axes, in meters."""
         end = self._profile.duration
         seconds = np.append(np.arange(0, end - 0.5 / pose_rate, 1 / pose_rate), end)
         return Trajectory(_nanoseconds(seconds), self._poses(self._profile.parameter(seconds)))

@@ -38,10 +38,15 @@ def spectral_noise(
     return noise / noise.std()
 
 
+def albedo(color: Array, relative_noise: Array) -> Texture:
+    """Return the texture of colors (N, N, 3) times the exponential of a noise (N, N), within `ALBEDO_RANGE`."""
+    return np.clip(color * np.exp(relative_noise)[..., None], *ALBEDO_RANGE).astype(np.float32)
+
+
 def mottled(size: int, rng: np.random.Generator, colors: Sequence[str], contrast: float = 0.08) -> Texture:
     """Make clouds that pass through all the colors, under a finer grain: plaster, stone, marble."""
     blend = _blend(colors, 0.5 + 0.24 * spectral_noise(size, rng, 1.5))
-    return _albedo(blend, contrast * spectral_noise(size, rng, 0.9))
+    return albedo(blend, contrast * spectral_noise(size, rng, 0.9))
 
 
 def wood(size: int, rng: np.random.Generator, colors: Sequence[str]) -> Texture:
@@ -49,7 +54,7 @@ def wood(size: int, rng: np.random.Generator, colors: Sequence[str]) -> Texture:
     warp = spectral_noise(size, rng, 1.8, (4.0, 1.0))
     rings = np.sin(2 * np.pi * (5 * _coordinate(size)[:, None] + 0.55 * warp))
     fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
-    return _albedo(_blend(colors, 0.5 + 0.22 * rings + 0.10 * fibres), 0.06 * fibres)
+    return albedo(_blend(colors, 0.5 + 0.22 * rings + 0.10 * fibres), 0.06 * fibres)
 
 
 def planks(size: int, rng: np.random.Generator, colors: Sequence[str], rows: int = 8, columns: int = 2) -> Texture:
@@ -58,7 +63,7 @@ def planks(size: int, rng: np.random.Generator, colors: Sequence[str], rows: int
     tone = rng.random((rows, columns))[row, column]
     fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
     board = _blend(colors, tone + 0.14 * fibres)
-    return _albedo(board * (0.6 + 0.4 * _smooth_step(edge, 0.002, 0.009))[..., None], 0.06 * fibres)
+    return albedo(board * (0.6 + 0.4 * _smooth_step(edge, 0.002, 0.009))[..., None], 0.06 * fibres)
 
 
 def bricks(
@@ -69,7 +74,7 @@ def bricks(
     grain = spectral_noise(size, rng, 0.8)
     brick = _blend(colors, rng.random((rows, columns))[row, column] + 0.12 * grain)
     mix = _smooth_step(edge + 0.0012 * grain, 0.006, 0.014)[..., None]
-    return _albedo(mix * brick + (1 - mix) * linear_color(mortar), 0.06 * grain)
+    return albedo(mix * brick + (1 - mix) * linear_color(mortar), 0.06 * grain)
 
 
 def striped_wallpaper(size: int, rng: np.random.Generator, colors: Sequence[str], stripes: int = 6) -> Texture:
@@ -82,7 +87,7 @@ def striped_wallpaper(size: int, rng: np.random.Generator, colors: Sequence[str]
     diamond = _smooth_step(0.26 - np.abs(u % 1 - 0.5) - np.abs((v + 0.5 * (index // 2 % 2)) % 1 - 0.5) * 0.7, 0.0, 0.05)
     diamond = (diamond * (index % 2 == 0))[..., None]
     paper = (1 - 0.7 * diamond) * paper + 0.7 * diamond * palette[1 % len(palette)]
-    return _albedo(paper, 0.05 * spectral_noise(size, rng, 1.0))
+    return albedo(paper, 0.05 * spectral_noise(size, rng, 1.0))
 
 
 def leafy_wallpaper(
@@ -100,14 +105,14 @@ def leafy_wallpaper(
         vein = 1 - 0.35 * _smooth_step(0.005 - np.abs(across), 0.0, 0.004)
         color = linear_color(colors[rng.integers(len(colors))]) * rng.uniform(0.8, 1.15)
         paper = paper * (1 - leaf[..., None]) + leaf[..., None] * vein[..., None] * color
-    return _albedo(paper, 0.06 * spectral_noise(size, rng, 1.1))
+    return albedo(paper, 0.06 * spectral_noise(size, rng, 1.1))
 
 
 def checker(size: int, rng: np.random.Generator, colors: Sequence[str], cells: int = 4) -> Texture:
     """Make soft-edged squares of two colors."""
     wave = np.sin(np.pi * cells * _coordinate(size))
     squares = np.clip(6 * wave[None, :] * wave[:, None], -0.5, 0.5)
-    return _albedo(_blend(colors, 0.5 + squares), 0.06 * spectral_noise(size, rng, 1.0))
+    return albedo(_blend(colors, 0.5 + squares), 0.06 * spectral_noise(size, rng, 1.0))
 
 
 def fabric(size: int, rng: np.random.Generator, colors: Sequence[str], threads: int = 24) -> Texture:
@@ -117,7 +122,7 @@ def fabric(size: int, rng: np.random.Generator, colors: Sequence[str], threads: 
     check = np.sin(2 * np.pi * 2 * coordinate)
     tone = 0.5 + 0.10 * wave[None, :] * wave[:, None] + 0.16 * (check[None, :] + check[:, None])
     uneven = spectral_noise(size, rng, 0.9, (6.0, 1.0)) + spectral_noise(size, rng, 0.9, (1.0, 6.0))
-    return _albedo(_blend(colors, tone + 0.08 * uneven), 0.05 * uneven)
+    return albedo(_blend(colors, tone + 0.08 * uneven), 0.05 * uneven)
 
 
 def rug(size: int, rng: np.random.Generator, colors: Sequence[str]) -> Texture:
@@ -132,7 +137,7 @@ def rug(size: int, rng: np.random.Generator, colors: Sequence[str]) -> Texture:
     for inner, color in ((0.36, ground), (0.385, light), (0.40, accent), (0.445, light), (0.46, ground)):
         picture = picture + (color - picture) * _smooth_step(reach - inner + teeth, 0.0, 0.006)[..., None]
     pile = spectral_noise(size, rng, 0.5, (3.0, 1.0))
-    return _albedo(picture, 0.06 * pile)
+    return albedo(picture, 0.06 * pile)
 
 
 def book_spine(size: int, rng: np.random.Generator) -> Texture:
@@ -144,7 +149,7 @@ def book_spine(size: int, rng: np.random.Generator) -> Texture:
     letters = _smooth_step(spectral_noise(size, rng, 0.6, (1.0, 5.0)), 0.2, 0.6)
     title = _smooth_step(0.16 - np.abs(v - 0.55), 0.0, 0.01) * _smooth_step(0.22 - np.abs((u * 4) % 1 - 0.5), 0.0, 0.06)
     tone += 0.25 * letters * title
-    return _albedo(np.repeat(tone[..., None], 3, axis=-1), 0.06 * spectral_noise(size, rng, 1.2))
+    return albedo(np.repeat(tone[..., None], 3, axis=-1), 0.06 * spectral_noise(size, rng, 1.2))
 
 
 def landscape(size: int, rng: np.random.Generator, sky: Sequence[str], hills: Sequence[str]) -> Texture:
@@ -157,7 +162,7 @@ def landscape(size: int, rng: np.random.Generator, sky: Sequence[str], hills: Se
         shade = (0.85 + 0.3 * np.clip((ridge - v) * 3, 0, 1) + 0.12 * spectral_noise(size, rng, 1.0))[..., None]
         mix = _smooth_step(ridge - v, 0.0, 0.006)[..., None]
         picture = (1 - mix) * picture + mix * linear_color(color) * shade
-    return _albedo(picture, 0.05 * spectral_noise(size, rng, 0.8))
+    return albedo(picture, 0.05 * spectral_noise(size, rng, 0.8))
 
 
 def abstract(size: int, rng: np.random.Generator, ground: str, colors: Sequence[str], shapes: int = 16) -> Texture:
@@ -172,7 +177,7 @@ def abstract(size: int, rng: np.random.Generator, ground: str, colors: Sequence[
         distance = np.hypot(du, dv) - radius if shape % 2 else bar
         color = linear_color(colors[shape % len(colors)])
         picture += 0.85 * _smooth_step(-distance, -0.003, 0.005)[..., None] * (color - picture)
-    return _albedo(picture, 0.08 * spectral_noise(size, rng, 0.9))
+    return albedo(picture, 0.08 * spectral_noise(size, rng, 0.9))
 
 
 def _coordinate(size: int) -> Array:
@@ -200,7 +205,3 @@ def _bond(size: int, rows: int, columns: int, shift: Array) -> tuple[NDArray[np.
     edge_u = (0.5 - np.abs(u * columns % 1 - 0.5)) / columns
     edge_v = (0.5 - np.abs(v * rows % 1 - 0.5)) / rows
     return row, column, np.minimum(edge_u, edge_v)
-
-
-def _albedo(color: Array, relative_noise: Array) -> Texture:
-    return np.clip(color * np.exp(relative_noise)[..., None], *ALBEDO_RANGE).astype(np.float32)

@@ -24,26 +24,19 @@ _GRAY_LEVELS = decode(np.arange(256) / 255, "srgb")
 
 
 class VideoInterval(NamedTuple):
-    """A frame of a video, and what the sensor fires since the frame before it.
+    """A frame of a video, and what the sensor fires since the frame before it."""
 
-    Attributes:
-        frame: (height, width, 3) uint8, sRGB.
-        time: of the frame in nanoseconds.
-        events: in (time of the frame before, time of this frame]; none for the first frame.
-    """
-
-    frame: NDArray[np.uint8]
-    time: int
-    events: EventStream
+    frame: NDArray[np.uint8]  # (height, width, 3), sRGB
+    time: int  # of the frame, in nanoseconds
+    events: EventStream  # in (time of the frame before, time of this frame]; none for the first frame
 
 
 def quantization_epsilon(sensor: SensorModel) -> float:
     """Return the radiance that is added before the logarithm, because 8 bits of sRGB are coarse near black.
 
-    Without it, the step from black to the first gray level would be infinite in log-radiance. With it, the step from
-    gray level 0 to 2 of 255 is exactly the smaller contrast threshold C: log((L(2) + ε) / ε) = C, where L is linear
-    radiance. For C of 0.1 or more, any other two levels that are 2 apart differ by less. So a pixel that flickers by
-    one gray level does not keep firing.
+    With it, the step from gray level 0 to 2 of 255 is exactly the smaller contrast threshold: log((L(2) + ε) / ε) = C,
+    where L is linear radiance. For C of 0.1 or more, any other two levels that are 2 apart differ by less. So a pixel
+    that flickers by one gray level does not keep firing.
     """
     threshold = min(sensor.positive_contrast_threshold, sensor.negative_contrast_threshold)
     return float(_GRAY_LEVELS[2]) / math.expm1(threshold)
@@ -59,22 +52,18 @@ def video_events(
 ) -> Iterator[VideoInterval]:
     """Simulate an event sensor that sees a video. One frame after the other is read, so memory does not grow.
 
-    sRGB values are decoded to linear radiance, and :func:`quantization_epsilon` is added before the logarithm. The
-    sensor is that of :class:`~aenerf_ns.simulator.esim.EventSimulator`.
+    sRGB values are decoded to linear radiance, and :func:`quantization_epsilon` is added before the logarithm.
 
     Args:
         video: the frames.
-        sensor: thresholds, refractory period and Bayer pattern.
-        noise: how the sensor differs from an ideal one.
+        sensor, noise, seed: see :class:`~aenerf_ns.simulator.esim.EventSimulator`.
         interpolation: "linear": log-radiance is linear in time between two frames. "flow": frames along the optical
             flow are put between them (:class:`FlowInterpolation`), and log-radiance is linear between all of these.
         max_displacement: pixels that 99 % of the picture may move between two frames that "flow" puts in.
-        seed: seed of the sensor's thresholds and noise.
 
     Raises:
         DataError: a frame cannot be read or has another size than the first one.
-        ValueError: the displacement is not positive, a value of the noise is out of range, or the frames are too small
-            for optical flow.
+        ValueError: the frames are too small for optical flow.
     """
     epsilon = quantization_epsilon(sensor)
     simulator = EventSimulator(video.width, video.height, sensor, noise, log_epsilon=epsilon, seed=seed)
@@ -106,17 +95,14 @@ class FlowInterpolation:
     linearly in log-radiance, so that without motion the picture is linear in time.
 
     Args:
-        width: pixel columns.
-        height: pixel rows.
+        width, height: of the frames, in pixels.
         max_displacement: pixels that 99 % of the picture may move between two pictures.
 
     Raises:
-        ValueError: the displacement is not positive, or the frames are too small for optical flow.
+        ValueError: the frames are too small for optical flow.
     """
 
     def __init__(self, width: int, height: int, max_displacement: float) -> None:
-        if not max_displacement > 0:
-            raise ValueError(f"max_displacement must be positive, got {max_displacement}")
         # Smaller pictures than the patches of the flow fail, or have no flow.
         if min(width, height) < 12:
             raise ValueError(f"optical flow needs frames of 12 x 12 pixels or more, not {width} x {height}")

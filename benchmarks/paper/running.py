@@ -30,10 +30,10 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.provenance import provenance
 from benchmarks.paper.plan import CEILING, Dataset, Run, digest, scene_name
-from benchmarks.runs import exclusive, run_command, script
+from benchmarks.runs import exclusive, make_dataset, run_command
 
-# A training has so many parts. The framework evaluates the validation views after each part but the last, because it
-# counts the final step as one less.
+# Parts of a training. The framework evaluates the validation views after each part but the last, because it counts the
+# final step as one less.
 _CURVE_PARTS = 5
 _CURVE = "Eval Images Metrics Dict (all images)/psnr"
 # By its path, because the command runs in the benchmark's folder, where the package `benchmarks` is not found.
@@ -51,6 +51,8 @@ class Runner:
     def __init__(self, folder: Path, device: str) -> None:
         self._folder = folder
         self._device = device
+        # ns-eval has no option for the device.
+        self._variables = {"CUDA_VISIBLE_DEVICES": ""} if device == "cpu" else {}
         self._failed: dict[str, DataError] = {}
         for name in ("datasets", "outputs", "logs", "runs"):
             (folder / name).mkdir(parents=True, exist_ok=True)
@@ -129,13 +131,8 @@ class Runner:
             raise
 
     def _make_dataset(self, name: str, command: str, *arguments: str) -> Path:
-        """Make a dataset by a command of aenerf, unless it has been made, and return its folder."""
-        folder = self._folder / "datasets" / name
-        # If another process is making the dataset, wait until it has finished.
-        with exclusive(folder):
-            if not folder.exists():
-                self._call(name, script("aenerf"), command, *arguments, "--output", str(folder.resolve()))
-        return folder
+        folder, log = self._folder / "datasets" / name, self._folder / "logs" / f"{name}.log"
+        return make_dataset(folder, log, command, arguments, self._folder, **self._variables)
 
     def _train(self, run: Run, data: Path) -> tuple[str, ...]:
         """Train, evaluate, and return the command of the training, without the folders of this machine."""
@@ -159,13 +156,9 @@ class Runner:
             words += ["--pipeline.model.lpips", "True", *run.options]
             poses = "ground-truth" if run.true_poses else "estimated"
             words += ["aenerf-data", "--data", str(data.resolve()), "--poses", poses]
-        self._call(run.name, *_WORKER, run.name, *words)
+        log = self._folder / "logs" / f"{run.name}.log"
+        run_command((*_WORKER, run.name, *words), log, self._folder, **self._variables)
         return ("ns-train", *(word.replace(f"{self._folder.resolve()}/", "") for word in words))
-
-    def _call(self, log: str, *command: str) -> None:
-        # ns-eval has no option for the device.
-        hidden = {"CUDA_VISIBLE_DEVICES": ""} if self._device == "cpu" else {}
-        run_command(command, self._folder / "logs" / f"{log}.log", self._folder, **hidden)
 
 
 def _read(file: Path) -> dict[str, Any] | None:

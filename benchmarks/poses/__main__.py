@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 from aenerf_ns.progress import progress_bar
 from benchmarks.poses.scenes import SCENES, Split, scene_argument
-from benchmarks.runs import run_benchmark, run_command, run_script, write_result
+from benchmarks.runs import make_dataset, run_benchmark, run_command, write_result
 
 _WORKER = Path(__file__).with_name("worker.py")
 _CASES = {
@@ -86,11 +86,11 @@ class Poses:
         with progress_bar() as progress, ThreadPoolExecutor(self.jobs) as pool:
             bar = progress.add_task("Poses", total=len(names) + len(todo))
             for name in names:
-                self._simulate(name)
+                self._dataset(name)
                 progress.advance(bar)
 
-            def run(one: tuple[str, str, str, int]) -> dict[str, Any]:
-                name, case, variant, seed = one
+            def run(settings: tuple[str, str, str, int]) -> dict[str, Any]:
+                name, case, variant, seed = settings
                 found = self._train(name, case, variants[variant], seed)
                 return {"scene": name, "case": case, "variant": variant, "seed": seed, **found}
 
@@ -109,22 +109,18 @@ class Poses:
                     },
                     show=False,
                 )
-        print(as_text(table(runs)))
 
-    def _simulate(self, name: str) -> None:
-        scene = SCENES[name]
-        folder = self.work / "datasets" / _file_name(name)
-        if not folder.exists():
-            argument = scene_argument(scene.scene, self.scenes_folder, self.work / "scenes")
-            run_script(
-                self.work, "aenerf", "simulate", "--output", str(folder.resolve()), "--scene", argument, *scene.options
-            )
+    def _dataset(self, name: str) -> Path:
+        """Return the dataset of a scene, which is simulated if it is missing."""
+        scene, file_name = SCENES[name], name.replace(" ", "_")
+        argument = scene_argument(scene.scene, self.scenes_folder, self.work / "scenes")
+        folder, log = self.work / "datasets" / file_name, self.work / "logs" / f"{file_name}.log"
+        return make_dataset(folder, log, "simulate", ("--scene", argument, *scene.options))
 
     def _train(self, name: str, case: str, options: str, seed: int) -> dict[str, Any]:
         """Return the results of a training, from the file of an earlier one if there is one."""
         poses, of_case = _CASES[case]
         evaluation = "refined" if self.refine else "placed"
-        data = self.work / "datasets" / _file_name(name)
         arguments = (
             self.method, "--machine.device-type", "cpu", "--machine.seed", str(seed), "--vis", "tensorboard",
             "--max-num-iterations", str(self.steps), *of_case, *shlex.split(options),
@@ -136,7 +132,7 @@ class Poses:
             command = [
                 sys.executable, str(_WORKER), str(result.resolve()), evaluation, *arguments,
                 "--output-dir", str((self.work / "outputs" / digest).resolve()),
-                "aenerf-data", "--data", str(data.resolve()), "--poses", poses,
+                "aenerf-data", "--data", str(self._dataset(name).resolve()), "--poses", poses,
             ]  # fmt: skip
             log = self.work / "logs" / f"{digest}.log"
             run_command(command, log, OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
@@ -178,37 +174,8 @@ def table(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def as_text(rows: list[dict[str, Any]]) -> str:
-    """Return the table of :func:`table` for a reader."""
-    lines = ["PSNR with test poses placed / refined, less than true poses; error that is left"]
-    for row in rows:
-        psnr = " / ".join(
-            _plus_minus(row[f"psnr_{poses}"]) for poses in ("placed", "refined") if f"psnr_{poses}" in row
-        )
-        less = row.get("psnr_placed_less_than_true_poses")
-        control = "" if less is None else f", {less['mean']:.2f} dB less"
-        lines.append(
-            f"{row['scene']:20s} {row['case']:22s} {row['variant']:16s} {psnr} dB"
-            f"{control}; {_plus_minus(row['degrees'])} degrees, "
-            f"{100 * row['translation']['mean']:.1f} cm, {row['pixels']['0.4']['mean']:.2f} px within 0.4 s; "
-            f"plateau left at {row['plateau_left_at']}"
-        )
-    return "\n".join(lines)
-
-
 def _summary(values: list[float]) -> dict[str, float]:
-    return {
-        "mean": math.fsum(values) / len(values),
-        "spread": max(values) - min(values),
-    }
-
-
-def _plus_minus(summary: dict[str, float]) -> str:
-    return f"{summary['mean']:.2f} (spread {summary['spread']:.2f})"
-
-
-def _file_name(name: str) -> str:
-    return name.replace(" ", "_")
+    return {"mean": math.fsum(values) / len(values), "spread": max(values) - min(values)}
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python benchmarks/poses/worker.py RESULT EVALUATION METHOD OPTIONS
 
 ``EVALUATION`` is "placed" or "refined": whether the test poses are refined photometrically, too. Writes the file
-``RESULT``. This file runs with the code of any commit that has the names it imports.
+``RESULT``.
 """
 
 from __future__ import annotations
@@ -97,11 +97,7 @@ def _camera(data: Path) -> dict[str, float]:
 
 
 class _Record:
-    """Losses of every step, and errors of the poses during a training.
-
-    Args:
-        trainer: of a run on a simulated dataset, whose true poses are known.
-    """
+    """Losses of every step, and errors of the poses during a training on a simulated dataset."""
 
     def __init__(self, trainer: Trainer) -> None:
         self._pipeline = trainer.pipeline
@@ -160,19 +156,12 @@ def plateau_left_at(losses: Tensor) -> int:
     return int((smooth > half).nonzero()[-1]) + window
 
 
-def _evaluated(config: Path, refined: bool) -> dict[str, Any]:
+def _evaluate(config: Path, refined: bool) -> dict[str, Any]:
     """Return the metrics of the test views, as ns-eval does, with their poses placed and, if wanted, refined."""
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
     pipeline.config.refine_test_poses = refined
     placed = pipeline.get_average_eval_image_metrics()
-    results = {"placed": placed}
-    if "refined_test_poses" in placed:
-        results["refined"] = placed.pop("refined_test_poses")
-    elif refined:
-        # Commits that refine on demand.
-        pipeline.refine_test_poses()
-        results["refined"] = pipeline.get_average_eval_image_metrics()
-    return results
+    return {"refined": placed.pop("refined_test_poses"), "placed": placed} if refined else {"placed": placed}
 
 
 def main() -> None:
@@ -191,7 +180,7 @@ def main() -> None:
 
     Trainer.train = recorded
     ns_train.entrypoint()
-    record.update(_evaluated(record.pop("config"), refined))
+    record.update(_evaluate(record.pop("config"), refined))
     result.write_text(json.dumps(record, indent=2) + "\n", "utf8")
 
 

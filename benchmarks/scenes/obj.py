@@ -17,6 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from aenerf_ns.errors import DataError
 from benchmarks.scenes.meshes import Array, Material, Model, Part, cross_2d, not_degenerate, unit_normals
 
+# Faces of more transparent materials are left out, because rays stop at every surface.
+_MIN_OPACITY = 0.8
+_TILE = 0.35
+"""Side of a texture tile in meters, where the file gives no texture coordinates."""
+
 
 @dataclass(frozen=True)
 class _ObjMaterial:
@@ -26,11 +31,7 @@ class _ObjMaterial:
 
 
 def read_obj(
-    path: Path,
-    surface: Callable[[str, tuple[float, float, float], Path | None], Material | None],
-    size: ArrayLike | None = None,
-    minimum_opacity: float = 0.8,
-    tile: float = 0.35,
+    path: Path, surface: Callable[[str, tuple[float, float, float], Path | None], Material | None], size: ArrayLike
 ) -> Model:
     """Read the polygons of an OBJ file, y up, as triangles, z up.
 
@@ -42,9 +43,7 @@ def read_obj(
         surface: maps the name, sRGB color and picture file (or None) of a material to the material to use, or to
             None to leave its faces out.
         size: extent (3,) of the content along x, y and z, in meters. Proportions are kept: the scale is the median
-            of the three ratios. None if the file's unit is the meter.
-        minimum_opacity: faces of more transparent materials are left out, because rays stop at every surface.
-        tile: side of a texture tile in those planes, in meters.
+            of the three ratios.
 
     Raises:
         DataError: if the file cannot be read or has no faces.
@@ -77,21 +76,20 @@ def read_obj(
         raise DataError(path, "no faces", "remove the asset cache and build again")
 
     points = np.array(vertices)[:, [0, 2, 1]] * (1, -1, 1)
-    if size is not None:
-        used = points[np.concatenate([where for faces in polygons.values() for where, _ in faces])]
-        points *= np.median(np.asarray(size) / np.maximum(np.ptp(used, axis=0), 1e-9))
+    used = points[np.concatenate([where for faces in polygons.values() for where, _ in faces])]
+    points *= np.median(np.asarray(size) / np.maximum(np.ptp(used, axis=0), 1e-9))
     # Index -1, of a corner without texture coordinates, is the last row.
     coordinates = np.array([*texture, [0.0, 0.0]])
     parts = []
     for name, faces in polygons.items():
         entry = materials.get(name, _ObjMaterial())
-        material = surface(name, entry.color, entry.picture) if entry.opacity >= minimum_opacity else None
+        material = surface(name, entry.color, entry.picture) if entry.opacity >= _MIN_OPACITY else None
         if material is None:
             continue
         corners = np.concatenate([face[:, triangulate(points[face[0]])] for face in faces], axis=1)
         where, at = corners[:, not_degenerate(points[corners[0]])]
         bare = (at < 0)[..., None] | (entry.picture is None)
-        uv = np.where(bare, _plane_coordinates(points[where]) / tile, coordinates[at])
+        uv = np.where(bare, _plane_coordinates(points[where]) / _TILE, coordinates[at])
         if len(where):
             parts.append(Part(points[where], uv, material))
     return Model(tuple(parts))

@@ -1,1 +1,1 @@
-"""The cost of training steps and of rendered pictures: by part, beside nerfacto, and beside an earlier commit."""
+"""The cost of training steps and of rendered pictures, beside nerfacto and beside an earlier commit."""

@@ -1,4 +1,4 @@
-"""Measure training steps and rendered pictures: by part, beside nerfacto, and beside an earlier commit.
+"""Measure training steps and rendered pictures, beside nerfacto and beside an earlier commit.
 
     python -m benchmarks.step --data demo/room --against ae14542 --output benchmarks/results/step_cpu2.json
 
@@ -9,8 +9,12 @@ within one round of turns. On a machine with a GPU, the trainings run there.
 
 from __future__ import annotations
 
+import json
+import os
 import shlex
 import statistics
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,13 +24,13 @@ from typing import Any, Literal, get_args
 
 import torch
 
-from benchmarks.runs import run_benchmark, write_result
-from benchmarks.step.sides import Side, Training, install
+from aenerf_ns.errors import DataError
+from benchmarks.runs import die_with_parent, run_benchmark, run_command, write_result
 
-Measurement = Literal[
-    "small", "small-two-threads", "full", "temporal-loss", "nerfacto-small", "nerfacto-full", "seconds-to-psnr"
-]
+Measurement = Literal["small", "small-two-threads", "full", "temporal-loss", "nerfacto-small", "nerfacto-full"]
 
+_ROOT = Path(__file__).parents[2]
+_WORKER = Path(__file__).with_name("worker.py")
 _ON_GPU = torch.cuda.is_available()
 _SMALL = ("aenerf-small", "--pipeline.model.camera-optimizer.mode", "spline")
 _RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
@@ -48,8 +52,93 @@ _NERFACTO_SMALL = (
     "--pipeline.model.proposal-net-args-list.0.log2-hashmap-size", "14",
 )  # fmt: skip
 _TEMPORAL_LOSS = ("--pipeline.model.loss-coefficients.temporal-loss", "0.001")
-# A run to a PSNR has so many turns. Its second half is evaluated, because the schedules reach the quality at the end.
-_PSNR_TURNS = 16
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a comparison.
+
+    Attributes:
+        arguments: of ns-train: the method and its options.
+        threads: of torch and numba.
+        commit: to measure; None for the code that is installed.
+    """
+
+    arguments: tuple[str, ...]
+    threads: int = 1
+    commit: str | None = None
+
+
+class Training:
+    """A training in a process of its own, which waits for requests.
+
+    Args:
+        side: what to train.
+        folder: for the log, the run, and the packages of earlier commits.
+        ending: the last arguments of ns-train.
+    """
+
+    def __init__(self, side: Side, folder: Path, ending: tuple[str, ...]) -> None:
+        self._packages = None if side.commit is None else _install(side.commit, folder)
+        self._log = folder / f"{len(list(folder.glob('*.log')))}.log"
+        paths = [str(self._packages or ""), os.environ.get("PYTHONPATH", "")]
+        threads = {"OMP_NUM_THREADS": str(side.threads), "NUMBA_NUM_THREADS": str(side.threads)}
+        output = ("--output-dir", str(self._log.with_suffix("")))
+        command = (sys.executable, str(_WORKER), *side.arguments, *output, *ending)
+        with self._log.open("w", encoding="utf8") as log:
+            self._process = subprocess.Popen(
+                die_with_parent(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
+                env={**os.environ, **threads, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+            )  # fmt: skip
+
+    def ask(self, name: str, *arguments: Any) -> Any:
+        """Return the answer to a request; see ``worker.py``.
+
+        Raises:
+            SystemExit: the training has failed; with the end of its output.
+        """
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(json.dumps([name, *arguments]) + "\n")
+            self._process.stdin.flush()
+            answer = self._process.stdout.readline()
+        except BrokenPipeError:
+            answer = ""
+        if not answer:
+            sys.exit(f"a training failed:\n{self._log.read_text('utf8')[-3000:]}")
+        return json.loads(answer)
+
+    def about(self, scale: float) -> dict[str, Any]:
+        """Wait until the training is ready, and scale the size of its picture.
+
+        Returns:
+            The most rays of a step and the pixels of the scaled picture.
+
+        Raises:
+            DataError: the training runs with the package of another commit.
+        """
+        about = self.ask("about", scale)
+        package = Path(about.pop("package"))
+        if self._packages is not None and not package.is_relative_to(self._packages):
+            raise DataError(package, "another commit's package would be measured", "check PYTHONPATH")
+        return about
+
+    def end(self) -> None:
+        """End the process, and with it the processes that it has started."""
+        self._process.communicate()
+
+
+def _install(commit: str, folder: Path) -> Path:
+    """Install this project's package as of a commit, without its dependencies. Return the folder for PYTHONPATH."""
+    packages, source, log = folder / commit / "packages", folder / commit / "source", folder / commit / "install"
+    if not packages.exists():
+        source.mkdir(parents=True)
+        run_command(("git", "-C", str(_ROOT), "archive", "--output", str(source) + ".tar", commit), log)
+        run_command(("tar", "-xf", f"{source}.tar", "-C", str(source)), log)
+        pip = (sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--no-index")
+        run_command((*pip, "--target", str(packages), str(source)), log)
+    return packages
 
 
 @dataclass
@@ -66,15 +155,10 @@ class StepCost:
     """The comparisons to make."""
     rounds: int = 12
     """Turns of each side, at least 2."""
-    psnr: float = 28.5
-    """PSNR over the validation views whose seconds are measured, in dB."""
-    psnr_steps: int = 800
-    """Steps of the runs that shall reach it."""
 
     def main(self) -> None:
         """Measure and write the figures."""
         small, full, two_threads = Side(_SMALL), Side(_FULL), Side(_SMALL, threads=2)
-        to_psnr = Side((*_SMALL, "--max-num-iterations", str(self.psnr_steps)))
         comparisons: dict[Measurement, tuple[Side, Side]] = {
             "small": (replace(small, commit=self.against), small),
             "small-two-threads": (replace(two_threads, commit=self.against), two_threads),
@@ -82,18 +166,13 @@ class StepCost:
             "temporal-loss": (small, Side((*_SMALL, *_TEMPORAL_LOSS))),
             "nerfacto-small": (Side(_NERFACTO_SMALL), small),
             "nerfacto-full": (Side(_NERFACTO_FULL), full),
-            "seconds-to-psnr": (replace(to_psnr, commit=self.against), to_psnr),
         }
         rows = []
         with TemporaryDirectory() as folder:
             for name in self.measure:
                 sides = comparisons[name]
                 with self._trainings(sides, Path(folder)) as trainings:
-                    figures = (
-                        self._seconds_to_psnr(*trainings)
-                        if name == "seconds-to-psnr"
-                        else self._cost(trainings, long=not _ON_GPU and "full" in name)
-                    )
+                    figures = self._cost(trainings, long=not _ON_GPU and "full" in name)
                 described = [{**vars(side), "arguments": shlex.join(side.arguments)} for side in sides]
                 rows.append({"measurement": name, "baseline": described[0], "subject": described[1], **figures})
                 # After each comparison, because all of them take long.
@@ -104,27 +183,18 @@ class StepCost:
         """Start the trainings of both sides, and end them."""
         trainings: list[Training] = []
         try:
-            for index, side in enumerate(sides):
-                packages = None
-                if side.commit is not None:
-                    packages = folder / side.commit / "packages"
-                    if not packages.exists():
-                        packages.parent.mkdir(parents=True)
-                        install(side.commit, packages.parent)
+            for side in sides:
                 # nerfacto reads the images with the estimated poses.
                 images = ("nerfstudio-data",) if side.arguments[0] == "nerfacto" else ()
-                ending = (
-                    "--machine.device-type", "cuda" if _ON_GPU else "cpu", "--vis", "tensorboard",
-                    "--output-dir", str(folder / str(index)), *images, "--data", str(self.data.resolve()),
-                )  # fmt: skip
-                trainings.append(Training(side, packages, folder / f"{index}.log", ending))
+                device = ("--machine.device-type", "cuda" if _ON_GPU else "cpu", "--vis", "tensorboard")
+                trainings.append(Training(side, folder, (*device, *images, "--data", str(self.data.resolve()))))
             yield trainings
         finally:
             for training in trainings:
                 training.end()
 
     def _cost(self, trainings: list[Training], long: bool) -> dict[str, Any]:
-        """Return the cost of steps and of pictures, and the parts of a step.
+        """Return the cost of steps and of pictures.
 
         Args:
             trainings: of the baseline and of the subject.
@@ -138,15 +208,10 @@ class StepCost:
             # The first steps compile, and the first ten all train the proposal networks.
             training.ask("train", 10)
         trained = self._turns(trainings, "train", steps)
-        # Before the pictures, because rendering puts off the next training of the proposal networks.
-        parts = [training.ask("parts", steps) for training in trainings]
         rendered = self._turns(trainings, "render")
         return {
             "step": _compare(trained, steps, "rays", [one["rays"] for one in about]),
             "picture": _compare(rendered, 1, "pixels", [one["pixels"] for one in about]),
-            "milliseconds_of_parts": [
-                {part: 1e3 * seconds / steps for part, seconds in of_side.items()} for of_side in parts
-            ],
         }
 
     def _turns(self, trainings: list[Training], *request: Any) -> list[list[dict[str, float]]]:
@@ -156,27 +221,6 @@ class StepCost:
             for side in (0, 1) if turn % 2 else (1, 0):
                 seconds[side].append(trainings[side].ask(*request))
         return seconds
-
-    def _seconds_to_psnr(self, *trainings: Training) -> dict[str, Any]:
-        """Return the seconds of training until the PSNR is reached, without start-up and without the evaluations."""
-        for training in trainings:
-            training.about()
-        steps = self.psnr_steps // _PSNR_TURNS
-        curves: list[list[dict[str, float]]] = [[], []]
-        spent = [{"wall": 0.0, "cpu": 0.0} for _ in trainings]
-        for turn in range(1, _PSNR_TURNS + 1):
-            for training, curve, seconds in zip(trainings, curves, spent, strict=True):
-                if curve and curve[-1]["psnr"] >= self.psnr:
-                    continue
-                for clock, value in training.ask("train", steps).items():
-                    seconds[clock] += value
-                if turn >= _PSNR_TURNS // 2:
-                    curve.append({"step": turn * steps, "psnr": training.ask("psnr"), **seconds})
-        reached = [curve[-1] if curve[-1]["psnr"] >= self.psnr else None for curve in curves]
-        ratio = None
-        if reached[0] is not None and reached[1] is not None:
-            ratio = {clock: reached[1][clock] / reached[0][clock] for clock in ("wall", "cpu")}
-        return {"psnr": self.psnr, "curves": curves, "ratio_of_seconds": ratio}
 
 
 def _compare(seconds: list[list[dict[str, float]]], count: int, unit: str, units: list[int]) -> dict[str, Any]:

@@ -14,22 +14,14 @@ import json
 import os
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
-from torch.autograd.profiler_util import FunctionEvent
-from torch.profiler import profile, record_function
-
-_RANGE = "part of a step: "
-_BACKWARD_NODE = "autograd::engine::evaluate_function: "
 
 
 class _Worker:
@@ -63,41 +55,6 @@ class _Worker:
         self._model.eval()
         return self._seconds(lambda: self._model.get_outputs_for_camera(self._camera))
 
-    def psnr(self) -> float:
-        """Return the PSNR over the validation views, with the color correction fitted on them."""
-        pipeline = self._trainer.pipeline
-        # Commits that refine the poses of the views would do it each time.
-        pipeline.config.refine_test_poses = False
-        pipeline.color_fit.fit()
-        return pipeline.get_average_eval_image_metrics()["psnr"]
-
-    def parts(self, steps: int) -> dict[str, float]:
-        """Return the seconds that each part of some steps took: on a GPU those of its kernels, else wall-clock time."""
-        trainer, model, manager = self._trainer, self._model, self._trainer.pipeline.datamanager
-        places = [
-            (manager, "next_train", "batch"),
-            (model, "forward", "rendering"),
-            (model.camera_optimizer, "apply_to_raybundle", "poses"),
-            (model.camera_optimizer, "ray_rates", "poses"),
-            (model.proposal_sampler, "forward", "proposals"),
-            (model.field, "forward", "field"),
-            (model, "get_loss_dict", "losses"),
-            (model, "get_metrics_dict", "metrics"),
-            (torch.Tensor, "backward", "backward"),
-            (trainer.optimizers, "zero_grad_some", "optimizers"),
-            (trainer.optimizers, "optimizer_scaler_step_some", "optimizers"),
-            (trainer.optimizers, "scheduler_step_all", "optimizers"),
-        ]
-        with ExitStack() as stack:
-            for owner, name, part in places:
-                if hasattr(owner, name):
-                    stack.enter_context(patch.object(owner, name, ranged(getattr(owner, name), part)))
-            # In this thread, so that the backward pass lies within its range.
-            stack.enter_context(torch.autograd.set_multithreading_enabled(False))
-            profiler = stack.enter_context(profile())
-            ranged(self._train, "rest")(steps)
-        return seconds_of_parts(profiler.events(), on_gpu=self._camera.device.type == "cuda")
-
     def _train(self, steps: int) -> None:
         trainer = self._trainer
         for step in range(trainer.step, trainer.step + steps):
@@ -121,48 +78,6 @@ class _Worker:
     def _wait(self) -> None:
         if self._camera.device.type == "cuda":
             torch.cuda.synchronize()
-
-
-def ranged(function: Callable[..., Any], part: str) -> Callable[..., Any]:
-    """Return a function that the profiler sees as a part of the step."""
-
-    def call(*arguments: Any, **options: Any) -> Any:
-        with record_function(_RANGE + part):
-            return function(*arguments, **options)
-
-    return call
-
-
-def seconds_of_parts(events: list[FunctionEvent], on_gpu: bool) -> dict[str, float]:
-    """Return the seconds of the parts, which add up to the whole.
-
-    A range does not count for the range around it. Autograd numbers the operations: a node of the backward pass has the
-    number of its operation, and counts for the part in which that operation ran.
-    """
-    seconds: dict[str, float] = defaultdict(float)
-    part_of_number: dict[int, str] = {}
-
-    def visit(event: FunctionEvent, part: str) -> None:
-        duration = (event.device_time_total if on_gpu else event.cpu_time_total) * 1e-6
-        inner = part
-        if event.name.startswith(_RANGE):
-            inner = event.name.removeprefix(_RANGE)
-        elif event.name.startswith(_BACKWARD_NODE):
-            inner = f"backward of {part_of_number.get(event.sequence_nr, 'rest')}"
-        elif not part.startswith("backward") and event.sequence_nr >= 0:
-            part_of_number[event.sequence_nr] = part
-        if inner != part:
-            seconds[inner] += duration
-            seconds[part] -= duration
-        for child in event.cpu_children:
-            visit(child, inner)
-
-    for event in events:
-        if event.name == _RANGE + "rest":
-            seconds["rest"] += (event.device_time_total if on_gpu else event.cpu_time_total) * 1e-6
-            for child in event.cpu_children:
-                visit(child, "rest")
-    return dict(seconds)
 
 
 def main() -> None:

@@ -126,7 +126,7 @@ def test_obj_files_are_read_with_their_materials(tmp_path):
     np.testing.assert_allclose(model.triangles, [[[0, 0, 0], [2, 0, 0], [2, 0, 1]]])
     (tmp_path / "b.obj").write_text("v 0 0\nf 1 2 x\n")
     with pytest.raises(DataError, match=r"b\.obj"):
-        read_obj(tmp_path / "b.obj", surface)
+        read_obj(tmp_path / "b.obj", surface, (1, 1, 1))
 
 
 def test_glb_files_hold_the_model(tmp_path):

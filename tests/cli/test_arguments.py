@@ -116,7 +116,7 @@ MISTAKES = [
     ("simulate --output F", 1, "Error: F: the folder exists already"),
     (f"simulate --output {LONG}", 1, f"Error: {LONG}: it cannot be created (File name too long); choose another"),
     (f"simulate --output O --train-images {10**400}", 1, "Error: --train-images: 1000000"),
-    ("simulate --output O --scene nothing.glb", 1, "Error: nothing.glb: the file does not exist"),
+    ("simulate --output O --scene nothing.glb", 1, "Error: nothing.glb: there is no such file"),
     ("simulate --output O --width 0", 1, "Error: --width: 0 is out of range; give a number from 1 to 16384"),
     ("simulate --output O --width 9999 --height 9999", 1, "Error: aenerf simulate: an event sensor of 9999 x 9999"),
     ("simulate --output O --leak-rate -1", 1, "Error: --leak-rate: -1.0 is out of range"),

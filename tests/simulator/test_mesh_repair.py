@@ -17,8 +17,8 @@ from helpers.small_meshes import (
 
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
+from aenerf_ns.simulator.rendering.mesh_loading import triangulate
 from aenerf_ns.simulator.rendering.mesh_repair import repair, subdivided
-from aenerf_ns.simulator.rendering.polygons import clip_ears
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
@@ -62,7 +62,7 @@ def test_concave_polygons() -> None:
     arrow = np.array([[0, 0], [2, 1], [0, 2], [0.7, 1.0]], np.float64) @ np.array([[1, 0, 0.2], [0, 1, -0.4]])
     for shift in range(4):
         corners = np.roll(arrow, shift, axis=0)[:: 1 if shift % 2 else -1]
-        triangles = np.array([corners[list(t)] for t in clip_ears(corners)])
+        triangles = np.array([corners[list(t)] for t in triangulate(corners)])
         cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         newell = np.cross(corners, np.roll(corners, -1, axis=0)).sum(0)
         assert (cross @ newell > 0).all()
@@ -82,7 +82,7 @@ def test_concave_polygons() -> None:
 )
 def test_holes_and_needless_corners_of_polygons(outline: list[tuple[float, float]]) -> None:
     corners = np.column_stack([outline, 1e-6 * np.random.default_rng(0).normal(size=len(outline))])
-    a, b, c = np.moveaxis(corners[clip_ears(corners)], 1, 0)
+    a, b, c = np.moveaxis(corners[triangulate(corners)], 1, 0)
     cross = np.cross(b - a, c - a)
     assert (cross[:, 2] >= 0).all()
     np.testing.assert_allclose(

@@ -34,7 +34,7 @@ DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [LAMP]}
 @pytest.mark.parametrize(
     ("values", "problem"),
     [
-        ({"mesh": "gone.glb"}, "gone.glb: the file does not exist"),
+        ({"mesh": "gone.glb"}, "gone.glb: there is no such file"),
         ({"mesh": "scene.json"}, "unknown kind of mesh"),
         ({"mesh": "../box.glb"}, "outside the folder"),
         ({"mesh": "m" * 5000 + ".glb"}, "cannot be read"),
@@ -48,7 +48,7 @@ DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [LAMP]}
         ({"light": {**DAY, "gain": 2}}, "belong to an environment"),
         ({"light": {"sky": [[1, 1, 1], [1, 1, -1]]}}, "light.sky[1][2]: "),
         ({"light": {"sky": [[1] * 3, [1e300] * 3]}}, "light.sky[1][0]: "),
-        ({"light": {"environment": "gone.hdr"}}, "gone.hdr: the environment does not exist"),
+        ({"light": {"environment": "gone.hdr"}}, "gone.hdr: there is no such file"),
         ({"light": {"environment": "box.glb"}}, "box.glb: not a Radiance picture"),
         ({"light": {**DAY, "lamps": [LAMP] * 101}}, "light.lamps: "),
         ({"light": {**DAY, "lamps": [{**LAMP, "half_v": [0, 0, 0]}]}}, "span no rectangle"),
@@ -60,7 +60,7 @@ DAY = {"sky": [[0, 0, 0], [1, 1, 1]], "lamps": [LAMP]}
         ({"background": [2, 1, 1]}, "background[0]: "),
         ({"background": "environment"}, "the light is baked"),
         ({"path": {"kind": "fly"}}, "path.kind: "),
-        ({"path": {"kind": "around", "radius": 0.5}}, "runs into the mesh at ("),
+        ({"path": {"kind": "around", "radius": 0.5}}, "runs into the mesh at ["),
         ({"path": {"kind": "around", "radius": 0.8}}, "comes within 0.0"),
         ({"path": {"kind": "around", "radius": 1e30}}, "path.radius: "),
         ({"path": {"kind": "around", "turns": 1e9}}, "path.turns: "),

@@ -23,14 +23,10 @@ class Hits(NamedTuple):
 
 
 class RayCaster:
-    """Cast rays against triangles.
+    """Cast rays against triangles, whose vertices (V, 3) are rounded to float32.
 
     Rays are float32 (N, 6): origin and direction. Queries use as many threads as numba. Answers do not depend on that
     number, because one thread builds the tree.
-
-    Args:
-        vertices: (V, 3), rounded to float32.
-        faces: (F, 3).
 
     Raises:
         DataError: Open3D cannot be loaded.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.limits import require_at_most
+from aenerf_ns.files.limits import require_at_most, require_file
 from aenerf_ns.simulator.arrays import Array
 
 # 16384 x 8192 pixels, uncompressed.
@@ -22,25 +22,19 @@ _BRIGHT = 4.0
 
 @dataclass(frozen=True)
 class Environment:
-    """Radiance from every direction, as an equirectangular picture.
+    """Radiance from every direction, as an equirectangular picture (rows, columns, 3) of linear RGB.
 
     The first row is straight up. The middle column lies along +x. Columns run clockwise seen from above, so +y lies a
     quarter of the width to the left of the middle.
-
-    Attributes:
-        radiance: (rows, columns, 3) linear RGB, float32.
     """
 
     radiance: NDArray[np.float32]
 
     def split(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Split the environment into an even part and a bright part that add up to the whole.
+        """Split the environment into an even part, at most 32 rows high, and a bright part, which add up to the whole.
 
         Sampling a light of a few texels like the sky gives noise, and sampling the sky like the sun takes many samples,
         so each part is sampled in its own way.
-
-        Returns:
-            the even part, at most 32 rows high, and the small bright part at full resolution.
         """
         solid_angle = row_weights(len(self.radiance))[:, None]
         luminance = self.radiance.mean(axis=-1)
@@ -69,19 +63,15 @@ def sky(nadir: ArrayLike, zenith: ArrayLike) -> Environment:
 def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -> Environment:
     """Read a Radiance .hdr panorama.
 
-    Args:
-        path: the file.
-        turn_degrees: rotation about the vertical, counterclockwise seen from above.
-        gain: factor of the radiance.
+    Turn it by ``turn_degrees`` about the vertical, counterclockwise seen from above, and scale its light by ``gain``.
 
     Raises:
         DataError: the file is missing or is not a panorama.
     """
     import cv2
 
+    require_file(path)
     with reading(path):
-        if not path.is_file():
-            raise DataError(path, "the environment does not exist", "check the name")
         require_at_most(path, _MAX_BYTES)
         with path.open("rb") as file:
             begin = file.read(2)
@@ -102,7 +92,7 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
     if not np.isfinite(picture).all() or picture.min() < 0 or not 0 < picture.max() * gain < 1e12:
         raise DataError(path, "radiance that is negative, infinite, or nowhere positive", "give another picture")
     radiance = gain * picture[..., 2::-1]
-    # An counterclockwise turn moves the content at +x towards +y, which is to the left.
+    # A counterclockwise turn moves the content at +x towards +y, which is to the left.
     shift = turn_degrees / 360.0 * columns
     whole, part = int(np.floor(shift)), shift - np.floor(shift)
     radiance = (1 - part) * np.roll(radiance, -whole, axis=1) + part * np.roll(radiance, -whole - 1, axis=1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
@@ -37,20 +36,13 @@ _SMOOTHING = 4
 _CHUNK = 1 << 14
 
 
-@dataclass(frozen=True)
-class AreaLight:
-    """An invisible rectangle that shines to one side, that of half_u x half_v.
+class AreaLight(NamedTuple):
+    """An invisible rectangle that shines to one side, that of half_u x half_v."""
 
-    Attributes:
-        center: (3,) in meters.
-        half_u, half_v: (3,) from the center to the middle of a side, in meters.
-        radiance: (3,) linear RGB, uniform.
-    """
-
-    center: ArrayLike
-    half_u: ArrayLike
+    center: ArrayLike  # (3,) in meters
+    half_u: ArrayLike  # (3,) from the center to the middle of a side, in meters
     half_v: ArrayLike
-    radiance: ArrayLike
+    radiance: ArrayLike  # (3,) linear RGB, uniform
 
 
 class LightPoints(NamedTuple):
@@ -147,19 +139,18 @@ def light_mesh(
     Light that a glossy face passes on to other faces is computed as if the face were diffuse.
 
     Args:
-        mesh: the mesh. Light is computed at the corners of its faces and is linear between them.
+        mesh: its light is computed at the corners of its faces and is linear between them.
         caster: casts rays against the mesh.
-        environment: light from far away.
-        lamps: invisible lamps.
+        environment, lamps: the light.
         background: (3,) radiance where a camera's ray hits nothing, unless the environment is shown there.
         show_environment: whether the camera sees the environment where its ray hits nothing.
         ambient: radiance that reaches every surface from all sides, occluded or not. It keeps crevices from going
             black, where small differences would become large contrasts of log-radiance.
-        seed: seed of the sampling.
+        seed: of the sampling.
     """
     points = light_points(mesh)
     surface = make_surface(mesh, points.corner)
-    emitters = np.array([[a.center, a.half_u, a.half_v, a.radiance] for a in lamps], np.float64).reshape(-1, 4, 3)
+    emitters = np.array(lamps, np.float64).reshape(-1, 4, 3)
     light = compute_light(surface, caster, points, environment, emitters, ambient, seed)
     glow = np.zeros(len(points.position), np.float32)
     np.maximum.at(glow, points.corner, mesh.emission[:, None].astype(np.float32))

@@ -52,13 +52,8 @@ class Mesh:
 
     def with_faces_kept(self, kept: NDArray) -> Mesh:
         """Return the mesh with the faces that an index or a mask (F,) selects."""
-        return replace(
-            self,
-            faces=self.faces[kept],
-            texture=self.texture[kept],
-            emission=self.emission[kept],
-            gloss=self.gloss[kept],
-        )
+        of_faces = {name: getattr(self, name)[kept] for name in ("faces", "texture", "emission", "gloss")}
+        return replace(self, **of_faces)
 
 
 def scaled(mesh: Mesh, scale: float) -> Mesh:
@@ -75,7 +70,7 @@ def normals_and_areas(mesh: Mesh) -> tuple[Array, Array]:
 
 
 def position_ids(vertices: Array) -> NDArray[np.int64]:
-    """Number (V,) the positions of vertices: two vertices in one place have the same number."""
+    """Number (V,) the positions of vertices (V, 3): equal positions have the same number."""
     keys = np.ascontiguousarray(vertices.astype(np.float32) + np.float32(0))  # -0 is 0
     words = keys.view(np.uint32).astype(np.uint64)
     order = np.lexsort(words.T)

@@ -10,6 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import mapbox_earcut
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -17,18 +18,15 @@ from PIL import Image
 
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.limits import file_inside, require_at_most
+from aenerf_ns.files.limits import file_inside, require_at_most, require_file
 from aenerf_ns.simulator.arrays import Array, Texture
 from aenerf_ns.simulator.options import MESH_SUFFIXES
 from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh
-from aenerf_ns.simulator.rendering.polygons import triangulate_obj
 
 # A ray caster takes no larger meshes.
 _MAX_BYTES = 1 << 30
-
-UNCOLORED = 0.5
+_UNCOLORED = 0.5
 """Albedo of a surface that has no color in its file."""
-
 _REMEDY = "export the mesh again"
 
 
@@ -49,17 +47,20 @@ def load_mesh(path: Path, y_up: bool, gloss: Mapping[str, Gloss] | None = None) 
     """
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise DataError(path, f"unknown kind of mesh {path.suffix!r}", f"give one of {', '.join(MESH_SUFFIXES)}")
-    with reading(path):
-        if not path.is_file():
-            raise DataError(path, "the file does not exist", "check the name")
-        require_at_most(path, _MAX_BYTES)
-        content = path.read_bytes()
+    content = _read(path)
     try:
         return _build_mesh(path, content, y_up, gloss or {})
     except DataError:
         raise
     except Exception as error:  # a malformed file raises exceptions of any kind in trimesh
         raise DataError(path, f"cannot be read ({error})", _REMEDY) from error
+
+
+def _read(path: Path) -> bytes:
+    require_file(path)
+    with reading(path):
+        require_at_most(path, _MAX_BYTES)
+        return path.read_bytes()
 
 
 class _FilesBeside(trimesh.resolvers.FilePathResolver):
@@ -87,11 +88,7 @@ class _FilesBeside(trimesh.resolvers.FilePathResolver):
         if name.startswith("-"):
             raise DataError(self._path, f"options of a texture ({name})", "apply them in the picture")
         file = file_inside(self._path.parent, name, self._path)
-        with reading(file):
-            if not file.is_file():
-                raise DataError(file, f"the file does not exist, and {self._path.name} needs it", "add it")
-            require_at_most(file, _MAX_BYTES)
-            content = file.read_bytes()
+        content = _read(file)
         if name == self._library:
             self.materials |= {found.decode(errors="replace").strip() for found in re.findall(rb"newmtl (.*)", content)}
         elif self._library is not None:
@@ -108,37 +105,33 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
     libraries: list[str] = []
     used: set[str] = set()
     if suffix == ".glb":
-        _check_glb(path, content)
+        _require_plain_glb(path, content)
     elif suffix == ".obj":
         text = content.decode("utf-8", errors="replace")
-        libraries = re.findall("^mtllib(.*)", text, re.MULTILINE)
+        libraries = [name.strip() for name in re.findall("^mtllib(.*)", text, re.MULTILINE)]
         used = {name.strip() for name in re.findall("^usemtl(.*)", text, re.MULTILINE)}
         if len(libraries) > 1:
             raise DataError(path, f"{len(libraries)} material files", "join them into one")
-        content = triangulate_obj(text).encode()
-    files = _FilesBeside(path, libraries[0].strip() if libraries else None)
+        content = _triangulate_obj(text).encode()
+    files = _FilesBeside(path, libraries[0] if libraries else None)
     scene = trimesh.load_scene(BytesIO(content), file_type=suffix[1:], resolver=files, process=False)
     if files.errors:
         raise files.errors[0]
     if libraries and used - files.materials:
         raise DataError(path, f"no material {min(used - files.materials)!r}", "add it to the material file")
-    nodes = list(scene.graph.nodes_geometry)
     # trimesh makes a part of each material of an .obj file, in reversed order.
-    placements = [scene.graph[name] for name in (reversed(nodes) if suffix == ".obj" else nodes)]
-    meshes = [
-        (scene.geometry[name], np.asarray(transform, np.float64))
-        for transform, name in placements
-        if len(getattr(scene.geometry[name], "faces", ()))
-    ]
-    if not meshes:
+    nodes = list(scene.graph.nodes_geometry)[:: -1 if suffix == ".obj" else 1]
+    placed = [(scene.geometry[name], transform) for transform, name in (scene.graph[node] for node in nodes)]
+    placed = [(mesh, transform) for mesh, transform in placed if len(getattr(mesh, "faces", ()))]
+    if not placed:
         raise DataError(path, "there is no surface in it", "give a mesh of triangles, not points or lines")
-    names = [getattr(getattr(mesh.visual, "material", None), "name", None) or "" for mesh, _ in meshes]
+    names = [getattr(getattr(mesh.visual, "material", None), "name", None) or "" for mesh, _ in placed]
     for name in gloss:
         if name not in names:
-            known = ", ".join(sorted({known for known in names if known})) or "no names of materials"
+            known = ", ".join(sorted({*names} - {""})) or "no names of materials"
             raise DataError(path, f"no surface has the material {name!r}", f"the file has {known}")
-    textures: dict[int, tuple[int, Texture]] = {}
-    parts = [_build_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in meshes]
+    textures: dict[int, Texture] = {}
+    parts = [_build_part(path, mesh, transform, suffix == ".glb", textures) for mesh, transform in placed]
     vertices, faces, uv, color, texture = zip(*parts, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
     world = np.concatenate(vertices)
@@ -155,24 +148,24 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
         np.concatenate(texture),
         np.zeros(len(joined)),
         np.repeat([gloss.get(name, DIFFUSE) for name in names], [len(part) for part in faces], axis=0),
-        tuple(image for _, image in textures.values()),
+        tuple(textures.values()),
     )
 
 
 def _build_part(
-    path: Path, mesh: Any, transform: Array, is_gltf: bool, textures: dict[int, tuple[int, Texture]]
+    path: Path, mesh: Any, transform: Array, is_gltf: bool, textures: dict[int, Texture]
 ) -> tuple[Array, NDArray[np.int64], Array, Array, NDArray[np.int64]]:
     """Return vertices, faces, texture coordinates, colors, and the texture of each face. Add new textures."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if faces.max() >= len(vertices) or faces.min() < 0:
         raise DataError(path, "a face has a vertex that does not exist", _REMEDY)
     visual = mesh.visual
-    uv, index, color = np.zeros((len(vertices), 2)), -1, np.full((len(vertices), 3), UNCOLORED)
     if visual.kind == "face":
         # Face colors need separate vertices for each face.
-        vertices, uv = vertices[faces].reshape(-1, 3), np.zeros((3 * len(faces), 2))
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    uv, index, color = np.zeros((len(vertices), 2)), -1, np.full((len(vertices), 3), _UNCOLORED)
+    if visual.kind == "face":
         color = np.repeat(_linear_colors(visual.face_colors, is_gltf), 3, axis=0)
-        faces = np.arange(3 * len(faces)).reshape(-1, 3)
     elif visual.kind == "vertex":
         color = _linear_colors(visual.vertex_colors, is_gltf)
     elif visual.kind == "texture":
@@ -186,10 +179,9 @@ def _build_part(
             if not np.isfinite(uv).all():
                 raise DataError(path, "texture coordinates that are not finite", _REMEDY)
             if id(image) not in textures:
-                pixels = np.asarray(image.convert("RGB"))[::-1]
-                table = decode(np.arange(256) / 255, "srgb").astype(np.float32)
-                textures[id(image)] = (len(textures), table[pixels])
-            index = textures[id(image)][0]
+                linear = decode(np.arange(256) / 255, "srgb").astype(np.float32)
+                textures[id(image)] = linear[np.asarray(image.convert("RGB"))[::-1]]
+            index = list(textures).index(id(image))
     # Infinite vertices are refused later, where the whole mesh is known.
     with np.errstate(invalid="ignore", over="ignore"):
         moved = vertices @ transform[:3, :3].T + transform[:3, 3]
@@ -207,7 +199,7 @@ def _base_color(material: Any) -> tuple[Array, Any]:
     image, factor = material.image, (material.kwargs or {}).get("kd")
     if factor is not None and np.size(factor) == 3:
         return np.asarray(factor, np.float64), image
-    return np.full(3, UNCOLORED if image is None else 1.0), image
+    return np.full(3, _UNCOLORED if image is None else 1.0), image
 
 
 def _linear_colors(values: Any, is_linear: bool) -> Array:
@@ -218,8 +210,8 @@ def _linear_colors(values: Any, is_linear: bool) -> Array:
     return decode(np.asarray(colors, np.float64).clip(0, None), "linear" if is_linear else "srgb")
 
 
-def _check_glb(path: Path, content: bytes) -> None:
-    """Refuse content that trimesh would ignore without a word."""
+def _require_plain_glb(path: Path, content: bytes) -> None:
+    """Raise a DataError for content that trimesh would ignore without a word."""
     try:
         magic, _, _, length, kind = struct.unpack_from("<4sIII4s", content)
         header = json.loads(content[20 : 20 + length])
@@ -233,3 +225,46 @@ def _check_glb(path: Path, content: bytes) -> None:
         raise DataError(path, f"needs {', '.join(required)}", "export the mesh without extensions or compression")
     if has_unknown_textures:
         raise DataError(path, "textures of an unknown kind", "export the mesh with PNG or JPEG textures")
+
+
+def triangulate(corners: Array) -> NDArray[np.int64]:
+    """Cut a simple polygon with corners (N, 3) into triangles that keep its orientation.
+
+    Returns:
+        Corner numbers (T, 3). T is at most N - 2: earcut may leave out corners that repeat a neighbor or lie on a line
+        with both, and parts of polygons that cross themselves.
+    """
+    normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)  # Newell's
+    axis = int(np.argmax(np.abs(normal)))
+    flat = corners[:, [(axis + 1) % 3, (axis + 2) % 3]] * [1.0, np.sign(normal[axis]) or 1.0]
+    triangles = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], np.uint32))
+    return triangles.reshape(-1, 3).astype(np.int64)
+
+
+def _triangulate_obj(text: str) -> str:
+    """Return the text of an .obj file with its concave polygons cut into triangles. trimesh fills all by a fan."""
+    if not re.search(r"^f(?:[ \t]+\S+){4}", text, re.MULTILINE):
+        return text
+    lines = text.replace("\\\n", " ").split("\n")
+    vertices: list[str] = []
+    polygons: dict[int, list[tuple[int, list[int]]]] = {}
+    for number, line in enumerate(lines):
+        if line.startswith(("v ", "v\t")):
+            vertices.append(line)
+        elif line.startswith(("f ", "f\t")) and len(names := line.split()[1:]) > 3:
+            index = [int(name.partition("/")[0]) for name in names]
+            corners = [i - 1 if i > 0 else len(vertices) + i for i in index]
+            polygons.setdefault(len(corners), []).append((number, corners))
+    positions = np.array([line.split()[1:4] for line in vertices], np.float64)
+    for rows in polygons.values():
+        corners = positions[np.array([row for _, row in rows])]
+        edges = np.roll(corners, -1, axis=1) - corners
+        turns = np.cross(edges, np.roll(edges, -1, axis=1))
+        normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1, keepdims=True)
+        concave = ((turns * normals).sum(axis=-1) < 0).any(axis=1)
+        for i in np.flatnonzero(concave):
+            number = rows[i][0]
+            names = lines[number].split()[1:]
+            triangles = (" ".join(names[k] for k in triangle) for triangle in triangulate(corners[i]))
+            lines[number] = "\n".join(f"f {triangle}" for triangle in triangles)
+    return "\n".join(lines)

@@ -22,9 +22,7 @@ NUM_CORNERS = 60_000
 def repair(mesh: Mesh, spacing: float | None = None) -> tuple[Mesh, int]:
     """Remove degenerate faces, separate coincident faces and subdivide large faces.
 
-    Args:
-        mesh: a mesh as it was read.
-        spacing: longest edge in meters. The default subdivides large faces into some ten thousand corners.
+    ``spacing`` is the longest edge in meters. By default large faces become about `NUM_CORNERS` corners.
 
     Returns:
         the mesh, and the number of its faces that coincided with others.
@@ -62,10 +60,8 @@ def without_duplicate_faces(mesh: Mesh) -> tuple[Mesh, int]:
 def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
     """Halve edges longer than ``spacing``, the longest of a face first (Rivara, 1984).
 
-    An edge is halved in all its faces or in none, so that no gaps open.
-
-    Returns:
-        the mesh, and the index (F,) of the original face that each face is part of.
+    An edge is halved in all its faces or in none, so that no gaps open. Return also the index (F,) of the original face
+    that each face is part of.
     """
     vertices, uv, color, faces = mesh.vertices, mesh.uv, mesh.color, mesh.faces
     source = np.arange(len(faces))
@@ -75,17 +71,7 @@ def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
         longest = square.argmax(axis=1)
         split = np.flatnonzero(square[np.arange(len(faces)), longest] > spacing * spacing)
         if len(split) == 0:
-            parts = replace(
-                mesh,
-                vertices=vertices,
-                uv=uv,
-                color=color,
-                faces=faces,
-                texture=mesh.texture[source],
-                emission=mesh.emission[source],
-                gloss=mesh.gloss[source],
-            )
-            return parts, source
+            return replace(mesh.with_faces_kept(source), vertices=vertices, uv=uv, color=color, faces=faces), source
         turn = (longest[split, None] + np.arange(3)) % 3
         a, b, c = np.take_along_axis(faces[split], turn, axis=1).T
         low, high = np.minimum(a, b), np.maximum(a, b)
@@ -106,21 +92,15 @@ def subdivided(mesh: Mesh, spacing: float) -> tuple[Mesh, NDArray[np.int64]]:
 def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:
     """Separate coincident faces: move each a hair behind the one that comes first.
 
-    Rounding would otherwise decide which of the two faces a ray hits, differently in each frame.
-
-    Args:
-        mesh: a mesh of small faces.
-        order: (F,) rank of each face. Of two coincident faces, the one with the lower rank stays.
-
-    Returns:
-        the mesh, and the indices of the moved faces.
+    Rounding would otherwise decide which of the two faces a ray hits, differently in each frame. Of two coincident
+    faces, the one with the lower rank in ``order`` (F,) stays. Return also the indices of the moved faces.
     """
     resolution = _RESOLUTION * float(np.abs(mesh.vertices).max())
     a, b, c = mesh.vertices[mesh.faces.T]
     normal = normals_and_areas(mesh)[0]
     caster = RayCaster(mesh.vertices, mesh.faces)
     above = 16 * resolution
-    depth = np.zeros(len(mesh.faces))
+    is_moved = np.zeros(len(mesh.faces), bool)
     shift = np.zeros((len(mesh.faces), 3))
     # The middle, and points near the corners.
     for weights in ((1 / 3, 1 / 3, 1 / 3), (0.8, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.1, 0.8)):
@@ -128,16 +108,16 @@ def with_coincident_faces_apart(mesh: Mesh, order: NDArray[np.int64]) -> tuple[M
         # The rays end just behind the face. Hits beyond that are listed too, and ignored.
         rays = np.concatenate([points + above * normal, -above * normal], axis=1).astype(np.float32)
         for start in range(0, len(rays), 1 << 18):
-            one, other, distance = caster.all_hits(rays[start : start + (1 << 18)])
-            one = one + start
-            near = (np.abs(distance - 1) * above < resolution) & (one != other)
-            near &= np.abs((normal[one] * normal[other]).sum(axis=1)) > 0.999
-            near &= order[one] != order[other]
-            one, other = one[near], other[near]
-            later, first = np.where(order[one] > order[other], (one, other), (other, one))
-            np.add.at(depth, later, 1.0)
+            face, other, distance = caster.all_hits(rays[start : start + (1 << 18)])
+            face = face + start
+            near = (np.abs(distance - 1) * above < resolution) & (face != other)
+            near &= np.abs((normal[face] * normal[other]).sum(axis=1)) > 0.999
+            near &= order[face] != order[other]
+            face, other = face[near], other[near]
+            later, first = np.where(order[face] > order[other], (face, other), (other, face))
+            is_moved[later] = True
             shift[later] = -normal[first]
-    moved = np.flatnonzero(depth)
+    moved = np.flatnonzero(is_moved)
     offset = _SEPARATION * resolution * shift[moved]
     apart = (mesh.vertices[mesh.faces[moved]] + offset[:, None]).reshape(-1, 3).astype(np.float32).astype(np.float64)
     faces = mesh.faces.copy()

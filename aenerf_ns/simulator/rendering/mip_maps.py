@@ -20,13 +20,15 @@ class MipMaps(NamedTuple):
     level: NDArray[np.int64]  # (L, 3) first texel, rows and columns
     first_level: NDArray[np.int64]  # (pictures + 1,)
 
+    def scaled(self, gain: float) -> MipMaps:
+        """Return the float32 pictures times a factor."""
+        return self._replace(texels=(gain * self.texels).astype(np.float32))
+
 
 def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
     """Build mip maps of pictures (rows, columns, 3). Every level keeps the mean of its picture.
 
-    Args:
-        pictures: the pictures.
-        bits16: store values as 16-bit integers, clipped to [0, 1], which halves the memory.
+    With ``bits16``, values are stored as 16-bit integers, clipped to [0, 1], which halves the memory.
     """
     texels, level, first_level, start = [], [], [0], 0
     for picture in pictures:
@@ -69,9 +71,8 @@ def _halved(picture: NDArray[np.floating], axis: int) -> NDArray[np.floating]:
 def lookup(maps, picture, u, v, footprint, repeats):
     """Interpolate a picture at (u, v), in widths and heights of the picture, trilinearly.
 
-    ``maps`` has the fields of `MipMaps`.
-    ``footprint`` is the side of the region to average, in texels of the finest level. Columns always repeat.
-    Rows repeat if ``repeats`` is true; otherwise the first and the last row extend to infinity.
+    ``maps`` has the fields of `MipMaps`. ``footprint`` is the side of the region to average, in texels of the finest
+    level. Columns repeat. Rows repeat too if ``repeats``; otherwise the first and the last row extend to infinity.
     """
     first, last = maps.first_level[picture], maps.first_level[picture + 1] - 1
     detail = min(math.log2(max(footprint, 1.0)), float(last - first))
@@ -87,11 +88,7 @@ def lookup(maps, picture, u, v, footprint, repeats):
             y = (v - math.floor(v)) * rows - 0.5
         i, j = int(math.floor(x)), int(math.floor(y))
         fx, fy = x - i, y - j
-        left, right = i, i + 1
-        if left < 0:
-            left = columns - 1
-        if right >= columns:
-            right = 0
+        left, right = (columns - 1 if i < 0 else i), (0 if i + 1 >= columns else i + 1)
         if repeats:
             low, high = (rows - 1 if j < 0 else j), (0 if j + 1 >= rows else j + 1)
         else:

@@ -49,25 +49,14 @@ class Reflections(NamedTuple):
 
     def scaled(self, gain: float) -> Reflections:
         """Return the reflections of the same coats in ``gain`` times the light."""
-        return Reflections(
-            self.coats,
-            self.lamps * np.array([1.0, 1.0, 1.0, gain])[:, None],
-            self.environment._replace(texels=(gain * self.environment.texels).astype(np.float32)),
-            gain * self.ambient,
-        )
+        lamps = self.lamps * np.array([1.0, 1.0, 1.0, gain])[:, None]
+        return self._replace(lamps=lamps, environment=self.environment.scaled(gain), ambient=gain * self.ambient)
 
 
 def make_reflections(
     mesh: Mesh, light_point: NDArray[np.integer], normal: Array, lamps: Array, environment: MipMaps, ambient: float
 ) -> Reflections:
-    """Build the reflections of a mesh.
-
-    Args:
-        mesh: the mesh.
-        light_point: (F, 3) light point of each corner.
-        normal: (G, 3) unit normals of the light points. They are interpolated over the faces.
-        lamps, environment, ambient: see `Reflections`.
-    """
+    """Build the reflections of a mesh, given the light points (F, 3) of its corners and their unit normals (G, 3)."""
     specular, roughness = mesh.gloss.T.astype(np.float32)
     corners, normals = mesh.vertices[mesh.faces], normal[light_point]
     side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
@@ -106,10 +95,7 @@ def add_reflections(
         surface, light, reflections.coats, rays[glossy], first, focal_length, surface.ray_offset,
         mirrored, optics, diffuse,
     )  # fmt: skip
-    _, lamps, environment, ambient = reflections
-    _reflect(
-        surface, light, lamps, environment, ambient, mirrored, caster.cast(mirrored), optics, diffuse, limit, change
-    )
+    _reflect(surface, light, *reflections[1:], mirrored, caster.cast(mirrored), optics, diffuse, limit, change)
     rows, columns = radiance.shape[:2]
     samples = len(rays) // (rows * columns)
     for channel in range(3):

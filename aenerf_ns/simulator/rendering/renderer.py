@@ -148,21 +148,14 @@ class Renderer:
             camera_to_world: (4, 4) or (3, 4), OpenCV axes.
             intrinsics: (fx, fy, cx, cy) in pixels, pixel centers at +0.5.
             width, height: size of the picture in pixels.
-            samples: rays per pixel, 1 or at least 3. Every pixel of every frame has the same pattern of rays, which
-                samples a Gaussian point-spread function. A single ray goes through the pixel's center.
+            samples: rays per pixel, 1 or at least 3: see `sample_offsets`. All pixels have the same pattern of rays.
 
         Returns:
             radiance (H, W, 3), linear RGB; depth (H, W) along the optical axis, the mean over the rays that hit, inf
             where none does; alpha (H, W), the fraction of rays that hit. All are float32.
-
-        Raises:
-            ValueError: `sample_offsets` has no pattern with this number of samples.
         """
-        pose, lens, offsets = (
-            np.asarray(camera_to_world, np.float64),
-            tuple(map(float, intrinsics)),
-            sample_offsets(samples),
-        )
+        pose, lens = np.asarray(camera_to_world, np.float64), tuple(map(float, intrinsics))
+        offsets = sample_offsets(samples)
         rotation, center = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
         rays = np.empty((height * width * samples, 6), np.float32)
         _camera_rays(rotation, center, lens, offsets, width, rays)
@@ -181,11 +174,10 @@ class Renderer:
 
     def with_gain(self, gain: float) -> Renderer:
         """Return the renderer of the same scene in ``gain`` times the light. The background does not change."""
-        seen = self.surroundings
         return replace(
             self,
             light=(gain * self.light).astype(np.float32),
-            surroundings=seen._replace(texels=(gain * seen.texels).astype(np.float32)),
+            surroundings=self.surroundings.scaled(gain),
             reflections=self.reflections and self.reflections.scaled(gain),
         )
 
@@ -199,15 +191,10 @@ def sample_offsets(samples: int) -> NDArray[np.float64]:
     """Return offsets (N, 2) in pixels of equally weighted rays that sample the point-spread function.
 
     The offsets lie on a spiral of golden angles, with radii at the quantiles of the Gaussian. A linear map then gives
-    them exactly the Gaussian's mean and covariance. A single ray goes through the center.
-
-    Raises:
-        ValueError: fewer than one ray, or two, because two rays cannot spread in both directions.
+    them exactly the Gaussian's mean and covariance, for which it takes three. A single ray goes through the center.
     """
     if samples == 1:
         return np.zeros((1, 2))
-    if samples < 3:
-        raise ValueError(f"samples must be 1 or at least 3, got {samples}")
     rank = np.arange(samples)
     radius = np.sqrt(-2.0 * np.log(1.0 - (rank + 0.5) / samples))
     angle = np.pi * (3.0 - np.sqrt(5.0)) * rank

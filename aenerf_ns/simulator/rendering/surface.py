@@ -71,8 +71,8 @@ def face_normal(surface, face):
 def diffuse_radiance(surface, light, face, side, weights, footprint):
     """Return the light that a point of a face reflects evenly: its albedo times the light that it receives.
 
-    ``light`` (2, G, 3) is that of the light points. ``side`` is 0 for the front and 1 for the back. ``weights`` are the
-    point's barycentric coordinates. ``footprint`` is the side of the texture region to average, in meters.
+    ``light`` (2, G, 3) is that of the light points, ``side`` 0 for the front and 1 for the back, ``weights`` are the
+    point's barycentric coordinates, and ``footprint`` is the side of the texture region to average, in meters.
     """
     corners, uv = row(surface.faces, face), surface.uv
     r, g, b = interpolate(light[side], row(surface.light_point, face), weights)
