@@ -61,7 +61,7 @@ ENVIRONMENTS = Package(
     ("npm", "pack", "--silent", "@pmndrs/assets@1.7.0"),
 )
 _FURNITURE_FILE = "usr/share/sweethome3d/furniture/BlendSwap-CC-0.sh3f"
-_CATALOGUE = "PluginFurnitureCatalog.properties"
+_CATALOG = "PluginFurnitureCatalog.properties"
 
 
 def fetch(package: Package, folder: Path) -> Path:
@@ -134,10 +134,10 @@ class Library:
         return _make_once(self.folder / package.stem, lambda empty: _unpack(package, empty))
 
     @cache  # noqa: B019
-    def _catalogue(self) -> dict[str, dict[str, str]]:
+    def _catalog(self) -> dict[str, dict[str, str]]:
         """Read the entries of the furniture's catalog, by model name."""
         entries: dict[str, dict[str, str]] = {}
-        for line in (self._furniture() / _CATALOGUE).read_text(encoding="latin-1").splitlines():
+        for line in (self._furniture() / _CATALOG).read_text(encoding="latin-1").splitlines():
             key, _, value = line.partition("=")
             name, _, number = key.partition("#")
             if name and number:
@@ -159,7 +159,7 @@ class Library:
             DataError: if the package lacks the model, or if the model's own license is not CC0: a few models of the
                 package's CC0 file are CC BY.
         """
-        entry = self._catalogue().get(name)
+        entry = self._catalog().get(name)
         if entry is None:
             raise DataError(name, f"no such model in {FURNITURE.file}", "name one of its folders")
         path = self._furniture() / entry["model"].lstrip("/")
