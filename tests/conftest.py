@@ -29,26 +29,25 @@ if not torch.cuda.is_available():
 settings.register_profile("suite", derandomize="AENERF_FUZZ_EXAMPLES" not in os.environ)
 settings.load_profile("suite")
 
-# Third-party recordings, which are not part of the project.
-_SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+def _third_party_data(name: str) -> Path:
+    """A folder of recordings that are not part of the project. Skips the test where it is missing."""
+    folder = Path(__file__).parents[2] / "shared" / "data" / name
+    if not folder.is_dir():
+        pytest.skip(f"../shared/data/{name} is missing")
+    return folder
 
 
 @pytest.fixture(scope="session")
 def slider_depth() -> Path:
     """The real recording slider_depth of the Event Camera Dataset (its first 50,000 events)."""
-    folder = _SHARED_DATA / "slider_depth"
-    if not folder.is_dir():
-        pytest.skip("the recording slider_depth of the Event Camera Dataset is not at ../shared/data/slider_depth")
-    return folder
+    return _third_party_data("slider_depth")
 
 
 @pytest.fixture(scope="session")
 def tum_vie_calibration() -> Path:
     """The folder of the real calibration files of TUM-VIE."""
-    folder = _SHARED_DATA / "tum_vie_calibration"
-    if not folder.is_dir():
-        pytest.skip("the calibration files of TUM-VIE are not at ../shared/data/tum_vie_calibration")
-    return folder
+    return _third_party_data("tum_vie_calibration")
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.colmap_stand_in import place_frames
 from helpers.commands import run
 from helpers.dataset_faults import put, remove
 from helpers.small_datasets import (
@@ -25,9 +26,7 @@ from helpers.small_datasets import (
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
-from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.noise import perturb
-from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -35,7 +34,6 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
-from aenerf_ns.poses_from_frames.structure_from_motion import EstimatedPoses
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
@@ -190,15 +188,7 @@ def test_hot_pixels_are_named(tmp_path: Path) -> None:
 
 
 def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # COLMAP itself is tested elsewhere. This stand-in places all frames but the last.
-    def place(files: list[Path], times: list[int], camera: CameraIntrinsics, source: Path, seed: int) -> EstimatedPoses:
-        assert [file.name for file in files] == ["0.png", "1.png", "2.png", "3.png"]
-        poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-        poses[:, 0, 3] = torch.arange(3)
-        trajectory = Trajectory(times[:3], poses, source)
-        return EstimatedPoses(np.array(times), trajectory, camera, [3], 9, 0.5, 100.0, 1.0)
-
-    monkeypatch.setattr("aenerf_ns.poses_from_frames.structure_from_motion.estimate_poses", place)
+    place_frames(3, monkeypatch)
     data = write_ecd(tmp_path / "made")
     with CONSOLE.capture() as output:
         with_truth = convert(data, tmp_path / "with_truth", poses="colmap")

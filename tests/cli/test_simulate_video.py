@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.colmap_stand_in import place_frames
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
@@ -23,8 +24,7 @@ from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
-from aenerf_ns.poses_from_frames.structure_from_motion import EstimatedPoses
-from aenerf_ns.poses_from_frames.video import Video, open_video
+from aenerf_ns.poses_from_frames.video import open_video
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.simulator.options import SensorNoise
 from aenerf_ns.simulator.video_events import video_events
@@ -130,17 +130,7 @@ def test_noise_is_added_to_the_given_poses(frames: Path, poses: Path, camchain: 
 
 
 def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # COLMAP itself is tested elsewhere. This stand-in places all frames but the last two.
-    def place(
-        video: Video, times: NDArray[np.int64], camera: CameraIntrinsics | tuple[int, int], source: Path, seed: int
-    ) -> EstimatedPoses:
-        assert len(list(video)) == len(times) == 10
-        if not isinstance(camera, CameraIntrinsics):
-            camera = CameraIntrinsics(*camera, 22.0, 22.0, 12.0, 8.0, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))
-        placed = Trajectory(times[:8], torch.eye(4, dtype=torch.float64).repeat(8, 1, 1), source)
-        return EstimatedPoses(times, placed, camera, [8], 9, 0.5, 100.0, 1.0)
-
-    monkeypatch.setattr("aenerf_ns.poses_from_frames.structure_from_motion.estimate_poses", place)
+    place_frames(8, monkeypatch)
     printed = simulate(tmp_path / "dataset", video=frames, poses="colmap")
     assert "8 of 10 frames registered" in printed
     assert "COLMAP estimates the lens: focal length 22.0 pixels, radial distortion 0.01" in printed

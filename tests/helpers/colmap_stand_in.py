@@ -1,0 +1,26 @@
+"""What stands in for COLMAP, which is tested by itself, in tests of commands that run it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.poses_from_frames.structure_from_motion import EstimatedPoses
+
+
+def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let COLMAP place the first frames along a straight line, and estimate a lens where it is asked for one."""
+
+    def place(frames, times, camera, source, seed) -> EstimatedPoses:
+        assert len(list(frames)) == len(times)
+        if not isinstance(camera, CameraIntrinsics):
+            camera = CameraIntrinsics(*camera, 22.0, 22.0, 12.0, 8.0, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))
+        poses = torch.eye(4, dtype=torch.float64).repeat(num_placed, 1, 1)
+        poses[:, 0, 3] = torch.arange(num_placed)
+        trajectory = Trajectory(times[:num_placed], poses, source)
+        return EstimatedPoses(np.array(times), trajectory, camera, [num_placed], 9, 0.5, 100.0, 1.0)
+
+    monkeypatch.setattr("aenerf_ns.poses_from_frames.structure_from_motion.estimate_poses", place)
