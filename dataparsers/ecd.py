@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.event_table import CHECK_SIZE
 from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.text import parse_numbers, read_rows
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
@@ -26,7 +26,6 @@ from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_traj
 
 # The camera that recorded the dataset.
 _DAVIS240C = 240, 180
-_GUESSED = "the size 240 x 180 was guessed, because there are no images: give ecd-data --width and --height"
 
 
 @dataclass
@@ -70,9 +69,10 @@ class EcdDataParser(EventDataParser):
                 size = image.size
         width, height = (own if given is None else given for given, own in zip(stated, size, strict=True))
         camera = _read_calibration(folder / "calib.txt", (width, height))
-        remedy = _GUESSED if not images and None in stated else CHECK_SIZE
+        if not images and None in stated:
+            CONSOLE.print(f"The sensor's size {width} x {height} is a guess: if it is another, give width and height.")
         capture = Capture(
-            event_file=TextEventFile(folder / "events.txt", width, height, remedy),
+            event_file=TextEventFile(folder / "events.txt", width, height),
             event_camera=camera,
             sensor=self.config.sensor(SensorModel(0.5, 0.5)),
             frame_camera=camera,

@@ -130,23 +130,20 @@ class WarpedEvents:
         runs: runs of consecutive events within the span of the poses, in the order of time.
         trajectory: given poses of the event camera, camera-to-world, OpenCV camera axes.
         camera: intrinsics of the event camera.
-        seed: seed of the choice of events in long slices, and of the position of each event within its pixel.
 
     Attributes:
         given: the slices, warped by the given poses.
     """
 
-    def __init__(
-        self, runs: list[EventStream], trajectory: Trajectory, camera: CameraIntrinsics, seed: int = 0
-    ) -> None:
+    def __init__(self, runs: list[EventStream], trajectory: Trajectory, camera: CameraIntrinsics) -> None:
         self._trajectory = trajectory
         self._width, self._height, self._binning = image_size(camera.width, camera.height)
         self._camera = camera
         directions, valid = camera.pixel_directions()
         depth = np.where(valid & (directions[..., 2] < -0.05), -directions[..., 2], np.nan)[..., None]
         self._plane = directions[..., :2] * [1, -1] / depth
-        self._seed = seed
-        rng = np.random.default_rng(seed)
+        # Chooses the events of long slices, and the position of each event within its pixel.
+        rng = np.random.default_rng(0)
         self._jitter = rng.uniform(-0.5, 0.5, (_SETTINGS.max_events, 2)) / [camera.fx, camera.fy]
         self._slices = self._cut(runs, rng)
         self.given = [self._warp(events, GIVEN) for events in self._slices]
@@ -231,7 +228,7 @@ class WarpedEvents:
         Within each slice the polarities, the pixels, or both are permuted, which is to permute the times. Noise has the
         contrast that is left.
         """
-        rng = np.random.default_rng(self._seed)
+        rng = np.random.default_rng(0)
         contrasts = []
         for columns in _SHUFFLED_COLUMNS * _SETTINGS.num_shuffles:
             permuted = []

@@ -18,8 +18,6 @@ from aenerf_ns.files.event_reader import CHUNK, EventReader
 from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
-CHECK_SIZE = "check the sensor size and the order of the columns"
-"""The remedy that an error about a pixel outside the sensor names."""
 FORMATS_REMEDY = "see the formats in the docs"
 # Number of events that tell the unit of the times.
 SAMPLE = 4096
@@ -156,7 +154,6 @@ def events_from_columns(
     fraction: NDArray[np.float64] | None = None,
     source: str | Path,
     describe_event: Callable[[int], str] = "event {}".format,
-    size_remedy: str = CHECK_SIZE,
 ) -> EventStream:
     """Return the events of columns of any numeric type.
 
@@ -168,7 +165,6 @@ def events_from_columns(
         fraction: (N,) added to the times, in their unit, where the times are integers; between −1 and 1.
         source: names the origin of the columns, for messages.
         describe_event: says which event one is in the source, for messages.
-        size_remedy: what to do about a pixel outside the sensor.
 
     Raises:
         DataError: a value is not one that an event can have.
@@ -188,7 +184,7 @@ def events_from_columns(
         if values.dtype.kind == "f":
             good &= values == np.floor(values)
         if not good.all():
-            remedy = f"it must be a whole number below {size}: {size_remedy}"
+            remedy = f"it must be a whole number below {size}: check the sensor size and the order of the columns"
             raise error(name, ~good, remedy)
         pixels[name] = values.astype(np.uint16)
 

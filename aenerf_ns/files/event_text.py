@@ -9,7 +9,6 @@ none comes with Nerfstudio.
 from __future__ import annotations
 
 import re
-from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventReader
-from aenerf_ns.files.event_table import CHECK_SIZE, SAMPLE, events_from_columns
+from aenerf_ns.files.event_table import SAMPLE, events_from_columns
 from aenerf_ns.files.limits import MAX_LINE
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
@@ -72,19 +71,18 @@ def _line_name(line: int, num_before: int | None) -> str:
     return "the last line" if num_before is None else f"line {num_before + line + 1}"
 
 
-class _EventLines(EventReader):
-    """A text file with one event a line. Formats implement :meth:`_names` and :meth:`_tick`."""
+class TextEventFile(EventReader):
+    """Read events.txt: lines of t in seconds, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017)."""
 
     with_commas = False
-    _size_remedy = CHECK_SIZE
 
-    @abstractmethod
     def _names(self, file: BinaryIO) -> list[str]:
         """Return the names of the columns, x, y, t and p among them. Read the header, if the format has one."""
+        return ["t", "x", "y", "p"]
 
-    @abstractmethod
     def _tick(self, time_fractions: NDArray[np.float64]) -> int:
         """Return the nanoseconds of the unit of the times, given the (N,) fractional parts of the first ones."""
+        return NANOSECONDS["s"]
 
     def _chunks(self) -> Iterator[EventStream]:
         tick = None
@@ -148,6 +146,14 @@ class _EventLines(EventReader):
         return DataError(self.path, f"{line_name} has {names[bad]} = {value}", "write plain decimal numbers")
 
     def _events(self, lines: _Lines, tick: int) -> EventStream:
+        negative = lines.whole[3] < 0
+        if negative.any() and not self.with_commas:
+            row = int(np.argmax(negative))
+            raise DataError(
+                self.path,
+                f"{lines.line_of(row)} has p = {lines.whole[3, row]}",
+                "polarities are 0 or 1 in this format",
+            )
         columns = {}
         for name, whole, fraction in zip(_COLUMNS, lines.whole, lines.fraction, strict=True):
             columns[name] = whole + fraction if name != "t" and fraction.any() else whole
@@ -159,39 +165,10 @@ class _EventLines(EventReader):
             fraction=lines.fraction[2],
             source=self.path,
             describe_event=lines.line_of,
-            size_remedy=self._size_remedy,
         )
 
 
-class TextEventFile(_EventLines):
-    """Read events.txt: lines of t in seconds, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017).
-
-    Args:
-        path, width, height: see :class:`EventFile`.
-        size_remedy: what to do about a pixel outside the sensor.
-    """
-
-    def __init__(self, path: Path, width: int, height: int, size_remedy: str = CHECK_SIZE) -> None:
-        super().__init__(path, width, height)
-        self._size_remedy = size_remedy
-
-    def _names(self, file: BinaryIO) -> list[str]:
-        return ["t", "x", "y", "p"]
-
-    def _tick(self, time_fractions: NDArray[np.float64]) -> int:
-        return NANOSECONDS["s"]
-
-    def _events(self, lines: _Lines, tick: int) -> EventStream:
-        negative = lines.whole[3] < 0
-        if negative.any():
-            row = int(np.argmax(negative))
-            raise DataError(
-                self.path, f"{lines.line_of(row)} has p = {lines.whole[3, row]}", "polarities are 0 or 1 in this format"
-            )
-        return super()._events(lines, tick)
-
-
-class CsvEventFile(_EventLines):
+class CsvEventFile(TextEventFile):
     """Read comma-separated values. The first line names the columns in any order, x, y, t and p among them.
 
     Args:

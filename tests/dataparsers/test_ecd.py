@@ -20,7 +20,7 @@ from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
 
 
-def test_guessed_size_can_be_given(tmp_path: Path) -> None:
+def test_guessed_size_can_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_ecd(tmp_path / "made")
     (folder / "images.txt").unlink()
     (folder / "events.txt").write_text("0.01 300 2 1\n0.02 300 2 0\n0.31 1 2 1\n")
@@ -29,7 +29,8 @@ def test_guessed_size_can_be_given(tmp_path: Path) -> None:
     for given in ({}, {"width": 346}):
         recording = EcdDataParserConfig(data=folder, **given).setup().recording
         assert (recording.event_camera.width, recording.event_camera.height) == (given.get("width", 240), 180)
-    with pytest.raises(DataError, match=r"line 1 has x = 300; .* guessed, .* give ecd-data --width and --height"):
+    assert "size 346 x 180 is a guess: if it is another" in capsys.readouterr().out
+    with pytest.raises(DataError, match=r"line 1 has x = 300; .* check the sensor size"):
         list(EcdDataParserConfig(data=folder).setup().recording.event_file.chunks())
 
 
