@@ -8,6 +8,7 @@ import shutil
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -17,7 +18,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from helpers.bounded_reading import little_memory, read_whole, readable_folder, without_rights_of_root
+from helpers.bounded_reading import read_whole, readable_folder, refusal
 from helpers.dataset_faults import dump_raw, load_raw, npy_header, rewrite_zip, zip_members
 from helpers.event_file_checks import EDITS, edited
 from helpers.malformed_inputs import camchain
@@ -27,10 +28,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.errors import DataError
 
 # Seconds that the search takes, and that reading one data set may take: a large lens alone takes some.
-SHORT, LONG, MAX_SECONDS = 12.0, 900.0, 10.0
+SHORT, LONG, MAX_SECONDS = 12.0, float(os.environ.get("AENERF_FUZZ_SECONDS", "900")), 10.0
 
 WORDS = [
     "", ".", "..", "../x", "/", "/etc/passwd",
@@ -104,27 +104,21 @@ def break_text(draw: Draw, path: Path) -> None:
 def broken_array(draw: Draw, values: np.ndarray) -> np.ndarray:
     """Change one value, the type, the length or the shape of an array."""
     way = draw(st.sampled_from(["value"] * 3 + ["type", "shorter", "flat", "deeper", "scalar", "reversed", "records"]))
-    if way == "value" and values.size and values.dtype.kind in "iuf":
-        changed = values.copy()
-        index = draw(st.integers(0, values.size - 1))
-        kind = values.dtype
-        with np.errstate(all="ignore"):
-            value = np.float64(draw(st.sampled_from(EXTREMES)))
-            changed.ravel()[index] = value.astype(kind)
-        return changed
-    if way == "type":
-        with np.errstate(all="ignore"):
-            try:
+    flat = values.ravel()
+    with np.errstate(all="ignore"):
+        if way == "value" and values.size and values.dtype.kind in "iuf":
+            flat = values.flatten()
+            flat[draw(st.integers(0, values.size - 1))] = np.float64(draw(st.sampled_from(EXTREMES))).astype(flat.dtype)
+            return flat.reshape(values.shape)
+        if way == "type":
+            with suppress(TypeError, ValueError):
                 return values.astype(draw(st.sampled_from(DTYPES)))
-            except (TypeError, ValueError):
-                return values
-    if way == "records":
-        return np.zeros(values.shape[:1], [("x", "u2"), ("t", "i8"), ("s", "S2")])
     changes = {
+        "records": np.zeros(values.shape[:1], [("x", "u2"), ("t", "i8"), ("s", "S2")]),
         "shorter": values[:-1] if values.ndim else values,
-        "flat": values.ravel(),
+        "flat": flat,
         "deeper": values[..., None],
-        "scalar": values.ravel()[0] if values.size else values,
+        "scalar": flat[0] if values.size else values,
         "reversed": values[::-1] if values.ndim else values,
     }
     return np.asarray(changes.get(way, values))
@@ -138,7 +132,7 @@ HEADER_TYPES = ["'<i8'", "'|O'", "'<f8'", "'<U1000000000'", "'<q99'", "[('a', '<
 
 def broken_npy(draw: Draw, content: bytes) -> bytes:
     """Break the array, the header or the bytes of an .npy file."""
-    way = draw(st.sampled_from(["array"] * 4 + ["header", "cut", "extend", "flip"]))
+    way = draw(st.sampled_from(["array"] * 4 + ["header", "bytes"]))
     if way == "array" and b"|O" not in content[:128]:
         stream = BytesIO()
         np.save(stream, broken_array(draw, np.load(BytesIO(content))))
@@ -146,14 +140,7 @@ def broken_npy(draw: Draw, content: bytes) -> bytes:
     if way == "header":
         shape, kind = draw(st.sampled_from(HEADER_SHAPES)), draw(st.sampled_from(HEADER_TYPES))
         return npy_header(shape, kind, draw(st.sampled_from([", }", "", "}", ", 'x': 1}"]))) + content[128:]
-    place = draw(st.integers(0, max(len(content) - 1, 0)))
-    if way == "flip" and content:
-        return flip_bit(draw, content, place)
-    return content[:place] if way == "cut" else content + bytes(place)
-
-
-def flip_bit(draw: Draw, content: bytes, index: int) -> bytes:
-    return content[:index] + bytes([content[index] ^ 1 << draw(st.integers(0, 7))]) + content[index + 1 :]
+    return edited(content, draw(EDITS))
 
 
 def break_npy(draw: Draw, path: Path) -> None:
@@ -182,6 +169,7 @@ def break_hdf5(draw: Draw, path: Path) -> None:
             st.sampled_from(["array"] * 4 + ["link", "attribute", "empty", "huge", "group", "type", "drop", "text"])
         )
         values = item[()] if isinstance(item, h5py.Dataset) else None
+        others = {"empty": h5py.Empty("i8"), "type": np.dtype("i8"), "text": ["a", "b"]}
         if way == "attribute":
             key = draw(st.sampled_from(["time_unit", "time_offset"]))
             value: Any = draw(
@@ -201,29 +189,21 @@ def break_hdf5(draw: Draw, path: Path) -> None:
         elif way == "huge":
             shape = draw(st.sampled_from([(10**12,), (10**12, 4), (4, 10**9), (200, 10**6)]))
             file.create_dataset(name, shape, draw(st.sampled_from(["i8", "u2", "f8"])), chunks=(1,) * len(shape))
-        elif way == "empty":
-            file[name] = h5py.Empty("i8")
-        elif way == "type":
-            file[name] = np.dtype("i8")
         elif way == "group":
             file.create_group(name)
-        elif way == "text":
-            file[name] = ["a", "b"]
+        elif way in others:
+            file[name] = others[way]
 
 
 def break_any(draw: Draw, path: Path) -> None:
-    """Break a file as a whole: cut it, empty it, or put something else in its place."""
-    way = draw(st.sampled_from(["cut", "flip", "empty", "missing", "folder", "loop", "locked", "zeros"]))
-    content = path.read_bytes()
-    place = draw(st.integers(0, max(len(content) - 1, 0)))
-    if way == "locked":
+    """Break a file as a whole: change its bytes, or put something else in its place."""
+    way = draw(st.sampled_from(["bytes"] * 3 + ["missing", "folder", "loop", "locked", "zeros"]))
+    if way == "bytes":
+        break_bytes(draw, path)
+    elif way == "locked":
         path.chmod(0)
     elif way == "zeros":
         os.truncate(path, 4 << 30)
-    elif way == "flip" and content:
-        path.write_bytes(flip_bit(draw, content, place))
-    elif way in ("cut", "empty"):
-        path.write_bytes(content[:place] if way == "cut" else b"")
     else:
         path.unlink()
         if way == "folder":
@@ -279,16 +259,7 @@ def search(folder: Path, seconds: float) -> int:
         path = data.draw(st.sampled_from([path for path in files if (path.parent.name, path.suffix) == kind]))
         change = BREAKS.get(path.suffix, break_any) if data.draw(st.integers(0, 4)) else break_any
         change(data.draw, path)
-        begin = time.process_time()
-        try:
-            with little_memory(), without_rights_of_root():
-                read(name, made)
-            message = ""
-        except DataError as error:
-            message = str(error)
-        assert "\n" not in message
-        assert len(message) < 800
-        assert time.process_time() - begin < MAX_SECONDS
+        refusal(lambda: read(name, made), MAX_SECONDS)
 
     while time.monotonic() < end:
         check()
@@ -301,14 +272,9 @@ def lenses_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CameraIntrinsics, "pixel_directions", lru_cache(maxsize=16)(CameraIntrinsics.pixel_directions))
 
 
-def test_broken_dataset_is_read_or_refused() -> None:
+@pytest.mark.parametrize("seconds", [SHORT, pytest.param(LONG, marks=pytest.mark.slow)])
+def test_broken_datasets_are_read_or_refused(seconds: float) -> None:
     with readable_folder() as folder:
-        assert search(folder, SHORT) > 20
-
-
-@pytest.mark.slow
-def test_broken_datasets_are_read_or_refused_for_long() -> None:
-    with readable_folder() as folder:
-        count = search(folder, float(os.environ.get("AENERF_FUZZ_SECONDS", LONG)))
+        count = search(folder, seconds)
         print(f"{count:,} data sets")
         assert count > 20

@@ -34,10 +34,23 @@ def write_with_filter(path: Path, code: int) -> None:
         dataset.write_direct_chunk((0,), b"compressed", 0)
 
 
-def set_offset(path: Path, value: object) -> None:
+def late_dsec(path: Path) -> None:
+    write_dsec(path, made_columns())
     with h5py.File(path, "a") as file:
         del file["t_offset"]
-        file["t_offset"] = value
+        file["t_offset"] = "late"
+
+
+def npz(edit: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    def write(path: Path) -> None:
+        np.savez_compressed(path, **made_columns())
+        path.write_bytes(edit(path.read_bytes()))
+
+    return write
+
+
+def evt3_of(*values: int) -> bytes:
+    return HEADER3 + words("<u2", *values)
 
 
 def bag(*messages: bytes, kind: str = ARRAY) -> Callable[[Path], object]:
@@ -60,10 +73,7 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "aedat4: cut in its header": (aedat4_file(ROWS)[:100], "not a readable AEDAT4 file"),
     "aedat4: with a header of zeros": (b"#!AER-DAT4.0\r\n" + sized(bytes(64)), "not a readable AEDAT4 file"),
     "aedat4: without events": (aedat4_file(ROWS, streams={0: "FRME"}), "no stream holds events"),
-    "aedat4: of no number": (
-        aedat4_file(ROWS).replace(b'node name="0"', b'node name="?"'),
-        "not a readable AEDAT4 file",
-    ),
+    "aedat4: of no number": (aedat4_file(ROWS).replace(b'e="0"', b'e="?"'), "not a readable AEDAT4 file"),
     "aedat4: of an unknown compression": (aedat4_file(ROWS, compression=9), "compression is number 9"),
     "aedat4: of another compression": (aedat4_file(ROWS, compression=1), ""),
     "aedat4: cut in a packet": (aedat4_file(ROWS)[:-20], "ends within the packet"),
@@ -83,10 +93,7 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "raw: with a header alone": (HEADER3, "holds no events"),
     "raw: with an endless header": (b"% evt 3.0\n% geometry 64x48", "does not end"),
     "raw: with an endless line": (b"% evt 3.0\n% " + b"x" * 100_000, "does not end"),
-    "raw: without an encoding": (
-        b"% format \n% geometry 64x48\n" + words("<u2", 0x8001),
-        "does not state the encoding",
-    ),
+    "raw: without an encoding": (b"% format \n% geometry 64x48\n" + words("<u2", 0x8001), "does not state the encod"),
     "raw: in another encoding": (b"% evt 2.1\n% geometry 64x48\n", "encoded as 2.1"),
     "raw: of histograms": (b"% format HISTO3D;width=64;height=48\n", "encoded as HISTO3D"),
     "raw: in big endian": (b"% format EVT3;endianness=big;width=64;height=48\n", "encoded as EVT3;endianness=big"),
@@ -96,18 +103,12 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "raw: evt2 cut": (evt2(ROWS)[:-1], "ends within a word of 4 bytes"),
     "raw: evt3 cut": (evt3(ROWS)[:-1], "ends within a word of 2 bytes"),
     "raw: evt2 garbage": (HEADER2 + words("<u4", 0x80000001, 0x70000000), "word 1 is 0x70000000, which EVT 2.0"),
-    "raw: evt3 garbage": (HEADER3 + words("<u2", 0x8001, 0x6000, 0x9123), "word 2 is 0x9123, which EVT 3.0"),
+    "raw: evt3 garbage": (evt3_of(0x8001, 0x6000, 0x9123), "word 2 is 0x9123, which EVT 3.0"),
     "raw: evt2 beside the sensor": (HEADER2 + words("<u4", 0x80000001, 64 << 11), "x = 64 on a sensor of width 64"),
-    "raw: evt3 beside the sensor": (
-        HEADER3 + words("<u2", 0x8001, 0x6000, 0x0030, 0x2001),
-        "y = 48 on a sensor of height",
-    ),
-    "raw: evt3 vectors that never end": (
-        HEADER3 + words("<u2", 0x8001, 0x6000, 0x0001, 0x3000, *[0x4001] * 6000),
-        "on a sensor of width 64",
-    ),
-    "raw: evt3 without a time": (HEADER3 + words("<u2", 0x0001, 0x2001), "holds no events"),
-    "raw: evt3 without a row": (HEADER3 + words("<u2", 0x8001, 0x6000, 0x2001), "holds no events"),
+    "raw: evt3 beside the sensor": (evt3_of(0x8001, 0x6000, 0x0030, 0x2001), "y = 48 on a sensor of height"),
+    "raw: evt3 vectors that never end": (evt3_of(0x8001, 0x6000, 1, 0x3000, *[0x4001] * 6000), "on a sensor of width"),
+    "raw: evt3 without a time": (evt3_of(0x0001, 0x2001), "holds no events"),
+    "raw: evt3 without a row": (evt3_of(0x8001, 0x6000, 0x2001), "holds no events"),
     "raw: evt2 read as evt3": (HEADER3 + evt2(ROWS).split(b"% end\n")[1], ""),
     "raw: empty": (b"", "the file is empty"),
     "raw: unknown": (b"RIFF....WAVE", "its format is not known"),
@@ -129,30 +130,18 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "npz: of text": (b"x y", "not a readable .npz file"),
     "npy: of text": (b"x y", "not a readable .npy file"),
     "npy: empty": (b"", "not a readable .npy file"),
-    "npz: truncated npz": (
-        lambda path: (np.savez(path, **made_columns()), path.write_bytes(path.read_bytes()[:900])),
-        "not a readable .npz file",
-    ),
-    "npz: damaged npz": (
-        lambda path: (
-            np.savez_compressed(path, **made_columns()),
-            path.write_bytes(path.read_bytes()[:200] + b"?" * 100 + path.read_bytes()[300:]),
-        ),
-        "not a readable array x",
-    ),
+    "npz: truncated npz": (npz(lambda content: content[:900]), "not a readable .npz file"),
+    "npz: damaged npz": (npz(lambda content: content[:200] + b"?" * 100 + content[300:]), "not a readable array x"),
     "npz: array of objects": (replaced("x", np.array([object] * N)), "not a readable array x .it holds Python objects"),
     "npz: no events in npz": (replaced("p", None), "its arrays are t, x, y; it must hold x, y, t and p"),
     "npz: empty stream": (
-        lambda path: np.savez(path, **{name: np.zeros(0) for name in "xytp"}),
+        lambda path: np.savez(path, **dict.fromkeys("xytp", np.zeros(0))),
         "the file holds no events",
     ),
     "npz: matrix as column": (replaced("x", np.zeros((N, 2), int)), r"x has shape \(300, 2\)"),
     "npy: three columns": (lambda path: np.save(path, np.zeros((9, 3))), "has 3 columns; column 3 must hold p"),
     "npy: one column": (lambda path: np.save(path, np.zeros(9)), r"has shape \(9,\)"),
-    "npy: records without p": (
-        lambda path: np.save(path, np.zeros(9, [("x", "u2"), ("y", "u2"), ("t", "i8")])),
-        "have no field p",
-    ),
+    "npy: records without p": (lambda path: np.save(path, np.zeros(9, "u2, u2")), "have no field"),
     "npz: words": (replaced("x", np.array(["one"] * N)), "column x has type <U3; store numbers"),
     "npz: fractional pixel": (replaced("y", ZEROS + 0.5), "event 0 has y = 0.5; it must be a whole number"),
     "npz: three polarities": (replaced("p", np.arange(N) % 3 - 1), "event 1 has p = 0; .* -1 beside it"),
@@ -167,10 +156,7 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "h5: negative pixel": (replaced("y", ZEROS - 1), "event 0 has y = -1"),
     "h5: polarity 2": (replaced("p", ZEROS + 2), "event 0 has p = 2; polarities are 0 and 1, or -1 and 1"),
     "h5: huge time": (replaced("t", T * 1_000), r"event 0 has t = 1\.6e\+18; check the unit"),
-    "h5: offset is a word": (
-        lambda path: (write_dsec(path, made_columns()), set_offset(path, "late")),
-        "its t_offset is .*late.*; store an integer",
-    ),
+    "h5: offset is a word": (late_dsec, "its t_offset is .*late.*; store an integer"),
     "h5: ECF": (lambda path: write_with_filter(path, 0x8ECF), "ECF filter: .* set HDF5_PLUGIN_PATH to its folder"),
     "h5: another filter": (lambda path: write_with_filter(path, 40_000), r"pip install 'aenerf-ns\[hdf5-"),
     "csv: missing": (None, "there is no such file"),
@@ -181,15 +167,12 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "csv: with five": (b"x,y,t,p\n1,2,3,1,9\n", "has 5 fields; .* the 4: x y t p"),
     "csv: with an empty field": (b"x,y,t,p\n1,,3,1\n", "line 2 has y = nothing"),
     "csv: with blanks between": (b"x,y,t,p\n1,2 3,4,1\n", "line 2 has y = 2 3;"),
-    "csv: with three polarities": (
-        b"x,y,t,p\n1,2,3,-1\n#\n1,2,3,0\n",
-        "line 4 has p = 0; there are events of polarity -1",
-    ),
+    "csv: with three polarities": (b"x,y,t,p\n1,2,3,-1\n#\n1,2,3,0\n", "line 4 has p = 0; .* of polarity -1"),
     "txt: with a huge time": (b"1e300 1 2 1\n", "line 1 has t = 9.2.*; check"),
     "txt: with a fault later": (b"# made\n" + b"1 1 2 1\n" * 50 + b"1 1 two 1\n1 1 2 1\n", "line 52 has y = two"),
     "txt: with a bad pixel later": (
-        b"# made\n" + b"1 1 2 1\n" * 50 + b"\n1 60 2 1\n1 1 2 1\n",
-        "line 53 has x = 60; it must be a whole number below 60",
+        b"#\n" + b"1 1 2 1\n" * 50 + b"\n1 60 2 1\n1 1 2 1\n",
+        "line 53 has x = 60; .* below 60",
     ),
     "txt: with a bad end": (b"1 1 2 1\n" * 90 + b"1 1 2\n", "the last line has 3"),
     "txt: without line ends": (b"1 1 2 1 " * 90, "line 1 has 360 fields"),

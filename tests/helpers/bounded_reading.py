@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import resource
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from aenerf_ns.errors import DataError
 
 # What a refusal may take, above what the process has.
 MAX_BYTES, MAX_SECONDS = 1 << 30, 2.0
@@ -43,6 +46,20 @@ def without_rights_of_root() -> Iterator[None]:
         yield
     finally:
         os.seteuid(user)
+
+
+def refusal(read: Callable[[], object], max_seconds: float = MAX_SECONDS) -> str:
+    """Read in little memory and time, and return the line of the error, or nothing where there is none."""
+    begin, message = time.process_time(), ""
+    with little_memory(), without_rights_of_root():
+        try:
+            read()
+        except DataError as error:
+            message = str(error)
+    assert "\n" not in message
+    assert len(message) < 800
+    assert time.process_time() - begin < max_seconds
+    return message
 
 
 def read_whole(read: Callable[[], object]) -> None:

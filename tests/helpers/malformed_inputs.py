@@ -281,22 +281,15 @@ _HDF5_VALUES: dict[tuple[str, str, str], list] = {
     (_OWN, "events.h5", "events/t"): [h5py.Empty("i8")],
     (_PAEV3D, _PAEV3D_EVENTS, "events"): [[["a"] * 4] * 3, 3.0],
 }
-_UNREADABLE: dict[str, list[str]] = {
-    _NATIVE: [
-        "transforms.json",
-        "trajectory_estimated.txt",
-        "trajectory_ground_truth.txt",
-        "events.h5",
-        "images/val/00000.png",
-        "images/val",
-        ".",
-    ],
-    _ECD: ["events.txt", "calib.txt", "images.txt"],
-    _ROBUST: ["raw_events.npz", "camera_poses.npz", "views/transforms_val.json"],
-    _ESIM: ["events/2.npy", "events", "poses_bounds.npy"],
-    _EVENTNERF: ["train/pose/r_00003.txt", "train/pose"],
-    _PAEV3D: ["Render_info/Bunny/0003.npz"],
-    _OWN: ["trajectory.txt"],
+_UNREADABLE: dict[str, str] = {
+    _NATIVE: "transforms.json trajectory_estimated.txt trajectory_ground_truth.txt events.h5 "
+    "images/val/00000.png images/val .",
+    _ECD: "events.txt calib.txt images.txt",
+    _ROBUST: "raw_events.npz camera_poses.npz views/transforms_val.json",
+    _ESIM: "events/2.npy events poses_bounds.npy",
+    _EVENTNERF: "train/pose/r_00003.txt train/pose",
+    _PAEV3D: "Render_info/Bunny/0003.npz",
+    _OWN: "trajectory.txt",
 }
 _CAMCHAINS = {
     "kalibr sensor": CAM0.replace("[60, 40]", "[1000000, 1000000]"),
@@ -529,7 +522,11 @@ MALFORMED: dict[str, tuple[str, Change]] = {
         for (kind, file, name), values in _HDF5_VALUES.items()
         for value in values
     },
-    **{f"unreadable {kind} {name}": (kind, unreadable(name)) for kind, names in _UNREADABLE.items() for name in names},
+    **{
+        f"unreadable {kind} {name}": (kind, unreadable(name))
+        for kind, names in _UNREADABLE.items()
+        for name in names.split()
+    },
     **{f"kalibr: {name}": (_OWN, camchain(text)) for name, text in _CAMCHAINS.items()},
     **{f"npy: {name}": (_ESIM, write_bytes("poses_bounds.npy", content)) for name, content in _NPY.items()},
     **{f"{kind} {name}": (kind, change) for kind, changes in _CHANGES.items() for name, change in changes.items()},

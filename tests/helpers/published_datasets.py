@@ -57,6 +57,11 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
+def make_times(start: int = 0, count: int = N_POSES) -> NDArray[np.int64]:
+    """Nanoseconds, from a start in microseconds."""
+    return start * 1_000 + np.linspace(0, DURATION * 1_000, count).astype(np.int64)
+
+
 def make_events(width: int, height: int, start: int = 0) -> dict[str, NDArray]:
     """Times in microseconds, the first and the last at the ends of the recording."""
     rng = np.random.default_rng(0)
@@ -101,7 +106,7 @@ def write_robust_enerf(
     folder.mkdir()
     width, height = 60, 40
     events, poses = make_events(width, height), make_poses()
-    times = np.linspace(0, DURATION * 1_000, N_POSES).astype(np.int64)
+    times = make_times()
     matrix = pinhole(50.0, 52.0, 29.25, 20.5)
     distortion = np.array([-0.05, 0.01, 0.002, -0.001])
     np.savez(
@@ -130,7 +135,7 @@ def write_robust_enerf(
     )
     if synthetic:
         np.savez(folder / "renderer_params.npz", interm_color_space="display", log_eps=0.002)
-    for split, angle in (("val", {"camera_angle_x": 0.8}), ("test", {"camera_angle_x": 0.8})):
+    for split in ("val", "test"):
         place = folder / views
         (place / split).mkdir(parents=True)
         frames = []
@@ -139,7 +144,7 @@ def write_robust_enerf(
             Image.fromarray(picture).save(place / split / f"r_{index}.png")
             pose = (poses[index] @ FLIP).tolist()
             frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": pose})
-        (place / f"transforms_{split}.json").write_text(json.dumps({**angle, "frames": frames}))
+        (place / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
     return Truth(folder, times, poses, events, width, height, matrix, tuple(distortion), model == "equidistant")
 
 
@@ -161,7 +166,7 @@ def write_tum_vie(folder: Path, calibration: Path, sequence: str = "mocap-desk2"
     mocap = json.loads((folder / f"mocap-imu-calibration{which}.json").read_text())["value0"]
 
     poses = make_poses(241)
-    times = EPOCH * 1_000 + np.linspace(0, DURATION * 1_000, 241).astype(np.int64)
+    times = make_times(EPOCH, 241)
     # T_world_camera = T_world_marker inv(T_imu_marker) T_imu_camera, solved for the marker.
     imu_camera, imu_marker = tum_vie_matrix(cameras["T_imu_cam"][index]), tum_vie_matrix(mocap["T_imu_marker"])
     truth = folder / f"{sequence}-vi_gt_data"
@@ -189,7 +194,7 @@ EDS_DISTORTION = (-0.09776467241921379, 0.2143738428636279, -0.00471071010517286
 
 def write_eds(folder: Path) -> Truth:
     folder.mkdir()
-    poses, times = make_poses(), EPOCH * 1_000 + np.linspace(0, DURATION * 1_000, N_POSES).astype(np.int64)
+    poses, times = make_poses(), make_times(EPOCH)
     events = make_events(640, 480, EPOCH)
     with h5py.File(folder / "events.h5", "w") as file:
         for name, values in events.items():
@@ -204,7 +209,7 @@ def write_eds(folder: Path) -> Truth:
 def write_enerf_esim(folder: Path) -> Truth:
     (folder / "events").mkdir(parents=True)
     width, height, focal = 64, 48, 70.0
-    poses, times = make_poses(), np.linspace(0, DURATION * 1_000, N_POSES).astype(np.int64)
+    poses, times = make_poses(), make_times()
     events = make_events(width, height)
     table = np.stack([events["x"], events["y"], events["t"] * 1_000, events["p"]], 1).astype(np.float64)
     # The second number has more digits, and a file may be empty.
@@ -271,7 +276,7 @@ CALIBRATION = {
 
 def write_own(folder: Path) -> Truth:
     folder.mkdir()
-    poses, times = make_poses(), EPOCH * 1_000 + np.linspace(0, DURATION * 1_000, N_POSES).astype(np.int64)
+    poses, times = make_poses(), make_times(EPOCH)
     events = make_events(60, 40, EPOCH)
     with h5py.File(folder / "events.h5", "w") as file:
         for name, values in events.items():
@@ -289,22 +294,14 @@ def write_own(folder: Path) -> Truth:
 
 CAMCHAIN = {
     "cam0": {
-        "camera_model": "pinhole",
-        "distortion_model": "equidistant",
-        "intrinsics": [70.0, 71.0, 40.0, 30.0],
-        "resolution": [80, 60],
-        "distortion_coeffs": [0.01, 0.02, 0.03, 0.04],
-        "rostopic": "/frames",
+        "camera_model": "pinhole", "distortion_model": "equidistant", "intrinsics": [70.0, 71.0, 40.0, 30.0],
+        "resolution": [80, 60], "distortion_coeffs": [0.01, 0.02, 0.03, 0.04], "rostopic": "/frames",
     },
     "cam1": {
-        "camera_model": "pinhole",
-        "distortion_model": "radtan",
-        "intrinsics": [50.0, 51.0, 29.5, 20.0],
-        "resolution": [60, 40],
-        "distortion_coeffs": [-0.1, 0.0, 0.0, 0.01],
-        "T_cn_cnm1": make_poses(3)[2].tolist(),
+        "camera_model": "pinhole", "distortion_model": "radtan", "intrinsics": [50.0, 51.0, 29.5, 20.0],
+        "resolution": [60, 40], "distortion_coeffs": [-0.1, 0.0, 0.0, 0.01], "T_cn_cnm1": make_poses(3)[2].tolist(),
     },
-}
+}  # fmt: skip
 
 
 def write_colmap(folder: Path, poses: NDArray[np.float64], names: list[str]) -> None:
