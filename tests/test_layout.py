@@ -56,24 +56,24 @@ def _modules() -> Iterator[tuple[str, Path]]:
     for folder in ("dataparsers", "method_configs"):
         yield from ((folder, path) for path in (ROOT / folder).rglob("*.py"))
     for path in (ROOT / "aenerf_ns").rglob("*.py"):
-        place = path.relative_to(ROOT / "aenerf_ns").with_suffix("").parts[0]
-        if place != "__init__":
-            yield place, path
+        folder = path.relative_to(ROOT / "aenerf_ns").with_suffix("").parts[0]
+        if folder != "__init__":
+            yield folder, path
 
 
-@pytest.mark.parametrize("place", MAY_USE)
-def test_imports_are_allowed(place: str) -> None:
+@pytest.mark.parametrize("folder", MAY_USE)
+def test_imports_are_allowed(folder: str) -> None:
     for own, path in _modules():
-        if own == place:
+        if own == folder:
             used = {name.split(".")[1] for name in imported_names(path) if name.startswith("aenerf_ns.")}
-            assert used - {place} <= MAY_USE[place], path
+            assert used - {folder} <= MAY_USE[folder], path
 
 
 def test_floors_are_ordered_and_complete() -> None:
     order = list(MAY_USE)
-    for place, used in MAY_USE.items():
-        assert all(order.index(name) < order.index(place) for name in used)
-    assert {place for place, _ in _modules()} == set(MAY_USE)
+    for folder, used in MAY_USE.items():
+        assert all(order.index(name) < order.index(folder) for name in used)
+    assert {folder for folder, _ in _modules()} == set(MAY_USE)
 
 
 def test_modules_form_no_circle() -> None:

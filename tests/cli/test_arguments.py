@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.commands import run
 
 from aenerf_ns.cli.dataset import DatasetCommand, training_command
 from aenerf_ns.cli.main import COMMANDS, load_command, main
@@ -217,12 +216,6 @@ def test_training_command_is_quoted() -> None:
         "--data 'my data'"
     )
     assert training_command(Path("data"), "e2vid-nerf") == "ns-train e2vid-nerf --data data"
-
-
-def test_real_command_ends_in_one_line(tmp_path: Path) -> None:
-    printed = run("aenerf", "check", tmp_path / "nothing", cwd=tmp_path, fails=True)
-    assert printed.startswith(f"Error: {tmp_path / 'nothing'}: there is no such folder")
-    assert printed.count("\n") == 1
 
 
 @pytest.mark.slow

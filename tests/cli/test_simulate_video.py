@@ -194,9 +194,9 @@ def test_contradicting_options_are_refused(
     tmp_path: Path,
 ) -> None:  # fmt: skip
     paths = {"trajectory": poses, "calibration": camchain}
-    with pytest.raises(DataError, match=message) as told:
+    with pytest.raises(DataError, match=message) as error:
         simulate(tmp_path / "out", video=frames, **{name: paths[name] for name in files}, **options)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()
 
 

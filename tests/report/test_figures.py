@@ -188,11 +188,11 @@ def test_read_what_a_run_wrote(tmp_path: Path) -> None:
     broken["scalars.csv"] = [f"step,name,value\n{line}\n" for line in ("1,loss", "a,loss,1", f"1,{'l' * 10**6},2")]
     for name, contents in broken.items():
         for number, content in enumerate(contents):
-            place = tmp_path / f"broken_{name}_{number}"
-            place.mkdir()
-            (place / name).write_text(content)
+            broken_run = tmp_path / f"broken_{name}_{number}"
+            broken_run.mkdir()
+            (broken_run / name).write_text(content)
             with pytest.raises(DataError, match=name) as raised:
-                (read_record if name == "run.json" else read_scalars)(place)
+                (read_record if name == "run.json" else read_scalars)(broken_run)
             assert "\n" not in str(raised.value)
     long = tmp_path / "scalars.csv"
     with long.open("w", newline="") as file:
