@@ -20,7 +20,7 @@ _MIN_CORRECTION = 5e-4
 # The clock offset is at its limit if its change is above this share of the greatest one.
 _MAX_CLOCK_SHARE = 0.9
 # A stretch is weak if more than this share of the loss of a constant field is left. After 1200 steps of aenerf-small,
-# runs with mended poses leave about 5 % and runs with wrong ones 10 to 35 % (benchmarks/LOG.md).
+# runs with mended poses leave 1 to 9 % and runs with wrong ones 10 to 35 % (benchmarks/LOG.md).
 _MAX_LOSS_SHARE = 0.15
 # Stretches hold equally many of the drawn pairs.
 _NUM_STRETCHES, _PAIRS_PER_STRETCH = 10, 512
