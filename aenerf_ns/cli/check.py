@@ -61,10 +61,10 @@ class Check(DatasetCommand):
         command = training_command(self.data, options=result.planes, format_words=format_words)
         remark = " (near and far plane for a camera that stays that close)" if result.planes else ""
         say(f"Train with{remark}: {command}")
-        if self.picture is not None and result.warped is None:
-            say(f"{self.picture}: not written, because too few events have a pose")
-        elif self.picture is not None:
+        if self.picture is not None and result.warped is not None:
             with creating(self.picture, "--picture"):
                 Image.fromarray(result.warped.picture()).save(self.picture)
             say(f"{self.picture}: events as they came, and warped")
+        elif self.picture is not None:
+            say(f"{self.picture}: not written, because too few events have a pose")
         return result.problems
