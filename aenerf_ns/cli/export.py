@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -196,7 +195,7 @@ class ExportVideo:
         require_range("frame-rate", self.frame_rate, 0.1, 1000)
         require_writable(self.output)
         _, run, _ = open_run(self.load_config, test_mode="inference")
-        from aenerf_ns.cli.video_file import new_video
+        from aenerf_ns.cli.video_file import write_video
         from aenerf_ns.export.times import times_at_rate
         from aenerf_ns.export.video import render_panels
 
@@ -204,13 +203,6 @@ class ExportVideo:
         times = times_at_rate(run.scene.window, self.rate)
         if len(times) < 2:
             raise DataError("--rate", f"{self.rate:g} frames a second give no two frames", "give a higher one")
-        pictures = render_panels(run, times)
-        first = next(pictures)
-        with (
-            creating(self.output),
-            closing(new_video(self.output, first.shape[1], first.shape[0], self.frame_rate)) as video,
-        ):
-            video.send(first.tobytes())
-            for picture in pictures:
-                video.send(picture.tobytes())
-        say(f"{self.output}: {len(times) - 1} frames.")
+        with creating(self.output):
+            num_frames = write_video(self.output, render_panels(run, times), self.frame_rate)
+        say(f"{self.output}: {num_frames} frames.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -62,25 +61,17 @@ class Reconstruct(DatasetCommand):
             self._reconstruct(parser, lock)
 
     def _reconstruct(self, parser: EventDataParser, lock: OutputLock) -> None:
-        from aenerf_ns.camera.trajectory import homogeneous
-        from aenerf_ns.cli.video_file import new_video
+        from aenerf_ns.cli.video_file import write_video
 
         recording = parser.recording
         source = self._source(recording)
         camera, longest_gap = recording.event_camera, parser.config.max_pose_gap_ns
         known = recording.trajectory.known_time(recording.max_pose_gap if longest_gap is None else longest_gap)
-        with (
-            open_writer(lock, parser, recording, camera, camera) as writer,
-            closing(new_video(writer.other_file(_VIDEO), camera.width, camera.height, _VIDEO_RATE)) as video,
-        ):
+        with open_writer(lock, parser, recording, camera, camera) as writer:
             writer.add_trajectories(recording.trajectory, recording.ground_truth)
             _add_reference_views(recording, writer)
-            num_images = 0
-            for time, image in self._images(recording, source, known, writer):
-                pose = homogeneous(recording.trajectory.interpolate(time))
-                writer.add_image("train", image, pose, time)
-                video.send(image.tobytes())
-                num_images += 1
+            images = self._write_images(recording, source, known, writer)
+            num_images = write_video(writer.other_file(_VIDEO), images, _VIDEO_RATE)
         say(
             f"{self.output}: {num_images} images reconstructed by {self.method}, and {_VIDEO}.\n"
             f"Train on them with: {training_command(self.output, method='e2vid-nerf')}"
@@ -98,10 +89,11 @@ class Reconstruct(DatasetCommand):
         device = "cuda" if torch.cuda.is_available() else "cpu"
         return NetworkImages(load_network(self.method, self.weights), sensor, device)
 
-    def _images(
+    def _write_images(
         self, recording: Recording, source: ImageSource, known: TimeWindow, writer: NativeDatasetWriter
-    ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Write the events, and yield time and image of each batch of them that ends at a time with a pose."""
+    ) -> Iterator[NDArray[np.uint8]]:
+        """Write the events and an image of each batch of them that ends at a time with a pose. Yield the images."""
+        from aenerf_ns.camera.trajectory import homogeneous
         from aenerf_ns.reconstruction.images import images_of
 
         events = recording.event_file
@@ -117,7 +109,8 @@ class Reconstruct(DatasetCommand):
             num_images += 1
             if known.contains(time):
                 num_posed += 1
-                yield time, image
+                writer.add_image("train", image, homogeneous(recording.trajectory.interpolate(time)), time)
+                yield image
         if num_posed == 0:
             raise DataError(
                 events.path,

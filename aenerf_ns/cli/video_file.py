@@ -1,18 +1,21 @@
-"""A video file that takes one picture after another."""
+"""Writing a video file."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Iterable
 from contextlib import closing
+from itertools import chain
 from pathlib import Path
 
 import imageio_ffmpeg
+import numpy as np
+from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 
 
-def new_video(path: Path, width: int, height: int, frame_rate: float) -> Generator[None, bytes | None, None]:
-    """Create a video that is sent (height, width, 3) RGB pictures, as bytes.
+def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frame_rate: float) -> int:
+    """Write (height, width, 3) RGB pictures, and count them. Without pictures, no file is written.
 
     Raises:
         DataError: there is no ffmpeg.
@@ -22,21 +25,18 @@ def new_video(path: Path, width: int, height: int, frame_rate: float) -> Generat
         imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
         raise DataError(path.name, f"there is no ffmpeg to write it ({error})", "install ffmpeg") from None
-    pictures = _write_pictures(path, width, height, frame_rate)
-    next(pictures)
-    return pictures
-
-
-def _write_pictures(path: Path, width: int, height: int, frame_rate: float) -> Generator[None, bytes | None, None]:
-    # ffmpeg complains of a video without pictures.
-    picture = yield
+    pictures = iter(pictures)
+    first = next(pictures, None)
+    if first is None:
+        return 0
     # H.264 stores colors for blocks of 2 x 2 pixels: an odd size is scaled by a fraction of a pixel.
-    with closing(
-        imageio_ffmpeg.write_frames(
-            str(path), (width, height), fps=frame_rate, macro_block_size=2, ffmpeg_log_level="error"
-        )
-    ) as video:
+    video = imageio_ffmpeg.write_frames(
+        str(path), first.shape[1::-1], fps=frame_rate, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    with closing(video):
         video.send(None)
-        while True:
-            video.send(picture)
-            picture = yield
+        count = 0
+        for picture in chain([first], pictures):
+            video.send(picture.tobytes())
+            count += 1
+    return count
