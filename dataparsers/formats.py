@@ -25,7 +25,7 @@ from aenerf_ns.files.output_paths import require_dataset
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
 
-# By the names they are registered with. Where a folder has several formats, the first one here is taken.
+# All formats by registered name. Where a folder has several formats, the first one here is taken.
 FORMATS: dict[str, EventDataParserConfig] = {
     "aenerf-data": native_dataparser.config,
     "ecd-data": ecd_dataparser.config,

@@ -104,7 +104,7 @@ def _scalar(of: _Type, content: bytes) -> str:
     return str(np.frombuffer(content, of.dtype)[0])
 
 
-# What the pickles of NumPy's arrays and numbers name.
+# Names in the pickles of NumPy's arrays and numbers.
 _STAND_INS = {"dtype": _Type, "_reconstruct": _Array, "scalar": _scalar, "ndarray": _Array}
 
 

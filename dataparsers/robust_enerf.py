@@ -26,12 +26,12 @@ from aenerf_ns.recording.options import ObjectDataParserConfig
 from aenerf_ns.recording.recording import Recording, ReferenceView, Split
 from aenerf_ns.recording.views import IMAGE_SUFFIXES
 
-# Half the side of the box around the synthetic scenes, in the authors' configuration.
+# The authors' configuration: half the side of the box around the synthetic scenes.
 _HALF_EXTENT = 1.5
 
 
 Matrix3 = tuple[Vector, Vector, Vector]
-# Far more than any array of a calibration has.
+# Limit on the numbers in an array of a calibration.
 _MAX_VALUES = 100
 
 

@@ -132,7 +132,7 @@ def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> li
     for chunk in tracked(file.chunks(), "Choosing events", file.count()):
         covered = chunk[window.contains(chunk.t)]
         for part, begin in zip(parts, begins - position, strict=True):
-            # By indices, because a slice would keep the whole chunk in memory.
+            # Indices make a copy: a slice would keep the whole chunk in memory.
             part.append(covered[np.arange(len(covered))[max(begin, 0) : max(begin + length, 0)]])
         position += len(covered)
     return [EventStream.concatenate(part) for part in parts]

@@ -92,7 +92,7 @@ class Convert(DatasetCommand):
 
     def _convert(self, parser: EventDataParser, filters: EventFilters, lock: OutputLock) -> None:
         from aenerf_ns.events.filters import FilteredEventFile
-        from aenerf_ns.recording.views import thinned
+        from aenerf_ns.recording.views import thin_views
 
         report = None
         if self.poses == "colmap":
@@ -102,7 +102,7 @@ class Convert(DatasetCommand):
         events = FilteredEventFile(recording.event_file, filters)
         trajectory = _cut(recording, events, filters.window)
         views = {
-            split: thinned(
+            split: thin_views(
                 [view for view in views if view.time is None or filters.window.contains(view.time)],
                 recording.max_views,
             )

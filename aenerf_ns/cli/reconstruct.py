@@ -124,9 +124,9 @@ class Reconstruct(DatasetCommand):
 def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> None:
     """Copy the validation and test views, with which every method on this recording is evaluated."""
     from aenerf_ns.recording.recording import SPLITS
-    from aenerf_ns.recording.views import thinned
+    from aenerf_ns.recording.views import thin_views
 
-    views = {split: thinned(recording.reference_views[split], recording.max_views) for split in SPLITS[1:]}
+    views = {split: thin_views(recording.reference_views[split], recording.max_views) for split in SPLITS[1:]}
     if recording.frame_camera != recording.event_camera:
         if any(views.values()):
             say("The recording's images are left out: they are of another camera than the events.")

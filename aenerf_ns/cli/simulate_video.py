@@ -164,16 +164,16 @@ class SimulateVideo(SimulationCommand):
         """Write a dataset folder, and describe it in one line."""
         from aenerf_ns.camera.trajectory import homogeneous
         from aenerf_ns.recording.recording import Split
-        from aenerf_ns.recording.views import evenly_spread
+        from aenerf_ns.recording.views import spread_evenly
         from aenerf_ns.recording.writer import NativeDatasetWriter
 
         reference = poses.estimated if poses.truth is None else poses.truth
         # The first frame lies before all events.
         taken = [time for time in video.times[1:].tolist() if reference.start <= time <= reference.end]
         chosen: dict[Split, list[int]] = {
-            "train": evenly_spread(taken, self.train_images),
-            "val": evenly_spread(taken[::2], self.validation_views),
-            "test": evenly_spread(taken[1::2], self.test_views),
+            "train": spread_evenly(taken, self.train_images),
+            "val": spread_evenly(taken[::2], self.validation_views),
+            "test": spread_evenly(taken[1::2], self.test_views),
         }
         with NativeDatasetWriter(lock, poses.camera, sensor, "srgb") as writer:
             writer.add_trajectories(poses.estimated, poses.truth)
@@ -201,10 +201,10 @@ class SimulateVideo(SimulationCommand):
         intervals: Iterable[VideoInterval],
     ) -> str:
         """Write the events and images of a video without poses, and describe them in one line."""
-        from aenerf_ns.recording.views import evenly_spread
+        from aenerf_ns.recording.views import spread_evenly
         from aenerf_ns.recording.writer import PoselessRecordingWriter
 
-        kept = evenly_spread(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
+        kept = spread_evenly(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
         with PoselessRecordingWriter(lock, camera, sensor) as writer:
 
             def add_image(frame: NDArray[np.uint8], time: int) -> None:

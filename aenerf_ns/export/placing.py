@@ -14,7 +14,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.export.camera_model_files import PlacedImage
 from aenerf_ns.recording.recording import SPLITS, ReferenceView, Split
-from aenerf_ns.recording.views import thinned, views_within
+from aenerf_ns.recording.views import thin_views, views_within
 
 
 def place_views(run: TrainedRun) -> list[tuple[PlacedImage, Path]]:
@@ -34,7 +34,7 @@ def place_views(run: TrainedRun) -> list[tuple[PlacedImage, Path]]:
     split_of: dict[Path, tuple[Split, ReferenceView]] = {}
     for split in SPLITS:
         views = views_within(recording.reference_views[split], run.scene.window)
-        for view in views if split == "train" else thinned(views, recording.max_views):
+        for view in views if split == "train" else thin_views(views, recording.max_views):
             split_of[view.file] = (split, view)
     found = {file: entry for file, entry in split_of.items() if file.is_file()}
     if not found:

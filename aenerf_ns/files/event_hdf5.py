@@ -28,7 +28,7 @@ _UNITS: tuple[TimeUnit, ...] = ("ns", "us", "ms")
 _ECF = 0x8ECF
 # Events collected before they are written: many small writes are slow.
 _WRITE_CHUNK = 1 << 18
-# More than HDF5 holds back: pieces of four columns that are not full, and its tables.
+# Bytes that HDF5 may hold back: pieces of four columns that are not full, and its tables.
 _HELD_BYTES = 1 << 22
 
 

@@ -195,7 +195,7 @@ def events_from_columns(
     if not good.all():
         raise error("t", ~good, "check the unit of the times and the order of the columns")
     if times.dtype.kind == "f":
-        # In two parts: nanoseconds since 1970 would be rounded.
+        # The fraction apart, because nanoseconds since 1970 would be rounded.
         fraction = times.astype(np.float64) % 1
         times = np.floor(times)
     nanoseconds = (times.astype(np.int64) + offset) * tick

@@ -254,7 +254,7 @@ def _parse(text, with_commas, slots, whole, fraction):
             part = _DECIMALS
         elif c | 0x20 == _E and part != _POWER and num_digits > 0:
             part, num_digits = _POWER, 0
-        # In ASCII, the comma stands between plus and minus.
+        # The comma stands between plus and minus in ASCII.
         elif abs(c - _COMMA) == 1 and part == _POWER and num_digits == 0 and power_sign == 0:
             power_sign = _COMMA - c
         elif abs(c - _COMMA) == 1 and part == _WHOLE and num_digits == 0 and sign == 0:

@@ -38,7 +38,7 @@ MAX_PIECE = 1 << 27
 MAX_HEADER = 1 << 20
 """Bytes of a header of an event file, which have some kilobytes."""
 
-# What any file may take, which is enough to compile a parser and for a million events in several types.
+# Memory that any file may take: enough to compile a parser, and for a million events in several types.
 _FREE_BYTES = 1 << 28
 # Real events are compressed by a factor of 2 to 10, and a bomb by 1000 and more.
 _MAX_FACTOR = 100
@@ -97,12 +97,11 @@ def bounded_items(items: Iterator[Item], path: Path, kind: str, extra: str = "")
 def _little_memory(path: Path) -> Iterator[None]:
     """Within the context, let the process take only as much more memory, and write only files as large, as the size
     of a file explains."""
-    files = list(path.iterdir()) if path.is_dir() else [path]
-    allowed = _max_unpacked(sum(file.stat().st_size for file in files if file.is_file()))
+    allowed = _max_unpacked(size_on_disk(path))
     available = re.search(r"MemAvailable:\s*(\d+)", _MEMORY.read_text())
     if available:
         allowed = min(allowed, int(available[1]) << 10)
-    # In pages; the sixth number is that of memory that is written to.
+    # The sixth number is memory that is written to, in pages.
     in_use = int(_STATUS.read_text().split()[5]) * resource.getpagesize()
     with _lock, _limit(resource.RLIMIT_DATA, in_use + allowed), _limit(resource.RLIMIT_FSIZE, allowed):
         yield
@@ -117,6 +116,12 @@ def _limit(kind: int, value: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(kind, before)
+
+
+def size_on_disk(path: Path) -> int:
+    """Return the bytes of a file, or of all files in a folder."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _max_unpacked(packed: int) -> int:

@@ -59,7 +59,7 @@ def open_event_file(
     """
     with bounded(path, "event file"):
         if not path.exists() and width is not None and height is not None:
-            # Of whatever format: every method says that there is no such file.
+            # A missing file has any format: every method says that there is no such file.
             return TextEventFile(path, width, height)
         beginning = _read_beginning(path)
     name = _format(path, beginning)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import Columns, EventReader, batches, resolve_sensor_size
-from aenerf_ns.files.limits import bounded, require_unpacked_size
+from aenerf_ns.files.limits import bounded, require_unpacked_size, size_on_disk
 from aenerf_ns.files.plain_yaml import read_plain_yaml
 
 if TYPE_CHECKING:
@@ -126,17 +126,12 @@ class RosbagEventFile(EventReader):
             _require_distinct_files(self.path / "metadata.yaml")
         elif _begins(self.path, _MCAP_MAGIC):
             _require_records(self.path)
-        reader = Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path)
-        reader.open()
-        try:
+        with Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path) as reader:
             yield reader
-        finally:
-            reader.close()
 
     def _messages(self, start: int | None = None) -> Iterator[_Message]:
         """Yield the messages of the topic in the order in which they were received, from a time in nanoseconds on."""
-        files = [file for file in self.path.iterdir() if file.is_file()] if self.path.is_dir() else [self.path]
-        packed, total = sum(file.stat().st_size for file in files), 0
+        packed, total = size_on_disk(self.path), 0
         with self._open() as bag:
             types = {connection.topic: connection.msgtype for connection in bag.connections}
             topic = _choose(self.path, types, self._topic)
@@ -175,7 +170,7 @@ class RosbagEventFile(EventReader):
             for message in self._messages(start):
                 words = self._words(message)
                 if message.sequence != expected:
-                    # At the first packet, and after lost packets, the state of the decoder is of no use.
+                    # The decoder's state is of no use at the first packet and after lost packets.
                     expected = None
                     time = _first_time(words)
                     if time is None:

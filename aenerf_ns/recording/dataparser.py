@@ -24,21 +24,21 @@ from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import Capture, Recording, Split
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
-from aenerf_ns.recording.views import seconds_on_trajectory, thinned, viewer_cameras, views_within
+from aenerf_ns.recording.views import seconds_on_trajectory, thin_views, viewer_cameras, views_within
 
-# In extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
+# Extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
 _MAX_REFERENCE_DISTANCE = 1e4
 # Units that times may have had that were read as seconds. In the right unit more than a few poses lie among the events.
 _UNITS = {"milliseconds": 1_000, "microseconds": 1_000_000, "nanoseconds": 1_000_000_000}
-_FEW_POSES = 5
-# Half the side and the corners of a scene box, in the units of the poses, whatever these are.
+_MIN_POSES = 5
+# Limits of half the side and of the corners of a scene box, in the units of the poses, whatever these are.
 _MIN_BOX, _MAX_BOX = 1e-6, 1e6
 
 
 class EventDataParser(DataParser):
     """Hand a recording to Nerfstudio.
 
-    Training cameras are places on the estimated trajectory; evaluation cameras are the reference views of a split. A
+    Training cameras are poses on the estimated trajectory; evaluation cameras are the reference views of a split. A
     format implements :meth:`read_recording`. A format that is found without being named also states its files in its
     configuration (``markers``).
     """
@@ -141,7 +141,7 @@ class EventDataParser(DataParser):
             cameras.metadata[TRAJECTORY_SECONDS] = trajectory.seconds(times)[:, None]
             frames = _frames(recording, window)
         else:
-            views = thinned(views_within(recording.reference_views[split], window), recording.max_views)
+            views = thin_views(views_within(recording.reference_views[split], window), recording.max_views)
             for view in views:
                 check_image(view.file, recording.frame_camera)
             poses = torch.stack([v.camera_to_world for v in views]) if views else torch.zeros(0, 4, 4).double()
@@ -266,8 +266,8 @@ def _require_seconds(trajectory: Trajectory, first: int, last: int) -> None:
         scaled = times // factor
         fitting = int(((scaled >= first) & (scaled <= last)).sum())
         lasts_as_long = 10 * int(scaled[-1] - scaled[0]) > last - first
-        few = len(trajectory.knots_between(first, last)) < _FEW_POSES
-        if few and lasts_as_long and fitting >= max(_FEW_POSES, len(times) / 2):
+        few = len(trajectory.knots_between(first, last)) < _MIN_POSES
+        if few and lasts_as_long and fitting >= max(_MIN_POSES, len(times) / 2):
             raise DataError(
                 trajectory.source,
                 f"its poses last {trajectory.duration:g} s and the events {(last - first) * 1e-9:g} s, as if the times "

@@ -14,7 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import output_error, require_absent
 
-# What the system answers in network folders that have no locks.
+# Errors of network folders that have no locks.
 _NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP}
 
 

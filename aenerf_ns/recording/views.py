@@ -127,20 +127,20 @@ def views_within(views: list[ReferenceView], window: TimeWindow) -> list[Referen
     return kept
 
 
-def thinned(views: list[ReferenceView], max_views: int | None) -> list[ReferenceView]:
+def thin_views(views: list[ReferenceView], max_views: int | None) -> list[ReferenceView]:
     """Return at most ``max_views`` of the timed views, evenly spread in their order, and all views without a time."""
     timed = [view for view in views if view.time is not None]
     if max_views is None or len(timed) <= max_views:
         return views
-    return [*evenly_spread(timed, max_views), *(view for view in views if view.time is None)]
+    return [*spread_evenly(timed, max_views), *(view for view in views if view.time is None)]
 
 
 def viewer_cameras(trajectory: Trajectory, views: list[ReferenceView]) -> tuple[Tensor, dict[int, Path]]:
     """Choose knots and times of images at which the viewer shows the camera: (N,) int64 nanoseconds, and the images
     among them by index."""
     taken = {v.time: v.file for v in views if v.time is not None and trajectory.start <= v.time <= trajectory.end}
-    shown = evenly_spread(sorted(taken), _MAX_SHOWN)
-    times = sorted({*evenly_spread(trajectory.times.tolist(), _MAX_SHOWN), *shown})
+    shown = spread_evenly(sorted(taken), _MAX_SHOWN)
+    times = sorted({*spread_evenly(trajectory.times.tolist(), _MAX_SHOWN), *shown})
     return torch.tensor(times), {times.index(time): taken[time] for time in shown}
 
 
@@ -152,7 +152,7 @@ def seconds_on_trajectory(views: list[ReferenceView], trajectory: Trajectory) ->
     return seconds
 
 
-def evenly_spread(items: Sequence[Item], max_items: int) -> list[Item]:
+def spread_evenly(items: Sequence[Item], max_items: int) -> list[Item]:
     """Return at most ``max_items`` of the items, evenly spread from the first to the last."""
     count = min(len(items), max_items)
     return [items[round(i * (len(items) - 1) / max(count - 1, 1))] for i in range(count)]
