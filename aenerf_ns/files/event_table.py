@@ -31,7 +31,7 @@ class EventLayout:
         columns: for x, y, t and p the name of an array and the part of it: None for an array of numbers, the index of a
             column for a matrix, or the name of a field for an array of records.
         time_unit: of the times, or None for the rule of :func:`guess_time_unit`.
-        time_offset: name of a number that is added to all times, in their unit. A missing number is 0.
+        time_offset: name of a number that is added to all times, in their unit, where there is one.
     """
 
     columns: Mapping[str, tuple[str, int | str | None]]
@@ -45,12 +45,9 @@ class EventLayout:
 
 
 class EventTableFile(EventReader):
-    """Read a file whose arrays hold events as an :class:`EventLayout` says. Formats implement :meth:`open_arrays`.
+    """Read a file whose arrays hold events as an :class:`EventLayout` says, or in another unit of the times.
 
-    Args:
-        path, width, height: see :class:`EventFile`.
-        layout: where the columns are.
-        time_unit: of the times, in place of the unit of the layout.
+    Formats implement :meth:`open_arrays`.
     """
 
     def __init__(
@@ -62,9 +59,7 @@ class EventTableFile(EventReader):
 
     @abstractmethod
     def open_arrays(self) -> AbstractContextManager[Mapping[str, Any]]:
-        """Open the arrays of the layout, by their names, and the time offset, an integer, as "time_offset".
-
-        Arrays are sliced along their first dimension.
+        """Open the arrays of the layout by name, to be sliced, and the time offset, an integer, as "time_offset".
 
         Raises:
             DataError: the file or an array is missing, or cannot be read.

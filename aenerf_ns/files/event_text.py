@@ -202,18 +202,17 @@ class CsvEventFile(TextEventFile):
 def parse_lines(
     text: bytes, with_commas: bool, slots: list[int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], int | None]:
-    """Parse lines of numbers. Skip lines that are empty or hold only a comment after ``#``.
+    """Parse lines of numbers, each of which ends with a newline. Skip empty lines, and comments after ``#``.
 
     Args:
-        text: lines, each of which ends with a newline.
-        with_commas: whether commas separate the numbers of a line, with or without blanks around them. Otherwise
-            blanks and tabs separate the numbers.
+        text: the lines.
+        with_commas: whether commas separate the numbers, with or without blanks around them, or blanks and tabs alone.
         slots: for each number of a line its row in the result, or −1 for a number that is not kept.
 
     Returns:
         The (max(slots) + 1, N) integer parts of the numbers of N lines, the fractional parts with the same shape and
-        signs, and the position of the first line that does not hold ``len(slots)`` numbers, or None. Parsing stops at
-        such a line. An integer part that int64 cannot hold becomes the largest int64.
+        signs, and the position of the first line that does not hold ``len(slots)`` numbers, at which parsing stops, or
+        None. An integer part that int64 cannot hold becomes the largest int64.
     """
     shape = max(slots) + 1, text.count(b"\n")
     whole, fraction = np.empty(shape, np.int64), np.empty(shape, np.float64)

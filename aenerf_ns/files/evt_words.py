@@ -124,13 +124,10 @@ def _decode_evt3(words, position, x, y, t, p, n, state):
 
 @dataclass(frozen=True)
 class Encoding:
-    """An encoding of events in words.
+    """An encoding of events in words of a type.
 
-    Attributes:
-        name: its name, for messages.
-        dtype: type of a word.
-        decode: decodes words from a position on until they end, the columns are full or a word is unknown. Returns
-            the position and the number of events in the columns.
+    ``decode`` decodes words from a position on until they end, the columns are full or a word is unknown. It returns
+    the position and the number of events in the columns.
     """
 
     name: str
@@ -149,9 +146,9 @@ def decode_words(
     """Decode words to events. Events before the first complete time cannot be dated and are left out.
 
     Args:
-        blocks: (N,) words in pieces; a piece may end anywhere.
+        blocks: (N,) words in pieces, which may end anywhere.
         encoding: the encoding of the words.
-        state: from :func:`initial_state`. The iterator of the blocks may reset it between two.
+        state: from :func:`initial_state`. The iterator of the blocks may reset it between two of them.
         source: the file, for messages.
 
     Yields:

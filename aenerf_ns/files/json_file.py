@@ -2,18 +2,9 @@
 
 A format is a :class:`msgspec.Struct`: its fields are the keys, their types are what the values must be, and a
 ``__post_init__`` that raises a ValueError checks what types cannot say. Keys that the class does not have are ignored,
-or refused with ``forbid_unknown_fields=True``:
-
-    class Lamp(msgspec.Struct, forbid_unknown_fields=True):
-        center: tuple[float, float, float]
-        gain: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.0
-        kind: Literal["point", "area"] = "point"
-        turned_on: Nanoseconds | None = None
-
-    lamp = read_json(folder / "lamp.json", Lamp)
-
-Whatever is wrong with the file is one DataError, such as "lamp.json: center[2]: expected `float`, got `str` ('high');
-see the dataset format in the docs". Values that come from elsewhere, such as YAML, go through :func:`convert`.
+or refused with ``forbid_unknown_fields=True``. Whatever is wrong with the file is one DataError, such as "lamp.json:
+center[2]: expected `float`, got `str` ('high'); see the dataset format in the docs". Values that come from elsewhere,
+such as YAML, go through :func:`convert`.
 """
 
 from __future__ import annotations
@@ -91,7 +82,8 @@ def convert(path: Path, values: Any, kind: type[T], remedy: str = DATASET_REMEDY
             value = values
             for key, index in re.findall(r"\.([^.[]+)|\[(\d+)\]", key_path):
                 value = value[key or int(index)]
-            found = f" ({_shorten(value)})" if isinstance(value, (str, int, float, Decimal)) else ""
+            value = float(value) if isinstance(value, Decimal) else value
+            found = f" ({value!r})" if isinstance(value, (str, int, float)) else ""
         key = f"{name}{key_path}".removeprefix(".")
         problem = f"{problem[:1].lower()}{problem[1:]}{found}"
         raise DataError(path, f"{key}: {problem}" if key else problem, remedy) from None
@@ -134,8 +126,3 @@ def _make_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _refuse_constant(text: str) -> NoReturn:
     raise ValueError(f"{text} is not allowed in JSON")
-
-
-def _shorten(value: str | float | Decimal) -> str:
-    text = repr(float(value) if isinstance(value, Decimal) else value)
-    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,9 +1,8 @@
 """The limits on the files of a dataset, and the one way in which their readers keep to them.
 
 A reader reads within :func:`bounded`: whatever a library raises there for a damaged file becomes one clear line, and
-memory and temporary files cannot grow far beyond what the size of the file explains. So no reader needs rules of its
-own for what a library might make of a file. What costs time and no memory, such as a small file that unpacks to events
-without end, is held by :func:`require_unpacked_size`.
+memory and temporary files cannot grow far beyond what the size of the file explains. What costs time and no memory,
+such as a small file that unpacks to events without end, is held by :func:`require_unpacked_size`.
 """
 
 from __future__ import annotations
@@ -50,11 +49,11 @@ _lock = threading.RLock()
 
 @contextmanager
 def bounded(path: Path, kind: str, extra: str = "") -> Iterator[None]:
-    """Read from a file within the context, in little memory, with one clear line for every error.
+    """Read from a file or the folder of a bag within the context, in little memory.
 
     Args:
-        path: the file, or the folder of a bag.
-        kind: what the file should be, such as "HDF5 file".
+        path: the file or folder.
+        kind: what it should be, such as "HDF5 file".
         extra: the optional dependencies that reading it may need.
 
     Raises:

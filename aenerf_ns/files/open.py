@@ -19,7 +19,12 @@ from aenerf_ns.files.text import TimeUnit
 SUFFIXES = (".raw", ".dat", ".aedat4", ".bag", ".db3", ".mcap", ".h5", ".hdf5", ".npz", ".npy", ".csv", ".txt")
 """The endings of names of event files."""
 
-# The first bytes of other files do not tell what they are.
+_FORMAT_OF_MAGIC = {
+    b"#!AER-DAT": "AEDAT4",
+    b"\x89HDF\r\n\x1a\n": "HDF5",
+    b"% ": "Prophesee",
+    **dict.fromkeys(BAG_MAGIC, "bag"),
+}
 _FORMAT_OF_SUFFIX = {".npz": "NumPy", ".npy": "NumPy", ".csv": "CSV", ".txt": "text"}
 _WITH_TOPICS = ("AEDAT4", "bag")
 # Formats that may leave the unit of the times open.
@@ -98,20 +103,13 @@ def _read_beginning(path: Path) -> bytes:
 
 
 def _format(path: Path, beginning: bytes) -> str:
-    if not beginning or beginning.startswith(BAG_MAGIC):
-        return "bag"
-    if beginning.startswith(b"#!AER-DAT"):
-        return "AEDAT4"
-    if beginning.startswith(b"\x89HDF\r\n\x1a\n"):
-        return "HDF5"
-    if beginning.startswith(b"% "):
-        return "Prophesee"
-    # A binary format would have been recognized.
-    by_suffix = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
-    if by_suffix is None:
+    # A binary format is recognized; the first bytes of other files do not tell what they are.
+    found = [name for magic, name in _FORMAT_OF_MAGIC.items() if beginning.startswith(magic)]
+    name = "bag" if not beginning else found[0] if found else _FORMAT_OF_SUFFIX.get(path.suffix.lower())
+    if name is None:
         raise DataError(
             path,
             f"its format is not known (it begins with {beginning[:8]!r})",
             "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS, HDF5, npz, npy, csv and text are read",
         )
-    return by_suffix
+    return name

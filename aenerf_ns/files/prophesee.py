@@ -41,12 +41,7 @@ _MAX_SAMPLES = 10_000
 
 @dataclass(frozen=True)
 class PropheseeHeader:
-    """The lines ``% keyword value`` at the beginning of a RAW or DAT file.
-
-    Attributes:
-        fields: values by keyword in lower case.
-        end: number of bytes before the events.
-    """
+    """The values by lower-case keyword of the lines ``% keyword value`` that begin a RAW or DAT file, and their end."""
 
     fields: dict[str, str]
     end: int

@@ -41,20 +41,15 @@ def poses_from_quaternions(source: Path, positions: NDArray[np.float64], quatern
     Raises:
         DataError: a value is not finite, or a quaternion is not of unit length.
     """
-    bad = ~(np.isfinite(positions).all(1) & np.isfinite(quaternions).all(1))
-    if bad.any():
-        index = int(np.argmax(bad))
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(quaternions, axis=1)
+    # NaN compares as false.
+    good = np.isfinite(positions).all(1) & (np.abs(norms - 1) <= _MAX_NORM_ERROR)
+    if not good.all():
+        index = int(np.argmin(good))
         values = " ".join(f"{value:g}" for value in (*positions[index], *quaternions[index]))
-        raise DataError(source, f"pose {index} holds {values}", "drop poses that are not finite")
-    norms = np.linalg.norm(quaternions, axis=1)
-    bad = np.abs(norms - 1) > _MAX_NORM_ERROR
-    if bad.any():
-        index = int(np.argmax(bad))
-        raise DataError(
-            source,
-            f"the quaternion of pose {index} has length {norms[index]:.6g}",
-            "write unit quaternions in the order qx qy qz qw",
-        )
+        remedy = "write finite positions and unit quaternions, in the order qx qy qz qw"
+        raise DataError(source, f"pose {index} holds {values}", remedy)
     rotations = rotation_from_quaternion(torch.from_numpy(quaternions / norms[:, None]))
     return homogeneous(torch.cat([rotations, torch.from_numpy(positions[:, :, None])], -1))
 

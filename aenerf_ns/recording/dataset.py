@@ -132,7 +132,7 @@ class EventDataset(InputDataset):
         return PolaritySums(self.scene.camera_times.tolist(), half)
 
     def _chunks(self, count: int | None) -> Iterable[EventStream]:
-        """Return the events in pieces, with a progress bar towards their number, if that is known."""
+        """Read the events in pieces, with a progress bar towards their number, if that is known."""
         events = self.scene.event_file
         return tracked(events.chunks(), f"Reading {events.path.name}", count)
 

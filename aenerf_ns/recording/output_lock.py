@@ -19,13 +19,10 @@ _NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP}
 
 
 class OutputLock:
-    """Keep an output that does not exist yet to this process. Use it as a context manager.
+    """Keep a folder that does not exist yet to this process. Use it as a context manager.
 
     The lock is a file beside the output, which names its owner. The system releases it when the owner ends, in whatever
     way. A file that a killed owner left locks nothing, and the next owner takes it over.
-
-    Args:
-        output: the folder that will be written.
 
     Raises:
         DataError: the output exists, another process holds the lock, or the file cannot be written.

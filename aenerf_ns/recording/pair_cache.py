@@ -31,15 +31,11 @@ _NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "in
 
 
 class PairFile:
-    """Keep the pairs of an event file in a file beside it.
+    """Keep the pairs of an event file, or of a folder of event files, in a file beside it.
 
     The file holds the rows of :class:`~aenerf_ns.events.pair_store.EventPairs`, then ``replacement_rows``,
-    ``block_ends`` and the pictures, all as they are in memory, then a description as JSON. It is written under another
-    name, and renamed when it is whole.
-
-    Args:
-        events: the event file, or folder of event files.
-        made_from: what the pairs depend on besides the event file, as JSON can hold it.
+    ``block_ends`` and the pictures, all as they are in memory, then a description as JSON, with what the pairs depend
+    on besides the events (``made_from``). It is written under another name, and renamed when it is whole.
     """
 
     def __init__(self, events: EventFile, made_from: Mapping[str, Any]) -> None:
