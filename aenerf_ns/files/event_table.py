@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, KeysView, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,9 +39,9 @@ class EventLayout:
     time_offset: str | None = None
 
     @property
-    def arrays(self) -> set[str]:
-        """Names of the arrays that hold columns."""
-        return {name for name, _ in self.columns.values()}
+    def arrays(self) -> KeysView[str]:
+        """Names of the arrays that hold columns, each once."""
+        return dict.fromkeys(name for name, _ in self.columns.values()).keys()
 
 
 class EventTableFile(EventReader):

@@ -11,25 +11,24 @@ import pytest
 
 from helpers.event_file_writers import HEIGHT, WIDTH, Rows, evt3_words
 
-_ARRAY_DEFINITION = """std_msgs/Header header
-uint32 height
-uint32 width
-dvs_msgs/Event[] events
-================================================================================
+_HEADER_DEFINITION = f"""{"=" * 80}
 MSG: std_msgs/Header
 uint32 seq
 time stamp
 string frame_id
-================================================================================
+"""
+_ARRAY_DEFINITION = f"""std_msgs/Header header
+uint32 height
+uint32 width
+dvs_msgs/Event[] events
+{_HEADER_DEFINITION}{"=" * 80}
 MSG: dvs_msgs/Event
 uint16 x
 uint16 y
 time ts
 bool polarity
 """
-
-
-_PACKET_DEFINITION = """std_msgs/Header header
+_PACKET_DEFINITION = f"""std_msgs/Header header
 uint32 height
 uint32 width
 uint64 seq
@@ -37,17 +36,8 @@ uint64 time_base
 string encoding
 bool is_bigendian
 uint8[] events
-================================================================================
-MSG: std_msgs/Header
-uint32 seq
-time stamp
-string frame_id
-"""
-
-
+{_HEADER_DEFINITION}"""
 ARRAY, PACKET = "dvs_msgs/msg/EventArray", "event_camera_msgs/msg/EventPacket"
-
-
 # The clock of ROS.
 START = 1_600_000_000_000_000_000
 
