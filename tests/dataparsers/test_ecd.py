@@ -37,13 +37,13 @@ def test_guessed_size_can_be_given(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_ecd_text_reads(tmp_path: Path) -> None:
     config = EcdDataParserConfig(data=write_ecd(tmp_path / "made"))
     dataset = EventDataset(parse(config))
-    camera = dataset.metadata[SCENE_KEY].event_camera
+    camera = dataset.scene.event_camera
     # The format counts the principal point from the center of the first pixel.
     assert (camera.width, camera.height, camera.cx, camera.cy) == (6, 4, 3.0, 2.0)
-    (chunk,) = dataset.metadata[SCENE_KEY].event_file.chunks()
+    (chunk,) = dataset.scene.event_file.chunks()
     assert chunk.t.tolist() == [10_000_000, 20_000_000, 30_000_000, 310_000_000]
     assert chunk.p.tolist() == [1, -1, 1, 1]
-    assert dataset.metadata[SCENE_KEY].window == TimeWindow(10_000_000, 310_000_000)
+    assert dataset.scene.window == TimeWindow(10_000_000, 310_000_000)
     assert [pair[3] for pair in unpacked(dataset.pairs)] == [20_000_000, 310_000_000]
     # Images at 0.05 and 0.25 s validate, 0.15 s tests, 0.35 s is after the last event.
     assert len(parse(config, "val").image_filenames) == 2
@@ -57,21 +57,20 @@ def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     write_tum_trajectory(tmp_path / "other.txt", other)
     config = EcdDataParserConfig(data=folder, trajectory=tmp_path / "other.txt")
     outputs, as_given = parse(config), parse(EcdDataParserConfig(data=folder))
+    scene = outputs.metadata[SCENE_KEY]
     assert as_given.metadata[SCENE_KEY].ground_truth is None
     # In the scene's frame, which follows from the estimated poses; images have true ones.
     to_scene = homogeneous(outputs.dataparser_transform.double())
     for name, poses in (("ground_truth", truth), ("trajectory", other)):
-        times = getattr(outputs.metadata[SCENE_KEY], name).times
+        times = getattr(scene, name).times
         expected = to_scene @ homogeneous(poses.interpolate(times)) @ OPENCV_TO_OPENGL
-        torch.testing.assert_close(
-            getattr(outputs.metadata[SCENE_KEY], name).camera_to_worlds, expected[:, :3], rtol=0, atol=1e-6
-        )
+        torch.testing.assert_close(getattr(scene, name).camera_to_worlds, expected[:, :3], rtol=0, atol=1e-6)
     views = parse(config, "test").cameras
     expected = to_scene @ homogeneous(truth.interpolate([150_000_000])) @ OPENCV_TO_OPENGL
     torch.testing.assert_close(views.camera_to_worlds, expected[:, :3].float(), rtol=0, atol=1e-6)
     assert views.metadata is not None
     taken = views.metadata[REFERENCE_SECONDS][0, 0].item()
-    assert taken == pytest.approx(0.15 - 1e-9 * outputs.metadata[SCENE_KEY].trajectory.start)
+    assert taken == pytest.approx(0.15 - 1e-9 * scene.trajectory.start)
 
 
 def test_read_the_real_recording(slider_depth: Path) -> None:
@@ -80,11 +79,11 @@ def test_read_the_real_recording(slider_depth: Path) -> None:
     pairs = dataset.pairs
     assert pairs.num_events == 50_000
     # The first pose is at 0.0223 s, the events begin at 0.0038 s.
-    assert dataset.metadata[SCENE_KEY].window == TimeWindow(22_291_582, 174_156_000)
+    assert dataset.scene.window == TimeWindow(22_291_582, 174_156_000)
     assert pairs.num_outside == 3_251
     assert len(pairs) + pairs.num_first + pairs.num_outside + pairs.num_merged == 50_000
     assert len(parse(config, "test").image_filenames) == 2
     # A linear slider: straight on, no turn.
-    poses = dataset.metadata[SCENE_KEY].trajectory.camera_to_worlds
+    poses = dataset.scene.trajectory.camera_to_worlds
     assert (poses[:, :, :3] - poses[:1, :, :3]).abs().max() < 1e-6
     assert torch.linalg.matrix_rank(poses[1:, :, 3] - poses[0, :, 3], atol=1e-4) == 1

@@ -24,16 +24,13 @@ from aenerf_ns.recording.scene import SCENE_KEY
 
 def test_written_dataset_reads_back(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
-    outputs = parse(NativeDataParserConfig(data=folder, **AS_RECORDED))
-    metadata = outputs.metadata
-    assert metadata[SCENE_KEY].event_camera == CAMERA
-    assert metadata[SCENE_KEY].sensor == SENSOR
-    assert metadata[SCENE_KEY].image_encoding == "srgb"
-    assert not metadata[SCENE_KEY].bounded
+    scene = parse(NativeDataParserConfig(data=folder, **AS_RECORDED)).metadata[SCENE_KEY]
+    assert (scene.event_camera, scene.sensor, scene.image_encoding) == (CAMERA, SENSOR, "srgb")
+    assert not scene.bounded
     expected = make_trajectory()
-    assert torch.equal(metadata[SCENE_KEY].trajectory.times, expected.times)
+    assert torch.equal(scene.trajectory.times, expected.times)
     torch.testing.assert_close(
-        metadata[SCENE_KEY].trajectory.camera_to_worlds,
+        scene.trajectory.camera_to_worlds,
         (homogeneous(expected.camera_to_worlds) @ OPENCV_TO_OPENGL)[:, :3],
         rtol=0,
         atol=1e-11,
@@ -41,9 +38,9 @@ def test_written_dataset_reads_back(tmp_path: Path) -> None:
     for split, values in (("val", [77]), ("test", [78, 79])):
         dataset = EventDataset(parse(NativeDataParserConfig(data=folder), split))
         assert [int(dataset.get_numpy_image(i)[0, 0, 0]) for i in range(len(dataset))] == values
-    events = list(metadata[SCENE_KEY].event_file.chunks())
-    assert sum(map(len, events)) == metadata[SCENE_KEY].event_file.count() == 200
-    assert metadata[SCENE_KEY].event_file.time_span() == (events[0].t[0], events[-1].t[-1])
+    events = list(scene.event_file.chunks())
+    assert sum(map(len, events)) == scene.event_file.count() == 200
+    assert scene.event_file.time_span() == (events[0].t[0], events[-1].t[-1])
 
 
 def test_frame_without_pose_gets_that_of_its_time(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -41,16 +40,16 @@ def test_own_recordings_have_views_at_their_times(tmp_path: Path) -> None:
 def test_own_recording_from_files_anywhere(tmp_path: Path) -> None:
     truth = write_own(tmp_path / "made")
     (tmp_path / "parts").mkdir()
-    renamed = {"events": "record.hdf5", "calibration": "cameras.json", "poses": "mocap.txt", "images": "stamps.txt"}
-    for name, new in (
-        ("events.h5", "record.hdf5"),
-        ("calibration.json", "cameras.json"),
-        ("trajectory.txt", "mocap.txt"),
-    ):
-        (truth.data / name).rename(tmp_path / "parts" / new)
-    shutil.move(truth.data / "images", tmp_path / "parts" / "images")
-    (truth.data / "images.txt").rename(tmp_path / "parts" / "stamps.txt")
-    options = {name: tmp_path / "parts" / new for name, new in renamed.items()}
+    names = {
+        "events": "events.h5",
+        "calibration": "calibration.json",
+        "poses": "trajectory.txt",
+        "images": "images.txt",
+    }
+    for option, name in names.items():
+        (truth.data / name).rename(tmp_path / "parts" / f"{option}_mine{Path(name).suffix}")
+    (truth.data / "images").rename(tmp_path / "parts" / "images")
+    options = {option: tmp_path / "parts" / f"{option}_mine{Path(name).suffix}" for option, name in names.items()}
     recording = recording_of(OwnRecordingDataParserConfig(data=tmp_path / "parts", **options))
     assert_same_poses(recording.trajectory.camera_to_worlds, truth.poses)
     assert len(recording.reference_views["train"]) == 3
@@ -74,9 +73,8 @@ def test_camchain_places_both_cameras(tmp_path: Path) -> None:
     # And the other way round.
     recording = recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam0", frame_camera="cam1"))
     expected = truth.poses[5] @ np.linalg.inv(make_poses(3)[2])
-    np.testing.assert_allclose(
-        recording.reference_views["train"][1].camera_to_world.numpy(), expected, rtol=0, atol=1e-9
-    )
+    view = recording.reference_views["train"][1]
+    np.testing.assert_allclose(view.camera_to_world.numpy(), expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("place", ["colmap", "colmap/sparse/0"])

@@ -50,7 +50,7 @@ def test_scene_box_sets_scale_and_bounds(tmp_path: Path) -> None:
 
 def test_training_cameras_show_images_or_events(tmp_path: Path) -> None:
     dataset = EventDataset(parse(NativeDataParserConfig(data=write_native(tmp_path / "made"))))
-    has_image = dataset.metadata[SCENE_KEY].has_image
+    has_image = dataset.scene.has_image
     # The 21 knots, two of them image times, and one image between two knots.
     assert len(dataset) == 22
     assert [i for i, image in enumerate(has_image) if image] == [0, 2, 21]
@@ -64,9 +64,9 @@ def test_time_window_leaves_out_the_rest(tmp_path: Path) -> None:
     folder = write_native(tmp_path / "made")
     start, end = START + 500_000_000, START + 1_050_000_000
     dataset = EventDataset(parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end)))
-    trajectory = dataset.metadata[SCENE_KEY].trajectory
+    trajectory = dataset.scene.trajectory
     assert (trajectory.start, trajectory.end) == (start, START + 1_100_000_000)
-    assert not any(dataset.metadata[SCENE_KEY].has_image)
+    assert not any(dataset.scene.has_image)
     intervals = [pair[2:4] for pair in unpacked(dataset.pairs)]
     assert min(begin for begin, _ in intervals) >= start
     assert max(last for _, last in intervals) <= end
