@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import fields
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -143,13 +144,34 @@ def test_broken_file_is_made_again(
     assert (data / KEPT).read_bytes() == content
 
 
-def test_interruption_leaves_no_file(data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("error", "raised", "message"),
+    [
+        (KeyboardInterrupt(), KeyboardInterrupt, ""),
+        (OSError(28, "No space left on device"), DataError, "events.h5.pairs: the disk is full; free some of it"),
+    ],
+)
+def test_failure_leaves_no_file(
+    error: BaseException,
+    raised: type[BaseException],
+    message: str,
+    data: Path,
+    long_recording: list[Path],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     # As if an earlier process had been killed.
     (data / (KEPT + ".part")).write_bytes(b"half")
+    read = Hdf5EventFile.read_chunks
+
+    def fail(self: Hdf5EventFile) -> Iterator[EventStream]:
+        yield from islice(read(self), 5)
+        raise error
+
     with monkeypatch.context() as patch:
-        patch.setattr(pairing._Table, "_merge", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
+        patch.setattr(Hdf5EventFile, "read_chunks", fail)
+        with pytest.raises(raised) as caught:
             _ = opened(data).pairs
+    assert message in str(caught.value)
     assert [path.name for path in data.glob("events*")] == ["events.h5"]
     assert len(opened(data).pairs) > 100
     assert sorted(path.name for path in data.glob("events*")) == ["events.h5", KEPT]
@@ -172,16 +194,6 @@ def test_unwritable_folder_is_left_alone(
     assert [path.name for path in data.glob("events*")] == ["events.h5"]
     assert_same(opened(data).pairs, first)
     assert len(long_recording) == 2
-
-
-def test_full_disk_is_one_line(data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(pairing._Table, "_merge", full)
-    with pytest.raises(DataError, match=r"events.h5.pairs: the disk is full; free some of it: .*16 bytes an event"):
-        _ = opened(data).pairs
-    assert [path.name for path in data.glob("events*")] == ["events.h5"]
 
 
 def test_short_recording_removes_the_file(
