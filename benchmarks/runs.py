@@ -45,16 +45,9 @@ def die_with_parent(command: Sequence[str]) -> list[str]:
 
 
 def run_command(command: Sequence[str], log: Path, folder: Path = Path(), **variables: str) -> float:
-    """Run a command.
+    """Run a command in a folder, with more environment variables, and return its seconds of wall-clock time.
 
-    Args:
-        command: a program and its arguments.
-        log: file that its output is added to.
-        folder: working directory of the command.
-        variables: more environment variables.
-
-    Returns:
-        Seconds of wall-clock time.
+    Its output is added to the file ``log``.
 
     Raises:
         DataError: the command failed.
@@ -104,11 +97,7 @@ def make_dataset(
 ) -> Path:
     """Make a dataset by a command of aenerf, unless it has been made, and return its folder.
 
-    Args:
-        folder: of the dataset. If another process is making it, this one waits.
-        log, work, variables: see :func:`run_command`.
-        command: of aenerf.
-        arguments: of the command, without the output.
+    If another process is making it, this one waits. For the other arguments see :func:`run_command`.
 
     Raises:
         DataError: the command failed.
@@ -121,18 +110,9 @@ def make_dataset(
 
 
 def train(folder: Path, name: str, method: str, steps: int, options: Sequence[str], data: Sequence[str]) -> float:
-    """Train with ns-train, on a GPU where there is one.
+    """Train with ns-train, on a GPU where there is one, and return the seconds of wall-clock time.
 
-    Args:
-        folder: working directory; the run lands in ``outputs/NAME`` there.
-        name: of the experiment.
-        method: registered method.
-        steps: number of training steps.
-        options: more options of ns-train.
-        data: the last arguments, which name the dataset and, where needed, its format.
-
-    Returns:
-        Seconds of wall-clock time.
+    The run lands in ``outputs/NAME`` in the folder. ``data`` are the last arguments of ns-train.
     """
     device = "cuda" if torch.cuda.is_available() else "cpu"
     return run_script(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,14 +12,14 @@ from aenerf_ns.cli.termination import sigterm_as_system_exit
 from aenerf_ns.errors import DataError
 from aenerf_ns.progress import progress_bar
 from benchmarks.paper.figures import draw
-from benchmarks.paper.plan import Method, Poses, Run, Scale, Table, plan
+from benchmarks.paper.plan import Plan, Run
 from benchmarks.paper.running import Runner
 from benchmarks.paper.tables import report
 from benchmarks.runs import exclusive, run_benchmark
 
 
-@dataclass
-class Bench:
+@dataclass(kw_only=True)
+class Bench(Plan):
     """Simulate, train and evaluate scenes x speeds x methods x seeds, and write tables and figures.
 
     Stop the command at any time and repeat it: finished runs are kept. Several processes can work on one folder: start
@@ -29,29 +28,6 @@ class Bench:
 
     output: Path
     """Folder of the benchmark."""
-    scale: Scale = "full"
-    """full: 346 x 260 pixels with aenerf. tiny, for a CPU: 96 x 72 pixels with aenerf-small."""
-    scenes: tuple[str, ...] = ("room", "object")
-    """Scenes as aenerf simulate takes them: built-in ones and files."""
-    speeds: tuple[Literal["easy", "hard"], ...] = ("easy", "hard")
-    """Constant speed, and 8^sin(2 pi t) times that speed."""
-    poses: Poses = "noise"
-    """Where the estimated poses come from: true poses with noise, or COLMAP."""
-    tables: tuple[Table, ...] = ("methods", "losses")
-    """Methods (the paper's tables 1 and 3), losses (its table 4)."""
-    methods: tuple[Method, ...] = ("aenerf", "nerfacto")
-    """Whose rows the table of methods has. A method of another paper has three: on estimated poses, on these with our
-    pose correction, and on true poses."""
-    e2vid_weights: Path | None = None
-    """Weights file of E2VID, which makes the images of e2vid-nerf. Without it the high-pass filter makes them."""
-    seeds: tuple[int, ...] = (42,)
-    """Seeds of the trainings."""
-    steps: int | None = None
-    """Steps of every training. By default 30,000 at full scale and 1500 at tiny scale."""
-    simulate: str = ""
-    """More options of aenerf simulate, as in --simulate="--bayer-pattern RGGB"."""
-    train: str = ""
-    """More options of the trainings of all methods but nerfacto."""
     device: Literal["cuda", "cpu"] = "cuda"
     """Where to train."""
 
@@ -61,10 +37,7 @@ class Bench:
         Raises:
             DataError: two scenes have one name, or some runs failed.
         """
-        runs = plan(
-            self.scenes, self.speeds, self.poses, self.tables, self.seeds, self.scale, self.steps,
-            shlex.split(self.simulate), shlex.split(self.train), self.methods, self.e2vid_weights,
-        )  # fmt: skip
+        runs = self.runs()
         runner = Runner(self.output, self.device)
         # The exception reaches the command that is running, which is then ended too.
         with sigterm_as_system_exit():

@@ -22,7 +22,7 @@ _MAX_COLUMNS = 7
 
 
 def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]]) -> list[Path]:
-    """Draw the figures of the runs that have been made into ``folder / "figures"``.
+    """Draw the figures of the runs that have been made into ``folder / "figures"``, and return their files.
 
     Each kind of figure is drawn for every scene, speed and table. One more figure has a view of every scene.
 
@@ -30,9 +30,6 @@ def draw(folder: Path, runs: Sequence[Run], figures: Mapping[str, dict[str, Any]
         folder: of the benchmark.
         runs: all runs.
         figures: results of the runs that have been made, by the name of the run.
-
-    Returns:
-        The files that were drawn.
     """
     output = folder / "figures"
     output.mkdir(exist_ok=True)
@@ -96,10 +93,7 @@ def _view(folder: Path, run: Run) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 def _grid(columns: Mapping[str, Sequence[NDArray[np.uint8]]]) -> Image.Image:
-    """Return a picture of columns of equally large pictures, with the names of the columns above.
-
-    The columns stand in bands of at most :data:`_MAX_COLUMNS`, one below another.
-    """
+    """Lay out columns of equally large pictures below their names, in bands of at most :data:`_MAX_COLUMNS`."""
     height, width = next(iter(columns.values()))[0].shape[:2]
     factor = -(-_MIN_WIDTH // width)
     height, width = factor * height, factor * width
@@ -120,10 +114,7 @@ def _grid(columns: Mapping[str, Sequence[NDArray[np.uint8]]]) -> Image.Image:
 
 
 def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an (H, W, 3) picture of the absolute error, averaged over the channels.
-
-    Black is no error. White is a quarter of the range of display values or more.
-    """
+    """Return an (H, W, 3) picture of the mean absolute error: black for none, white for a quarter of the range."""
     from matplotlib import colormaps
 
     error = np.abs(rendered.astype(np.float64) - truth).mean(-1) / 255

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,7 +112,7 @@ class Run:
     """A training and its evaluation.
 
     Attributes:
-        table: the table that the run is a row of.
+        table: the table that the run is a row of: a `Table`, or that of another benchmark.
         row: name of the row.
         dataset: to train and evaluate on.
         method: registered method.
@@ -121,7 +122,7 @@ class Run:
         images: options of aenerf reconstruct, where the run trains on images made by it.
     """
 
-    table: Table
+    table: str
     row: str
     dataset: Dataset
     method: str
@@ -143,83 +144,91 @@ class Run:
         return f"{scene_name(self.dataset.scene)}_{self.dataset.speed}_{row}_seed{self.seed}_{unique}"
 
 
-def plan(
-    scenes: Sequence[str],
-    speeds: Sequence[str],
-    poses: Poses,
-    tables: Sequence[Table],
-    seeds: Sequence[int],
-    scale: Scale,
-    steps: int | None = None,
-    simulate: Sequence[str] = (),
-    train: Sequence[str] = (),
-    methods: Sequence[Method] = ("aenerf", "nerfacto"),
-    e2vid_weights: Path | None = None,
-) -> list[Run]:
-    """Return all runs, in the order in which they are made.
+@dataclass(kw_only=True)
+class Plan:
+    """Scenes x speeds x methods x seeds."""
 
-    Args:
-        scenes: names or files, as aenerf simulate takes them.
-        speeds: "easy" and "hard".
-        poses: where the estimated poses come from.
-        tables: "methods" for the paper's tables 1 and 3; "losses" for its table 4, at hard speed only.
-        seeds: of the trainings.
-        scale: "full" or, for a CPU, "tiny".
-        steps: of every training; 30,000 or 1500 by default.
-        simulate: more options of aenerf simulate.
-        train: more options of the trainings of all methods but nerfacto.
-        methods: whose rows the table of methods has.
-        e2vid_weights: weights file of E2VID; without it the high-pass filter makes the images of e2vid-nerf.
+    scale: Scale = "full"
+    """full: 346 x 260 pixels with aenerf. tiny, for a CPU: 96 x 72 pixels with aenerf-small."""
+    scenes: tuple[str, ...] = ("room", "object")
+    """Scenes as aenerf simulate takes them: built-in ones and files."""
+    speeds: tuple[Literal["easy", "hard"], ...] = ("easy", "hard")
+    """Constant speed, and 8^sin(2 pi t) times that speed."""
+    poses: Poses = "noise"
+    """Where the estimated poses come from: true poses with noise, or COLMAP."""
+    tables: tuple[Table, ...] = ("methods", "losses")
+    """Methods (the paper's tables 1 and 3), losses (its table 4, at hard speed only)."""
+    methods: tuple[Method, ...] = ("aenerf", "nerfacto")
+    """Whose rows the table of methods has. A method of another paper has three: on estimated poses, on these with our
+    pose correction, and on true poses."""
+    e2vid_weights: Path | None = None
+    """Weights file of E2VID, which makes the images of e2vid-nerf. Without it the high-pass filter makes them."""
+    seeds: tuple[int, ...] = (42,)
+    """Seeds of the trainings."""
+    steps: int | None = None
+    """Steps of every training. By default 30,000 at full scale and 1500 at tiny scale."""
+    simulate: str = ""
+    """More options of aenerf simulate, as in --simulate="--bayer-pattern RGGB"."""
+    train: str = ""
+    """More options of the trainings of all methods but nerfacto."""
 
-    Raises:
-        DataError: two scenes have one name.
-    """
-    for scene in scenes:
-        if [scene_name(other) for other in scenes].count(scene_name(scene)) > 1:
-            raise DataError("--scenes", f"two scenes have the name {scene_name(scene)}", "give one another folder")
+    def runs(self) -> list[Run]:
+        """Return all runs, in the order in which they are made.
 
-    def dataset(scene: str, speed: str) -> Dataset:
-        estimated = _NOISE[scale] if poses == "noise" else ("--poses", "colmap")
+        Raises:
+            DataError: two scenes have one name.
+        """
+        names = [scene_name(scene) for scene in self.scenes]
+        for name in names:
+            if names.count(name) > 1:
+                raise DataError("--scenes", f"two scenes have the name {name}", "give one another folder")
+        steps = _STEPS[self.scale] if self.steps is None else self.steps
+        runs: list[Run] = []
+        for seed in self.seeds:
+            for scene in self.scenes:
+                for speed in self.speeds if "methods" in self.tables else ():
+                    runs += [
+                        Run("methods", row, self._dataset(scene, speed), name, steps, seed, options, images)
+                        for method in self.methods
+                        for row, (name, options, images) in self._rows_of(method).items()
+                    ]
+                if "losses" in self.tables:
+                    data, name = self._dataset(scene, "hard"), self._registered("aenerf")
+                    for row, weights in LOSSES.items():
+                        rays = (3 if weights["temporal-loss"] else 2) * _PAIRS[self.scale]
+                        options = ["--pipeline.datamanager.train-num-rays-per-batch", str(rays)]
+                        for loss, weight in weights.items():
+                            options += [f"--pipeline.model.loss-coefficients.{loss}", str(weight)]
+                        runs.append(Run("losses", row, data, name, steps, seed, (*shlex.split(self.train), *options)))
+        return runs
+
+    def _dataset(self, scene: str, speed: str) -> Dataset:
+        estimated = _NOISE[self.scale] if self.poses == "noise" else ("--poses", "colmap")
         # Otherwise all paths of one duration would have the same errors, and a mean over scenes would hold one draw.
         seed = str(int(digest((scene_name(scene), speed)), 16))
-        return Dataset(scene, speed, poses, (*_SIMULATE[scale], "--seed", seed, *estimated, *simulate))
+        options = (*_SIMULATE[self.scale], "--seed", seed, *estimated, *shlex.split(self.simulate))
+        return Dataset(scene, speed, self.poses, options)
 
-    length, runs = _STEPS[scale] if steps is None else steps, []
-    end = "-small" if scale == "tiny" else ""
-    images: tuple[str, ...] = ("--method", "high-pass")
-    if e2vid_weights is not None:
-        images = ("--method", "e2vid", "--weights", str(e2vid_weights.resolve()))
+    def _registered(self, method: Method) -> str:
+        return f"{method}-small" if self.scale == "tiny" else method
 
-    def rows_of(method: Method) -> dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]]:
+    def _rows_of(self, method: Method) -> dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]]:
         """Return method, options of ns-train and options of aenerf reconstruct by row."""
         if method == "nerfacto":
-            return {CEILING: (method, _SMALL_NERFACTO if scale == "tiny" else (), ())}
+            return {CEILING: (method, _SMALL_NERFACTO if self.scale == "tiny" else (), ())}
+        train = tuple(shlex.split(self.train))
         off, spline = (*train, *_OFF), (*train, *_SPLINE)
+        images: tuple[str, ...] = ()
         if method == "aenerf":
-            options = {OURS: tuple(train), WITHOUT_CORRECTION: off, TRUE_POSES: off}
-            return {row: (method + end, words, ()) for row, words in options.items()}
-        of_images = images if method == "e2vid-nerf" else ()
-        name = HIGH_PASS if of_images and e2vid_weights is None else PEERS[method]
-        options = {name: off, name + CORRECTED: spline, name + ON_TRUE_POSES: off}
-        return {row: (method + end, words, of_images) for row, words in options.items()}
-
-    for seed in seeds:
-        for scene in scenes:
-            for speed in speeds if "methods" in tables else ():
-                runs += [
-                    Run("methods", row, dataset(scene, speed), name, length, seed, options, of_images)
-                    for method in methods
-                    for row, (name, options, of_images) in rows_of(method).items()
-                ]
-            if "losses" in tables:
-                data = dataset(scene, "hard")
-                for row, weights in LOSSES.items():
-                    rays = (3 if weights["temporal-loss"] else 2) * _PAIRS[scale]
-                    options = ["--pipeline.datamanager.train-num-rays-per-batch", str(rays)]
-                    for loss, weight in weights.items():
-                        options += [f"--pipeline.model.loss-coefficients.{loss}", str(weight)]
-                    runs.append(Run("losses", row, data, f"aenerf{end}", length, seed, (*train, *options)))
-    return runs
+            options = {OURS: train, WITHOUT_CORRECTION: off, TRUE_POSES: off}
+        else:
+            name = PEERS[method]
+            if method == "e2vid-nerf" and self.e2vid_weights is None:
+                name, images = HIGH_PASS, ("--method", "high-pass")
+            elif method == "e2vid-nerf":
+                images = ("--method", "e2vid", "--weights", str(self.e2vid_weights.resolve()))
+            options = {name: off, name + CORRECTED: spline, name + ON_TRUE_POSES: off}
+        return {row: (self._registered(method), words, images) for row, words in options.items()}
 
 
 def scene_name(scene: str) -> str:

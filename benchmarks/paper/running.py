@@ -41,12 +41,7 @@ _WORKER = (sys.executable, str(Path(__file__).with_name("worker.py")))
 
 
 class Runner:
-    """Make runs in a folder.
-
-    Args:
-        folder: of the benchmark.
-        device: "cuda" or "cpu".
-    """
+    """Make runs in the folder of a benchmark, on the device "cuda" or "cpu"."""
 
     def __init__(self, folder: Path, device: str) -> None:
         self._folder = folder

@@ -54,7 +54,7 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
         figures: of the runs that have been made.
         missing: names of the other runs with the reason, which is empty for runs that were not tried.
     """
-    methods, losses = ([one for one in figures if one["table"] == table] for table in ("methods", "losses"))
+    methods, losses = ([run for run in figures if run["table"] == table] for table in ("methods", "losses"))
     parts = ["# Benchmark", _conditions(figures), _TEST_POSES]
     if missing:
         parts.append(f"**Not complete:** {len(missing)} of {len(missing) + len(figures)} runs are missing.")
@@ -64,7 +64,7 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
             "Means over what all methods of a column have in common.",
             methods_table(methods),
         ]
-    if any(one["row"] not in _OWN_ROWS for one in methods):
+    if any(run["row"] not in _OWN_ROWS for run in methods):
         parts += ["## Methods of other papers", *peers_parts(methods)]
     if _of(methods, row=OURS):
         parts += [
@@ -77,7 +77,7 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
         parts += ["## Losses (the paper's table 4), hard speed", losses_table(losses)]
     if figures:
         parts += ["## Every scene", scenes_table(figures)]
-    sequences = {(one["scene"], one["speed"]): one for one in figures if one["poses_report"]}
+    sequences = {(run["scene"], run["speed"]): run for run in figures if run["poses_report"]}
     if sequences:
         parts += ["## Poses from COLMAP", sequences_table(list(sequences.values()))]
     if missing:
@@ -97,7 +97,7 @@ def methods_table(figures: Sequence[Figures]) -> str:
     header, rows = ["method"], [[row] for row in (*peers, *_OWN_ROWS) if _of(figures, row=row)]
     for kind, speed in columns:
         common = _common(_of(figures, kind=kind, speed=speed))
-        count = len({one["scene"] for one in common})
+        count = len({run["scene"] for run in common})
         header += [f"{count} {kind} scenes, {speed}: {metric.upper()}" for metric in _METRICS]
         for row in rows:
             row += [_mean(_of(common, row=row[0]), metric) for metric in _METRICS]
@@ -123,7 +123,7 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
             "are a filter's and not a network's."
         )
     for (kind, speed), paper in _PAPER.items():
-        common = _common([one for one in _of(figures, kind=kind, speed=speed) if one["row"] != CEILING])
+        common = _common([run for run in _of(figures, kind=kind, speed=speed) if run["row"] != CEILING])
         if not common:
             continue
         published = {name: value for name, value in zip((*PEERS.values(), _AE_NERF), paper, strict=True) if value}
@@ -139,11 +139,11 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
         for setting, (peers_column, own_column) in _ORDERS.items():
             wanted = {name: _ROWS_OF[name][own_column if name == _AE_NERF else peers_column] for name in named}
             found = {name: some for name, row in wanted.items() if (some := _of(common, row=row))}
-            means = {name: fmean(one["results"]["psnr"] for one in some) for name, some in found.items()}
+            means = {name: fmean(run["results"]["psnr"] for run in some) for name, some in found.items()}
             if len(means) > 1:
                 orders.append(f"- here, {setting}: {_order(means)}")
         parts += [
-            f"### Scenes of kind {kind}: {len({one['scene'] for one in common})}, {speed} speed",
+            f"### Scenes of kind {kind}: {len({run['scene'] for run in common})}, {speed} speed",
             _markdown(["method", "the paper", *_SETTINGS], rows),
             "Order by PSNR with placed test poses:",
             "\n".join(orders),
@@ -160,13 +160,13 @@ def _mean_and_spread(figures: Sequence[Figures]) -> str:
     if not figures:
         return "-"
     parts = []
-    for results in ([one["results"] for one in figures], [one["results"].get("refined_test_poses") for one in figures]):
+    for results in ([run["results"] for run in figures], [run["results"].get("refined_test_poses") for run in figures]):
         if None in results:
             parts.append("-")
             continue
         by_seed: dict[int, list[float]] = {}
-        for one, result in zip(figures, results, strict=True):
-            by_seed.setdefault(one["seed"], []).append(result["psnr"])
+        for run, result in zip(figures, results, strict=True):
+            by_seed.setdefault(run["seed"], []).append(result["psnr"])
         means = [fmean(values) for values in by_seed.values()]
         parts.append(f"{fmean(means):.2f}" + (f" ± {stdev(means):.2f}" if len(means) > 1 else ""))
     return " / ".join(parts)
@@ -180,7 +180,7 @@ def poses_table(figures: Sequence[Figures]) -> str:
     rows = []
     for name, key in (("RE", "rotation_error_degrees"), ("TE", "translation_error_percent")):
         cells = [
-            f"{fmean(one['results']['pose_errors'][which][key] for one in _of(corrected, speed=speed)):.3f}"
+            f"{fmean(run['results']['pose_errors'][which][key] for run in _of(corrected, speed=speed)):.3f}"
             for speed in speeds
             for which in ("corrected", "estimated")
         ]
@@ -200,13 +200,13 @@ def scenes_table(figures: Sequence[Figures]) -> str:
     errors_of_poses = ("RE before", "RE after", "TE before", "TE after")
     header = ["scene", "speed", "row", "seeds", *map(str.upper, _METRICS), *errors_of_poses]
     rows = []
-    for scene, speed, row in dict.fromkeys((one["scene"], one["speed"], one["row"]) for one in figures):
+    for scene, speed, row in dict.fromkeys((run["scene"], run["speed"], run["row"]) for run in figures):
         some = _of(figures, scene=scene, speed=speed, row=row)
         cells = [_mean(some, metric) for metric in _METRICS]
         if len(some) > 1:
             placed, refined = cells[0].split(" / ")
-            cells[0] = f"{placed} ± {stdev(one['results']['psnr'] for one in some):.2f} / {refined}"
-        errors = [one["results"].get("pose_errors") for one in some]
+            cells[0] = f"{placed} ± {stdev(run['results']['psnr'] for run in some):.2f} / {refined}"
+        errors = [run["results"].get("pose_errors") for run in some]
         poses = [
             f"{fmean(error[which][key] for error in errors):.3f}{unit}" if all(errors) else "n/a"
             for key, unit in (("rotation_error_degrees", "°"), ("translation_error_percent", " %"))
@@ -220,36 +220,36 @@ def sequences_table(figures: Sequence[Figures]) -> str:
     """Return COLMAP's mean errors on each sequence, at the frames and between them, given one run of each sequence."""
     header = ["scene", "speed", "frames", "registered", "misplaced", "RE", "TE", "RE between", "TE between"]
     rows = []
-    for one in figures:
-        poses = one["poses_report"]
+    for run in figures:
+        poses = run["poses_report"]
         cells = [str(poses["frames"]), str(poses["registered_frames"]), str(poses["errors"]["misplaced_frames"])]
         for errors in (poses["errors"], poses["errors_between_frames"]):
             cells += [f"{errors['rotation_error_degrees']:.2f}°", f"{100 * errors['translation_error']:.1f} cm"]
-        rows.append([one["scene"], one["speed"], *cells])
+        rows.append([run["scene"], run["speed"], *cells])
     return _markdown(header, rows)
 
 
 def _common(figures: Sequence[Figures]) -> list[Figures]:
     """Return the figures of the scenes, speeds and seeds that every row has."""
     made: dict[str, set[tuple]] = {}
-    for one in figures:
-        made.setdefault(one["row"], set()).add((one["scene"], one["speed"], one["seed"]))
+    for run in figures:
+        made.setdefault(run["row"], set()).add((run["scene"], run["speed"], run["seed"]))
     shared = set.intersection(*made.values()) if made else set()
-    return [one for one in figures if (one["scene"], one["speed"], one["seed"]) in shared]
+    return [run for run in figures if (run["scene"], run["speed"], run["seed"]) in shared]
 
 
 def _conditions(figures: Sequence[Figures]) -> str:
     """Return a list of where and how the figures were made."""
-    trained = dict.fromkeys((one["method"], one["steps"]) for one in figures)
+    trained = dict.fromkeys((run["method"], run["steps"]) for run in figures)
     lines = [f"- {method}, {steps} steps" for method, steps in trained]
-    lines += [f"- data: `{command}`" for command in dict.fromkeys(_simulation(one) for one in figures)]
-    made = dict.fromkeys(one["reconstruct"] for one in figures if one.get("reconstruct"))
+    lines += [f"- data: `{command}`" for command in dict.fromkeys(_simulation(run) for run in figures)]
+    made = dict.fromkeys(run["reconstruct"] for run in figures if run.get("reconstruct"))
     lines += [f"- images of the events: `aenerf reconstruct {options}`" for options in made]
-    for one in {(str(one["machine"]), str(one["versions"]), one["commit"]): one for one in figures}.values():
-        machine, versions = one["machine"], ", ".join(f"{name} {number}" for name, number in one["versions"].items())
-        device = f"{machine['gpu'] if one['device'] == 'cuda' else machine['cpu']}, {machine['cores']} cores"
-        lines.append(f"- {device}; {versions}; commit {one['commit']}")
-    used = {one["results"].get("color_correction", "none (nerfacto)") for one in figures}
+    for run in {(str(run["machine"]), str(run["versions"]), run["commit"]): run for run in figures}.values():
+        machine, versions = run["machine"], ", ".join(f"{name} {number}" for name, number in run["versions"].items())
+        device = f"{machine['gpu'] if run['device'] == 'cuda' else machine['cpu']}, {machine['cores']} cores"
+        lines.append(f"- {device}; {versions}; commit {run['commit']}")
+    used = {run["results"].get("color_correction", "none (nerfacto)") for run in figures}
     lines.append(f"- color correction: {'; '.join(sorted(used))}")
     return "\n".join(lines)
 
@@ -263,15 +263,15 @@ def _simulation(figures: Figures) -> str:
 
 
 def _of(figures: Sequence[Figures], **wanted: str) -> list[Figures]:
-    return [one for one in figures if all(one[key] == value for key, value in wanted.items())]
+    return [run for run in figures if all(run[key] == value for key, value in wanted.items())]
 
 
 def _mean(figures: Sequence[Figures], metric: str) -> str:
     """Return the means of a metric with test poses placed / refined."""
     digits = 2 if metric == "psnr" else 3
-    placed = [one["results"].get(metric) for one in figures]
+    placed = [run["results"].get(metric) for run in figures]
     # Results of earlier versions and of nerfacto have no refined poses.
-    refined = [one["results"].get("refined_test_poses", {}).get(metric) for one in figures]
+    refined = [run["results"].get("refined_test_poses", {}).get(metric) for run in figures]
     return " / ".join(
         f"{fmean(values):.{digits}f}" if values and None not in values else absent
         for values, absent in ((placed, "n/a"), (refined, "-"))

@@ -5,15 +5,15 @@
     python -m benchmarks.poses --split choose --variants density="--pipeline.model.average-init-density 3" ...
 
 Each recording is trained with its wrong poses and, as a control, with its true poses. Every variant of the settings is
-trained on the same recordings with the same seeds. A finished training is found again in the folder ``--work``, so a
-measurement that was stopped goes on. See ``scenes.py`` for the recordings, and ``worker.py`` for the measures.
+trained on the same recordings with the same seeds. The runs are made as those of ``benchmarks.paper``, in the folder
+``--work``, where finished runs are found again. See ``scenes.py`` for the recordings.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
+import os
 import shlex
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -21,18 +21,33 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from aenerf_ns.progress import progress_bar
-from benchmarks.poses.scenes import SCENES, Split, scene_argument
-from benchmarks.runs import make_dataset, run_benchmark, run_command, write_result
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
 
-_WORKER = Path(__file__).with_name("worker.py")
+from aenerf_ns.camera.alignment import align, pose_errors
+from aenerf_ns.camera.trajectory import homogeneous
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.progress import progress_bar
+from benchmarks.paper.plan import ON_TRUE_POSES, Dataset, Run
+from benchmarks.paper.running import Runner
+from benchmarks.poses.scenes import SCENES, Split, scene_argument
+from benchmarks.runs import run_benchmark, write_result
+
+_OFF = ("--pipeline.model.camera-optimizer.mode", "off")
+# Row of the run, and options of ns-train.
 _CASES = {
-    "noise, corrected": ("estimated", ()),
-    "noise, not corrected": ("estimated", ("--pipeline.model.camera-optimizer.mode", "off")),
-    "true poses, corrected": ("ground-truth", ()),
-    "true poses": ("ground-truth", ("--pipeline.model.camera-optimizer.mode", "off")),
+    "noise, corrected": ("corrected", ()),
+    "noise, not corrected": ("not corrected", _OFF),
+    "true poses, corrected": (f"corrected{ON_TRUE_POSES}", ()),
+    "true poses": (f"not corrected{ON_TRUE_POSES}", _OFF),
 }
 _DEFAULT = "default"
+LAGS = (0.1, 0.2, 0.4, 0.8)
+"""Seconds between two poses whose relative error is measured."""
+_GRID = 5
+"""Points across and down the picture that a relative error is measured on."""
 
 
 @dataclass
@@ -42,7 +57,7 @@ class Poses:
     output: Path
     """JSON file to write after each training."""
     work: Path
-    """Folder for datasets, logs and the results of single trainings."""
+    """Folder for datasets, runs and logs."""
     scenes_folder: Path
     """Folder of ``benchmarks.scenes.build``."""
     split: Split | Literal["all"] = "all"
@@ -59,8 +74,6 @@ class Poses:
     """Steps of each training."""
     variants: dict[str, str] = field(default_factory=dict)
     """More options of ns-train by the name of a variant. The method's defaults are always measured beside them."""
-    refine: bool = True
-    """Also evaluate with test poses that are refined photometrically."""
     jobs: int = 1
     """Trainings at a time, each with one thread."""
 
@@ -72,71 +85,120 @@ class Poses:
             sys.exit(
                 f"unknown: {', '.join(sorted(unknown))}; scenes are {', '.join(SCENES)}; cases {', '.join(_CASES)}"
             )
-        for folder in ("datasets", "runs", "logs"):
-            (self.work / folder).mkdir(parents=True, exist_ok=True)
+        os.environ |= {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
         variants = {_DEFAULT: "", **self.variants}
-        todo = [
+        datasets = {name: self._dataset(name) for name in names}
+        settings = [
             (name, case, variant, seed)
             for seed in self.seeds
             for name in names
             for case in self.cases
             for variant in variants
         ]
-        runs: list[dict[str, Any]] = []
+        described = {
+            name: {"about": SCENES[name].about, "simulate": shlex.join(datasets[name].command)} for name in names
+        }
+        about = {"method": self.method, "steps": self.steps, "variants": variants, "scenes": described}
+        runner, runs = Runner(self.work, "cpu"), []
+
+        def measure(name: str, case: str, variant: str, seed: int) -> dict[str, Any] | None:
+            row, of_case = _CASES[case]
+            options = (*of_case, *shlex.split(variants[variant]))
+            run = Run("poses", row, datasets[name], self.method, self.steps, seed, options)
+            made = runner.make(run)
+            if made is None:
+                return None
+            placed = made["results"]
+            refined = placed.pop("refined_test_poses")
+            found = {"placed": placed, "refined": refined, "poses": self._pose_errors(run)}
+            return {"scene": name, "case": case, "variant": variant, "seed": seed, **found}
+
         with progress_bar() as progress, ThreadPoolExecutor(self.jobs) as pool:
-            bar = progress.add_task("Poses", total=len(names) + len(todo))
-            for name in names:
-                self._dataset(name)
-                progress.advance(bar)
+            finished = pool.map(lambda chosen: measure(*chosen), settings)
+            for result in progress.track(finished, total=len(settings), description="Poses"):
+                if result is not None:
+                    runs.append(result)
+                    write_result(self.output, {**about, "table": table(runs), "runs": runs}, show=False)
 
-            def run(settings: tuple[str, str, str, int]) -> dict[str, Any]:
-                name, case, variant, seed = settings
-                found = self._train(name, case, variants[variant], seed)
-                return {"scene": name, "case": case, "variant": variant, "seed": seed, **found}
-
-            for finished in pool.map(run, todo):
-                runs.append(finished)
-                progress.advance(bar)
-                write_result(
-                    self.output,
-                    {
-                        "method": self.method,
-                        "steps": self.steps,
-                        "variants": variants,
-                        "scenes": {n: {"about": SCENES[n].about, "simulate": SCENES[n].options} for n in names},
-                        "table": table(runs),
-                        "runs": runs,
-                    },
-                    show=False,
-                )
-
-    def _dataset(self, name: str) -> Path:
-        """Return the dataset of a scene, which is simulated if it is missing."""
-        scene, file_name = SCENES[name], name.replace(" ", "_")
+    def _dataset(self, name: str) -> Dataset:
+        scene = SCENES[name]
         argument = scene_argument(scene.scene, self.scenes_folder, self.work / "scenes")
-        folder, log = self.work / "datasets" / file_name, self.work / "logs" / f"{file_name}.log"
-        return make_dataset(folder, log, "simulate", ("--scene", argument, *scene.options))
+        return Dataset(argument, scene.speed, scene.poses, scene.options)
 
-    def _train(self, name: str, case: str, options: str, seed: int) -> dict[str, Any]:
-        """Return the results of a training, from the file of an earlier one if there is one."""
-        poses, of_case = _CASES[case]
-        evaluation = "refined" if self.refine else "placed"
-        arguments = (
-            self.method, "--machine.device-type", "cpu", "--machine.seed", str(seed), "--vis", "tensorboard",
-            "--max-num-iterations", str(self.steps), *of_case, *shlex.split(options),
-        )  # fmt: skip
-        # Without the folder of this machine.
-        digest = hashlib.sha256("\0".join((name, poses, evaluation, *arguments)).encode()).hexdigest()[:12]
-        result = self.work / "runs" / f"{digest}.json"
-        if not result.exists():
-            command = [
-                sys.executable, str(_WORKER), str(result.resolve()), evaluation, *arguments,
-                "--output-dir", str((self.work / "outputs" / digest).resolve()),
-                "aenerf-data", "--data", str(self._dataset(name).resolve()), "--poses", poses,
-            ]  # fmt: skip
-            log = self.work / "logs" / f"{digest}.log"
-            run_command(command, log, OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
-        return json.loads(result.read_text("utf8"))
+    def _pose_errors(self, run: Run) -> dict[str, Any]:
+        """Return the errors of the poses at the end of a run."""
+        data = self.work / "datasets" / run.dataset.name
+        truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
+        corrected = read_tum_trajectory(self.work / "runs" / run.name / "corrected.txt")
+        times = corrected.knots_covered_by(truth)
+        poses, reference = corrected.interpolate(times), truth.interpolate(times)
+        errors = pose_errors(poses, reference)
+        return {
+            "degrees": errors["rotation_error_degrees"],
+            "translation": errors["translation_error"],
+            "pixels": pixel_errors(poses, reference, (times - times[0]).double() * 1e-9, _camera(data)),
+        }
+
+
+def pixel_errors(poses: Tensor, reference: Tensor, seconds: Tensor, camera: dict[str, float]) -> dict[str, float]:
+    """Return how far scene points seem to move between two poses that are some time apart, against the truth.
+
+    Events tell of motion between nearby times, and of nothing else. So an error that all poses share is none here.
+
+    Args:
+        poses: (N, 3, 4) camera-to-world, OpenCV axes.
+        reference: (N, 3, 4) true poses at the same times, in the same units.
+        seconds: (N,) increasing times.
+        camera: ``fx``, ``fy``, ``width``, ``height`` in pixels and the ``depth`` of the scene in the poses' unit.
+
+    Returns:
+        For each of :data:`LAGS`, the root mean square distance in pixels between points that are projected by the true
+        and by the given relative motion. The points lie on a grid of pixels at the scene's depth. Points that leave the
+        picture do not count. NaN where there are none.
+    """
+    aligned = homogeneous(align(poses, reference)(poses.double()))
+    true = homogeneous(reference.double())
+    width, height, depth = camera["width"], camera["height"], camera["depth"]
+    focal = torch.tensor([camera["fx"], camera["fy"]], dtype=torch.float64)
+    grid = (torch.arange(_GRID, dtype=torch.float64) + 0.5) / _GRID - 0.5
+    x, y = torch.meshgrid(grid * width, grid * height, indexing="xy")
+    pixels = torch.stack([x.flatten(), y.flatten()], -1)
+    points = depth * torch.cat([pixels / focal, torch.ones(_GRID**2, 1, dtype=torch.float64)], -1)
+    half = torch.tensor([width / 2, height / 2], dtype=torch.float64)
+
+    errors = {}
+    for lag in LAGS:
+        # A microsecond less, because sums of seconds are rounded.
+        later = torch.searchsorted(seconds, seconds + (lag - 1e-6))
+        first = (later < len(seconds)).nonzero()[:, 0]
+        later = later[first]
+        expected, found = (_points_seen_later(points, source[first], source[later]) for source in (true, aligned))
+        offset = focal * (found[..., :2] / found[..., 2:] - expected[..., :2] / expected[..., 2:])
+        in_front = torch.minimum(expected[..., 2], found[..., 2]) > 0.1 * depth
+        in_picture = (focal * expected[..., :2] / expected[..., 2:]).abs() < half
+        squares = offset[in_front & in_picture.all(-1)].square().sum(-1)
+        errors[str(lag)] = float(squares.mean().sqrt()) if len(squares) else math.nan
+    return errors
+
+
+def _points_seen_later(points: Tensor, poses: Tensor, later: Tensor) -> Tensor:
+    """Return points (K, 3), seen from each of (N, 4, 4) poses, as (N, K, 3) in the frames of later poses (N, 4, 4)."""
+    motion = torch.linalg.inv(later) @ poses
+    return points @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
+
+
+def _camera(data: Path) -> dict[str, float]:
+    """Return the camera of a simulated dataset and the scene's depth: the median over the training views."""
+    meta = json.loads((data / "transforms.json").read_text("utf8"))
+    depths = []
+    for frame in meta["frames"]:
+        if "depth_file_path" in frame and frame["file_path"] in meta["train_filenames"]:
+            thousandths = np.asarray(Image.open(data / frame["depth_file_path"]), np.float64)
+            depths.append(thousandths[thousandths > 0] / 1000)
+    return {
+        "fx": meta["fl_x"], "fy": meta["fl_y"], "width": meta["w"], "height": meta["h"],
+        "depth": float(np.median(np.concatenate(depths))),
+    }  # fmt: skip
 
 
 def table(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -165,11 +227,10 @@ def table(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 if differences and other != (scene, case, variant):
                     sign = -1 if name == "less_than_true_poses" else 1
                     row[f"psnr_{poses}_{name}"] = _summary([sign * value for value in differences])
-        ends = [run["poses"]["end"] for run in own.values()]
+        ends = [run["poses"] for run in own.values()]
         row["degrees"] = _summary([end["degrees"] for end in ends])
         row["translation"] = _summary([end["translation"] for end in ends])
         row["pixels"] = {lag: _summary([end["pixels"][lag] for end in ends]) for lag in ends[0]["pixels"]}
-        row["plateau_left_at"] = [run["plateau_left_at"] for run in own.values()]
         rows.append(row)
     return rows
 

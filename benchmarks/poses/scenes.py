@@ -10,12 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-Split = Literal["choose", "report"]
+from benchmarks.paper.plan import Poses
 
-_NOISE = ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04")
-_SLOW_NOISE = (*_NOISE, "--pose-noise-correlation-time", "0.5")
-_SMALL = ("--width", "96", "--height", "72")
-_MIDDLE = ("--width", "160", "--height", "120")
+Split = Literal["choose", "report"]
 
 
 @dataclass(frozen=True)
@@ -25,67 +22,50 @@ class PoseScene:
     Attributes:
         split: whether settings are chosen on it or reported on it.
         scene: a built-in scene, a scene of ``benchmarks.scenes.build``, or OUTWARDS.
+        speed: of the camera.
         options: of aenerf simulate.
         about: the reason for the recording, in a few words.
     """
 
     split: Split
     scene: str
+    speed: str
     options: tuple[str, ...]
     about: str
+
+    @property
+    def poses(self) -> Poses:
+        """Where the estimated poses come from."""
+        return "colmap" if "colmap" in self.options else "noise"
 
 
 OUTWARDS = "outwards"
 """The living room, seen from a loop around its middle by a camera that looks outwards: no place is seen again before
 the loop closes."""
 
+_NOISE = "--pose-noise-degrees 1.5 --pose-noise-translation 0.04"
+_SLOW_NOISE = f"{_NOISE} --pose-noise-correlation-time 0.5"
+_SMALL = "--width 96 --height 72"
+_MIDDLE = "--width 160 --height 120"
+_RGGB = "--bayer-pattern RGGB"
 SCENES = {
-    "object": PoseScene(
-        "choose", "object", ("--speed", "hard", *_SMALL, *_NOISE, "--seed", "77"), "small in the picture, no floor"
-    ),
-    "room": PoseScene("choose", "room", ("--speed", "hard", *_SMALL, *_NOISE, "--seed", "5"), "seen from within"),
-    "outwards": PoseScene(
-        "choose", OUTWARDS, ("--speed", "easy", *_SMALL, *_SLOW_NOISE, "--seed", "6"), "slow noise, no revisits"
-    ),
-    "forklift": PoseScene(
-        "choose",
-        "forklift",
-        ("--speed", "hard", *_SMALL, *_NOISE, "--bayer-pattern", "RGGB", "--seed", "7"),
-        "color, on a floor",
-    ),
-    "games": PoseScene(
-        "report", "games", ("--speed", "hard", *_SMALL, *_NOISE, "--seed", "11"), "large in the picture"
-    ),
-    "plants": PoseScene(
-        "report",
-        "plants",
-        ("--speed", "easy", *_SMALL, *_NOISE, "--bayer-pattern", "RGGB", "--seed", "12"),
-        "color, fine structures",
-    ),
-    "workshop": PoseScene("report", "workshop", ("--speed", "hard", *_SMALL, *_NOISE, "--seed", "13"), "a large place"),
-    "gallery": PoseScene(
-        "report", "gallery", ("--speed", "easy", *_SMALL, *_SLOW_NOISE, "--seed", "14"), "a long place, slow noise"
-    ),
-    "room large noise": PoseScene(
-        "report",
-        "room",
-        (
-            "--speed", "easy", *_MIDDLE, "--pose-noise-degrees", "3", "--pose-noise-translation", "0.08", "--seed", "15"
-        ),
-        "large noise, middle size",
-    ),
-    "object COLMAP 25 Hz": PoseScene(
-        "report",
-        "object",
-        ("--speed", "hard", *_MIDDLE, "--poses", "colmap", "--frame-rate", "25", "--seed", "16"),
-        "COLMAP's own errors",
-    ),
-    "room COLMAP 125 Hz": PoseScene(
-        "report",
-        "room",
-        ("--speed", "hard", *_MIDDLE, "--poses", "colmap", "--frame-rate", "125", "--seed", "17"),
-        "COLMAP's own errors",
-    ),
+    name: PoseScene(split, scene, speed, tuple(options.split()), about)  # type: ignore[arg-type]
+    for name, split, scene, speed, about, options in (
+        ("object", "choose", "object", "hard", "small in the picture, no floor", f"{_SMALL} {_NOISE} --seed 77"),
+        ("room", "choose", "room", "hard", "seen from within", f"{_SMALL} {_NOISE} --seed 5"),
+        ("outwards", "choose", OUTWARDS, "easy", "slow noise, no revisits", f"{_SMALL} {_SLOW_NOISE} --seed 6"),
+        ("forklift", "choose", "forklift", "hard", "color, on a floor", f"{_SMALL} {_NOISE} {_RGGB} --seed 7"),
+        ("games", "report", "games", "hard", "large in the picture", f"{_SMALL} {_NOISE} --seed 11"),
+        ("plants", "report", "plants", "easy", "color, fine structures", f"{_SMALL} {_NOISE} {_RGGB} --seed 12"),
+        ("workshop", "report", "workshop", "hard", "a large place", f"{_SMALL} {_NOISE} --seed 13"),
+        ("gallery", "report", "gallery", "easy", "a long place, slow noise", f"{_SMALL} {_SLOW_NOISE} --seed 14"),
+        ("room large noise", "report", "room", "easy", "large noise, middle size",
+         f"{_MIDDLE} --pose-noise-degrees 3 --pose-noise-translation 0.08 --seed 15"),
+        ("object COLMAP 25 Hz", "report", "object", "hard", "COLMAP's own errors",
+         f"{_MIDDLE} --poses colmap --frame-rate 25 --seed 16"),
+        ("room COLMAP 125 Hz", "report", "room", "hard", "COLMAP's own errors",
+         f"{_MIDDLE} --poses colmap --frame-rate 125 --seed 17"),
+    )
 }  # fmt: skip
 
 
@@ -112,11 +92,7 @@ def scene_argument(scene: str, built: Path, folder: Path) -> str:
     # Ahead of the camera and outwards.
     gaze = turn + 0.6
     targets = np.column_stack([2.2 * np.cos(gaze), 1.8 * np.sin(gaze), 1 + 0.3 * np.sin(3 * turn - 0.6)])
-    description["path"] = {
-        "kind": "walk",
-        "positions": eyes.round(3).tolist(),
-        "targets": targets.round(3).tolist(),
-        "duration": 4.0,
-    }
+    walk = {"positions": eyes.round(3).tolist(), "targets": targets.round(3).tolist()}
+    description["path"] = {"kind": "walk", **walk, "duration": 4.0}
     (target / "scene.json").write_text(json.dumps(description), "utf8")
     return str((target / "scene.json").resolve())

@@ -37,13 +37,7 @@ _LICENSE = "CC0 1.0"
 
 @dataclass(frozen=True)
 class Package:
-    """A file of a package registry.
-
-    Attributes:
-        file: name under which the registry's client saves the file.
-        sha256: pinned hash of the file.
-        command: fetches the file into the current folder.
-    """
+    """A file of a package registry: its name, its pinned hash, and the client's command that saves it here."""
 
     file: str
     sha256: str
@@ -97,12 +91,7 @@ def _run(command: Sequence[str], folder: Path, file: Path, remedy: str) -> None:
 
 
 def _make_once(path: Path, make: Callable[[Path], Path]) -> Path:
-    """Return a file or folder that is made if it is missing. What is cut off leaves nothing under its name.
-
-    Args:
-        path: of the file or folder.
-        make: makes it in an empty folder, and returns where.
-    """
+    """Return a file or folder. If it is missing, ``make`` makes it in an empty folder and returns where."""
     if not path.exists():
         # Another process that builds scenes may be making it, too.
         with exclusive(path):
@@ -113,16 +102,12 @@ def _make_once(path: Path, make: Callable[[Path], Path]) -> Path:
 
 
 class Library:
-    """Hold the models and environments of the packages. Fetch and unpack a package at its first use.
-
-    Attributes:
-        folder: keeps the packages.
-        credits: entries of a scene file's "credits", by asset, for all assets that were used.
-    """
+    """Hold the models and environments of the packages in a folder. Fetch and unpack a package at its first use."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.credits: dict[str, dict[str, str]] = {}
+        """Entries of a scene file's "credits", by asset, for all assets that were used."""
 
     def _credit(self, name: str, asset: str, source: str, author: str) -> None:
         self.credits[name] = {"asset": asset, "source": source, "author": author, "license": _LICENSE}

@@ -24,7 +24,6 @@ class BenchmarkScene:
     Attributes:
         compose: makes the mesh from a library.
         environment: name of the environment that lights the scene.
-        gain: factor of the environment's radiance.
         turn_degrees: turn of the environment.
         lamps: further lights, as in a scene file.
         walk: positions and targets of a walk. None if the camera goes around the scene.
@@ -34,7 +33,6 @@ class BenchmarkScene:
 
     compose: Callable[[Library], Model]
     environment: str
-    gain: float = 1.0
     turn_degrees: float = 0.0
     lamps: tuple[dict[str, list[float]], ...] = ()
     walk: tuple[list[list[float]], list[list[float]]] | None = None
@@ -54,7 +52,7 @@ class BenchmarkScene:
         if self.walk is not None:
             path = {"kind": "walk", "positions": self.walk[0], "targets": self.walk[1]}
         path["duration"] = self.duration
-        light: dict[str, object] = {"environment": environment, "turn_degrees": self.turn_degrees, "gain": self.gain}
+        light: dict[str, object] = {"environment": environment, "turn_degrees": self.turn_degrees, "gain": 1.0}
         if self.lamps:
             light["lamps"] = list(self.lamps)
         return {
@@ -67,19 +65,16 @@ class BenchmarkScene:
 
 
 def loop(
-    half_length: float, half_width: float, height: float, reach: float, look_height: float, count: int = 16
+    half_length: float, half_width: float, height: float, reach: float, look_height: float
 ) -> tuple[list[list[float]], list[list[float]]]:
     """Return positions and targets of an oval walk around the origin. The camera bobs and looks across the middle.
 
     Args:
-        half_length: half axis of the oval along x, in meters.
-        half_width: half axis of the oval along y, in meters.
-        height: mean height of the camera, in meters.
+        half_length, half_width: half axes of the oval along x and y, in meters.
+        height, look_height: mean heights of the camera and of the targets, in meters.
         reach: distance of the targets beyond the middle, as a fraction of the oval's half axes.
-        look_height: mean height of the targets, in meters.
-        count: number of positions.
     """
-    turn = 2 * np.pi * np.arange(count) / count
+    turn = 2 * np.pi * np.arange(16) / 16
     across = turn + np.pi + 0.45 * np.sin(2 * turn + 0.4)
     bob, nod = height + 0.14 * np.sin(3 * turn + 0.7), look_height + 0.3 * np.sin(3 * turn - 0.6)
     eyes = np.column_stack([half_length * np.cos(turn), half_width * np.sin(turn), bob])

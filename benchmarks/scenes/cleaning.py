@@ -20,11 +20,7 @@ def without_coincident_faces(model: Model, gap: float) -> Model:
     """Drop duplicate faces and move overlapping ones apart.
 
     Of triangles with the same corners, in any order, the first stays. Where different triangles that face the same
-    way overlap within a third of the gap, the smaller of the two flat pieces moves outwards by the gap.
-
-    Args:
-        model: meshes that may touch.
-        gap: in meters.
+    way overlap within a third of the gap, in meters, the smaller of the two flat pieces moves outwards by the gap.
     """
     owner = np.repeat(np.arange(len(model.parts)), [len(part.points) for part in model.parts])
     _, first = np.unique(np.sort(_corner_numbers(model.triangles), axis=1), axis=0, return_index=True)
@@ -81,13 +77,13 @@ def _overlapped(triangles: Array, asked: NDArray[np.bool_], tolerance: float) ->
         origin = np.einsum("k,fkd->fd", weight, triangles[source]) + tolerance * normals[source]
         rays = np.concatenate([origin, -normals[source]], axis=1).astype(np.float32)
         ray, other, distance = caster.all_hits(rays)
-        one = source[ray]
-        near = (distance < 2 * tolerance) & (piece[one] != piece[other])
-        near &= (normals[one] * normals[other]).sum(axis=1) > 0.99
-        one, other = one[near], other[near]
-        size = piece_area[piece[one]] - piece_area[piece[other]]
-        smaller = (size < 0) | ((size == 0) & (piece[one] > piece[other]))
-        moving[np.where(smaller, one, other)] = True
+        face = source[ray]
+        near = (distance < 2 * tolerance) & (piece[face] != piece[other])
+        near &= (normals[face] * normals[other]).sum(axis=1) > 0.99
+        face, other = face[near], other[near]
+        size = piece_area[piece[face]] - piece_area[piece[other]]
+        smaller = (size < 0) | ((size == 0) & (piece[face] > piece[other]))
+        moving[np.where(smaller, face, other)] = True
     # A flat piece moves as a whole, because it must not tear.
     return np.isin(piece, piece[moving])
 

@@ -39,10 +39,8 @@ def podium(radius: float, height: float, top: Material, side: Material, tile: fl
 def books(width: float, depth: float, height: float, seed: int, fill: float = 1.0) -> Model:
     """Make a row of books that stands on z = 0, its spines at y = 0, from x = 0 to at most ``fill`` of the width."""
     rng = np.random.default_rng(seed)
-    spine, cover = (
-        paint("book spine", tx.book_spine, size=128),
-        paint("book cover", tx.mottled, ["9a968c", "b0aca2"], size=64),
-    )
+    spine = paint("book spine", tx.book_spine, size=128)
+    cover = paint("book cover", tx.mottled, ["9a968c", "b0aca2"], size=64)
     pages = paint("pages", tx.mottled, ["cbbf9f", "d8cfb4"], 0.1, size=64)
     row: list[Model] = []
     x = 0.0
@@ -192,9 +190,5 @@ def skirting(low: tuple[float, float], high: tuple[float, float], material: Mate
 
 def lamp(x: float, y: float, z: float, half_size: float, radiance: Sequence[float]) -> dict[str, list[float]]:
     """Describe a square lamp that shines downwards, for a scene file."""
-    return {
-        "center": [x, y, z],
-        "half_u": [half_size, 0, 0],
-        "half_v": [0, -half_size, 0],
-        "radiance": list(radiance),
-    }
+    sides = {"half_u": [half_size, 0, 0], "half_v": [0, -half_size, 0]}
+    return {"center": [x, y, z], **sides, "radiance": list(radiance)}

@@ -21,12 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A Lambertian surface.
-
-    Attributes:
-        name: unique among the materials of a scene.
-        picture: (H, W, 3) uint8 sRGB albedo, its first row at the top.
-    """
+    """A Lambertian surface: a name that no other has, and its sRGB albedo (H, W, 3), the first row at the top."""
 
     name: str
     picture: NDArray[np.uint8]
@@ -78,11 +73,9 @@ class Model:
         return self.moved((-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]))
 
     def fitted(self, half_extent: float, radius: float) -> Model:
-        """Center the bounds at the origin and scale the model to the largest size within two limits.
+        """Center the bounds at the origin and scale the model to the largest size within two limits, in meters.
 
-        Args:
-            half_extent: half of the longest side of the bounds, at most; in meters.
-            radius: radius of a ball around the origin that must hold the model; in meters.
+        ``half_extent`` limits half of the longest side of the bounds, ``radius`` a ball that holds the model.
         """
         low, high = self.bounds
         center = (low + high) / 2

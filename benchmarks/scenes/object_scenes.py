@@ -16,10 +16,8 @@ def piano(library: Library) -> Model:
     boards = paint("parquet", tx.planks, ["8f6a45", "a98258", "c09a6e"], rows=6)
     scene = podium(1.3, 0.12, boards, mahogany)
     scene += library.model("pianoAQueue", "wood", {"black": mahogany}).moved((0, 0.25, 0))
-    bench = library.model(
-        "pianoBench", "wood", {"Glossy_Coating": walnut(), "Matte_Coating": walnut(), "Leather": cloth}
-    )
-    scene += bench.moved((0, -0.92, 0))
+    dress = {"Glossy_Coating": walnut(), "Matte_Coating": walnut(), "Leather": cloth}
+    scene += library.model("pianoBench", "wood", dress).moved((0, -0.92, 0))
     scene = scene.with_dropped(library.model("teddyBear"), 0.05, -0.92, 165)
     scene += library.model("electricGuitar").moved((0.85, -0.55, 0), -30)
     return furnish(scene, library, [
@@ -38,14 +36,9 @@ def bookshelf(library: Library) -> Model:
     for x, canvas in ((-0.36, landscape), (0.36, shapes)):
         scene += framed_picture(0.5, 0.8, canvas, walnut()).moved((x, 0.62, 1.05), 180)
     for name, x, below, turn in (
-        ("cactus", 0.62, 0.9, 0),
-        ("cartoon_biplane", 0.62, 1.25, -30),
-        ("woodToy", 0.60, 0.5, 10),
-        ("JapaneseLantern", 0.60, 1.6, 0),
-        ("littlePlant", 0.5, 9, 0),
-        ("augalas", -0.4, 9, 180),
-        ("deer", 0.1, 9, 40),
-    ):
+        ("cactus", 0.62, 0.9, 0), ("cartoon_biplane", 0.62, 1.25, -30), ("woodToy", 0.60, 0.5, 10),
+        ("JapaneseLantern", 0.60, 1.6, 0), ("littlePlant", 0.5, 9, 0), ("augalas", -0.4, 9, 180), ("deer", 0.1, 9, 40),
+    ):  # fmt: skip
         scene = scene.with_dropped(library.model(name), x, 0.43, turn, below)
     scene += library.model("caballito", "wood").moved((-0.35, -0.35, 0), 25)
     return furnish(scene, library, [
@@ -84,24 +77,16 @@ def breakfast(library: Library) -> Model:
     china = paint("china", tx.mottled, ["d8d6cf", "e2e0da", "e9e7e1"], 0.03)
     scene = box((-0.46, -0.36, -0.04), (0.46, 0.36, 0), walnut(), 0.3)
     scene += box((-0.42, -0.32, 0), (0.42, 0.32, 0.004), cloth, 0.3, without="z")
-    plate = revolved([(0.06, 0), (0.115, 0.014), (0.11, 0.018), (0.06, 0.008)], china, 0.1) + disc(
-        0.06, 0.008, china, 0.1
-    )
+    plate = revolved([(0.06, 0), (0.115, 0.014), (0.11, 0.018), (0.06, 0.008)], china, 0.1)
+    plate += disc(0.06, 0.008, china, 0.1)
     for x, y in ((-0.24, -0.17), (0.06, -0.19)):
         scene = scene.with_dropped(plate, x, y)
     for name, x, y, turn, scale in (
-        ("kitchenaid", 0.27, 0.12, 205, 1.0),
-        ("coffeeBrewer", -0.28, 0.16, 20, 1.0),
-        ("hotDog", -0.24, -0.145, 20, 0.8),
-        ("hotDog", -0.24, -0.2, 14, 0.8),
-        ("cupcake", 0.06, -0.15, 0, 1.2),
-        ("cupcake", 0.10, -0.215, 40, 1.2),
-        ("cupcake", 0.02, -0.215, 80, 1.2),
-        ("caffe_final", -0.09, -0.03, 30, 1.1),
-        ("bread", 0.0, 0.2, 15, 1.0),
-        ("tetrapak", -0.1, 0.24, 160, 0.9),
-        ("butter", 0.28, -0.2, 65, 1.0),
-    ):
+        ("kitchenaid", 0.27, 0.12, 205, 1.0), ("coffeeBrewer", -0.28, 0.16, 20, 1.0),
+        ("hotDog", -0.24, -0.145, 20, 0.8), ("hotDog", -0.24, -0.2, 14, 0.8), ("cupcake", 0.06, -0.15, 0, 1.2),
+        ("cupcake", 0.10, -0.215, 40, 1.2), ("cupcake", 0.02, -0.215, 80, 1.2), ("caffe_final", -0.09, -0.03, 30, 1.1),
+        ("bread", 0.0, 0.2, 15, 1.0), ("tetrapak", -0.1, 0.24, 160, 0.9), ("butter", 0.28, -0.2, 65, 1.0),
+    ):  # fmt: skip
         scene = scene.with_dropped(library.model(name).moved(scale=scale), x, y, turn)
     return scene
 

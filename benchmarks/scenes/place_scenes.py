@@ -164,13 +164,9 @@ def gallery(library: Library) -> Model:
         for y in (-2.75, 2.75):
             scene += revolved(shaft, marble, 0.6).moved((x, y, 0))
     exhibits = (
-        ("cartoon_biplane", -5.0, 4.5, 40),
-        ("deer", -3.0, 5.0, 30),
-        ("horse2", -1.0, 0.35, 60),
-        ("peterbilt", 1.0, 0.06, 20),
-        ("chicken", 3.0, 1.8, -40),
-        ("cuckooClock", 5.0, 1.0, 80),
-    )
+        ("cartoon_biplane", -5.0, 4.5, 40), ("deer", -3.0, 5.0, 30), ("horse2", -1.0, 0.35, 60),
+        ("peterbilt", 1.0, 0.06, 20), ("chicken", 3.0, 1.8, -40), ("cuckooClock", 5.0, 1.0, 80),
+    )  # fmt: skip
     for name, x, scale, turn in exhibits:
         scene += box((x - 0.36, -0.36, 0), (x + 0.36, 0.36, 0.12), marble, 0.6, without="z")
         scene += box((x - 0.3, -0.3, 0.12), (x + 0.3, 0.3, 0.85), marble, 0.6, without="zZ")
@@ -208,12 +204,8 @@ def workshop(library: Library) -> Model:
     for y0 in (1.0, 5.0):
         scene += window(3.0, 1.1, steel(), 3).moved((low[0] - 0.06, low[1] + y0, 2.4), 90)
     # Marked lanes, a hair above the floor.
-    for x0, y0, x1, y1 in (
-        (-3.1, -2.35, 3.1, -2.25),
-        (-3.1, 2.25, 3.1, 2.35),
-        (-3.1, -2.25, -3.0, 2.25),
-        (3.0, -2.25, 3.1, 2.25),
-    ):
+    lanes = ((-3.1, -2.35, 3.1, -2.25), (-3.1, 2.25, 3.1, 2.35), (-3.1, -2.25, -3.0, 2.25), (3.0, -2.25, 3.1, 2.25))
+    for x0, y0, x1, y1 in lanes:
         scene += rectangle((x0, y0, 0.002), (x1 - x0, 0, 0), (0, y1 - y0, 0), yellow, 1.0)
     for x in (-5.2, -1.8, 1.8, 5.2):
         scene += box((x - 0.1, low[1], z - 0.35), (x + 0.1, high[1], z), steel(), 0.8, without="yYZ")

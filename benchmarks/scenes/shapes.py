@@ -20,14 +20,7 @@ def rectangle(origin: ArrayLike, u: ArrayLike, v: ArrayLike, material: Material,
 
 
 def box(low: ArrayLike, high: ArrayLike, material: Material, tile: float = 0.5, without: str = "") -> Model:
-    """Make a box between two corners.
-
-    Args:
-        low, high: (3,) corners.
-        material: of all sides.
-        tile: side of a texture tile, in meters.
-        without: sides to leave out, as letters: "x" is the side at low x, "X" the side at high x, and so on.
-    """
+    """Make a box between two corners, ``without`` the sides of some letters: "x" at low x, "X" at high x, and so on."""
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     x, y, z = np.diag(high - low)
     sides = {

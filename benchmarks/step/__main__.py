@@ -210,8 +210,8 @@ class StepCost:
         trained = self._turns(trainings, "train", steps)
         rendered = self._turns(trainings, "render")
         return {
-            "step": _compare(trained, steps, "rays", [one["rays"] for one in about]),
-            "picture": _compare(rendered, 1, "pixels", [one["pixels"] for one in about]),
+            "step": _compare(trained, steps, "rays", [side["rays"] for side in about]),
+            "picture": _compare(rendered, 1, "pixels", [side["pixels"] for side in about]),
         }
 
     def _turns(self, trainings: list[Training], *request: Any) -> list[list[dict[str, float]]]:
@@ -234,7 +234,7 @@ def _compare(seconds: list[list[dict[str, float]]], count: int, unit: str, units
     """
     result: dict[str, Any] = {}
     for clock in ("wall", "cpu"):
-        baseline, subject = ([one[clock] / count for one in of_side] for of_side in seconds)
+        baseline, subject = ([turn[clock] / count for turn in of_side] for of_side in seconds)
         medians = [statistics.median(of_side) for of_side in (baseline, subject)]
         result[clock] = {
             "milliseconds": [1e3 * median for median in medians],

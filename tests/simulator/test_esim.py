@@ -16,19 +16,17 @@ LOG_EPSILON = 1e-3
 
 
 def make_simulator(
-    width: int,
-    height: int,
-    *,
-    positive_contrast_threshold: float,
-    negative_contrast_threshold: float,
+    positive: float,
+    negative: float,
+    width: int = WIDTH,
+    height: int = HEIGHT,
     refractory_period: int = 0,
     bayer_pattern: BayerPattern = "",
-    log_epsilon: float = LOG_EPSILON,
     seed: int = 0,
     **noise: float,
 ) -> EventSimulator:
-    sensor = SensorModel(positive_contrast_threshold, negative_contrast_threshold, refractory_period, bayer_pattern)
-    return EventSimulator(width, height, sensor, SensorNoise(**noise), log_epsilon=log_epsilon, seed=seed)
+    sensor = SensorModel(positive, negative, refractory_period, bayer_pattern)
+    return EventSimulator(width, height, sensor, SensorNoise(**noise), log_epsilon=LOG_EPSILON, seed=seed)
 
 
 def simulate(simulator: EventSimulator, images: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -82,9 +80,7 @@ def test_every_pair_is_one_threshold_apart(positive: float, negative: float) -> 
     rng = np.random.default_rng(1)
     times = np.cumsum(rng.integers(20_000_000, 60_000_000, 40))
     images = to_images(random_log_frames(rng, len(times), 1.0))
-    simulator = make_simulator(
-        WIDTH, HEIGHT, positive_contrast_threshold=positive, negative_contrast_threshold=negative
-    )
+    simulator = make_simulator(positive, negative)
     x, y, t, p = simulate(simulator, images, times)
     log_frames = log_of(images)
     pairs = 0
@@ -104,7 +100,7 @@ def test_every_pair_is_one_threshold_apart(positive: float, negative: float) -> 
 
 
 def test_ramp_fires_at_the_crossings() -> None:
-    simulator = make_simulator(1, 1, positive_contrast_threshold=0.25, negative_contrast_threshold=0.5)
+    simulator = make_simulator(0.25, 0.5, 1, 1)
     simulator([[1.0 - LOG_EPSILON]], 1000)
     x, y, t, p = simulator([[math.exp(1.1) - LOG_EPSILON]], 1000 + 1_100_000)
     np.testing.assert_array_equal(t, 1000 + 250_000 * np.arange(1, 5))
@@ -120,8 +116,7 @@ def test_agrees_with_slow_reference(refractory: int) -> None:
     rng = np.random.default_rng(2)
     times = 10_000_000_000 + np.cumsum(rng.integers(200_000, 900_000, 60))
     images = to_images(random_log_frames(rng, len(times), 0.5))
-    settings = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.3, "refractory_period": refractory}
-    simulator = make_simulator(WIDTH, HEIGHT, contrast_threshold_spread=0.05, seed=4, **settings)
+    simulator = make_simulator(0.2, 0.3, refractory_period=refractory, contrast_threshold_spread=0.05, seed=4)
     positive, negative = simulator.positive_contrast_threshold, simulator.negative_contrast_threshold
     simulator(images[0], times[0])
     starts = simulator._reference_time.copy()
@@ -131,13 +126,9 @@ def test_agrees_with_slow_reference(refractory: int) -> None:
     for row in range(HEIGHT):
         for column in range(WIDTH):
             mine = (x == column) & (y == row)
+            here = (row, column)
             expected = reference_events(
-                log_frames[:, row, column],
-                times,
-                positive[row, column],
-                negative[row, column],
-                refractory,
-                int(starts[row, column]),
+                log_frames[:, row, column], times, positive[here], negative[here], refractory, int(starts[here])
             )
             np.testing.assert_allclose(t[mine], [time for time, _ in expected], atol=1, rtol=0)
             np.testing.assert_array_equal(p[mine], [polarity for _, polarity in expected])
@@ -148,9 +139,7 @@ def test_agrees_with_slow_reference(refractory: int) -> None:
 
 
 def test_initial_reference_times_fill_the_refractory_period() -> None:
-    simulator = make_simulator(
-        60, 50, positive_contrast_threshold=0.1, negative_contrast_threshold=0.1, refractory_period=1_000_000
-    )
+    simulator = make_simulator(0.1, 0.1, 60, 50, refractory_period=1_000_000)
     simulator(np.ones((50, 60)), 0)
     # A steady rise of one threshold each 2 ms: a pixel fires exactly 2 ms after it took its reference.
     _, _, t, _ = simulator(np.exp(0.5) * (1 + LOG_EPSILON) * np.ones((50, 60)) - LOG_EPSILON, 10_000_000)
@@ -162,7 +151,7 @@ def test_initial_reference_times_fill_the_refractory_period() -> None:
 
 def test_stream_order_and_range() -> None:
     rng = np.random.default_rng(3)
-    simulator = make_simulator(WIDTH, HEIGHT, positive_contrast_threshold=0.01, negative_contrast_threshold=0.01)
+    simulator = make_simulator(0.01, 0.01)
     simulator(rng.uniform(0, 1, (HEIGHT, WIDTH)), 0)
     x, y, t, _ = simulator(rng.uniform(0, 1, (HEIGHT, WIDTH)), 50)  # far more events than time stamps
     assert len(t) > 1000
@@ -173,19 +162,18 @@ def test_stream_order_and_range() -> None:
 
 
 def test_color_filters_and_luminance() -> None:
-    thresholds = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.2}
     before, after = np.ones((4, 6, 3)), np.ones((4, 6, 3))
     for channel, pixels in enumerate(
         ([(0, 0)], [(0, 1), (1, 0)], [(1, 1)])  # (y, x) modulo 2 behind red, green and blue filters
     ):
         after[:] = before
         after[..., channel] = 1.3
-        color = make_simulator(6, 4, bayer_pattern="RGGB", **thresholds)
+        color = make_simulator(0.2, 0.2, 6, 4, bayer_pattern="RGGB")
         color(before, 0)
         x, y, _, _ = color(after, 1000)
         assert sorted(set(zip((y % 2).tolist(), (x % 2).tolist(), strict=True))) == pixels
         assert len(x) == 6 * len(pixels)
-    gray, luminance = make_simulator(6, 4, **thresholds), make_simulator(6, 4, **thresholds)
+    gray, luminance = make_simulator(0.2, 0.2, 6, 4), make_simulator(0.2, 0.2, 6, 4)
     rgb = np.random.default_rng(0).uniform(0, 3, (2, 4, 6, 3))
     weights = np.array([0.2126, 0.7152, 0.0722])
     from_rgb = simulate(gray, rgb, np.array([0, 10**6]))
@@ -195,9 +183,7 @@ def test_color_filters_and_luminance() -> None:
 
 
 def test_threshold_spread() -> None:
-    simulator = make_simulator(
-        200, 200, positive_contrast_threshold=0.25, negative_contrast_threshold=0.1, contrast_threshold_spread=0.05
-    )
+    simulator = make_simulator(0.25, 0.1, 200, 200, contrast_threshold_spread=0.05)
     positive, negative = simulator.positive_contrast_threshold, simulator.negative_contrast_threshold
     assert abs(positive.mean() - 0.25) < 1e-3
     assert abs(positive.std() - 0.05) < 1e-3
@@ -206,11 +192,8 @@ def test_threshold_spread() -> None:
     assert abs(np.corrcoef(positive.ravel(), negative.ravel())[0, 1]) < 0.02
 
 
-def test_a_leaking_reference_fires_in_steady_light() -> None:
-    simulator = make_simulator(
-        50, 40, positive_contrast_threshold=0.2, negative_contrast_threshold=0.2,
-        contrast_threshold_spread=0.03, leak_rate=4.0, seed=1,
-    )  # fmt: skip
+def test_leak_fires_in_steady_light() -> None:
+    simulator = make_simulator(0.2, 0.2, 50, 40, contrast_threshold_spread=0.03, leak_rate=4.0, seed=1)
     start = 1_700_000_000 * 10**9
     images = np.full((3, 40, 50), 0.3)
     x, y, t, p = simulate(simulator, images, start + np.array([0, 10**9, 5 * 10**9]))
@@ -223,12 +206,10 @@ def test_a_leaking_reference_fires_in_steady_light() -> None:
         assert mine.sum() == int(5 / period)
 
 
-def test_shot_noise_comes_at_its_rate_and_less_in_the_light() -> None:
+def test_shot_noise_has_its_rate() -> None:
     image = np.zeros((80, 100))
     image[:, 50:] = 1.0
-    simulator = make_simulator(
-        100, 80, positive_contrast_threshold=0.2, negative_contrast_threshold=0.2, shot_noise_rate=2.0
-    )
+    simulator = make_simulator(0.2, 0.2, 100, 80, shot_noise_rate=2.0)
     x, y, t, p = simulate(simulator, np.stack([image] * 11), np.arange(11) * 5 * 10**8)
     seconds, pixels = 5.0, 80 * 50
     dark, bright = (x < 50).sum(), (x >= 50).sum()
@@ -243,13 +224,12 @@ def test_shot_noise_comes_at_its_rate_and_less_in_the_light() -> None:
 
 
 @pytest.mark.parametrize("refractory", [0, 40_000_000])
-def test_shot_noise_moves_the_reference_as_any_event(refractory: int) -> None:
+def test_shot_noise_moves_the_reference(refractory: int) -> None:
     # A signal that rises and falls by many thresholds: between two events of noise there are others.
     times = np.arange(9) * 10**8
     log_frames = np.array([0, 1, -1, 0.5, 0.3, 2, 2.1, -1, 0.0]) - 1
     images = to_images(np.broadcast_to(log_frames[:, None, None], (9, HEIGHT, WIDTH)))
-    settings = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.3}
-    simulator = make_simulator(WIDTH, HEIGHT, shot_noise_rate=8.0, refractory_period=refractory, **settings)
+    simulator = make_simulator(0.2, 0.3, shot_noise_rate=8.0, refractory_period=refractory)
     x, y, t, p = simulate(simulator, images, times)
     signal = log_of(images)[:, 0, 0]
     noise = 0
@@ -273,33 +253,24 @@ def test_seed_decides_everything() -> None:
     images, times = rng.uniform(0, 1, (5, HEIGHT, WIDTH)), np.arange(5) * 10**6
     streams = []
     for seed in (1, 1, 2):
-        simulator = make_simulator(
-            WIDTH,
-            HEIGHT,
-            positive_contrast_threshold=0.2,
-            negative_contrast_threshold=0.2,
-            contrast_threshold_spread=0.02,
-            refractory_period=1000,
-            shot_noise_rate=10_000.0,
-            seed=seed,
-        )
+        noise = {"contrast_threshold_spread": 0.02, "shot_noise_rate": 10_000.0}
+        simulator = make_simulator(0.2, 0.2, refractory_period=1000, seed=seed, **noise)
         streams.append(b"".join(column.tobytes() for column in simulate(simulator, images, times)))
     assert streams[0] == streams[1] != streams[2]
 
 
-def test_single_precision_frames_are_accepted_as_they_are() -> None:
+def test_accept_single_precision_frames() -> None:
     image = np.random.default_rng(0).uniform(0, 1, (2, HEIGHT, WIDTH)).astype(np.float32)
     streams = []
     for frames in (image, image.astype(np.float64)):
-        simulator = make_simulator(WIDTH, HEIGHT, positive_contrast_threshold=0.2, negative_contrast_threshold=0.2)
+        simulator = make_simulator(0.2, 0.2)
         streams.append(simulate(simulator, frames, np.array([0, 1000])))
     for single, double in zip(*streams, strict=True):
         np.testing.assert_array_equal(single, double)
 
 
 def test_refuse_frame() -> None:
-    thresholds = {"positive_contrast_threshold": 0.2, "negative_contrast_threshold": 0.2}
-    simulator = make_simulator(WIDTH, HEIGHT, **thresholds)
+    simulator = make_simulator(0.2, 0.2)
     good = np.ones((HEIGHT, WIDTH))
     simulator(good, 5)
     with pytest.raises(ValueError, match=r"must increase.*got 5 ns after 5 ns"):
@@ -312,6 +283,6 @@ def test_refuse_frame() -> None:
         with pytest.raises(ValueError, match="finite and not negative, got 1 other"):
             simulator(bad, 6)
     with pytest.raises(ValueError, match=r"shape \(6, 7, 3\), got \(6, 7\)"):
-        make_simulator(WIDTH, HEIGHT, bayer_pattern="RGGB", **thresholds)(good, 0)
+        make_simulator(0.2, 0.2, bayer_pattern="RGGB")(good, 0)
     # A refused frame leaves no trace.
     assert len(simulator(good, 7)[0]) == 0

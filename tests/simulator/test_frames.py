@@ -9,10 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.small_meshes import (
-    ray_directions,
-    scene_file,
-)
+from helpers.small_meshes import ray_directions, scene_file
 
 from aenerf_ns.simulator.frames import frame_displacement, frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene
@@ -22,7 +19,7 @@ from aenerf_ns.simulator.scene import SimulationScene
 pytestmark = pytest.mark.usefixtures("small_work")
 
 
-def test_frame_displacement_of_a_turn_and_of_a_shift() -> None:
+def test_frame_displacement() -> None:
     intrinsics, depth = (50.0, 50.0, 16.0, 12.0), np.full((24, 32), 2.0)
     shifted = np.eye(4)
     shifted[0, 3] = 0.1
@@ -60,7 +57,7 @@ def test_frame_parameters_bound_the_motion(toy: SimulationScene) -> None:
     assert np.mean(moved[1:-1]) > 0.9
 
 
-def test_frames_follow_what_moves_behind_a_mesh(box_file: Path) -> None:
+def test_frames_follow_environment(box_file: Path) -> None:
     """Around a box, what is far behind it moves most: an environment there must not, a plain color may."""
     intrinsics = 1.2 * 24, 1.2 * 24, 12.0, 9.0
     lens = np.array([[intrinsics[0], 0, 12.0], [0, intrinsics[1], 9.0], [0, 0, 1]])

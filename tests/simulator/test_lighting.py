@@ -9,16 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import (
-    BLACK,
-    NIGHT,
-    OVERHEAD,
-    joined,
-    light_mesh,
-    mesh_of,
-    plate,
-    ray_directions,
-)
+from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, joined, light_mesh, mesh_of, plate, ray_directions
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
@@ -29,21 +20,21 @@ from aenerf_ns.simulator.rendering.mesh_repair import repair
 pytestmark = pytest.mark.usefixtures("small_work")
 
 
-def test_an_even_sky_lights_a_convex_body_evenly() -> None:
+def test_even_sky() -> None:
     mesh, _ = repair(mesh_of(trimesh.creation.icosphere(2)), 1.0)
     scene = light_mesh(mesh, sky((1, 2, 3), (1, 2, 3)), [], BLACK)
     np.testing.assert_allclose(scene.light[0], np.tile([1, 2, 3], (len(scene.light[0]), 1)), rtol=1e-4)
     assert scene.light[1].max() == 0
 
 
-def test_a_linear_sky_has_its_cosine_weighted_mean() -> None:
+def test_linear_sky() -> None:
     scene = light_mesh(repair(plate(1.0), 0.2)[0], sky(BLACK, (1, 2, 0.5)), [], BLACK)
     # The mean of (1 + cos) / 2 over cosine-weighted directions is 5 / 6 above, 1 / 6 below.
     np.testing.assert_allclose(scene.light[0].mean(0), 5 / 6 * np.array([1, 2, 0.5]), rtol=2e-3)
     np.testing.assert_allclose(scene.light[1].mean(0), 1 / 6 * np.array([1, 2, 0.5]), rtol=1e-2)
 
 
-def test_direct_light_is_the_form_factor() -> None:
+def test_direct_light() -> None:
     """A small lamp above a plate, against radiance x area x cos x cos / (pi d^2). It shines to one side only."""
     lamp = AreaLight((0.5, 0, 2.0), (0.01, 0, 0), (0, -0.01, 0), (100.0, 200.0, 300.0))
     scene = light_mesh(repair(plate(2.0), 0.1)[0], NIGHT, [lamp], BLACK)
@@ -76,7 +67,7 @@ def test_shadow() -> None:
     assert (shaded[0, clear] > 0.98 * clear_sky[0, clear]).all()
 
 
-def test_ambient_light_bounces_and_emission_lights_nothing() -> None:
+def test_ambient_light_and_emission() -> None:
     """In a closed box, ambient light a becomes a / (1 - albedo). A glow stays where it is."""
     box = trimesh.creation.box((2.0, 2.0, 2.0))
     box.invert()
@@ -89,7 +80,7 @@ def test_ambient_light_bounces_and_emission_lights_nothing() -> None:
     np.testing.assert_allclose(light, np.broadcast_to(expected[:, None, None], light.shape), rtol=1e-4)
 
 
-def test_a_small_sun_is_no_noise() -> None:
+def test_small_sun() -> None:
     """Half a degree of sun in a dim sky: its irradiance is radiance x solid angle x cosine, on every point alike."""
     rows, columns = 256, 512
     picture = np.full((rows, columns, 3), 0.1, np.float32)
@@ -120,7 +111,7 @@ def test_environment_parts_add_up() -> None:
     assert bright.max() > 0
 
 
-def test_an_environment_file_is_turned(tmp_path: Path) -> None:
+def test_turn_environment_file(tmp_path: Path) -> None:
     picture = np.zeros((16, 32, 3), np.float32)
     picture[:, 16] = (1.0, 2.0, 3.0)  # blue, green, red: just right of +x
     assert cv2.imwrite(str(tmp_path / "a.hdr"), picture)
@@ -132,7 +123,7 @@ def test_an_environment_file_is_turned(tmp_path: Path) -> None:
         load_environment(tmp_path / "b.hdr")
 
 
-def test_a_closed_box_balances_its_energy() -> None:
+def test_energy_in_closed_box() -> None:
     """Furnace: what the walls receive is the lamp's power over their area and what they absorb."""
     box = trimesh.creation.box((2.0, 2.0, 2.0))
     box.invert()
@@ -149,7 +140,7 @@ def test_a_closed_box_balances_its_energy() -> None:
     assert scene.light[1].max() == 0
 
 
-def test_both_sides_are_lit_by_what_they_face() -> None:
+def test_light_both_sides() -> None:
     lamps = [
         AreaLight((0, 0, 2.0), (0.1, 0, 0), (0, -0.1, 0), (50.0, 0, 0)),
         AreaLight((0, 0, -2.0), (0.1, 0, 0), (0, 0.1, 0), (0, 50.0, 0)),
@@ -162,7 +153,7 @@ def test_both_sides_are_lit_by_what_they_face() -> None:
         assert radiance[..., dark].max() == 0
 
 
-def test_smooth_surfaces_share_their_light_and_creases_do_not() -> None:
+def test_share_light_on_smooth_surfaces() -> None:
     sphere, box = mesh_of(trimesh.creation.icosphere(3)), mesh_of(trimesh.creation.box())
     assert len(light_points(sphere).position) == len(sphere.vertices)
     points = light_points(box)

@@ -7,12 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import (
-    BLACK,
-    OVERHEAD,
-    baked_mesh,
-    painted_box,
-)
+from helpers.small_meshes import BLACK, OVERHEAD, baked_mesh, painted_box
 
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.errors import DataError
@@ -30,7 +25,7 @@ def seen(path: Path, up: str) -> np.ndarray:
     return scene.render(pose, (60, 60, 32, 24), 64, 48, 1)[0]
 
 
-def test_the_same_picture_from_glb_and_obj(tmp_path: Path) -> None:
+def test_glb_and_obj_look_alike(tmp_path: Path) -> None:
     z_up = painted_box()
     # As a program with y up would write it: our (x, y, z) is its (x, z, -y).
     y_up = z_up.copy()
@@ -67,7 +62,7 @@ def test_the_same_picture_from_glb_and_obj(tmp_path: Path) -> None:
     np.testing.assert_allclose(overhead, value * [0.8, 1.0, 0.6], atol=1e-3)
 
 
-def test_colors_of_a_ply_are_srgb(tmp_path: Path) -> None:
+def test_ply_colors_are_srgb(tmp_path: Path) -> None:
     body = trimesh.creation.box()
     for kind in ("vertex_colors", "face_colors"):
         colored = trimesh.Trimesh(
@@ -83,7 +78,7 @@ def test_colors_of_a_ply_are_srgb(tmp_path: Path) -> None:
         )
 
 
-def test_an_obj_with_a_concave_polygon_and_two_materials(tmp_path: Path) -> None:
+def test_obj_with_concave_polygon(tmp_path: Path) -> None:
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 0.7 0.1 0.1\nnewmtl green\nKd 0.1 0.6 0.1\n")
     (tmp_path / "a.obj").write_text(
         "mtllib a.mtl\nv 0 0 0\nv 1 1 0\nv 0 2 0\nv 0.4 1 0\nusemtl red\nf 1 2 3 4\n"

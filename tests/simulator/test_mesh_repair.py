@@ -7,13 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import (
-    BLACK,
-    baked_mesh,
-    joined,
-    mesh_of,
-    plate,
-)
+from helpers.small_meshes import BLACK, baked_mesh, joined, mesh_of, plate
 
 from aenerf_ns.simulator import paths
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
@@ -34,7 +28,7 @@ def test_subdivision_leaves_no_gaps() -> None:
     np.testing.assert_allclose((old * new).sum(1), 1, atol=1e-5)
 
 
-def test_coincident_faces_show_the_first_from_everywhere() -> None:
+def test_first_of_coincident_faces_is_seen() -> None:
     red, green = (mesh_of(trimesh.creation.box((1, 1, 0.2)), color) for color in ((0.8, 0, 0), (0, 0.8, 0)))
     smaller = mesh_of(trimesh.creation.box((0.6, 0.6, 0.2)), (0, 0, 0.8))
     for second, count in ((green, 12), (smaller, 4)):
@@ -80,7 +74,7 @@ def test_concave_polygons() -> None:
         [(0, 0), (4, 0), (4, 0), (4, 4), (2, 1), (0, 4)],
     ],
 )
-def test_holes_and_needless_corners_of_polygons(outline: list[tuple[float, float]]) -> None:
+def test_polygons_with_holes(outline: list[tuple[float, float]]) -> None:
     corners = np.column_stack([outline, 1e-6 * np.random.default_rng(0).normal(size=len(outline))])
     a, b, c = np.moveaxis(corners[triangulate(corners)], 1, 0)
     cross = np.cross(b - a, c - a)

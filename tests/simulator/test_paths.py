@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.small_meshes import (
-    WALK,
-    plate,
-)
+from helpers.small_meshes import WALK, plate
 from scipy.integrate import quad
 
 from aenerf_ns.simulator import paths
@@ -35,7 +32,7 @@ def test_paths_are_smooth(path: paths.CameraPath) -> None:
     assert np.abs(np.diff(second, axis=0)).max() < 0.02 * np.abs(second).max()
 
 
-def test_room_path_is_a_loop_that_turns_about_every_axis() -> None:
+def test_room_path_turns_about_every_axis() -> None:
     path = paths.RoomPath()
     np.testing.assert_allclose(path(0.0), path(1.0), atol=1e-12)
     step = 1e-5
@@ -46,7 +43,7 @@ def test_room_path_is_a_loop_that_turns_about_every_axis() -> None:
     assert (np.abs(rates).max(0) > 0.5).all()
 
 
-def test_object_path_is_a_hemisphere_spiral() -> None:
+def test_object_path_is_a_spiral() -> None:
     poses = np.stack([paths.ObjectPath(turns=3.0)(s) for s in np.linspace(0, 1, 3001)])
     positions = poses[:, :3, 3]
     np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 4.0, rtol=1e-12)
@@ -74,7 +71,7 @@ def test_hard_speed() -> None:
     assert abs(long.duration - 100) < 1e-9
 
 
-def test_a_walk_is_closed_and_smooth() -> None:
+def test_walk_is_closed_and_smooth() -> None:
     path = paths.WalkPath(WALK["positions"], WALK["targets"])
     np.testing.assert_allclose(path(0.0), path(1.0), atol=1e-12)
     poses = np.stack([path(s) for s in np.linspace(0, 1, 4001)])
@@ -87,7 +84,7 @@ def test_a_walk_is_closed_and_smooth() -> None:
     assert speed.max() < 1.5 * speed.min()
 
 
-def test_a_path_through_a_hair_of_space_is_refused() -> None:
+def test_free_space() -> None:
     space = FreeSpace(RayCaster(plate(1.0).vertices, plate(1.0).faces), 0.1 / 0.13)
     assert space.is_free((0, 0, 0.11))
     assert not space.is_free((0, 0, -0.09))

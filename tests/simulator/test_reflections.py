@@ -34,7 +34,7 @@ def red(scene: Renderer, pose: np.ndarray = OVERHEAD) -> np.ndarray:
     return scene.render(pose, LENS, *SIZE, 1)[0][..., 0]
 
 
-def test_without_specular_every_byte_is_that_of_a_diffuse_surface() -> None:
+def test_without_specular_is_diffuse() -> None:
     lamp = AreaLight((0.5, 0, 2.0), (0.3, 0, 0), (0, -0.3, 0), (5.0, 5.0, 5.0))
     mesh, _ = repair(plate(1.0), 0.3)
     other = mesh_of(trimesh.creation.icosphere(2, 0.2).apply_translation((0, 0, 0.5)))
@@ -57,7 +57,7 @@ def test_without_specular_every_byte_is_that_of_a_diffuse_surface() -> None:
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.5])
-def test_under_an_even_sky_reflectance_is_schlicks_and_no_light_is_lost_or_made(roughness: float) -> None:
+def test_reflectance_under_even_sky(roughness: float) -> None:
     ball, _ = repair(mesh_of(trimesh.creation.icosphere(4)), 1.0)
     even = sky((2, 2, 2), (2, 2, 2))
     white, black = (light_mesh(coated(ball, 0.04, roughness, albedo), even, [], BLACK) for albedo in (1.0, 0.0))
@@ -75,7 +75,7 @@ def test_under_an_even_sky_reflectance_is_schlicks_and_no_light_is_lost_or_made(
     assert red(black, pose)[30, 40] == pytest.approx(2.0 * 0.04, rel=1e-2)
 
 
-def test_a_mirror_shows_a_lamp_where_the_reflected_ray_meets_it() -> None:
+def test_mirror_shows_lamp() -> None:
     lamp = AreaLight((0.8, 0.2, 2.0), (0.5, 0.1, 0), (0.06, -0.3, 0), (10.0, 20.0, 30.0))
     scene = light_mesh(coated(plate(2.0), 0.1, 0.0, 0.0), NIGHT, [lamp], BLACK)
     x, y = (ray_directions(LENS, *SIZE)[..., :2] * [3.0, -3.0]).transpose(2, 0, 1)
@@ -93,7 +93,7 @@ def test_a_mirror_shows_a_lamp_where_the_reflected_ray_meets_it() -> None:
     assert red(light_mesh(coated(plate(2.0), 0.1, 0.0, 0.0), NIGHT, [away], BLACK)).max() == 0
 
 
-def test_a_rough_highlight_is_that_of_facets_with_gaussian_slopes() -> None:
+def test_rough_highlight() -> None:
     """Each facet mirrors: the share of facets, seen from the eye, that show the lamp."""
     lamp = AreaLight((0, 0, 2.0), (0.2, 0, 0), (0, -0.2, 0), (1.0, 1.0, 1.0))
     roughness = 0.4
@@ -110,7 +110,7 @@ def test_a_rough_highlight_is_that_of_facets_with_gaussian_slopes() -> None:
     assert picture[30, 40] < 0.6 * 0.1
 
 
-def test_a_mirror_shows_other_surfaces_and_they_hide_a_lamp() -> None:
+def test_mirror_shows_surfaces() -> None:
     box = mesh_of(trimesh.creation.box((0.5, 0.5, 0.5)).apply_translation((0, 2.0, 1.0)), (0.2, 0.4, 0.8))
     lamp = AreaLight((0, 3.0, 1.5), (0.5, 0, 0), (0, 0.2, 0.4), (9.0, 9.0, 9.0))
     mirror = coated(plate(1.5), 1.0, 0.0)
@@ -125,7 +125,7 @@ def test_a_mirror_shows_other_surfaces_and_they_hide_a_lamp() -> None:
     np.testing.assert_allclose(seen[on_box], expected[on_box], rtol=1e-3)
 
 
-def test_small_bodies_reflect_as_widely_as_their_pixels_curve() -> None:
+def test_highlight_of_small_body() -> None:
     """A mirror ball of a few pixels: its highlight does not come and go as the ball moves through the pixels."""
     lamp = AreaLight((3, 3, 4.0), (1.0, 0, 0), (0, -1.0, 0), (50.0, 50.0, 50.0))
     ball = mesh_of(trimesh.creation.icosphere(4, 0.06))
@@ -136,7 +136,7 @@ def test_small_bodies_reflect_as_widely_as_their_pixels_curve() -> None:
     assert np.std(totals) < 0.25 * np.mean(totals)
 
 
-def test_the_shiny_object_is_the_object_with_coats(toy: SimulationScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shiny_object_is_object_with_coats(toy: SimulationScene, monkeypatch: pytest.MonkeyPatch) -> None:
     # Light takes seconds, and the coats do not change it.
     monkeypatch.setattr(lighting, "compute_light", lambda *args: toy.renderer.light.copy())
     shiny = open_scene("shiny_object")

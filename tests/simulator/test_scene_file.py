@@ -9,12 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from helpers.small_meshes import (
-    WALK,
-    painted_box,
-    ray_directions,
-    scene_file,
-)
+from helpers.small_meshes import WALK, painted_box, ray_directions, scene_file
 
 from aenerf_ns.camera.image_encoding import LUMINANCE
 from aenerf_ns.cli.simulate import Simulate
