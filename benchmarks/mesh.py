@@ -76,11 +76,12 @@ class Mesh:
         accuracy = caster.distance(on_mesh)
         seen = self._seen(caster, truth.interpolate(times[:: max(len(times) // _NUM_VIEWS, 1)]).numpy())
         completeness = RayCaster(mesh.vertices, mesh.faces).distance(seen)
+        run = self.run if self.run.is_dir() else self.run.parent
         write_result(
             self.output,
             {
                 "scene": self.scene,
-                "run": json.loads((self._folder / "run.json").read_text("utf8"))["command"],
+                "run": json.loads((run / "run.json").read_text("utf8"))["command"],
                 "resolution": self.resolution,
                 "num_views": self.num_views,
                 "triangles": len(mesh.faces),
@@ -92,16 +93,12 @@ class Mesh:
             },
         )
 
-    @property
-    def _folder(self) -> Path:
-        return self.run if self.run.is_dir() else self.run.parent
-
     def _seen(self, caster: RayCaster, poses: np.ndarray) -> np.ndarray:
         """Return true points (N, 3) that cameras at poses (M, 3, 4) see, evenly spread over their pictures."""
         meta = json.loads((self.data / "transforms.json").read_text("utf8"))["event_camera"]
         intrinsics = (meta[name] for name in ("fl_x", "fl_y", "cx", "cy"))
         directions, _ = CameraIntrinsics(meta["width"], meta["height"], *intrinsics).pixel_directions()
-        # From OpenGL's axes to OpenCV's.
+        # OpenGL's axes become OpenCV's.
         in_camera = directions.reshape(-1, 3) * [1, -1, -1]
         generator = np.random.default_rng(0)
         points = []

@@ -18,7 +18,6 @@ from scipy.special import i0, iv
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.arrays import Array
-from aenerf_ns.simulator.free_space import FreeSpace
 from aenerf_ns.simulator.rendering.embree import RayCaster
 
 HARD_SPEED_RATIO = 8.0
@@ -26,6 +25,8 @@ HARD_MEAN_SPEED = float(i0(np.log(HARD_SPEED_RATIO)))
 """Mean of 8 ** sin(2 pi t) over a period: 2.411."""
 ORIGIN = (0.0, 0.0, 0.0)
 _MAX_TRIES = 200
+_MAX_CLEARANCE = 0.15
+_NUM_STEPS = 2000
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), roll: float = 0.0) -> Array:
@@ -43,6 +44,43 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), 
     pose[:3, 1] = np.cos(roll) * down - np.sin(roll) * right
     pose[:3, 2], pose[:3, 3] = forward, eye
     return pose
+
+
+class FreeSpace:
+    """The space at a clearance from every face: 0.15 m, or less along a path of less than about a meter.
+
+    Args:
+        caster: casts rays against the mesh, or None where all space is free.
+        path_size: about the distance of the path from its middle, in meters.
+    """
+
+    def __init__(self, caster: RayCaster | None, path_size: float) -> None:
+        self._caster = caster
+        self._clearance = min(_MAX_CLEARANCE, 0.13 * path_size)
+
+    def is_free(self, eye: ArrayLike) -> bool:
+        """Tell whether a position (3,) keeps the clearance."""
+        return self._caster is None or bool(self._caster.distance(eye)[0] >= self._clearance)
+
+    def is_reached(self, eye: ArrayLike, home: ArrayLike) -> bool:
+        """Tell whether a position (3,) keeps the clearance and sees ``home``: both are on one side of all walls."""
+        segment = np.concatenate([np.asarray(home), np.subtract(eye, home)]).astype(np.float32)
+        return self.is_free(eye) and (self._caster is None or not self._caster.blocked(segment[None])[0])
+
+    def require_clear(self, path: CameraPath) -> None:
+        """Raise a ValueError if a path passes through a face or comes too close to one."""
+        if self._caster is None:
+            return
+        eyes = np.stack([path(s)[:3, 3] for s in np.linspace(0, 1, _NUM_STEPS + 1)]).astype(np.float32)
+        distance = self._caster.distance(eyes)
+        through = self._caster.blocked(np.concatenate([eyes[:-1], np.diff(eyes, axis=0)], axis=1))
+        if through.any():
+            raise ValueError(f"the camera's path runs into the mesh at {eyes[through.argmax()].round(2)}")
+        if distance.min() < self._clearance:
+            raise ValueError(
+                f"the camera's path comes within {distance.min():.3f} m of the mesh at "
+                f"{eyes[distance.argmin()].round(2)}; it must keep {self._clearance:.3g} m"
+            )
 
 
 class CameraPath(ABC):
@@ -85,7 +123,7 @@ class RoomPath(CameraPath):
         return self._pose(2 * np.pi * s, 0.0, 0.0, 0.0)
 
     def _validation_view(self, k: int, count: int) -> Array:
-        # By turns inside, outside, above and below the path.
+        # The views lie by turns inside, outside, above and below the path.
         return self._pose(2 * np.pi * (k + 0.5) / count, 0.12 * np.cos(2.4 * k), 0.12 * np.sin(2.4 * k), 0.0)
 
     def _test_view(self, rng: np.random.Generator) -> Array:
@@ -125,7 +163,7 @@ class ObjectPath(CameraPath):
         return self._pose(2 * np.pi * self._turns * s, 0.5 * np.pi * s, self._radius, ORIGIN)
 
     def _validation_view(self, k: int, count: int) -> Array:
-        # On a golden-angle spiral all over the hemisphere. A view turns about the vertical until it is clear.
+        # The views lie on a golden-angle spiral. A view turns about the vertical until it is clear of the mesh.
         elevation = np.arcsin((k + 0.5) / count)
         return self._first_free(
             self._pose(2.399963 * k + 0.1 * i, elevation, self._radius, ORIGIN) for i in range(_MAX_TRIES)
@@ -189,7 +227,7 @@ class WalkPath(CameraPath):
             raise ValueError("the camera looks straight up or down, or at its own position; move the targets")
         # Root mean square distance of the positions from their mean.
         size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
-        # In proportion to the built-in room's.
+        # The proportion is the built-in room's.
         self._spread = min(0.13 * size, 0.5)
         self._space = FreeSpace(caster, size)
         self._space.require_clear(self)

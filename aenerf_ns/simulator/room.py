@@ -27,7 +27,7 @@ def room_scene(seed: int = 0) -> Renderer:
     shapes = [*_shell(), *_window(), *_pictures(), *_table(), *_bookshelf(rng), *_sofa(), *_cabinet(), *_corners()]
     lights = [
         AreaLight((0, 0, HEIGHT - 0.09), (0.45, 0, 0), (0, -0.45, 0), (8.8, 8.4, 7.8)),
-        # In front of the curtains and the sill, which would be too bright right beside the lamp.
+        # This lamp is in front of curtains and sill, which would be too bright right beside it.
         AreaLight((0.2, -1.75, 1.5), (-0.6, 0, 0), (0, 0, 0.4), (4.5, 5.0, 5.7)),
         AreaLight((1.72, 0.95, 0.99), (0.1, 0, 0), (0, -0.1, 0), (1.2, 0.9, 0.6)),
     ]

@@ -14,9 +14,8 @@ class SimulationScene:
     """A scene and the cameras in it. Poses are camera-to-world, OpenCV axes, z up, meters.
 
     Attributes:
-        name: name of a built-in scene or of a file.
-        renderer: renders the scene.
-        path: the camera's path, and the held-out views beside it.
+        name: of a built-in scene or of a file.
+        renderer, path: the lit mesh, and the camera's path with the held-out views around it.
         focal_ratio: focal length divided by image width. Pixels are square, and the principal point is the middle.
         aabb: (2, 3) corners of the box around the scene, or None if the scene surrounds the camera.
         background: (3,) linear RGB behind the scene, or None if every ray hits something or sees an environment.

@@ -68,7 +68,7 @@ def mesh_of(
     vertices, faces, uv, color, count = [], [], [], [], 0
     for shape in shapes:
         local, corners, tiles = shape.surface(min(spacing, shape.spacing))
-        # Not a matrix product, which may round equal rows differently: the two sides of a seam must stay in one place.
+        # Not a matrix product, which may round equal rows differently: the two sides of a seam must not part.
         vertices.append((local[:, None, :] * shape.rotation).sum(axis=-1) + np.asarray(shape.center))
         faces.append(corners + count)
         uv.append(tiles + shape.texture_offset)

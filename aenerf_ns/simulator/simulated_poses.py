@@ -17,7 +17,7 @@ from aenerf_ns.simulator.simulation import Simulation
 def poses_from_frames(
     simulation: Simulation, camera: CameraIntrinsics, truth: Trajectory, frame_rate: float, exposure: float, seed: int
 ) -> tuple[Trajectory, dict[str, Any], str]:
-    """Run COLMAP on the frames of a camera at the event sensor's place, as in a DAVIS.
+    """Run COLMAP on the frames of a camera at the event sensor's position, as in a DAVIS.
 
     The truth provides only what pictures cannot: the position, orientation and scale of the world.
 

@@ -93,16 +93,13 @@ class Simulation:
         frames = zip(self._frames, self._times, strict=True)
         with progress_bar() as progress:
             for parameter, time in progress.track(frames, total=len(self._frames), description="Simulating events"):
-                image = self._render(self._scene.path(float(parameter)), RAYS_PER_PIXEL)
+                image = self._render(self._scene.path(float(parameter)), RAYS_PER_PIXEL)[0]
                 yield EventStream(*self._simulator(image, int(time)), camera.width, camera.height, "simulation")
 
     def frame_times(self, frame_rate: float, exposure: float) -> NDArray[np.int64]:
         """Return the middles of the exposures of a camera that takes frames along the path, in nanoseconds.
 
-        Args:
-            frame_rate: frames a second.
-            exposure: duration of an exposure in seconds. The first exposure begins with the path, and the last one ends
-                within it.
+        ``exposure`` is in seconds. The first exposure begins with the path, and the last one ends within it.
 
         Raises:
             ValueError: a number is not positive, an exposure takes longer than a frame, or the path is too short for
@@ -124,34 +121,29 @@ class Simulation:
 
         Args:
             time: middle of the exposure in nanoseconds.
-            exposure: duration of the exposure in seconds.
+            exposure: its duration in seconds.
 
         Returns:
             (height, width) for a monochrome sensor, (height, width, 3) for a color sensor.
         """
-        middle = time * 1e-9
-        ends = np.interp(
-            [middle - exposure / 2, middle + exposure / 2], self._times * 1e-9, np.arange(len(self._times))
-        )
+        middle, half = time * 1e-9, exposure / 2
+        ends = np.interp([middle - half, middle + half], self._times * 1e-9, np.arange(len(self._times)))
         steps = max(int(np.ceil(ends[1] - ends[0])), 1)
         seconds = middle + exposure * ((np.arange(steps) + 0.5) / steps - 0.5)
         parameters = self._profile.parameter(seconds).clip(0, 1)
-        radiance = [self._render(self._scene.path(float(s)), _RAYS_OF_EXPOSURES) for s in parameters]
+        radiance = [self._render(self._scene.path(float(s)), _RAYS_OF_EXPOSURES)[0] for s in parameters]
         seen = to_channels(torch.from_numpy(np.mean(radiance, axis=0)), self._sensor.num_channels)
         return _display(seen.squeeze(-1))
 
     def reference_picture(self, camera_to_world: NDArray[np.float64] | Tensor) -> ReferencePicture:
         """Render the picture from a (4, 4) pose, without noise or blur."""
         pose = np.asarray(camera_to_world)
-        seen = to_channels(torch.from_numpy(self._render(pose, RAYS_PER_PIXEL)), self._sensor.num_channels)
+        seen = to_channels(torch.from_numpy(self._render(pose, RAYS_PER_PIXEL)[0]), self._sensor.num_channels)
         seen = seen.expand(-1, -1, 3)
         linear = (encode(seen, "linear") * 65535).round().numpy().astype(np.uint16)
-        return ReferencePicture(_display(seen), linear, self._view(pose, 1)[1])
+        return ReferencePicture(_display(seen), linear, self._render(pose, 1)[1])
 
-    def _render(self, camera_to_world: NDArray[np.float64], samples: int) -> NDArray[np.float32]:
-        return self._view(camera_to_world, samples)[0]
-
-    def _view(self, camera_to_world: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float32], ...]:
+    def _render(self, camera_to_world: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float32], ...]:
         camera = self._camera
         return self._scene.renderer.render(camera_to_world, self._intrinsics, camera.width, camera.height, samples)
 

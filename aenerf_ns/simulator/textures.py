@@ -50,20 +50,20 @@ def mottled(size: int, rng: np.random.Generator, colors: Sequence[str], contrast
 
 
 def wood(size: int, rng: np.random.Generator, colors: Sequence[str]) -> Texture:
-    """Make wood with its grain along u: warped year rings and stretched fibres."""
+    """Make wood with its grain along u: warped year rings and stretched fibers."""
     warp = spectral_noise(size, rng, 1.8, (4.0, 1.0))
     rings = np.sin(2 * np.pi * (5 * _coordinate(size)[:, None] + 0.55 * warp))
-    fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
-    return albedo(_blend(colors, 0.5 + 0.22 * rings + 0.10 * fibres), 0.06 * fibres)
+    fibers = spectral_noise(size, rng, 0.9, (14.0, 1.0))
+    return albedo(_blend(colors, 0.5 + 0.22 * rings + 0.10 * fibers), 0.06 * fibers)
 
 
 def planks(size: int, rng: np.random.Generator, colors: Sequence[str], rows: int = 8, columns: int = 2) -> Texture:
     """Make floorboards along u, each of its own tone, with staggered joints."""
     row, column, edge = _bond(size, rows, columns, rng.random(rows))
     tone = rng.random((rows, columns))[row, column]
-    fibres = spectral_noise(size, rng, 0.9, (14.0, 1.0))
-    board = _blend(colors, tone + 0.14 * fibres)
-    return albedo(board * (0.6 + 0.4 * _smooth_step(edge, 0.002, 0.009))[..., None], 0.06 * fibres)
+    fibers = spectral_noise(size, rng, 0.9, (14.0, 1.0))
+    board = _blend(colors, tone + 0.14 * fibers)
+    return albedo(board * (0.6 + 0.4 * _smooth_step(edge, 0.002, 0.009))[..., None], 0.06 * fibers)
 
 
 def bricks(

@@ -1,4 +1,4 @@
-"""Turn a video into events: what an event sensor in the place of the camera would have seen between the frames."""
+"""Turn a video into events: what an event sensor at the camera's position would have seen."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class FlowInterpolation:
             first_log, second_log: (height, width) or (height, width, 3) log-radiance, which moves along the flow.
         """
         first_gray, second_gray = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (first_frame, second_frame))
-        # Without a guess of the flow to start from.
+        # No guess of the flow to start from.
         forward = self._flow.calc(first_gray, second_gray, np.empty(0))
         backward = self._flow.calc(second_gray, first_gray, np.empty(0))
         displacement = max(

@@ -20,9 +20,9 @@ _SIMULATE = {
     "full": ("--width", "346", "--height", "260", "--validation-views", "100", "--test-views", "100"),
     "tiny": ("--width", "96", "--height", "72", "--validation-views", "20", "--test-views", "20"),
 }
-# At full size about the errors that COLMAP leaves on the benchmark's scenes: 0.5 degrees and 4 cm at easy speed, 1.1
-# degrees and 8 cm at hard (medians over the sequences of the mean errors,
-# benchmarks/results/estimated_poses_scenes_cpu2.json). Larger at tiny size, where a pixel covers a larger angle.
+# The errors that COLMAP leaves at full size: 0.5 degrees and 4 cm at easy speed, 1.1 degrees and 8 cm at hard speed
+# (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json). They are larger
+# at tiny size, where a pixel covers a larger angle.
 _NOISE = {
     "full": ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03"),
     "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),

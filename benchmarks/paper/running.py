@@ -36,7 +36,7 @@ from benchmarks.runs import exclusive, make_dataset, run_command
 # final step as one less.
 _CURVE_PARTS = 5
 _CURVE = "Eval Images Metrics Dict (all images)/psnr"
-# By its path, because the command runs in the benchmark's folder, where the package `benchmarks` is not found.
+# A path, because the command runs in the benchmark's folder, where the package `benchmarks` is not found.
 _WORKER = (sys.executable, str(Path(__file__).with_name("worker.py")))
 
 
@@ -147,7 +147,7 @@ class Runner:
                 words += ["--pipeline.model.eval-num-rays-per-chunk", "1024"]
             words += [*run.options, "nerfstudio-data", "--data", str(_with_true_poses(data).resolve())]
         else:
-            # As for nerfacto, LPIPS is reported where its network can be downloaded.
+            # LPIPS is reported as for nerfacto, where its network can be downloaded.
             words += ["--pipeline.model.lpips", "True", *run.options]
             poses = "ground-truth" if run.true_poses else "estimated"
             words += ["aenerf-data", "--data", str(data.resolve()), "--poses", poses]

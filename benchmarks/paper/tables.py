@@ -32,7 +32,7 @@ _SETTINGS = ("estimated poses", "estimated poses, pose correction", "true poses"
 # Rows of a method in these settings, the method of the paper last.
 _ROWS_OF = {name: (name, name + CORRECTED, name + ON_TRUE_POSES) for name in (HIGH_PASS, *PEERS.values())}
 _ROWS_OF[_AE_NERF] = (WITHOUT_CORRECTION, OURS, TRUE_POSES)
-# Which of these rows are put in order: of other papers' methods, and of AE-NeRF.
+# The rows that are put in order: of other papers' methods, and of AE-NeRF.
 _ORDERS = {
     "estimated poses, which only AE-NeRF corrects": (0, 1),
     "estimated poses, which all correct": (1, 1),

@@ -15,7 +15,6 @@ import json
 import math
 import os
 import shlex
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +27,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.alignment import align, pose_errors
 from aenerf_ns.camera.trajectory import homogeneous
+from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.progress import progress_bar
 from benchmarks.paper.plan import ON_TRUE_POSES, Dataset, Run
@@ -80,11 +80,9 @@ class Poses:
     def main(self) -> None:
         """Simulate and train whatever is missing, and write the table."""
         names = self.scenes or tuple(name for name, scene in SCENES.items() if self.split in ("all", scene.split))
-        unknown = (set(names) - set(SCENES)) | (set(self.cases) - set(_CASES))
-        if unknown:
-            sys.exit(
-                f"unknown: {', '.join(sorted(unknown))}; scenes are {', '.join(SCENES)}; cases {', '.join(_CASES)}"
-            )
+        for option, chosen, known in (("--scenes", names, SCENES), ("--cases", self.cases, _CASES)):
+            if unknown := set(chosen) - set(known):
+                raise DataError(option, f"unknown: {', '.join(sorted(unknown))}", f"choose among {', '.join(known)}")
         os.environ |= {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
         variants = {_DEFAULT: "", **self.variants}
         datasets = {name: self._dataset(name) for name in names}

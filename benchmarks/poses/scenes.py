@@ -40,7 +40,7 @@ class PoseScene:
 
 
 OUTWARDS = "outwards"
-"""The living room, seen from a loop around its middle by a camera that looks outwards: no place is seen again before
+"""The living room, seen from a loop around its middle by a camera that looks outwards: nothing is seen again before
 the loop closes."""
 
 _NOISE = "--pose-noise-degrees 1.5 --pose-noise-translation 0.04"
@@ -70,12 +70,9 @@ SCENES = {
 
 
 def scene_argument(scene: str, built: Path, folder: Path) -> str:
-    """Return what ``aenerf simulate --scene`` takes for a scene.
+    """Return the argument of ``aenerf simulate --scene`` for the scene of a :class:`PoseScene`.
 
-    Args:
-        scene: of a :class:`PoseScene`.
-        built: folder of ``benchmarks.scenes.build``.
-        folder: for a scene file that has to be written.
+    ``built`` is the folder of ``benchmarks.scenes.build``, and ``folder`` is for a scene file that has to be written.
     """
     if scene in ("object", "room"):
         return scene

@@ -41,7 +41,7 @@ _FULL = ("aenerf", *_SMALL[1:], *_FULL_RAYS)
 # The framework's implementation that needs no CUDA extension. Its grids, networks and samples are those of `aenerf`.
 _NERFACTO = ("nerfacto", "--pipeline.model.implementation", "torch")
 _NERFACTO_FULL = (*_NERFACTO, *_FULL_RAYS)
-# With the sizes of `aenerf-small`.
+# The sizes are those of `aenerf-small`.
 _NERFACTO_SMALL = (
     *_NERFACTO, _RAYS, "1024", *_CHUNK, "--pipeline.model.num-levels", "8", "--pipeline.model.max-res", "256",
     "--pipeline.model.log2-hashmap-size", "15", "--pipeline.model.hidden-dim", "32",
@@ -175,7 +175,7 @@ class StepCost:
                     figures = self._cost(trainings, long=not _ON_GPU and "full" in name)
                 described = [{**vars(side), "arguments": shlex.join(side.arguments)} for side in sides]
                 rows.append({"measurement": name, "baseline": described[0], "subject": described[1], **figures})
-                # After each comparison, because all of them take long.
+                # The file is written after each comparison, because all of them take long.
                 write_result(self.output, {"rows": rows})
 
     @contextmanager

@@ -83,7 +83,7 @@ class _Worker:
 def main() -> None:
     """Answer requests until standard input ends."""
     if sys.argv[1] == "nerfacto":
-        # At the end, because the repository's own `aenerf_ns` lacks two folders of the installed one.
+        # The path comes last, because the repository's own `aenerf_ns` lacks two folders of the installed one.
         sys.path.append(str(Path(__file__).parents[2]))
         from benchmarks.paper.worker import prepare
 

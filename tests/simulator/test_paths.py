@@ -8,7 +8,6 @@ from helpers.small_meshes import WALK, plate
 from scipy.integrate import quad
 
 from aenerf_ns.simulator import paths
-from aenerf_ns.simulator.free_space import FreeSpace
 from aenerf_ns.simulator.rendering.embree import RayCaster
 
 
@@ -85,7 +84,7 @@ def test_walk_is_closed_and_smooth() -> None:
 
 
 def test_free_space() -> None:
-    space = FreeSpace(RayCaster(plate(1.0).vertices, plate(1.0).faces), 0.1 / 0.13)
+    space = paths.FreeSpace(RayCaster(plate(1.0).vertices, plate(1.0).faces), 0.1 / 0.13)
     assert space.is_free((0, 0, 0.11))
     assert not space.is_free((0, 0, -0.09))
     assert space.is_reached((0, 0, 0.5), (0.5, 0, 0.5))

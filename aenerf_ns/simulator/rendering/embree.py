@@ -48,8 +48,8 @@ class RayCaster:
 
     def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Tell for each ray (N,) whether a triangle lies between its origin and origin + direction."""
-        tensor, threads = self._tensor(rays), numba.get_num_threads()
-        return self._scene.test_occlusions(tensor, tnear=0.0, tfar=1.0, nthreads=threads).numpy()
+        threads = numba.get_num_threads()
+        return self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0, nthreads=threads).numpy()
 
     def all_hits(self, rays: NDArray[np.float32]) -> tuple[NDArray, NDArray, NDArray]:
         """Find all hits (M,) of all rays: the numbers of the rays and of the faces (int64), and the distances."""

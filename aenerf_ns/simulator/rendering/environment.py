@@ -78,7 +78,7 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
     # OpenCV prints errors of its own beside the one line.
     level = cv2.setLogLevel(0)
     try:
-        # From the file, because imdecode leaves temporary files behind for pictures that are too large.
+        # It is read from the file, because imdecode leaves temporary files behind for pictures that are too large.
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if begin == b"#?" else None
     except cv2.error:
         picture = None

@@ -81,8 +81,7 @@ def add_reflections(
 
     Args:
         reflections, surface, light, caster, limit: see `Renderer`.
-        rays: (rows * columns * samples, 6) rays through the picture, one meter long along the optical axis.
-        hits: what the rays hit.
+        rays, hits: rays (rows * columns * samples, 6), one meter long along the optical axis, and what they hit.
         focal_length: in pixels.
         radiance: (rows, columns, 3) diffuse picture, changed in place.
     """

@@ -122,8 +122,7 @@ class Renderer:
     """Render a lit mesh.
 
     Attributes:
-        surface: the mesh.
-        caster: casts rays against the mesh.
+        surface, caster: the mesh.
         light: (2, G, 3) irradiance / pi at the light points, in front of the faces and behind them.
         background: (3,) radiance where a ray hits nothing and ``surroundings`` is empty.
         surroundings: panorama that is seen where a ray hits nothing, or empty.
