@@ -223,10 +223,10 @@ class Plan:
             options = {OURS: train, WITHOUT_CORRECTION: off, TRUE_POSES: off}
         else:
             name = PEERS[method]
-            if method == "e2vid-nerf" and self.e2vid_weights is None:
-                name, images = HIGH_PASS, ("--method", "high-pass")
-            elif method == "e2vid-nerf":
+            if method == "e2vid-nerf" and self.e2vid_weights is not None:
                 images = ("--method", "e2vid", "--weights", str(self.e2vid_weights.resolve()))
+            elif method == "e2vid-nerf":
+                name, images = HIGH_PASS, ("--method", "high-pass")
             options = {name: off, name + CORRECTED: spline, name + ON_TRUE_POSES: off}
         return {row: (self._registered(method), words, images) for row, words in options.items()}
 
