@@ -11,15 +11,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.dataparsers.ecd import ecd_dataparser
-from aenerf_ns.dataparsers.eds import eds_dataparser
-from aenerf_ns.dataparsers.enerf_esim import enerf_esim_dataparser
-from aenerf_ns.dataparsers.eventnerf import eventnerf_dataparser
-from aenerf_ns.dataparsers.native import native_dataparser
-from aenerf_ns.dataparsers.own_recording import own_recording_dataparser
-from aenerf_ns.dataparsers.paev3d import paev3d_dataparser
-from aenerf_ns.dataparsers.robust_enerf import robust_enerf_dataparser
-from aenerf_ns.dataparsers.tum_vie import tum_vie_dataparser
+from aenerf_ns.dataparsers import ecd, eds, enerf_esim, eventnerf, native, own_recording, paev3d, robust_enerf, tum_vie
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.output_paths import require_dataset
 from aenerf_ns.recording.dataparser import EventDataParser
@@ -27,15 +19,15 @@ from aenerf_ns.recording.options import EventDataParserConfig
 
 # All formats by registered name. Where a folder has several formats, the first one here is taken.
 FORMATS: dict[str, EventDataParserConfig] = {
-    "aenerf-data": native_dataparser.config,
-    "ecd-data": ecd_dataparser.config,
-    "robust-enerf-data": robust_enerf_dataparser.config,
-    "tum-vie-data": tum_vie_dataparser.config,
-    "eds-data": eds_dataparser.config,
-    "enerf-esim-data": enerf_esim_dataparser.config,
-    "eventnerf-data": eventnerf_dataparser.config,
-    "paev3d-data": paev3d_dataparser.config,
-    "event-recording-data": own_recording_dataparser.config,
+    "aenerf-data": native.native_dataparser.config,
+    "ecd-data": ecd.ecd_dataparser.config,
+    "robust-enerf-data": robust_enerf.robust_enerf_dataparser.config,
+    "tum-vie-data": tum_vie.tum_vie_dataparser.config,
+    "eds-data": eds.eds_dataparser.config,
+    "enerf-esim-data": enerf_esim.enerf_esim_dataparser.config,
+    "eventnerf-data": eventnerf.eventnerf_dataparser.config,
+    "paev3d-data": paev3d.paev3d_dataparser.config,
+    "event-recording-data": own_recording.own_recording_dataparser.config,
 }
 
 
