@@ -103,13 +103,17 @@ def _read_beginning(path: Path) -> bytes:
 
 
 def _format(path: Path, beginning: bytes) -> str:
-    # A binary format is recognized; the first bytes of other files do not tell what they are.
-    found = [name for magic, name in _FORMAT_OF_MAGIC.items() if beginning.startswith(magic)]
-    name = "bag" if not beginning else found[0] if found else _FORMAT_OF_SUFFIX.get(path.suffix.lower())
-    if name is None:
+    if not beginning:
+        return "bag"
+    for magic, name in _FORMAT_OF_MAGIC.items():
+        if beginning.startswith(magic):
+            return name
+    # The first bytes of other files do not tell what they are.
+    by_suffix = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
+    if by_suffix is None:
         raise DataError(
             path,
             f"its format is not known (it begins with {beginning[:8]!r})",
             "RAW (EVT2, EVT3), DAT, AEDAT4, bags of ROS, HDF5, npz, npy, csv and text are read",
         )
-    return name
+    return by_suffix
