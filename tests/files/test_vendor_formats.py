@@ -1,16 +1,46 @@
-"""RAW files of Prophesee cameras."""
+"""AEDAT4 files of DV, and RAW files of Prophesee's cameras."""
 
 from __future__ import annotations
 
+import re
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.event_file_checks import lapless, read
-from helpers.event_file_writers import WIDTH, evt3
+from helpers.event_file_checks import lapless, read, table
+from helpers.event_file_writers import WIDTH, aedat4_file, evt3
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.files import prophesee
 from aenerf_ns.files.open import open_event_file
+
+
+@pytest.mark.parametrize(("compression", "package"), [(1, "lz4.frame"), (2, "lz4.frame"), (4, "backports.zstd")])
+def test_compressed_packets_of_aedat4(
+    compression: int, package: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compress = pytest.importorskip(package).compress
+    rows = [(x, 7, 1_600_000_000_000_000 + x, 1 - 2 * (x % 2)) for x in range(20)]
+    path = folder / "packed.aedat4"
+    path.write_bytes(aedat4_file(rows, compression, compress, with_table=True))
+    file = open_event_file(path)
+    np.testing.assert_array_equal(read(file), table(rows))
+    assert file.count() == len(rows)
+    assert file.time_span() == (rows[0][2] * 1000, rows[-1][2] * 1000)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(DataError, match=re.escape("pip install 'aenerf-ns[aedat4]'")):
+        read(file)
+
+
+def test_choose_a_stream_of_aedat4(folder: Path) -> None:
+    path = folder / "stereo.aedat4"
+    path.write_bytes(aedat4_file([(1, 2, 3, 1)], streams={0: "EVTS", 4: "EVTS"}))
+    with pytest.raises(DataError, match="several streams hold events; choose one of 0, 4"):
+        open_event_file(path)
+    assert len(read(open_event_file(path, topic="0"))) == 1
+    with pytest.raises(DataError, match="holds no events"):
+        read(open_event_file(path, topic="4"))
 
 
 def test_evt3_keeps_time_over_many_wraps(folder: Path) -> None:
