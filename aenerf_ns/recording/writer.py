@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from abc import ABC, abstractmethod
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -49,17 +50,17 @@ class _FolderWriter(ABC):
     """
 
     def __init__(self, folder: Path | OutputLock) -> None:
-        lock = OutputLock(folder) if isinstance(folder, Path) else folder
-        self._own_lock = lock if isinstance(folder, Path) else None
+        self._cleanup = ExitStack()
+        lock = self._cleanup.enter_context(OutputLock(folder)) if isinstance(folder, Path) else folder
         self._folder, self._partial = lock.output, lock.partial
         # A process that was killed may have left it. Nobody else writes it, because the lock is held.
         shutil.rmtree(self._partial, ignore_errors=True)
+        self._cleanup.callback(shutil.rmtree, self._partial, ignore_errors=True)
         try:
             self._partial.mkdir()
             self.events = Hdf5EventWriter(self._partial / "events.h5")
         except OSError as error:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            self._unlock()
+            self._cleanup.close()
             raise output_error(self._folder, error) from None
 
     def __enter__(self: _Writer) -> _Writer:
@@ -78,16 +79,11 @@ class _FolderWriter(ABC):
                 self._folder, f"it cannot be written ({reason(problem)})", "check the space and the rights"
             ) from None
         finally:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            self._unlock()
+            self._cleanup.close()
 
     @abstractmethod
     def _finish(self) -> None:
         """Write what is known when all events and images are written."""
-
-    def _unlock(self) -> None:
-        if self._own_lock is not None:
-            self._own_lock.release()
 
 
 class NativeDatasetWriter(_FolderWriter):
