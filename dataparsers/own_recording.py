@@ -35,7 +35,7 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     markers = (
         f"events{{{','.join(SUFFIXES)}}}",
         " or ".join(_CALIBRATIONS),
-        "trajectory.txt or a COLMAP model in colmap",
+        "poses in trajectory.txt or a COLMAP model in colmap, where there are any",
     )
     _target: type = field(default_factory=lambda: OwnRecordingDataParser)
     events: Path | None = None
@@ -64,8 +64,10 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:
-        has_calibration = any((data / name).is_file() for name in _CALIBRATIONS)
-        return has_calibration and ((data / "trajectory.txt").is_file() or (data / "colmap").is_dir())
+        # Poses may be missing: they can be estimated.
+        has_events = any((data / f"events{suffix}").is_file() for suffix in SUFFIXES)
+        has_poses = (data / "trajectory.txt").is_file() or (data / "colmap").is_dir()
+        return any((data / name).is_file() for name in _CALIBRATIONS) and (has_events or has_poses)
 
 
 class OwnRecordingDataParser(EventDataParser):
@@ -83,6 +85,13 @@ class OwnRecordingDataParser(EventDataParser):
             if not timed:
                 raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
             reference = _read_colmap(model, timed, images, frame_from_event)
+        elif config.poses is None and not poses.is_file():
+            raise DataError(
+                poses,
+                "there is no such file",
+                "give the poses, or have them estimated from the events: aenerf convert ... --output FOLDER --poses "
+                "events (or from frames: --poses colmap)",
+            )
         else:
             reference = read_tum_trajectory(poses)
         views = views_on_trajectory(

@@ -26,7 +26,7 @@ MAY_USE: dict[str, set[str]] = {
     "files": {"errors", "events", "camera"},
     "recording": {"errors", "progress", "events", "camera", "files"},
     # Poses of a recording from its frames: a tool, which only commands and the simulator use.
-    "poses_from_frames": {"errors", "progress", "camera", "files", "recording"},
+    "pose_estimation": {"errors", "progress", "events", "reconstruction", "camera", "files", "recording"},
     "checking": {"progress", "events", "camera", "recording"},
     "supervision": {"errors", "events", "camera", "recording"},
     "method": {"errors", "camera", "recording", "supervision"},
@@ -38,14 +38,14 @@ MAY_USE: dict[str, set[str]] = {
     # What training and checking left behind, measured and shown.
     "report": {"errors", "progress", "camera", "files", "supervision", "evaluation", "training", "checking"},
     # Stands beside the method: only commands and benchmarks use it.
-    "simulator": {"errors", "progress", "open3d_import", "events", "camera", "files", "poses_from_frames"},
+    "simulator": {"errors", "progress", "open3d_import", "events", "camera", "files", "pose_estimation"},
     # What other tools take from a trained run.
     "export": {"errors", "progress", "open3d_import", "events", "camera", "files", "recording", "evaluation"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},
     "method_configs": {"supervision", "method", "training", "dataparsers"},
     "cli": {
         "errors", "progress", "open3d_import", "events", "reconstruction", "camera", "files", "recording",
-        "poses_from_frames", "method", "evaluation", "training", "checking", "export", "report", "simulator",
+        "pose_estimation", "method", "evaluation", "training", "checking", "export", "report", "simulator",
         "dataparsers",
     },
 }  # fmt: skip

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.events.filters import EventFilters, FilteredEventFile
     from aenerf_ns.events.stream import EventFile, EventStream
+    from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
     from aenerf_ns.recording.dataparser import EventDataParser
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.recording.recording import Capture, Recording
@@ -47,9 +48,10 @@ class Convert(DatasetCommand):
 
     output: Path
     """Dataset folder to create."""
-    poses: Literal["given", "colmap"] = "given"
-    """given: take the dataset's poses. colmap: have COLMAP estimate poses from the recording's frames, without metric
-    scale. The given poses are then kept as ground truth, to compare with."""
+    poses: Literal["given", "colmap", "events"] = "given"
+    """given: take the dataset's poses. colmap: have COLMAP estimate poses from the recording's frames. events: have it
+    estimate poses from images that are made of the events, for a recording without frames or of fast motion. Estimated
+    poses have no metric scale. Given poses are then kept as ground truth, to compare with."""
     start_time_ns: int | None = None
     """Leave out events and images before this time on the clock of the events, in nanoseconds."""
     end_time_ns: int | None = None
@@ -95,8 +97,8 @@ class Convert(DatasetCommand):
         from aenerf_ns.recording.views import thin_views
 
         report = None
-        if self.poses == "colmap":
-            recording, report = _with_estimated_poses(*parser.read_frames(), filters.window, self.data, self.seed)
+        if self.poses != "given":
+            recording, report = self._with_estimated_poses(*parser.read_frames(), filters.window)
         else:
             recording = parser.recording
         events = FilteredEventFile(recording.event_file, filters)
@@ -129,6 +131,28 @@ class Convert(DatasetCommand):
             f"Look it over with: aenerf check {self.output}\n"
             f"Train with: {training_command(self.output)}"
         )
+
+    def _with_estimated_poses(
+        self, capture: Capture, images: list[tuple[int, Path]], window: TimeWindow
+    ) -> tuple[Recording, dict[str, Any]]:
+        """Estimate poses with COLMAP, and return the recording with them and COLMAP's report."""
+        from aenerf_ns.pose_estimation.from_events import estimate_poses_from_events
+        from aenerf_ns.pose_estimation.from_frames import estimate_poses
+
+        has_own_frames = capture.frame_camera == capture.event_camera
+        if self.poses == "events":
+            found = estimate_poses_from_events(capture, window, self.data, self.seed)
+            return _with_poses(found, capture, images if has_own_frames else [])
+        if not has_own_frames:
+            raise DataError(
+                self.data,
+                "its frames are of another camera than its events, and COLMAP finds the poses of the frames only",
+                "estimate them from the events (--poses events), or estimate poses elsewhere, convert them to poses of "
+                "the event camera, and give them as the trajectory",
+            )
+        kept = [(time, file) for time, file in images if window.contains(time)]
+        times, files = [time for time, _ in kept], [file for _, file in kept]
+        return _with_poses(estimate_poses(files, times, capture.frame_camera, self.data, self.seed), capture, kept)
 
 
 def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) -> Trajectory:
@@ -171,27 +195,19 @@ def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDat
     return num_read, num_written
 
 
-def _with_estimated_poses(
-    capture: Capture, images: list[tuple[int, Path]], window: TimeWindow, source: Path, seed: int
+def _with_poses(
+    found: EstimatedPoses, capture: Capture, images: list[tuple[int, Path]]
 ) -> tuple[Recording, dict[str, Any]]:
-    """Estimate poses with COLMAP, and return the recording with them and COLMAP's report."""
+    """Return the recording with estimated poses, and the report on them."""
     from aenerf_ns.camera.trajectory import Trajectory
-    from aenerf_ns.poses_from_frames.structure_from_motion import compare_with_truth, estimate_poses
+    from aenerf_ns.pose_estimation.from_frames import compare_with_truth
     from aenerf_ns.recording.recording import Recording
     from aenerf_ns.recording.views import views_on_trajectory
 
-    if capture.frame_camera != capture.event_camera:
-        raise DataError(
-            source,
-            "its frames are of another camera than its events, and COLMAP finds the poses of the frames only",
-            "estimate poses elsewhere, convert them to poses of the event camera, and give them as the trajectory",
-        )
-    kept = [(time, file) for time, file in images if window.contains(time)]
-    found = estimate_poses([file for _, file in kept], [time for time, _ in kept], capture.frame_camera, source, seed)
     trajectory, report = found.trajectory, found.report()
     say(found.summary())
     say(
-        "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale, because frames of one "
+        "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale, because images of one "
         "camera tell no lengths."
     )
     if isinstance(capture, Recording):
@@ -207,6 +223,6 @@ def _with_estimated_poses(
             )
         # The scene box is in the world of the given poses, and the longest gap is about the given poses.
         return replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None), report
-    placed = [(time, file) for time, file in kept if trajectory.start <= time <= trajectory.end]
+    placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
     views = views_on_trajectory(placed, trajectory)
     return Recording(**vars(capture), trajectory=trajectory, reference_views=views), report

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.camera.trajectory import Trajectory
-    from aenerf_ns.poses_from_frames.video import Video
+    from aenerf_ns.pose_estimation.video import Video
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.recording.writer import NativeDatasetWriter, PoselessRecordingWriter
     from aenerf_ns.simulator.video_events import VideoInterval
@@ -91,7 +91,7 @@ class SimulateVideo(SimulationCommand):
     def _simulate(self, sensor: SensorModel, lock: OutputLock) -> None:
         import numpy as np
 
-        from aenerf_ns.poses_from_frames.video import open_video
+        from aenerf_ns.pose_estimation.video import open_video
         from aenerf_ns.simulator.video_events import video_events
 
         video = open_video(self.video, self.frame_rate)
@@ -132,7 +132,7 @@ class SimulateVideo(SimulationCommand):
     def _find_poses(self, video: Video, camera: CameraIntrinsics | None) -> _VideoPoses | None:
         """Read or estimate the poses of the video's camera, or return None where no option asks for them."""
         from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-        from aenerf_ns.poses_from_frames.structure_from_motion import estimate_poses
+        from aenerf_ns.pose_estimation.from_frames import estimate_poses
 
         if self.trajectory is not None:
             assert camera is not None

@@ -10,11 +10,11 @@ from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.poses_from_frames.structure_from_motion import compare_with_truth, estimate_poses
+from aenerf_ns.pose_estimation.from_frames import compare_with_truth, estimate_poses
 from aenerf_ns.simulator.simulation import Simulation
 
 
-def poses_from_frames(
+def pose_estimation(
     simulation: Simulation, camera: CameraIntrinsics, truth: Trajectory, frame_rate: float, exposure: float, seed: int
 ) -> tuple[Trajectory, dict[str, Any], str]:
     """Run COLMAP on the frames of a camera at the event sensor's position, as in a DAVIS.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from aenerf_ns.camera.image_encoding import decode, to_channels
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.poses_from_frames.video import Video
+from aenerf_ns.pose_estimation.video import Video
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.simulator.esim import NOISELESS, EventSimulator
 from aenerf_ns.simulator.frames import DISPLACEMENT_PERCENTILE

@@ -24,7 +24,7 @@ from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
-from aenerf_ns.poses_from_frames.video import open_video
+from aenerf_ns.pose_estimation.video import open_video
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.simulator.options import SensorNoise
 from aenerf_ns.simulator.video_events import video_events

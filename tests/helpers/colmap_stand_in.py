@@ -8,7 +8,7 @@ import torch
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.poses_from_frames.structure_from_motion import EstimatedPoses
+from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 
 
 def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -23,4 +23,4 @@ def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:
         trajectory = Trajectory(times[:num_placed], poses, source)
         return EstimatedPoses(np.array(times), trajectory, camera, [num_placed], 9, 0.5, 100.0, 1.0)
 
-    monkeypatch.setattr("aenerf_ns.poses_from_frames.structure_from_motion.estimate_poses", place)
+    monkeypatch.setattr("aenerf_ns.pose_estimation.from_frames.estimate_poses", place)

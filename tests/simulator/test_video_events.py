@@ -18,7 +18,7 @@ from PIL import Image
 from aenerf_ns.camera.image_encoding import decode, encode
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.poses_from_frames.video import Video, open_video
+from aenerf_ns.pose_estimation.video import Video, open_video
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.options import Interpolation, SensorNoise
 from aenerf_ns.simulator.textures import spectral_noise

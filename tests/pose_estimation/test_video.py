@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.poses_from_frames.video import open_video
+from aenerf_ns.pose_estimation.video import open_video
 
 WIDTH, HEIGHT = 32, 20
 

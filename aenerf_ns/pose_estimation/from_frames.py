@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import statistics
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,22 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
-from rich.progress import Progress, TaskID
 from torch import Tensor
 
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, trajectory_of
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.recording.images import read_image, require_8_bits
-
-# Each frame is matched with this number of frames after it, and with the frames 16, 32, ... 1024 after it.
-_NUM_NEIGHBORS = 10
-# This number of frames, evenly spread, are matched with each other. Without them errors add up along the path, and a
-# loop stays open.
-_NUM_KEY_FRAMES = 100
 
 # Beyond these errors, a pose is not inaccurate but wrong: COLMAP put the camera elsewhere.
 _FLIP_DEGREES = 90.0
@@ -54,6 +44,9 @@ class EstimatedPoses:
         reprojection_error: mean over their observations, in pixels.
         features: median number of features in a frame.
         seconds: how long it took.
+        images: what the frames are, for people to read.
+        mapper: COLMAP's mapper whose model was taken, incremental or global.
+        agreement: share of the matches kept apart that fit the poses; None where none were kept apart.
     """
 
     frame_times: NDArray[np.int64]
@@ -64,6 +57,9 @@ class EstimatedPoses:
     reprojection_error: float
     features: float
     seconds: float
+    images: str = "frames"
+    mapper: str = "incremental"
+    agreement: float | None = None
 
     def gaps(self) -> list[tuple[int, int, int]]:
         """Return first time, last time (nanoseconds) and number of frames of every run of frames without a pose."""
@@ -87,15 +83,19 @@ class EstimatedPoses:
             "mean_reprojection_error_pixels": self.reprojection_error,
             "median_features": self.features,
             "seconds": self.seconds,
+            "mapper": self.mapper,
+            "agreement": self.agreement,
         }
 
     def summary(self) -> str:
         """Return a line of figures, and a second line that names the times of frames without a pose, if any."""
         pieces = f" in the largest of {len(self.model_sizes)} models" if len(self.model_sizes) > 1 else ""
         line = (
-            f"COLMAP: {len(self.trajectory)} of {len(self.frame_times)} frames registered{pieces}, {self.num_points} "
-            f"points, reprojection error {self.reprojection_error:.2f} px"
+            f"COLMAP: {len(self.trajectory)} of {len(self.frame_times)} {self.images} registered{pieces}, "
+            f"{self.num_points} points, reprojection error {self.reprojection_error:.2f} px"
         )
+        if self.agreement is not None:
+            line += f", {self.mapper} mapper; {self.agreement:.0%} of the matches that were kept apart fit the poses"
         gaps = [f"{start * 1e-9:.3f} to {end * 1e-9:.3f} s ({count})" for start, end, count in self.gaps()]
         if len(gaps) > _MAX_GAPS_SHOWN:
             gaps = [*gaps[:_MAX_GAPS_SHOWN], f"and {len(gaps) - _MAX_GAPS_SHOWN} more runs"]
@@ -143,7 +143,7 @@ def estimate_poses(
     given = camera if isinstance(camera, CameraIntrinsics) else None
     size = (camera.width, camera.height) if isinstance(camera, CameraIntrinsics) else camera
     with TemporaryDirectory() as folder, progress_bar() as progress:
-        workspace = _Workspace(Path(folder), len(times), seed, progress)
+        workspace = ColmapWorkspace(Path(folder), len(times), seed, progress)
         workspace.add_frames(frames, size, source)
         workspace.find_features(given)
         workspace.match()
@@ -157,19 +157,13 @@ def estimate_poses(
             "it needs a moving camera and sharp, textured frames: a shorter exposure, a higher frame rate, more pixels",
         )
     model = models[0]
-    poses = {
-        int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
-        for image in model.images.values()
-        if image.has_pose
-    }
     if given is None:
         (found,) = model.cameras.values()
         focal_length, cx, cy, k1 = (float(value) for value in found.params)
         given = CameraIntrinsics(*size, focal_length, focal_length, cx, cy, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
-    indices = sorted(poses)
     return EstimatedPoses(
         frame_times=times,
-        trajectory=Trajectory(times[indices], torch.from_numpy(np.stack([poses[i] for i in indices])), source),
+        trajectory=trajectory_of(model, times, source),
         camera=given,
         model_sizes=[model.num_reg_images() for model in models],
         num_points=model.num_points3D(),
@@ -224,115 +218,3 @@ def _align_majority(poses: Tensor, truth: Tensor) -> Similarity:
     if 2 * agree.sum() <= len(poses):
         return align(poses, truth)
     return align(poses[agree], truth[agree])
-
-
-class _Workspace:
-    """COLMAP's database and images in a folder, and the steps of its work."""
-
-    def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
-        self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
-        self._images.mkdir()
-        self._names = [f"{index:08d}.png" for index in range(num_frames)]
-        self._seed = seed
-        self._progress = progress
-
-    def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
-        """Write the frames as image files for COLMAP."""
-        named = zip(self._names, frames, strict=True)
-        for name, frame in self._progress.track(named, total=len(self._names), description="Collecting frames"):
-            origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
-            with read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
-                if image.size != size:
-                    raise DataError(
-                        origin,
-                        f"the frame has {image.width} x {image.height} pixels, its camera {size[0]} x {size[1]}",
-                        "give the intrinsics of the frames as they are",
-                    )
-                require_8_bits(image, origin)
-                image.convert("L" if image.mode == "L" else "RGB").save(self._images / name)
-
-    def find_features(self, camera: CameraIntrinsics | None) -> None:
-        import pycolmap
-
-        reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
-        if camera is None:
-            reader.camera_model = "SIMPLE_RADIAL"
-        else:
-            reader.camera_model, parameters = camera.to_colmap()
-            reader.camera_params = ", ".join(map(repr, parameters))
-        extraction.use_gpu, extraction.num_threads = False, 1
-        # COLMAP's own limits suit photographs of many megapixels. This one, and those of the mapper below, suit frames
-        # of a fraction of a megapixel.
-        extraction.sift.peak_threshold = 0.004
-        with self._step("Finding features"):
-            pycolmap.extract_features(
-                self._database,
-                self._images,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=extraction,
-                device=pycolmap.Device.cpu,
-            )
-
-    def match(self) -> None:
-        import pycolmap
-
-        pairs = [f"{self._names[i]} {self._names[j]}" for i, j in _choose_pairs(len(self._names))]
-        matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
-        verification = pycolmap.TwoViewGeometryOptions()
-        matching.use_gpu, matching.num_threads = False, 1
-        pairing.match_list_path = self._folder / "pairs.txt"
-        pairing.match_list_path.write_text("\n".join(pairs), encoding="utf-8")
-        verification.ransac.random_seed = self._seed
-        with self._step("Matching frames"):
-            pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
-
-    def reconstruct(self, refine_intrinsics: bool) -> list[Any]:
-        """Return the models, in the order of the number of frames that they place, the largest first."""
-        import pycolmap
-
-        options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self._seed
-        options.num_threads = options.mapper.num_threads = 1
-        options.ba_refine_focal_length = options.ba_refine_extra_params = refine_intrinsics
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
-        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = 15, 50
-        options.extract_colors = False
-        output = self._folder / "models"
-        output.mkdir()
-        with self._step("Placing frames", len(self._names)) as task:
-            models = pycolmap.incremental_mapping(
-                self._database, self._images, output, options, next_image_callback=lambda: self._progress.advance(task)
-            )
-        return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
-
-    def count_features_and_pairs(self) -> tuple[float, int]:
-        """Return the median number of features in a frame, and the number of pairs of frames that match."""
-        import pycolmap
-
-        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
-            counts = [database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()]
-            return statistics.median(counts) if counts else 0.0, database.num_verified_image_pairs()
-
-    @contextlib.contextmanager
-    def _step(self, description: str, total: int | None = None) -> Iterator[TaskID]:
-        """Show the progress of a step, and keep COLMAP's log off the console."""
-        import pycolmap
-
-        level = pycolmap.logging.minloglevel
-        pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-        task = self._progress.add_task(description, total=total)
-        try:
-            yield task
-        finally:
-            pycolmap.logging.minloglevel = level
-            self._progress.update(task, total=len(self._names), completed=len(self._names))
-
-
-def _choose_pairs(num_frames: int) -> list[tuple[int, int]]:
-    """Return which frames of a video to match: pairs of indices, the smaller index first."""
-    offsets = [*range(1, _NUM_NEIGHBORS + 1), *(2**power for power in range(4, 11))]
-    pairs = {(i, i + offset) for offset in offsets for i in range(num_frames - offset)}
-    keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _NUM_KEY_FRAMES))})
-    pairs |= {(i, j) for i in keys for j in keys if i < j}
-    return sorted(pairs)

@@ -1,0 +1,295 @@
+"""COLMAP's work on the frames of a video: features, matches and models."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import statistics
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from rich.progress import Progress, TaskID
+
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.recording.images import read_image, require_8_bits
+
+# Each frame is matched with this number of frames after it, and with the frames 16, 32, ... 1024 after it.
+_NUM_NEIGHBORS = 10
+# This number of frames, evenly spread, are matched with each other. Without them errors add up along the path, and a
+# loop stays open.
+_NUM_KEY_FRAMES = 100
+# Pixels that a match may be off.
+_MAX_EPIPOLAR_ERROR = 1.0
+
+
+@dataclass(frozen=True)
+class HeldOutMatches:
+    """Matches between frames that no model was made of.
+
+    Attributes:
+        pairs: the COLMAP indices of two frames, and the (M, 2) rays of the matched features in each, as points in the
+            plane at depth 1.
+        focal_length: in pixels.
+    """
+
+    pairs: list[tuple[tuple[int, int], list[NDArray[np.float64]]]]
+    focal_length: float
+
+    def agreement(self, model: Any) -> float:
+        """Return the share of the matches that fit the poses of a model: matches of frames without a pose do not.
+
+        A match fits if its epipolar error (Sampson's distance) is less than a pixel.
+        """
+        poses = {image.image_id: image.cam_from_world().matrix() for image in model.images.values() if image.has_pose}
+        fitting = total = 0
+        for (first, second), rays in self.pairs:
+            total += len(rays[0])
+            if first not in poses or second not in poses:
+                continue
+            rotation = poses[second][:, :3] @ poses[first][:, :3].T
+            translation = poses[second][:, 3] - rotation @ poses[first][:, 3]
+            essential = np.cross(translation, rotation.T).T
+            x, y = (np.pad(points, ((0, 0), (0, 1)), constant_values=1.0) for points in rays)
+            lines_in_second, lines_in_first = x @ essential.T, y @ essential
+            slopes = np.square(lines_in_second[:, :2]).sum(1) + np.square(lines_in_first[:, :2]).sum(1)
+            errors = np.abs((y * lines_in_second).sum(1)) / np.sqrt(slopes + 1e-30)
+            fitting += int((errors * self.focal_length < _MAX_EPIPOLAR_ERROR).sum())
+        return fitting / max(total, 1)
+
+
+class ColmapWorkspace:
+    """COLMAP's database and images in a folder, and the steps of its work.
+
+    COLMAP runs on one thread, because its results depend on the order in which threads end.
+
+    Args:
+        folder: an empty folder.
+        num_frames: number of frames.
+        seed: of COLMAP's random samples.
+        progress: shows each step.
+
+    Attributes:
+        database: COLMAP's file of features and matches.
+        images: the folder of the frames.
+    """
+
+    def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
+        self.folder, self.images, self.database = folder, folder / "images", folder / "database.db"
+        self.images.mkdir()
+        self._names = [f"{index:08d}.png" for index in range(num_frames)]
+        self.seed = seed
+        self.progress = progress
+
+    def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
+        """Write the frames as image files for COLMAP."""
+        named = zip(self._names, frames, strict=True)
+        for name, frame in self.progress.track(named, total=len(self._names), description="Collecting frames"):
+            origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
+            with read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
+                if image.size != size:
+                    raise DataError(
+                        origin,
+                        f"the frame has {image.width} x {image.height} pixels, its camera {size[0]} x {size[1]}",
+                        "give the intrinsics of the frames as they are",
+                    )
+                require_8_bits(image, origin)
+                image.convert("L" if image.mode == "L" else "RGB").save(self.images / name)
+
+    def find_features(self, camera: CameraIntrinsics | None) -> None:
+        import pycolmap
+
+        reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+        if camera is None:
+            reader.camera_model = "SIMPLE_RADIAL"
+        else:
+            reader.camera_model, parameters = camera.to_colmap()
+            reader.camera_params = ", ".join(map(repr, parameters))
+        extraction.use_gpu, extraction.num_threads = False, 1
+        # COLMAP's own limits suit photographs of many megapixels. This one, and those of the mapper below, suit frames
+        # of a fraction of a megapixel.
+        extraction.sift.peak_threshold = 0.004
+        with self.step("Finding features"):
+            pycolmap.extract_features(
+                self.database,
+                self.images,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
+
+    def match(self) -> None:
+        import pycolmap
+
+        pairs = [f"{self._names[i]} {self._names[j]}" for i, j in _choose_pairs(len(self._names))]
+        matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
+        verification = pycolmap.TwoViewGeometryOptions()
+        matching.use_gpu, matching.num_threads = False, 1
+        pairing.match_list_path = self.folder / "pairs.txt"
+        pairing.match_list_path.write_text("\n".join(pairs), encoding="utf-8")
+        verification.ransac.random_seed = self.seed
+        with self.step("Matching frames"):
+            pycolmap.match_image_pairs(self.database, matching, pairing, verification, device=pycolmap.Device.cpu)
+
+    def hold_out_matches(self, share: float) -> HeldOutMatches:
+        """Take the matches of a share of the pairs of frames out of the database, to judge models by."""
+        import pycolmap
+
+        with contextlib.closing(pycolmap.Database.open(self.database)) as database:
+            camera = database.read_all_cameras()[0]
+            pair_ids, geometries = database.read_two_view_geometries()
+            chosen = np.random.default_rng(self.seed).random(len(pair_ids)) < share
+            matches = []
+            for pair_id, geometry, is_chosen in zip(pair_ids, geometries, chosen, strict=True):
+                if not is_chosen or len(geometry.inlier_matches) == 0:
+                    continue
+                images = pycolmap.pair_id_to_image_pair(pair_id)
+                rays = [
+                    camera.cam_from_img(np.asarray(database.read_keypoints(image), np.float64)[rows, :2])
+                    for image, rows in zip(images, geometry.inlier_matches.T, strict=True)
+                ]
+                matches.append((images, rays))
+                database.delete_two_view_geometry(*images)
+                database.delete_matches(*images)
+        return HeldOutMatches(matches, camera.mean_focal_length())
+
+    def reconstruct(self, refine_intrinsics: bool) -> list[Any]:
+        """Return the models of the incremental mapper, in the order of the number of frames, the largest first."""
+        import pycolmap
+
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self.seed
+        options.num_threads = options.mapper.num_threads = 1
+        options.ba_refine_focal_length = options.ba_refine_extra_params = refine_intrinsics
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
+        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = 15, 50
+        options.extract_colors = False
+        output = self._new_folder("models")
+        with self.step("Placing frames", len(self._names)) as task:
+            models = pycolmap.incremental_mapping(
+                self.database, self.images, output, options, next_image_callback=lambda: self.progress.advance(task)
+            )
+        return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+    def reconstruct_globally(self) -> list[Any]:
+        """Return the models of the global mapper (GLOMAP), the largest first. The intrinsics stay as given."""
+        import pycolmap
+
+        options = pycolmap.GlobalPipelineOptions()
+        mapper = options.mapper
+        options.random_seed = mapper.random_seed = mapper.retriangulation.random_seed = self.seed
+        mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = self.seed
+        options.num_threads = mapper.num_threads = 1
+        mapper.global_positioning.use_gpu = False
+        _keep_intrinsics(mapper.bundle_adjustment)
+        output = self._new_folder("global models")
+        with self.step("Placing all frames at once"):
+            models = pycolmap.global_mapping(self.database, self.images, output, options)
+        return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+    def adjust(self, model: Any, max_pixels: float, max_degrees: float, max_iterations: int) -> Any:
+        """Triangulate all matches again from the poses of a model, and adjust poses and points to them.
+
+        Args:
+            model: its poses; intrinsics stay as they are.
+            max_pixels: reprojection error beyond which an observation belongs to no point.
+            max_degrees: the same as an angle between rays.
+            max_iterations: of the bundle adjustment.
+        """
+        import pycolmap
+
+        posed = pycolmap.Reconstruction()
+        (camera,) = model.cameras.values()
+        posed.add_camera_with_trivial_rig(camera)
+        for image in model.images.values():
+            if image.has_pose:
+                copied = pycolmap.Image(name=image.name, image_id=image.image_id, camera_id=camera.camera_id)
+                posed.add_image_with_trivial_frame(copied, image.cam_from_world())
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed = options.triangulation.random_seed = self.seed
+        options.num_threads, options.extract_colors = 1, False
+        limits = options.triangulation
+        options.mapper.filter_max_reproj_error = limits.complete_max_reproj_error = max_pixels
+        limits.merge_max_reproj_error = max_pixels
+        limits.create_max_angle_error = limits.continue_max_angle_error = max_degrees
+        adjustment = pycolmap.BundleAdjustmentOptions()
+        _keep_intrinsics(adjustment)
+        # Tracks of images of events are often wrong.
+        adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        adjustment.ceres.loss_function_scale = 1.0
+        adjustment.ceres.solver_options.max_num_iterations = max_iterations
+        with self.step("Adjusting poses to all tracks"):
+            posed = pycolmap.triangulate_points(
+                posed, self.database, self.images, self._new_folder("adjusted"), clear_points=True, options=options
+            )
+            pycolmap.bundle_adjustment(posed, adjustment)
+        return posed
+
+    def _new_folder(self, name: str) -> Path:
+        folder = self.folder / name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        return folder
+
+    def count_features_and_pairs(self) -> tuple[float, int]:
+        """Return the median number of features in a frame, and the number of pairs of frames that match."""
+        import pycolmap
+
+        with contextlib.closing(pycolmap.Database.open(self.database)) as database:
+            counts = [database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()]
+            return statistics.median(counts) if counts else 0.0, database.num_verified_image_pairs()
+
+    @contextlib.contextmanager
+    def step(self, description: str, total: int | None = None) -> Iterator[TaskID]:
+        """Show the progress of a step, and keep COLMAP's log off the console."""
+        import pycolmap
+
+        level = pycolmap.logging.minloglevel
+        pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+        task = self.progress.add_task(description, total=total)
+        try:
+            yield task
+        finally:
+            pycolmap.logging.minloglevel = level
+            self.progress.update(task, total=len(self._names), completed=len(self._names))
+
+
+def _choose_pairs(num_frames: int) -> list[tuple[int, int]]:
+    """Return which frames of a video to match: pairs of indices, the smaller index first."""
+    offsets = [*range(1, _NUM_NEIGHBORS + 1), *(2**power for power in range(4, 11))]
+    pairs = {(i, i + offset) for offset in offsets for i in range(num_frames - offset)}
+    keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _NUM_KEY_FRAMES))})
+    pairs |= {(i, j) for i in keys for j in keys if i < j}
+    return sorted(pairs)
+
+
+def _keep_intrinsics(adjustment: Any) -> None:
+    """Let a bundle adjustment leave the intrinsics as they are, and run on one thread of the CPU."""
+    adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
+    adjustment.ceres.use_gpu = adjustment.print_summary = False
+    adjustment.ceres.solver_options.num_threads = 1
+
+
+def trajectory_of(model: Any, times: NDArray[np.int64], source: str | Path) -> Trajectory:
+    """Return the camera-to-world poses of the frames that a model places, with OpenCV camera axes.
+
+    Args:
+        model: COLMAP's.
+        times: (N,) of all frames in nanoseconds.
+        source: the file or folder of the frames, for messages.
+    """
+    poses = {
+        int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
+        for image in model.images.values()
+        if image.has_pose
+    }
+    indices = sorted(poses)
+    return Trajectory(times[indices], torch.from_numpy(np.stack([poses[i] for i in indices])), source)

@@ -1,0 +1,107 @@
+"""Camera poses from the events alone: COLMAP on images that are made of them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.filters import EventFilters, FilteredEventFile
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, trajectory_of
+from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
+from aenerf_ns.progress import progress_bar, tracked
+from aenerf_ns.reconstruction.batches import batches_of
+from aenerf_ns.reconstruction.two_sided import two_sided_images
+from aenerf_ns.recording.recording import Capture
+
+EVENTS_PER_PIXEL = 1.05
+"""Events between two images, as a share of the sensor's pixels."""
+# Share of the pairs of images whose matches judge the models, and are used for nothing else.
+_HELD_OUT = 0.05
+# Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, and iterations.
+_ROUNDS = ((12.0, 8.0, 30), (8.0, 5.0, 30), (5.0, 3.0, 30), (4.0, 2.0, 60))
+_MIN_IMAGES = 3
+
+
+def estimate_poses_from_events(
+    capture: Capture, window: TimeWindow, source: str | Path, seed: int = 0
+) -> EstimatedPoses:
+    """Estimate the poses of an event camera from its events, on the CPU.
+
+    Images are made of the events (:func:`~aenerf_ns.reconstruction.two_sided.two_sided_images`) whenever the picture
+    has got about one event per pixel, so there are more of them where the camera moves fast. COLMAP finds and matches
+    features in them. Its incremental and its global mapper place the images, and adjust them in some rounds. The
+    poses that more of the matches kept apart agree with are taken. Intrinsics stay as they are. A seed
+    gives the same poses again, to the last bit on one machine with one version of COLMAP.
+
+    Args:
+        capture: the events and the camera's intrinsics.
+        window: events outside it are left out.
+        source: the dataset, for messages.
+        seed: of COLMAP's random samples.
+
+    Raises:
+        DataError: there are too few events for three images, or COLMAP places no images.
+    """
+    begin = time.perf_counter()
+    camera, events = capture.event_camera, capture.event_file
+    num_events = int(EVENTS_PER_PIXEL * camera.width * camera.height)
+    # Pixels that fire by themselves would be features that do not move.
+    kept = FilteredEventFile(events, EventFilters(start=window.start, end=window.end, hot_pixels=True))
+    kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
+    chunks = kept.filtered(tracked(events.chunks(), "Making images of the events", events.count()))
+    images = list(two_sided_images(batches_of(chunks, num_events), capture.sensor))
+    if len(images) < _MIN_IMAGES:
+        raise DataError(
+            events.path,
+            f"its events make {len(images)} images of {num_events:,} events each",
+            f"poses can be estimated from {_MIN_IMAGES} images or more: record for longer, or widen the time window",
+        )
+    times = np.array([moment for moment, _ in images], np.int64)
+    # Events of one time may end one image and begin the next.
+    later = np.append(True, np.diff(times) > 0)
+    times, pictures = times[later], [image for (_, image), is_later in zip(images, later, strict=True) if is_later]
+    with TemporaryDirectory() as folder, progress_bar() as progress:
+        workspace = ColmapWorkspace(Path(folder), len(times), seed, progress)
+        workspace.add_frames(pictures, (camera.width, camera.height), source)
+        workspace.find_features(camera)
+        workspace.match()
+        features, pairs = workspace.count_features_and_pairs()
+        held_out = workspace.hold_out_matches(_HELD_OUT)
+        found = {"incremental": workspace.reconstruct(False), "global": workspace.reconstruct_globally()}
+        models: dict[str, Any] = {mapper: models[0] for mapper, models in found.items() if models}
+        if not models:
+            raise DataError(
+                source,
+                f"COLMAP places none of {len(times)} images of the events: they have {features:.0f} features (median), "
+                f"and {pairs} pairs of images match",
+                "poses need a camera that moves sideways and sees textured surfaces; check the calibration too",
+            )
+        for limits in _ROUNDS:
+            models = {mapper: workspace.adjust(model, *limits) for mapper, model in models.items()}
+
+        def rank(mapper: str) -> tuple[bool, float]:
+            # The global mapper may throw images far out where it sees nothing, and no adjustment takes them back.
+            is_sane = models[mapper].compute_mean_reprojection_error() < _ROUNDS[-1][0]
+            return is_sane, held_out.agreement(models[mapper])
+
+        mapper = max(models, key=rank)
+        model = models[mapper]
+    return EstimatedPoses(
+        frame_times=times,
+        trajectory=trajectory_of(model, times, source),
+        camera=camera,
+        model_sizes=[model.num_reg_images() for model in found[mapper]],
+        num_points=model.num_points3D(),
+        reprojection_error=model.compute_mean_reprojection_error(),
+        features=features,
+        seconds=time.perf_counter() - begin,
+        images="images of the events",
+        mapper=mapper,
+        agreement=held_out.agreement(model),
+    )

@@ -1,0 +1,110 @@
+"""Images of events without a network: a high-pass filter that runs forwards and backwards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+
+_DECAY = 0.12
+"""Share of a pixel's state that is forgotten while the picture gets one event per pixel. It does not depend on time, so
+neither do the images on the camera's speed."""
+# The backward filter starts this number of events per pixel after the image: e^-3 of what lies further is left.
+_LOOK_AHEAD = 25.0
+# Pixels: standard deviation of a Gaussian, and the percentiles of the picture that are shown black and white.
+_BLUR, _PERCENTILES = 0.8, (1.0, 99.0)
+
+
+def two_sided_images(
+    batches: Iterable[EventStream], sensor: SensorModel, decay: float = _DECAY
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield the time in nanoseconds and the (height, width) image at the end of each batch of a stream.
+
+    A pixel's state adds up contrast thresholds, forwards up to the image and backwards, with reversed polarities, down
+    to it; both forget with the number of events in the picture. Their mean has no ghosts of what was seen before.
+    FIBAR (arXiv 2510.20071) is a published filter of the forward kind, with a decay in events and a blur where events
+    are few.
+
+    Args:
+        batches: the stream in consecutive pieces, in the order of time, all of one sensor.
+        sensor: the contrast thresholds.
+        decay: share of a state that is forgotten per event and pixel of the picture.
+    """
+    held: list[tuple[EventStream, NDArray[np.float32]]] = []
+    forward: _Filter | None = None
+    # The latest batches whose images wait for what follows: as many again are yielded at a time.
+    num_ahead = 0
+    for batch in batches:
+        if forward is None:
+            forward = _Filter(batch.width, batch.height, sensor, decay)
+        forward.add(batch)
+        held.append((batch, forward.state()))
+        num_ahead = math.ceil(_LOOK_AHEAD * batch.width * batch.height / len(batch))
+        if len(held) == 2 * num_ahead:
+            yield from _finish(held, sensor, decay)[:num_ahead]
+            held = held[num_ahead:]
+    yield from _finish(held, sensor, decay)
+
+
+def _finish(
+    held: list[tuple[EventStream, NDArray[np.float32]]], sensor: SensorModel, decay: float
+) -> list[tuple[int, NDArray[np.uint8]]]:
+    """Add the states of the backward filter to those of the forward filter, and return times and images."""
+    images: list[tuple[int, NDArray[np.uint8]]] = []
+    backward: _Filter | None = None
+    for batch, state in reversed(held):
+        if backward is None:
+            backward = _Filter(batch.width, batch.height, sensor, decay)
+            both = state
+        else:
+            both = (state + backward.state()) / 2
+        images.append((int(batch.t[-1]), _display(both)))
+        backward.add(batch, reverse=True)
+    return images[::-1]
+
+
+def _display(state: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return (height, width) display values of log-intensities."""
+    smooth = cv2.GaussianBlur(state, (0, 0), _BLUR)
+    low, high = np.percentile(smooth, _PERCENTILES)
+    return np.rint(np.clip((smooth - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
+
+
+class _Filter:
+    """Leaky integrators of the events of all pixels; they forget with the number of events in the picture."""
+
+    def __init__(self, width: int, height: int, sensor: SensorModel, decay: float) -> None:
+        self._thresholds = sensor.positive_contrast_threshold, sensor.negative_contrast_threshold
+        self._decay = decay / (width * height)
+        self._state = np.zeros((height, width))
+        self._last = np.zeros((height, width), np.int64)
+        self._count = 0
+
+    def add(self, events: EventStream, reverse: bool = False) -> None:
+        positive, negative = self._thresholds
+        x, y, p = events.x, events.y, events.p
+        if reverse:
+            # A rise of light is a fall backwards.
+            x, y, p = x[::-1], y[::-1], -p[::-1]
+        _integrate(self._state, self._last, x, y, p, positive, negative, self._decay, self._count)
+        self._count += len(events)
+
+    def state(self) -> NDArray[np.float32]:
+        return (self._state * np.exp(-self._decay * (self._count - self._last))).astype(np.float32)
+
+
+@numba.njit(cache=True)
+def _integrate(state, last, x, y, p, positive, negative, decay, count):
+    for event in range(len(x)):
+        row, column = y[event], x[event]
+        now = count + event
+        kept = np.exp(-decay * (now - last[row, column])) * state[row, column]
+        state[row, column] = kept + (positive if p[event] > 0 else -negative)
+        last[row, column] = now
