@@ -89,8 +89,8 @@ class OwnRecordingDataParser(EventDataParser):
             raise DataError(
                 poses,
                 "there is no such file",
-                "give the poses, or have them estimated from the events: aenerf convert ... --output FOLDER --poses "
-                "events (or from frames: --poses colmap)",
+                f"give the poses, or have them estimated: aenerf convert {folder} --output NEW_FOLDER --poses events, or "
+                "colmap where there are frames",
             )
         else:
             reference = read_tum_trajectory(poses)
