@@ -89,8 +89,7 @@ class OwnRecordingDataParser(EventDataParser):
             raise DataError(
                 poses,
                 "there is no such file",
-                f"give the poses, or have them estimated: aenerf convert {folder} --output NEW_FOLDER --poses events, or "
-                "colmap where there are frames",
+                f"give the poses, or have them estimated: aenerf convert {folder} --output FOLDER --poses events",
             )
         else:
             reference = read_tum_trajectory(poses)
