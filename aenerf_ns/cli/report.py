@@ -43,13 +43,7 @@ class ReportCommand:
         require_writable(self.output / "report.html")
         for run in self.runs:
             require_run(run)
-        from aenerf_ns.report.comparison import (
-            paired_differences,
-            protocol_differences,
-            read_protocol,
-            shared_views,
-            views_left_out,
-        )
+        from aenerf_ns.report import comparison
         from aenerf_ns.report.measuring import measure_run
         from aenerf_ns.report.page import make_page
         from aenerf_ns.report.sections import VIEW_COLUMNS, view_rows
@@ -58,19 +52,19 @@ class ReportCommand:
         opened: list[tuple[TrainerConfig, Protocol]] = []
         for run in self.runs:
             config, opened_run, _ = open_run(run)
-            opened.append((config, read_protocol(opened_run)))
+            opened.append((config, comparison.read_protocol(opened_run)))
             del opened_run
             gc.collect()
         names = _names([config for config, _ in opened])
         protocols = [protocol for _, protocol in opened]
-        mixed = protocol_differences(names, protocols)
+        mixed = comparison.protocol_differences(names, protocols)
         if mixed and not self.allow_different_protocols:
             raise DataError(
                 "aenerf report",
                 f"the runs are measured differently: {'; '.join(mixed)}",
                 "evaluate both alike, or give --allow-different-protocols",
             )
-        shared = shared_views(protocols)
+        shared = comparison.shared_views(protocols)
         reports: list[RunReport] = []
         for run, name in zip(self.runs, names, strict=True):
             config, opened_run, _ = open_run(run)
@@ -79,8 +73,8 @@ class ReportCommand:
             reports.append(measure_run(name, config, opened_run, shared, shown))
             del opened_run
             gc.collect()
-        paired = paired_differences(reports, shared)
-        left_out = views_left_out(reports, shared)
+        paired = comparison.paired_differences(reports, shared)
+        left_out = comparison.views_left_out(reports, shared)
         page = make_page(reports, paired, left_out, mixed, shared)
         with creating(self.output / "report.html"):
             (self.output / "report.html").write_text(page, "utf8")

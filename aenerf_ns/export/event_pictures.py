@@ -19,21 +19,21 @@ def sum_recorded_events(events: EventFile, times: NDArray[np.int64]) -> Iterator
     """
     shape = (events.height, events.width)
     net = np.zeros(shape, np.int64)
-    index = 1
+    index, last = 0, len(times) - 1
     for chunk in tracked(events.chunks(), f"Reading {events.path.name}", events.count()):
-        begin = int(np.searchsorted(chunk.t, times[0]))
-        while index < len(times):
-            end = int(np.searchsorted(chunk.t, times[index]))
-            np.add.at(net, (chunk.y[begin:end], chunk.x[begin:end]), chunk.p[begin:end])
-            if end == len(chunk):
+        edges = np.searchsorted(chunk.t, times)
+        while index < last:
+            inside = slice(edges[index], edges[index + 1])
+            np.add.at(net, (chunk.y[inside], chunk.x[inside]), chunk.p[inside])
+            if inside.stop == len(chunk):
                 # The next chunk may continue this interval.
                 break
             yield net
             net = np.zeros(shape, np.int64)
-            begin, index = end, index + 1
-        if index == len(times):
+            index += 1
+        if index == last:
             return
-    for _ in range(index, len(times)):
+    for _ in range(index, last):
         yield net
         net = np.zeros(shape, np.int64)
 
