@@ -129,37 +129,29 @@ class Library:
                 entries.setdefault(number, {})[name] = value
         return {Path(entry["model"]).parent.name: entry for entry in entries.values()}
 
-    def model(
-        self, name: str, detail: str | Mapping[str, str] = "plain", dress: Mapping[str, Material | None] | None = None
-    ) -> Model:
+    def model(self, name: str, detail: str = "plain", dress: Mapping[str, Material] | None = None) -> Model:
         """Return a piece of furniture at its true size. It stands on z = 0 above the origin, its front towards -y.
 
         Args:
             name: folder of the model in its package.
-            detail: pattern of the materials without a picture: "plain", "wood" or "cloth", or a pattern for each
-                material by name.
-            dress: replacements of materials, by the replaced name. None leaves the faces out.
+            detail: pattern of the materials without a picture: "plain", "wood" or "cloth".
+            dress: replacements of materials, by the replaced name.
 
         Raises:
-            DataError: if the package lacks the model, or if the model's own license is not CC0: a few models of the
-                package's CC0 file are CC BY.
+            DataError: the model's own license is not CC0: a few models of the package's CC0 file are CC BY.
         """
-        entry = self._catalog().get(name)
-        if entry is None:
-            raise DataError(name, f"no such model in {FURNITURE.file}", "name one of its folders")
+        entry = self._catalog()[name]
         path = self._furniture() / entry["model"].lstrip("/")
         for license_file in path.parent.glob("*[Ll][Ii][Cc][Ee][Nn]*"):
             if "Creative Commons Zero" not in license_file.read_text(errors="replace"):
                 raise DataError(license_file, f"{name} is not under {_LICENSE}", "use another model")
-        dress = dress or {}
 
-        def surface(material: str, color: tuple[float, float, float], picture: Path | None) -> Material | None:
-            if material in dress:
+        def surface(material: str, color: tuple[float, float, float], picture: Path | None) -> Material:
+            if dress and material in dress:
                 return dress[material]
             if picture is not None:
                 return _photograph(f"{name}/{picture.name}", picture)
-            pattern = detail if isinstance(detail, str) else detail.get(material, "plain")
-            return colored(f"{name}/{material}", color, pattern)
+            return colored(f"{name}/{material}", color, detail)
 
         centimeters = [float(entry[key]) for key in ("width", "depth", "height")]
         model = read_obj(path, surface, np.array(centimeters) / 100)
@@ -167,19 +159,11 @@ class Library:
         return model.standing()
 
     def environment(self, name: str) -> NDArray[np.float32]:
-        """Return the linear RGB radiance (256, 512, 3) of an equirectangular environment, its first row straight up.
-
-        Raises:
-            DataError: if the package lacks the environment.
-        """
+        """Return the linear RGB radiance (256, 512, 3) of an equirectangular environment, its first row straight up."""
         package = fetch(ENVIRONMENTS, self.folder)
         with tarfile.open(package) as archive:
-            try:
-                stream = archive.extractfile(f"package/hdri/{name}.exr.js")
-            except KeyError:
-                stream = None
-            if stream is None:
-                raise DataError(name, f"no such environment in {package.name}", "name one of its hdri/*.exr.js")
+            stream = archive.extractfile(f"package/hdri/{name}.exr.js")
+            assert stream is not None
             encoded = stream.read().split(b"base64,")[1].rstrip(b"';\n ")
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_UNCHANGED)
         self._credit(name, f"{name} (environment)", f"{package.name}: hdri/{name}.exr.js", "Poly Haven")

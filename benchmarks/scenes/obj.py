@@ -31,7 +31,7 @@ class _ObjMaterial:
 
 
 def read_obj(
-    path: Path, surface: Callable[[str, tuple[float, float, float], Path | None], Material | None], size: ArrayLike
+    path: Path, surface: Callable[[str, tuple[float, float, float], Path | None], Material], size: ArrayLike
 ) -> Model:
     """Read the polygons of an OBJ file, y up, as triangles, z up.
 
@@ -40,8 +40,7 @@ def read_obj(
 
     Args:
         path: OBJ file. Its material libraries lie beside it.
-        surface: maps the name, sRGB color and picture file (or None) of a material to the material to use, or to
-            None to leave its faces out.
+        surface: maps the name, sRGB color and picture file (or None) of a material to the material to use.
         size: extent (3,) of the content along x, y and z, in meters. Proportions are kept: the scale is the median
             of the three ratios.
 
@@ -83,15 +82,14 @@ def read_obj(
     parts = []
     for name, faces in polygons.items():
         entry = materials.get(name, _ObjMaterial())
-        material = surface(name, entry.color, entry.picture) if entry.opacity >= _MIN_OPACITY else None
-        if material is None:
+        if entry.opacity < _MIN_OPACITY:
             continue
         corners = np.concatenate([face[:, triangulate(points[face[0]])] for face in faces], axis=1)
         where, at = corners[:, not_degenerate(points[corners[0]])]
         bare = (at < 0)[..., None] | (entry.picture is None)
         uv = np.where(bare, _plane_coordinates(points[where]) / _TILE, coordinates[at])
         if len(where):
-            parts.append(Part(points[where], uv, material))
+            parts.append(Part(points[where], uv, surface(name, entry.color, entry.picture)))
     return Model(tuple(parts))
 
 

@@ -112,17 +112,17 @@ def test_boxes_face_outwards():
 def test_read_obj(tmp_path):
     (tmp_path / "a.obj").write_text(
         "mtllib a.mtl\nv 0 0 0\nv 100 0 0\nv 100 50 0\nv 0 50 -20\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
-        "usemtl wood\nf 1/1 2/2 3/3\nusemtl glass\nf -4 -2 -1\nusemtl paper\nf 1 3 4\n"
+        "usemtl wood\nf 1/1 2/2 3/3\nusemtl glass\nf -4 -2 -1\n"
     )
-    (tmp_path / "a.mtl").write_text("newmtl wood\nKd 0.5 0.25 0\nnewmtl glass\nd 0.3\nnewmtl paper\nKd 1 1 1\n")
+    (tmp_path / "a.mtl").write_text("newmtl wood\nKd 0.5 0.25 0\nnewmtl glass\nd 0.3\n")
     asked = {}
 
     def surface(name, color, picture):
         asked[name] = (color, picture)
-        return None if name == "paper" else PLAIN
+        return PLAIN
 
     model = read_obj(tmp_path / "a.obj", surface, size=(2.0, 0.4, 1.0))
-    assert asked == {"wood": ((0.5, 0.25, 0), None), "paper": ((1, 1, 1), None)}
+    assert asked == {"wood": ((0.5, 0.25, 0), None)}
     np.testing.assert_allclose(model.triangles, [[[0, 0, 0], [2, 0, 0], [2, 0, 1]]])
     (tmp_path / "b.obj").write_text("v 0 0\nf 1 2 x\n")
     with pytest.raises(DataError, match=r"b\.obj"):
