@@ -31,7 +31,6 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.method.box_collider import BoxCollider
 from aenerf_ns.method.color_correction import COLOR_CORRECTIONS, ColorCorrection
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
-from aenerf_ns.method.field import to_unit_cube
 from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method.networks import Backbone, FieldConfig, ProposalConfig, make_networks
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
@@ -133,18 +132,14 @@ class AENeRFModel(Model):
             camera_times=scene.camera_times,
             ground_truth=deepcopy(scene.ground_truth),
         )
-        self.warp = (
-            PoseFollowingWarp(
-                self.camera_optimizer, lambda positions: to_unit_cube(positions, distortion, self.field.aabb)
-            )
-            if self.camera_optimizer.is_learned
-            else None
-        )
+        learned = self.camera_optimizer.is_learned
+        aabb = _with_room(self.scene_box.aabb) if learned else self.scene_box.aabb
+        self.warp = PoseFollowingWarp(self.camera_optimizer, distortion, aabb) if learned else None
         self.field, proposal_networks = make_networks(
             config.backbone,
             config.field,
             config.proposal,
-            self.scene_box.aabb if self.warp is None else _with_room(self.scene_box.aabb),
+            aabb,
             distortion,
             self.sensor.num_channels,
             config.average_init_density,
@@ -247,7 +242,7 @@ class AENeRFModel(Model):
             distance along the ray in scene units; of a color sensor also ``mean_log_radiance`` (N, 1) of its channels.
         """
         if self.warp is not None:
-            self.warp.update()
+            self.warp.update(self.camera_optimizer)
         samples, weights_list, samples_list = self.proposal_sampler(ray_bundle, density_fns=self.density_fns)
         outputs: dict[str, Any] = {}
         is_trained_on = self.training and _is_of_batch(ray_bundle)

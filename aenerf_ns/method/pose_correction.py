@@ -100,10 +100,9 @@ class PoseCorrection(CameraOptimizer):
         camera_times: Tensor,
         ground_truth: Trajectory | None = None,
     ) -> None:
-        nn.Module.__init__(self)
+        # The framework's corrections, one for each camera, are off.
+        super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
-        self.num_cameras = num_cameras
-        self.device = device
         self.trajectory = trajectory
         self.register_buffer("_camera_seconds", trajectory.seconds(camera_times), persistent=False)
         times = _compared_times(trajectory, ground_truth)

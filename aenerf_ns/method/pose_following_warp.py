@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 import torch.autograd.forward_ad as forward_ad
 import torch.nn.functional as F
+from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from torch import Tensor, nn
 
+from aenerf_ns.method.field import to_unit_cube
 from aenerf_ns.method.pose_correction import PoseCorrection
 
 # Cells along an axis of the unit cube of the scene. The times that see a place change little from cell to cell.
@@ -41,8 +42,9 @@ class PoseFollowingWarp(nn.Module):
     neighbors move alike.
 
     Args:
-        correction: of the poses, of which something is learned. It stays the model's.
-        unit_positions: maps (N, 3) positions in the scene to the unit cube, as the fields do.
+        correction: of the poses, of which something is learned.
+        spatial_distortion: contraction of space, or None for a bounded scene.
+        aabb: (2, 3) box of the fields.
 
     Attributes:
         accumulating: whether rays are being counted. The model switches it.
@@ -53,12 +55,12 @@ class PoseFollowingWarp(nn.Module):
     _seen: Tensor
     _weights: Tensor
     _strides: Tensor
+    _aabb: Tensor
 
-    def __init__(self, correction: PoseCorrection, unit_positions: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, correction: PoseCorrection, spatial_distortion: SpatialDistortion | None, aabb: Tensor) -> None:
         super().__init__()
-        # Not as a submodule: the correction's parameters are the model's already.
-        self._correction = (correction,)
-        self._unit_positions = unit_positions
+        self._spatial_distortion = spatial_distortion
+        self.register_buffer("_aabb", aabb, persistent=False)
         self.accumulating = False
         duration = correction.trajectory.duration
         count = min(math.ceil(duration / correction.config.knot_interval) + 1, _MAX_TIMES)
@@ -71,9 +73,9 @@ class PoseFollowingWarp(nn.Module):
         self.register_buffer("_strides", torch.tensor([_RESOLUTION**2, _RESOLUTION, 1]), persistent=False)
         self._twists: Tensor | None = None
 
-    def update(self) -> None:
+    def update(self, correction: PoseCorrection) -> None:
         """Take the corrections as they are now, for all positions until the next call."""
-        twists = self._correction[0].world_twists(self._seconds, self._base_poses).to(self._weights)
+        twists = correction.world_twists(self._seconds, self._base_poses).to(self._weights)
         # Half precision would round the places to a thousandth of the twists' size.
         with torch.autocast(twists.device.type, enabled=False):
             self._twists = (self._weights @ twists).unflatten(0, [_RESOLUTION] * 3)
@@ -90,7 +92,7 @@ class PoseFollowingWarp(nn.Module):
 
     def _moved(self, positions: Tensor, grid: Tensor) -> Tensor:
         with torch.no_grad():
-            unit = self._unit_positions(forward_ad.unpack_dual(positions).primal.flatten(0, -2)).to(grid.dtype)
+            unit = self._to_unit(forward_ad.unpack_dual(positions).primal.flatten(0, -2)).to(grid.dtype)
         translation, rotation = self._look_up(grid, unit).unflatten(0, positions.shape[:-1]).split(3, -1)
         return positions - translation - torch.linalg.cross(rotation, positions)
 
@@ -101,6 +103,9 @@ class PoseFollowingWarp(nn.Module):
         cells = grid.permute(3, 0, 1, 2)[None]
         return F.grid_sample(cells, places, padding_mode="border", align_corners=False)[0, :, 0, 0].T
 
+    def _to_unit(self, positions: Tensor) -> Tensor:
+        return to_unit_cube(positions, self._spatial_distortion, self._aabb)
+
     @torch.no_grad()
     def accumulate(self, positions: Tensor, weights: Tensor, seconds: Tensor) -> None:
         """Count rays.
@@ -110,7 +115,7 @@ class PoseFollowingWarp(nn.Module):
             weights: (N, samples) rendering weights.
             seconds: (N,) times of the rays since the trajectory's start.
         """
-        unit = self._unit_positions(positions.flatten(0, -2)).unflatten(0, positions.shape[:-1])
+        unit = self._to_unit(positions.flatten(0, -2)).unflatten(0, positions.shape[:-1])
         inside = ((unit > 0) & (unit < 1)).all(-1)
         cell = ((unit * _RESOLUTION).long().clamp(0, _RESOLUTION - 1) * self._strides).sum(-1)
         place = seconds / self._interval

@@ -139,7 +139,7 @@ def test_the_mlp_density_is_softplus_and_ends_at_the_box(contraction: str) -> No
 def test_a_field_that_moves_along_has_room_beyond_the_box(mode: str) -> None:
     model = make_model(bounded=True, camera_optimizer=PoseCorrectionConfig(mode=mode))
     if model.warp is not None:
-        model.warp.update()
+        model.warp.update(model.camera_optimizer)
     # The box ends at 1, and a twentieth of its side is 0.1.
     positions = torch.tensor([[[0.0, 0.0, 0.99]], [[0.0, -1.09, 0.0]], [[1.11, 0.0, 0.0]]])
     densities = [network.density_fn(positions)[:, 0, 0] > 0 for network in (model.field, *model.proposal_networks)]

@@ -15,10 +15,7 @@ from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfi
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 
 _DURATION = 2.0
-
-
-def _unit(positions: Tensor) -> Tensor:
-    return (positions + 1) / 2
+BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 
 
 @pytest.fixture
@@ -51,13 +48,13 @@ def _set(correction: PoseCorrection, twist: Tensor) -> None:
 
 
 def test_a_motion_that_all_times_share_moves_the_field_with_the_cameras(correction: PoseCorrection) -> None:
-    warp = PoseFollowingWarp(correction, _unit)
+    warp = PoseFollowingWarp(correction, None, BOX)
     twist = 1e-2 * torch.tensor([0.3, -0.2, 0.5, 0.4, 0.1, -0.6], dtype=torch.float64)
     _set(correction, twist)
     base = correction.trajectory.pose(torch.tensor([0.7], dtype=torch.float64))
     corrected = correction.pose(torch.tensor([0.7], dtype=torch.float64))
     seen = torch.tensor([0.1, -0.2, 0.4, 1.0], dtype=torch.float64)
-    warp.update()
+    warp.update(correction)
     found = warp((corrected @ seen).float())
     # To first order: the square of the twist is left.
     assert (found - (base @ seen).float()).abs().max() < 3e-4
@@ -65,7 +62,7 @@ def test_a_motion_that_all_times_share_moves_the_field_with_the_cameras(correcti
 
 
 def test_a_place_moves_with_the_times_that_see_it(correction: PoseCorrection) -> None:
-    warp = PoseFollowingWarp(correction, _unit)
+    warp = PoseFollowingWarp(correction, None, BOX)
     left, right = torch.tensor([-0.8, 0.0, 0.0]), torch.tensor([0.8, 0.0, 0.0])
     early, late = torch.tensor([0.2], dtype=torch.float64), torch.tensor([1.8], dtype=torch.float64)
     warp.accumulate(left.expand(1, 4, 3), torch.full((1, 4), 0.25), early)
@@ -74,7 +71,7 @@ def test_a_place_moves_with_the_times_that_see_it(correction: PoseCorrection) ->
     with torch.no_grad():
         # Only the late half of the recording is corrected.
         correction.twists.control_twists[14:, 0] = 0.02
-        warp.update()
+        warp.update(correction)
         moved = torch.stack([left, right]) - warp(torch.stack([left, right]))
     expected = correction.world_twists(late, correction.trajectory.pose(late))[0]
     shift = expected[:3] + torch.linalg.cross(expected[3:], right.double())
@@ -83,24 +80,24 @@ def test_a_place_moves_with_the_times_that_see_it(correction: PoseCorrection) ->
 
 
 def test_without_corrections_nothing_moves(correction: PoseCorrection) -> None:
-    warp = PoseFollowingWarp(correction, _unit)
-    warp.update()
+    warp = PoseFollowingWarp(correction, None, BOX)
+    warp.update(correction)
     positions = torch.randn(50, 3)
     assert torch.equal(warp(positions), positions)
 
 
 def test_a_position_that_is_not_a_number_stays_one(correction: PoseCorrection) -> None:
-    warp = PoseFollowingWarp(correction, _unit)
-    warp.update()
+    warp = PoseFollowingWarp(correction, None, BOX)
+    warp.update(correction)
     found = warp(torch.tensor([[math.nan, math.inf, -math.inf], [0.0, 0.0, 0.0]]))
     assert found[0, 0].isnan()
     assert found[1].isfinite().all()
 
 
 def test_positions_that_move_have_rates(correction: PoseCorrection) -> None:
-    warp = PoseFollowingWarp(correction, _unit)
+    warp = PoseFollowingWarp(correction, None, BOX)
     correction.twists.control_twists.data.fill_(0.01)
-    warp.update()
+    warp.update(correction)
     positions, rates = torch.zeros(3, 3), torch.eye(3)
     with forward_ad.dual_level():
         moved = forward_ad.unpack_dual(warp(forward_ad.make_dual(positions, rates)))
@@ -111,8 +108,8 @@ def test_positions_that_move_have_rates(correction: PoseCorrection) -> None:
 
 
 def test_the_proposals_teach_the_poses_nothing(correction: PoseCorrection) -> None:
-    warp = PoseFollowingWarp(correction, _unit)
-    warp.update()
+    warp = PoseFollowingWarp(correction, None, BOX)
+    warp.update(correction)
     assert warp(torch.rand(4, 3)).requires_grad
     assert not warp.without_gradient(torch.rand(4, 3)).requires_grad
 
@@ -122,6 +119,6 @@ def test_the_times_of_a_long_recording_are_bounded() -> None:
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 0, 3] = 1
     correction = PoseCorrection(PoseCorrectionConfig(mode="spline"), 1, "cpu", Trajectory(times, poses), times)
-    warp = PoseFollowingWarp(correction, _unit)
+    warp = PoseFollowingWarp(correction, None, BOX)
     assert len(warp._seconds) == 256
     assert math.isclose(float(warp._seconds[-1]), 3600)
