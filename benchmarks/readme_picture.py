@@ -8,7 +8,7 @@
     python -m benchmarks.readme_picture --data forklift --uncorrected uncorrected --corrected corrected \\
         --views 3 18 --output docs/images/pose_correction.png
 
-Prints the PSNR of each rendering shown, and how far the camera's path is from each view.
+Prints the PSNR of each rendering shown.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.files.open import open_event_file
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from benchmarks.runs import run_benchmark
 
 _SCALE = 2
 _GAP = 4
@@ -76,20 +76,18 @@ class ReadmePicture:
         truth = pictures[0][:, :width]
         renderings = [picture[:, width:] for picture in pictures]
         psnr = [-10 * np.log10(np.mean((truth / 255.0 - picture / 255.0) ** 2)) for picture in renderings]
-        time, distance = self._nearest(view)
-        events = self._events(time, width, truth.shape[0])
-        print(f"view {view}: {psnr[0]:.1f} and {psnr[1]:.1f} dB; the camera's path is {distance:.2f} away")
-        return [events, *renderings, truth]
+        print(f"view {view}: {psnr[0]:.1f} and {psnr[1]:.1f} dB")
+        return [self._events(self._nearest(view), width, truth.shape[0]), *renderings, truth]
 
-    def _nearest(self, view: int) -> tuple[int, float]:
-        """Return when the camera was nearest to a test view, in nanoseconds, and how near it was."""
+    def _nearest(self, view: int) -> int:
+        """Return when the camera was nearest to a test view, in nanoseconds."""
         transforms = json.loads((self.data / "transforms.json").read_text(encoding="utf-8"))
         name = transforms["test_filenames"][view]
         frame = next(frame for frame in transforms["frames"] if frame["file_path"] == name)
         position = np.array(frame["transform_matrix"])[:3, 3]
         path = read_tum_trajectory(self.data / "trajectory_ground_truth.txt")
         distances = np.linalg.norm(path.camera_to_worlds[:, :, 3].numpy() - position, axis=1)
-        return int(path.times[distances.argmin()]), float(distances.min())
+        return int(path.times[distances.argmin()])
 
     def _events(self, time: int, width: int, height: int) -> NDArray[np.uint8]:
         """Return the picture of the events around a time in nanoseconds."""
@@ -101,4 +99,4 @@ class ReadmePicture:
 
 
 if __name__ == "__main__":
-    tyro.cli(ReadmePicture).main()
+    run_benchmark(ReadmePicture)

@@ -128,9 +128,9 @@ class Simulate(SimulationCommand):
         """Make the estimated trajectory and, if COLMAP estimates it, COLMAP's report."""
         if self.poses == "noise":
             return self.add_pose_noise(truth), None
-        from aenerf_ns.simulator.simulated_poses import pose_estimation
+        from aenerf_ns.simulator.simulated_poses import estimate_simulated_poses
 
-        estimated, report, summary = pose_estimation(
+        estimated, report, summary = estimate_simulated_poses(
             simulation, camera, truth, self.frame_rate, self.exposure, self.seed
         )
         say(summary)

@@ -199,11 +199,8 @@ def _sphere(radius: float, scale: float, spacing: float) -> Surface:
     latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, len(turn) // 2 + 1)
     ring = np.cos(latitude)
     ring[[0, -1]] = 0.0
-    grid = np.empty((len(latitude), len(turn), 3))
-    grid[..., :2] = ring[:, None, None] * circle
-    grid[..., 2] = radius * np.sin(latitude)[:, None]
-    uv = np.empty((len(latitude), len(turn), 2))
-    uv[..., 0], uv[..., 1] = turn, latitude[:, None] * radius / scale
+    grid = np.insert(ring[:, None, None] * circle, 2, radius * np.sin(latitude)[:, None], axis=-1)
+    uv = np.stack(np.broadcast_arrays(turn, latitude[:, None] * radius / scale), axis=-1)
     # A triangle at a pole has there the mean of its other two corners' u.
     uv[0, :, 0] += 0.5 / (len(turn) - 1)
     uv[-1, :, 0] -= 0.5 / (len(turn) - 1)
@@ -214,8 +211,7 @@ def _sphere(radius: float, scale: float, spacing: float) -> Surface:
 def _cylinder(radius: float, length: float, scale: float, spacing: float) -> Surface:
     turn, circle = _circle(radius, spacing)
     height = np.linspace(-length / 2, length / 2, _cells(length, spacing) + 1)
-    wall = np.empty((len(height), len(turn), 3))
-    wall[..., :2], wall[..., 2] = circle, height[:, None]
+    wall = np.insert(np.repeat(circle[None], len(height), axis=0), 2, height[:, None], axis=-1)
     uv = np.stack(np.meshgrid(turn * _tiles_around(radius, scale), height / scale), axis=-1)
     parts = [(wall.reshape(-1, 3), _triangles(wall), uv.reshape(-1, 2))]
     for end in (-1, 1):

@@ -14,7 +14,7 @@ from aenerf_ns.pose_estimation.from_frames import compare_with_truth, estimate_p
 from aenerf_ns.simulator.simulation import Simulation
 
 
-def pose_estimation(
+def estimate_simulated_poses(
     simulation: Simulation, camera: CameraIntrinsics, truth: Trajectory, frame_rate: float, exposure: float, seed: int
 ) -> tuple[Trajectory, dict[str, Any], str]:
     """Run COLMAP on the frames of a camera at the event sensor's position, as in a DAVIS.

@@ -7,17 +7,7 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
-from benchmarks.paper.plan import (
-    CEILING,
-    CORRECTED,
-    HIGH_PASS,
-    LOSSES,
-    ON_TRUE_POSES,
-    OURS,
-    PEERS,
-    TRUE_POSES,
-    WITHOUT_CORRECTION,
-)
+from benchmarks.paper import plan
 
 Figures = dict[str, Any]
 _METRICS = ("psnr", "ssim", "lpips")
@@ -26,12 +16,14 @@ _TEST_POSES = (
     "PSNR, SSIM and LPIPS: with test poses as placed / refined photometrically on the test images; - where only the "
     "first was measured."
 )
-_OWN_ROWS = (WITHOUT_CORRECTION, OURS, TRUE_POSES, CEILING)
+_OWN_ROWS = (plan.WITHOUT_CORRECTION, plan.OURS, plan.TRUE_POSES, plan.CEILING)
 _AE_NERF = "AE-NeRF"
 _SETTINGS = ("estimated poses", "estimated poses, pose correction", "true poses")
 # Rows of a method in these settings, the method of the paper last.
-_ROWS_OF = {name: (name, name + CORRECTED, name + ON_TRUE_POSES) for name in (HIGH_PASS, *PEERS.values())}
-_ROWS_OF[_AE_NERF] = (WITHOUT_CORRECTION, OURS, TRUE_POSES)
+_ROWS_OF = {
+    name: (name, name + plan.CORRECTED, name + plan.ON_TRUE_POSES) for name in (plan.HIGH_PASS, *plan.PEERS.values())
+}
+_ROWS_OF[_AE_NERF] = (plan.WITHOUT_CORRECTION, plan.OURS, plan.TRUE_POSES)
 # The rows that are put in order: of other papers' methods, and of AE-NeRF.
 _ORDERS = {
     "estimated poses, which only AE-NeRF corrects": (0, 1),
@@ -48,12 +40,7 @@ _PAPER = {
 
 
 def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
-    """Return all tables of some runs.
-
-    Args:
-        figures: of the runs that have been made.
-        missing: names of the other runs with the reason, which is empty for runs that were not tried.
-    """
+    """Return all tables of the runs that have been made, and why others are ``missing``, if they were tried."""
     methods, losses = ([run for run in figures if run["table"] == table] for table in ("methods", "losses"))
     parts = ["# Benchmark", _conditions(figures), _TEST_POSES]
     if missing:
@@ -66,7 +53,7 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
         ]
     if any(run["row"] not in _OWN_ROWS for run in methods):
         parts += ["## Methods of other papers", *peers_parts(methods)]
-    if _of(methods, row=OURS):
+    if _of(methods, row=plan.OURS):
         parts += [
             "## Pose correction (the paper's table 3)",
             "RE: rotation error in degrees, TE: translation error in percent of the length of the path; both after "
@@ -86,10 +73,9 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
 
 
 def methods_table(figures: Sequence[Figures]) -> str:
-    """Return the means for each method, kind of scene and speed.
+    """Return the means for each method, kind of scene and speed, over the scenes and seeds that all methods have.
 
-    A mean covers the scenes and seeds that all methods of the column have: a method whose difficult scenes are missing
-    would otherwise look better.
+    A method whose difficult scenes are missing would otherwise look better.
     """
     columns = [(kind, speed) for kind in ("object", "large") for speed in ("easy", "hard")]
     columns = [column for column in columns if _of(figures, kind=column[0], speed=column[1])]
@@ -105,10 +91,7 @@ def methods_table(figures: Sequence[Figures]) -> str:
 
 
 def peers_parts(figures: Sequence[Figures]) -> list[str]:
-    """Return a table of PSNR and the order of the methods for each kind of scene and speed, beside the paper's.
-
-    Cells are means over scenes, of all seeds, with the standard deviation of the means of the seeds.
-    """
+    """Return a table of PSNR and the order of the methods for each kind of scene and speed, beside the paper's."""
     named = [name for name, rows in _ROWS_OF.items() if any(_of(figures, row=row) for row in rows)]
     parts = [
         "PSNR: mean over scenes and seeds ± standard deviation over seeds, with test poses as placed / refined. Means "
@@ -117,16 +100,16 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
         "does not say on which poses it ran the others. In the other tables, rows without a method's name are "
         "AE-NeRF's."
     ]
-    if HIGH_PASS in named:
+    if plan.HIGH_PASS in named:
         parts.append(
-            f"{HIGH_PASS} stands in the place of {PEERS['e2vid-nerf']}. It is not the paper's row, because its images "
-            "are a filter's and not a network's."
+            f"{plan.HIGH_PASS} stands in the place of {plan.PEERS['e2vid-nerf']}. It is not the paper's row, because "
+            "its images are a filter's and not a network's."
         )
     for (kind, speed), paper in _PAPER.items():
-        common = _common([run for run in _of(figures, kind=kind, speed=speed) if run["row"] != CEILING])
+        common = _common([run for run in _of(figures, kind=kind, speed=speed) if run["row"] != plan.CEILING])
         if not common:
             continue
-        published = {name: value for name, value in zip((*PEERS.values(), _AE_NERF), paper, strict=True) if value}
+        published = {name: value for name, value in zip((*plan.PEERS.values(), _AE_NERF), paper, strict=True) if value}
         rows = [
             [
                 name,
@@ -174,7 +157,7 @@ def _mean_and_spread(figures: Sequence[Figures]) -> str:
 
 def poses_table(figures: Sequence[Figures]) -> str:
     """Return the errors of the poses with and without correction, means over scenes and seeds."""
-    corrected = _of(figures, row=OURS)
+    corrected = _of(figures, row=plan.OURS)
     speeds = [speed for speed in ("easy", "hard") if _of(corrected, speed=speed)]
     header = ["", *(f"{speed}: {which} ψ" for speed in speeds for which in ("with", "without"))]
     rows = []
@@ -191,7 +174,9 @@ def poses_table(figures: Sequence[Figures]) -> str:
 def losses_table(figures: Sequence[Figures]) -> str:
     """Return the means for each set of losses, over the scenes and seeds that all sets have."""
     figures = _common(figures)
-    rows = [[name, *(_mean(_of(figures, row=name), m) for m in _METRICS)] for name in LOSSES if _of(figures, row=name)]
+    rows = [
+        [name, *(_mean(_of(figures, row=name), m) for m in _METRICS)] for name in plan.LOSSES if _of(figures, row=name)
+    ]
     return _markdown(["losses", *map(str.upper, _METRICS)], rows)
 
 
