@@ -40,6 +40,7 @@ FORMAT_WRITERS: dict[str, Callable[[Path], object]] = {"aenerf-data": write_nati
 
 _NATIVE, _ECD, _ROBUST, _EDS = "aenerf-data", "ecd-data", "robust-enerf-data", "eds-data"
 _ESIM, _EVENTNERF, _PAEV3D, _OWN = "enerf-esim-data", "eventnerf-data", "paev3d-data", "event-recording-data"
+_H5, _OBJECTS = "events.h5", "Render_info/Bunny/0003.npz"
 _VAL_IMAGE, _TRAIN_IMAGE, _PAEV3D_EVENTS = "images/val/00000.png", "images/train/00001.png", "H5_Files/Bunny/event.h5"
 
 
@@ -103,6 +104,18 @@ def unallocated(name: str, columns: dict[str, str], group: str = "", shape: tupl
             without(file, key).create_dataset(key, shape, dtype, chunks=chunks, compression="gzip")
 
     return edit_hdf5(name, edit)
+
+
+def typed_polarities(dtype: np.dtype) -> Change:
+    return edit_hdf5(_H5, lambda file: without(file, "p").create_dataset("p", (200,), dtype))
+
+
+def references(file: h5py.File) -> None:
+    without(file, "events/t")["events/t"] = np.array([file.ref], h5py.ref_dtype)
+
+
+def deflated(name: str, array: str, content: bytes) -> Change:
+    return member(name, array, content, zipfile.ZIP_DEFLATED)
 
 
 _COLUMNS = {"x": "u2", "y": "u2", "t": "i8", "p": "i1"}
@@ -173,7 +186,7 @@ CAM0 = """cam0:
 def poses_pickle(*opcodes: bytes) -> Change:
     """An object_poses that is a pickle of these opcodes."""
     stream = b"\x80\x03" + b"".join(opcodes) + b"."
-    return member("Render_info/Bunny/0003.npz", "object_poses", npy_header("(1,)", "'|O'") + stream)
+    return member(_OBJECTS, "object_poses", npy_header("(1,)", "'|O'") + stream)
 
 
 _RECONSTRUCT = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\n"
@@ -233,6 +246,8 @@ _SOFT_LOOP = all_of(
     put("events.h5", "events/t", h5py.SoftLink("/events/t2")), put("events.h5", "events/t2", h5py.SoftLink("/events/t"))
 )
 _NAMED_TYPE = put("events.h5", "events/t", np.dtype("i8"))
+_MILLISECONDS = set_attribute("time_unit", "ms")
+_TOO_MANY_ROWS = npy_header("(10000000000000,)")
 BIG, HUGE = int("9" * 400), "RAW:1e999999999"
 
 # Values in transforms.json, by the keys that lead to them.
@@ -288,7 +303,7 @@ _UNREADABLE: dict[str, str] = {
     _ROBUST: "raw_events.npz camera_poses.npz views/transforms_val.json",
     _ESIM: "events/2.npy events poses_bounds.npy",
     _EVENTNERF: "train/pose/r_00003.txt train/pose",
-    _PAEV3D: "Render_info/Bunny/0003.npz",
+    _PAEV3D: _OBJECTS,
     _OWN: "trajectory.txt",
 }
 _CAMCHAINS = {
@@ -351,12 +366,8 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "pose time of 1e30": poses("0 0 0 0 0 0 0 1\n1e30 0 0 0 0 0 0 1\n"),
         "pose time of 1e999999999": poses("0 0 0 0 0 0 0 1\n1e999999999 0 0 0 0 0 0 1\n"),
         "pose at 1e300": poses("1600000000 1e300 0 0 0 0 0 1\n1600000009 0 0 0 0 0 0 1\n"),
-        "time offset that overflows": all_of(
-            set_attribute("time_offset", np.int64(2**62)), set_attribute("time_unit", "ms")
-        ),
-        "times that overflow with their unit": all_of(
-            put("events.h5", "events/t", np.arange(200) + (1 << 62)), set_attribute("time_unit", "ms")
-        ),
+        "time offset that overflows": all_of(set_attribute("time_offset", np.int64(2**62)), _MILLISECONDS),
+        "times that overflow with their unit": all_of(put(_H5, "events/t", np.arange(200) + (1 << 62)), _MILLISECONDS),
         "json of depth 100000": write_text("transforms.json", '{"a":' + "[" * 100_000 + "]" * 100_000 + "}"),
         "text that is not UTF-8": write_bytes("transforms.json", b'{"a": "\xff\xfe"}'),
         "a folder for the poses": folder_for("trajectory_estimated.txt"),
@@ -390,14 +401,10 @@ _CHANGES: dict[str, dict[str, Change]] = {
     },
     _ROBUST: {
         "robust sensor": calibration(img_width=30000, img_height=30000),
-        "npz of 10^13 rows, stored": member("raw_events.npz", "timestamp", npy_header("(10000000000000,)")),
-        "npz of 10^13 rows, compressed": member(
-            "raw_events.npz", "timestamp", npy_header("(10000000000000,)") + bytes(64), zipfile.ZIP_DEFLATED
-        ),
+        "npz of 10^13 rows, stored": member("raw_events.npz", "timestamp", _TOO_MANY_ROWS),
+        "npz of 10^13 rows, compressed": deflated("raw_events.npz", "timestamp", _TOO_MANY_ROWS + bytes(64)),
         "npz of 2^70 rows": member("raw_events.npz", "timestamp", npy_header(f"({2**70},)")),
-        "poses of 10^13 rows": member(
-            "camera_poses.npz", "T_wc_timestamp", npy_header("(10000000000000,)") + bytes(64), zipfile.ZIP_DEFLATED
-        ),
+        "poses of 10^13 rows": deflated("camera_poses.npz", "T_wc_timestamp", _TOO_MANY_ROWS + bytes(64)),
         "npz bomb": npz_bomb("raw_events.npz", "timestamp"),
         "npz bomb of one number": npz_bomb("camera_calibration.npz", "img_width"),
         "npz text of 10^9 letters": member(
@@ -418,9 +425,7 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "robust file_path of 5000 letters": view("frames", 0, "file_path", value="a" * 5000),
         "robust file_path with a null": view("frames", 0, "file_path", value="a\0b"),
         "unbalanced header in npz": member("raw_events.npz", "timestamp", npy_header("(3", end="")),
-        "unbalanced header in compressed npz": member(
-            "camera_poses.npz", "T_wc_timestamp", npy_header("(3", end=""), zipfile.ZIP_DEFLATED
-        ),
+        "unbalanced header in compressed npz": deflated("camera_poses.npz", "T_wc_timestamp", npy_header("(3", end="")),
         "half an archive": truncated("raw_events.npz"),
         "member with a password": edit_bytes(
             "camera_poses.npz", lambda b: b.replace(b"PK\1\2\x2d\3\x2d\0\0\0", b"PK\1\2\x2d\3\x2d\0\1\0")
@@ -440,12 +445,8 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "unreadable camchain": all_of(camchain(CAM0), unreadable("camchain.yaml")),
         "own soft links in a circle": _SOFT_LOOP,
         "own named type": _NAMED_TYPE,
-        "own t_offset that is a group": edit_hdf5(
-            "events.h5", lambda f: without(f, "t_offset").create_group("t_offset")
-        ),
-        "own references": edit_hdf5(
-            "events.h5", lambda f: without(f, "events/t").update({"events/t": np.array([f.ref], h5py.ref_dtype)})
-        ),
+        "own t_offset that is a group": edit_hdf5(_H5, lambda f: without(f, "t_offset").create_group("t_offset")),
+        "own references": edit_hdf5(_H5, references),
         "own listed image": outside_image(write_text("images.txt", "1600000000.05 ../outside.png\n"), (60, 40), "L"),
     },
     _ESIM: {
@@ -457,12 +458,8 @@ _CHANGES: dict[str, dict[str, Change]] = {
     },
     _EDS: {
         "HDF5 columns of 10^12 rows": unallocated("events.h5", {**_COLUMNS, "p": "u1"}),
-        "eds enumeration": edit_hdf5(
-            "events.h5", lambda f: without(f, "p").create_dataset("p", (200,), h5py.enum_dtype({"A": 0, "B": 1}, "i1"))
-        ),
-        "eds lists": edit_hdf5(
-            "events.h5", lambda f: without(f, "p").create_dataset("p", (200,), h5py.vlen_dtype("i1"))
-        ),
+        "eds enumeration": typed_polarities(h5py.enum_dtype({"A": 0, "B": 1}, "i1")),
+        "eds lists": typed_polarities(h5py.vlen_dtype("i1")),
     },
     _PAEV3D: {
         "HDF5 matrix of 10^12 rows": unallocated(_PAEV3D_EVENTS, {"events": "f8"}, shape=(10**12, 4)),
@@ -478,10 +475,8 @@ _CHANGES: dict[str, dict[str, Change]] = {
         ),
         "pickle of bytes of 2^40": poses_pickle(b"\x96" + (1 << 40).to_bytes(8, "little")),
         "pickle that multiplies": poses_pickle(nested_pickle()),
-        "unbalanced header of poses": member(
-            "Render_info/Bunny/0003.npz", "object_poses", npy_header("(3", "'|O'", "")
-        ),
-        "half an archive of poses": truncated("Render_info/Bunny/0003.npz"),
+        "unbalanced header of poses": member(_OBJECTS, "object_poses", npy_header("(3", "'|O'", "")),
+        "half an archive of poses": truncated(_OBJECTS),
     },
     _ECD: {
         "png of 30000 x 30000": black("images/0.png", 30000),
@@ -500,9 +495,7 @@ _CHANGES: dict[str, dict[str, Change]] = {
     },
     _EVENTNERF: {
         "matrix of 8 GB": sparse("train/pose/r_00003.txt"),
-        "eventnerf intrinsics of 1e300": write_text(
-            "train/intrinsics/r_00000.txt", "1e300 0 0 0 0 1e300 0 0 0 0 1 0 0 0 0 1"
-        ),
+        "eventnerf intrinsics of 1e300": write_text("train/intrinsics/r_00000.txt", "1e300 0 0 0 0 1e300" + " 1" * 10),
     },
 }
 
