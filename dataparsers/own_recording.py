@@ -85,12 +85,6 @@ class OwnRecordingDataParser(EventDataParser):
             if not timed:
                 raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
             reference = _read_colmap(model, timed, images, frame_from_event)
-        elif config.poses is None and not poses.is_file():
-            raise DataError(
-                poses,
-                "there is no such file",
-                f"give the poses, or have them estimated: aenerf convert {folder} --output FOLDER --poses events",
-            )
         else:
             reference = read_tum_trajectory(poses)
         views = views_on_trajectory(
