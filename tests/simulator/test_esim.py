@@ -75,30 +75,6 @@ def reference_events(
     return events
 
 
-@pytest.mark.parametrize(("positive", "negative"), [(0.25, 0.25), (0.31, 0.17)])
-def test_every_pair_is_one_threshold_apart(positive: float, negative: float) -> None:
-    rng = np.random.default_rng(1)
-    times = np.cumsum(rng.integers(20_000_000, 60_000_000, 40))
-    images = to_images(random_log_frames(rng, len(times), 1.0))
-    simulator = make_simulator(positive, negative)
-    x, y, t, p = simulate(simulator, images, times)
-    log_frames = log_of(images)
-    pairs = 0
-    for row in range(HEIGHT):
-        for column in range(WIDTH):
-            mine = (x == column) & (y == row)
-            level = np.interp(t[mine], times, log_frames[:, row, column])
-            expected = np.where(p[mine] > 0, positive, -negative)
-            # From the very first frame on: a drift of the reference would add up.
-            np.testing.assert_allclose(level - log_frames[0, row, column], np.cumsum(expected), atol=1e-6)
-            np.testing.assert_allclose(np.diff(level), expected[1:], atol=1e-6)
-            # Nothing is missed either: what remains is below the threshold.
-            rest = log_frames[-1, row, column] - (log_frames[0, row, column] + expected.sum())
-            assert -negative < rest < positive
-            pairs += len(level) - 1
-    assert pairs > 1000
-
-
 def test_ramp_fires_at_the_crossings() -> None:
     simulator = make_simulator(0.25, 0.5, 1, 1)
     simulator([[1.0 - LOG_EPSILON]], 1000)
