@@ -35,9 +35,7 @@ class ReferencePicture(NamedTuple):
 
     display: NDArray[np.uint8]  # (height, width, 3), sRGB
     linear: NDArray[np.uint16]  # (height, width, 3), linear radiance; 65535 stands for 1, which is display white
-    depth: NDArray[
-        np.float32
-    ]  # (height, width) along the optical axis at the pixels' centers, inf where nothing is hit
+    depth: NDArray[np.float32]  # (height, width) along the optical axis at the pixels' centers, inf for no hit
 
 
 class Simulation:
