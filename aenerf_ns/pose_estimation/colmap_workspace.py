@@ -230,7 +230,13 @@ class ColmapWorkspace:
             posed = pycolmap.triangulate_points(
                 posed, self.database, self.images, self._new_folder("adjusted"), clear_points=True, options=options
             )
-            pycolmap.bundle_adjustment(posed, adjustment)
+            # What pycolmap.bundle_adjustment does, which turns COLMAP's log on again.
+            pycolmap.ObservationManager(posed).filter_observations_with_negative_depth()
+            config = pycolmap.BundleAdjustmentConfig()
+            for image in posed.images:
+                config.add_image(image)
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+            pycolmap.create_default_bundle_adjuster(adjustment, config, posed).solve()
         return posed
 
     def _new_folder(self, name: str) -> Path:

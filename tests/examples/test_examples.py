@@ -12,6 +12,7 @@ import pytest
 import torch
 from helpers.examples import EXAMPLES, run_example
 from helpers.small_datasets import make_trajectory, parse, write_native
+from helpers.small_trainings import own_log
 
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -84,7 +85,8 @@ def test_way_back_to_the_world(tmp_path: Path) -> None:
 
 def test_supervision_of_your_own(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
-    runpy.run_path(str(EXAMPLES / "add_a_supervision.py"))["main"](data, tmp_path / "outputs", 3)
+    with own_log():
+        runpy.run_path(str(EXAMPLES / "add_a_supervision.py"))["main"](data, tmp_path / "outputs", 3)
     assert list((tmp_path / "outputs").rglob("step-000000002.ckpt"))
 
 

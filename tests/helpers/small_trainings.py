@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,16 @@ from nerfstudio.engine.trainer import writer
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.training.trainer import AENeRFTrainer, AENeRFTrainerConfig
 from helpers.small_pipelines import make_pipeline_config
+
+
+@contextmanager
+def own_log() -> Iterator[None]:
+    """Forget afterwards who writes the log of a training in this process. The framework keeps them for good."""
+    try:
+        yield
+    finally:
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
 
 
 def train_small_model(folder: Path, name: str, num_steps: int, seed: int = 42, **options: Any) -> AENeRFTrainer:
@@ -35,12 +47,8 @@ def train_small_model(folder: Path, name: str, num_steps: int, seed: int = 42, *
         group["scheduler"].warm_up = 4
     config.optimizers["camera_opt"]["scheduler"].delay = 2
     torch.manual_seed(seed)
-    try:
+    with own_log():
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.train()
-    finally:
-        # The framework keeps them for good.
-        writer.EVENT_WRITERS.clear()
-        writer.EVENT_STORAGE.clear()
     return trainer

@@ -27,8 +27,8 @@ import websockets.sync.client
 import yaml
 from helpers.browser import chromium
 from helpers.commands import CPU, newest_config, run
+from helpers.small_trainings import own_log
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.trainer import writer
 from nerfstudio.scripts import train
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, SpiralRender
@@ -83,13 +83,8 @@ def train_again(config: Path, name: str, **settings: Any) -> Path:
     changed.experiment_name, changed.timestamp = name, "{timestamp}"
     for setting, value in settings.items():
         setattr(changed, setting, value)
-    try:
-        with events_of(changed.data):
-            train.main(changed)
-    finally:
-        # The framework keeps them for good.
-        writer.EVENT_WRITERS.clear()
-        writer.EVENT_STORAGE.clear()
+    with own_log(), events_of(changed.data):
+        train.main(changed)
     return newest_config(Path("outputs") / name)
 
 
