@@ -6,7 +6,13 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+import tyro
+
+from aenerf_ns.cli.simulate import Simulate
 
 CPU = ("--machine.device-type", "cpu")
 
@@ -26,9 +32,21 @@ def run(*command: str | Path, cwd: Path, fails: bool = False, gpu: bool = False)
 
 
 def simulate(folder: Path, *options: str) -> Path:
+    """Simulates a small recording in this process."""
     size = ("--width", "48", "--height", "36", "--train-images", "4", "--validation-views", "4", "--test-views", "3")
-    run("aenerf", "simulate", "--output", folder, *size, *options, cwd=folder.parent)
+    tyro.cli(Simulate, args=["--output", str(folder), *size, *options]).main()
     return folder
+
+
+@contextmanager
+def chdir(folder: Path) -> Iterator[None]:
+    """Works in a folder for a while, as a command does that is started there: a run's paths are relative."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
 
 
 def newest_config(folder: Path) -> Path:

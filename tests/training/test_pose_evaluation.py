@@ -340,7 +340,7 @@ def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor)
     assert pose_errors(*flipped) == pytest.approx(errors, rel=1e-9)
 
 
-@pytest.mark.parametrize("mode", ["network", "spline"])
+@pytest.mark.parametrize("mode", [pytest.param("network", marks=pytest.mark.slow), "spline"])
 def test_in_a_known_scene_the_correction_finds_the_true_poses(mode: str) -> None:
     times = np.linspace(0, SECOND, 60).astype(np.int64)
     path = torch.eye(4, dtype=torch.float64).repeat(60, 1, 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,16 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from helpers.commands import CPU, newest_config, run, simulate
+from helpers.commands import CPU, chdir, newest_config, run, simulate
+from helpers.small_trainings import own_log
+from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.scripts import train
+
+from aenerf_ns.cli.evaluate import Evaluate
+from aenerf_ns.errors import DataError
+from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
+from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
+from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +34,14 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def room(workspace: Path) -> Path:
     """A tiny simulated room."""
     return simulate(workspace / "room")
+
+
+def train_here(config: AENeRFTrainerConfig, data: Path, folder: Path) -> None:
+    """Trains on the CPU in this process, as ns-train does in a folder."""
+    config.data, config.output_dir, config.vis = data, folder / "outputs", "tensorboard"
+    config.machine.device_type = "cpu"
+    with own_log():
+        train.main(config)
 
 
 # For tests in which it does not matter how exact the events are.
@@ -58,22 +76,11 @@ def test_neither_images_nor_ground_truth_are_trained_on(room: Path, workspace: P
         imageio.imwrite(image, np.zeros_like(imageio.imread(image)))
     weights = []
     for data in (room, changed):
-        run(
-            "ns-train",
-            "aenerf-small",
-            *CPU,
-            "--vis",
-            "tensorboard",
-            "--max-num-iterations",
-            "4",
-            "--optimizers.camera-opt.scheduler.delay",
-            "0",
-            "--gradient-accumulation-steps.camera-opt",
-            "1",
-            "--data",
-            data,
-            cwd=workspace,
-        )
+        config = deepcopy(aenerf_small.config)
+        config.max_num_iterations = 4
+        config.optimizers["camera_opt"]["scheduler"].delay = 0
+        config.gradient_accumulation_steps = {"camera_opt": 1}
+        train_here(config, data, workspace)
         (checkpoint,) = (workspace / "outputs" / data.name).rglob("*.ckpt")
         weights.append(torch.load(checkpoint, weights_only=True)["pipeline"])
     for name, value in weights[0].items():
@@ -84,30 +91,16 @@ def test_neither_images_nor_ground_truth_are_trained_on(room: Path, workspace: P
     assert not torch.equal(*(w["_model.color_correction.offset"] for w in weights))
 
 
-@pytest.mark.parametrize(
-    ("method", "small"),
-    [
-        ("aenerf", ("--pipeline.model.field.log2-hashmap-size", "12")),
-        ("aenerf-mlp", ("--pipeline.model.field.hidden-dim", "32", "--pipeline.model.proposal.hidden-dim", "16")),
-    ],
-)
-def test_the_methods_for_gpus_train_too(room: Path, workspace: Path, method: str, small: tuple[str, ...]) -> None:
-    run(
-        "ns-train",
-        method,
-        *CPU,
-        "--vis",
-        "tensorboard",
-        "--max-num-iterations",
-        "2",
-        "--pipeline.datamanager.train-num-rays-per-batch",
-        "60",
-        *small,
-        "--data",
-        room,
-        cwd=workspace,
-    )
-    assert len(list((workspace / "outputs" / "room" / method).rglob("*.ckpt"))) == 1
+@pytest.mark.parametrize("method", [aenerf, aenerf_mlp])
+def test_methods_for_gpus_train_too(room: Path, workspace: Path, method: MethodSpecification) -> None:
+    config = deepcopy(method.config)
+    config.max_num_iterations = 2
+    config.pipeline.datamanager.train_num_rays_per_batch = 60
+    field, proposal = config.pipeline.model.field, config.pipeline.model.proposal
+    # Smaller ones, because the real ones take minutes.
+    field.log2_hashmap_size, field.hidden_dim, proposal.hidden_dim = 12, 32, 16
+    train_here(config, room, workspace)
+    assert len(list((workspace / "outputs" / "room" / config.method_name).rglob("*.ckpt"))) == 1
 
 
 def train_processes(room: Path, folder: Path, count: int, *options: str) -> list[dict[str, Any]]:
@@ -141,7 +134,8 @@ def test_two_processes_learn_the_same_from_different_pairs(room: Path, workspace
     assert (first["num_fits"], second["num_fits"]) == (2, 0)
     assert first["weights"]["camera_optimizer.twists.control_twists"].any()
     results = workspace / "two.json"
-    run("ns-eval", "--load-config", newest_config(folder), "--output-path", results, cwd=folder)
+    with chdir(folder):
+        Evaluate(newest_config(folder), results).main()
     learned = json.loads(results.read_text())["results"]
     assert learned["contrast_threshold_ratio"] != 1
     assert learned["pose_diagnosis"]["summary"].startswith("Pose correction: ")
@@ -197,11 +191,10 @@ def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Pa
     assert "nothing: there is no such folder; give the folder of a dataset as --data" in errors[0]
 
 
-def test_training_that_diverges_ends_with_one_line(workspace: Path) -> None:
-    data = simulate(workspace / "diverging")
+def test_training_that_diverges_ends_with_one_line(room: Path, workspace: Path) -> None:
     output = run(
-        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "20", "--data", data,
-        "--optimizers.networks.optimizer.lr", "1e30",
+        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "20", "--data", room,
+        "--experiment-name", "diverging", "--optimizers.networks.optimizer.lr", "1e30",
         cwd=workspace, fails=True,
     )  # fmt: skip
     assert "Traceback" not in output
@@ -209,28 +202,37 @@ def test_training_that_diverges_ends_with_one_line(workspace: Path) -> None:
     assert re.match(r"Error: step \d+: (loss|gradient) not finite \(", error)
 
 
-def test_a_recording_without_reference_views_trains_and_says_so_at_evaluation(workspace: Path) -> None:
+@pytest.fixture(scope="module")
+def without_views(workspace: Path) -> tuple[Path, Path]:
+    """A recording without reference views, and config.yml of a run on it."""
     none = ("--train-images", "0", "--validation-views", "0", "--test-views", "0")
     data = simulate(workspace / "bare", *none, "--scene", "object", *FEW_FRAMES)
     run(
         "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "3", "--data", data,
         cwd=workspace,
     )  # fmt: skip
-    config = newest_config(workspace / "outputs" / "bare")
-    # What can be evaluated is the poses, as long as the true ones are known.
-    command = ("ns-eval", "--load-config", config, "--output-path", workspace / "none.json")
-    run(*command, cwd=workspace)
-    results = json.loads((workspace / "none.json").read_text())["results"]
-    assert results["num_views"] == 0
-    assert "psnr" not in results
-    assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 1
-    (data / "trajectory_ground_truth.txt").unlink()
-    output = run(*command, cwd=workspace, fails=True)
-    assert "Error: " in output
-    assert "it has no reference images to evaluate on" in output
-    # The renderers start from places on the trajectory then.
-    for mode in (("spiral", "--seconds", "0.1"), ("interpolate", "--interpolation-steps", "1")):
-        video = workspace / f"bare_{mode[0]}.mp4"
-        options = ("--load-config", config, "--output-path", video, "--downscale-factor", "4")
-        run("ns-render", *mode, *options, cwd=workspace)
-        assert video.stat().st_size > 0
+    return data, newest_config(workspace / "outputs" / "bare")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [("spiral", "--seconds", "0.1"), ("interpolate", "--interpolation-steps", "1")])
+def test_rendering_without_reference_views_starts_on_the_trajectory(
+    without_views: tuple[Path, Path], workspace: Path, mode: tuple[str, ...]
+) -> None:
+    video = workspace / f"bare_{mode[0]}.mp4"
+    options = ("--load-config", without_views[1], "--output-path", video, "--downscale-factor", "4")
+    run("ns-render", *mode, *options, cwd=workspace)
+    assert video.stat().st_size > 0
+
+
+def test_evaluation_without_reference_views_is_of_poses(without_views: tuple[Path, Path], workspace: Path) -> None:
+    data, config = without_views
+    with chdir(workspace):
+        Evaluate(config, workspace / "none.json").main()
+        results = json.loads((workspace / "none.json").read_text())["results"]
+        assert results["num_views"] == 0
+        assert "psnr" not in results
+        assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 1
+        (data / "trajectory_ground_truth.txt").unlink()
+        with pytest.raises(DataError, match="it has no reference images to evaluate on"):
+            Evaluate(config, workspace / "again.json").main()
