@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.reconstruction.high_pass import HighPassFilter
 
 _DECAY = 0.12
 """Share of a pixel's state that is forgotten while the picture gets one event per pixel. It does not depend on time, so
@@ -22,9 +23,7 @@ _LOOK_AHEAD = 25.0
 _BLUR, _PERCENTILES = 0.8, (1.0, 99.0)
 
 
-def two_sided_images(
-    batches: Iterable[EventStream], sensor: SensorModel, decay: float = _DECAY
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def two_sided_images(batches: Iterable[EventStream], sensor: SensorModel) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Yield the time in nanoseconds and the (height, width) image at the end of each batch of a stream.
 
     A pixel's state adds up contrast thresholds, forwards up to the image and backwards, with reversed polarities, down
@@ -35,33 +34,32 @@ def two_sided_images(
     Args:
         batches: the stream in consecutive pieces, in the order of time, all of one sensor.
         sensor: the contrast thresholds.
-        decay: share of a state that is forgotten per event and pixel of the picture.
     """
     held: list[tuple[EventStream, NDArray[np.float32]]] = []
-    forward: _Filter | None = None
+    forward: _EventClock | None = None
     # The latest batches whose images wait for what follows: as many again are yielded at a time.
     num_ahead = 0
     for batch in batches:
         if forward is None:
-            forward = _Filter(batch.width, batch.height, sensor, decay)
+            forward = _EventClock(batch.width, batch.height, sensor)
         forward.add(batch)
         held.append((batch, forward.state()))
         num_ahead = math.ceil(_LOOK_AHEAD * batch.width * batch.height / len(batch))
         if len(held) == 2 * num_ahead:
-            yield from _finish(held, sensor, decay)[:num_ahead]
+            yield from _finish(held, sensor)[:num_ahead]
             held = held[num_ahead:]
-    yield from _finish(held, sensor, decay)
+    yield from _finish(held, sensor)
 
 
 def _finish(
-    held: list[tuple[EventStream, NDArray[np.float32]]], sensor: SensorModel, decay: float
+    held: list[tuple[EventStream, NDArray[np.float32]]], sensor: SensorModel
 ) -> list[tuple[int, NDArray[np.uint8]]]:
     """Add the states of the backward filter to those of the forward filter, and return times and images."""
     images: list[tuple[int, NDArray[np.uint8]]] = []
-    backward: _Filter | None = None
+    backward: _EventClock | None = None
     for batch, state in reversed(held):
         if backward is None:
-            backward = _Filter(batch.width, batch.height, sensor, decay)
+            backward = _EventClock(batch.width, batch.height, sensor)
             both = state
         else:
             both = (state + backward.state()) / 2
@@ -77,34 +75,22 @@ def _display(state: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.rint(np.clip((smooth - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
 
 
-class _Filter:
-    """Leaky integrators of the events of all pixels; they forget with the number of events in the picture."""
+class _EventClock:
+    """The high-pass filter, whose time is the number of events in the picture: a nanosecond each."""
 
-    def __init__(self, width: int, height: int, sensor: SensorModel, decay: float) -> None:
-        self._thresholds = sensor.positive_contrast_threshold, sensor.negative_contrast_threshold
-        self._decay = decay / (width * height)
-        self._state = np.zeros((height, width))
-        self._last = np.zeros((height, width), np.int64)
+    def __init__(self, width: int, height: int, sensor: SensorModel) -> None:
+        self._filter = HighPassFilter(width, height, sensor, 1e9 * _DECAY / (width * height), cutoff_per_event=0.0)
         self._count = 0
 
     def add(self, events: EventStream, reverse: bool = False) -> None:
-        positive, negative = self._thresholds
-        x, y, p = events.x, events.y, events.p
+        counts = np.arange(self._count, self._count + len(events))
         if reverse:
             # A rise of light is a fall backwards.
-            x, y, p = x[::-1], y[::-1], -p[::-1]
-        _integrate(self._state, self._last, x, y, p, positive, negative, self._decay, self._count)
+            backwards = {"x": events.x[::-1], "y": events.y[::-1], "p": -events.p[::-1]}
+            self._filter.add(replace(events, t=counts, **backwards))
+        else:
+            self._filter.add(replace(events, t=counts))
         self._count += len(events)
 
     def state(self) -> NDArray[np.float32]:
-        return (self._state * np.exp(-self._decay * (self._count - self._last))).astype(np.float32)
-
-
-@numba.njit(cache=True)
-def _integrate(state, last, x, y, p, positive, negative, decay, count):
-    for event in range(len(x)):
-        row, column = y[event], x[event]
-        now = count + event
-        kept = np.exp(-decay * (now - last[row, column])) * state[row, column]
-        state[row, column] = kept + (positive if p[event] > 0 else -negative)
-        last[row, column] = now
+        return self._filter.log_intensity(self._count).astype(np.float32)
