@@ -62,11 +62,11 @@ def reading(source: str | Path) -> Iterator[None]:
         raise DataError(place, f"it cannot be read ({reason})", "check its name and its rights") from None
 
 
-def require_file(path: Path) -> None:
+def require_file(path: Path, remedy: str = "check the path of the dataset") -> None:
     """Raise a DataError if a file of a dataset does not exist."""
     with reading(path):
         if not path.is_file():
-            raise DataError(path, "there is no such file", "check the path of the dataset")
+            raise DataError(path, "there is no such file", remedy)
 
 
 @contextmanager

@@ -109,7 +109,7 @@ class TumVieDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         events, sequence, side = _choose(Path(self.config.data))
-        capture, imu_from_event, imu_from_frame = self._read_cameras()
+        capture, imu_from_event, imu_from_frame = self._read_cameras(events, sequence, side)
         # The motion capture gives the poses of its marker.
         path = _find_calibration(events.parent, f"mocap-imu-calibration{_calibration_set(sequence)}.json")
         imu_from_marker = read_json(path, _File[_Mocap]).value0.T_imu_marker.matrix(path)
@@ -132,14 +132,13 @@ class TumVieDataParser(EventDataParser):
         )
 
     def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        events, sequence, _ = _choose(Path(self.config.data))
+        events, sequence, side = _choose(Path(self.config.data))
         if (events.parent / f"{sequence}-vi_gt_data" / "mocap_data.txt").is_file():
             return super().read_frames()
-        return self._read_cameras()[0], []
+        return self._read_cameras(events, sequence, side)[0], []
 
-    def _read_cameras(self) -> tuple[Capture, Tensor, Tensor]:
+    def _read_cameras(self, events: Path, sequence: str, side: str) -> tuple[Capture, Tensor, Tensor]:
         """Read the cameras, and the (4, 4) motions from the event and the frame camera's coordinates to the IMU's."""
-        events, sequence, side = _choose(Path(self.config.data))
         path = _find_calibration(events.parent, f"camera-calibration{_calibration_set(sequence)}.json")
         cameras = read_json(path, _File[_Cameras]).value0
         (event_camera, imu_from_event), (frame_camera, imu_from_frame) = (

@@ -1,4 +1,4 @@
-"""What commands print."""
+"""How commands print."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.errors import DataError, require_file
 from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
 
 # Trajectories are commonly printed with six or more digits, so quaternions have rounding errors.
@@ -27,10 +27,7 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
             not increase.
     """
-    with reading(path):
-        if not path.is_file():
-            remedy = "give the poses, or have them estimated: aenerf convert DATA --output FOLDER --poses events"
-            raise DataError(path, "there is no such file", remedy)
+    require_file(path, "give the poses, or have them estimated: aenerf convert DATA --output FOLDER --poses events")
     rows = read_rows(path, POSE_COLUMNS)
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")

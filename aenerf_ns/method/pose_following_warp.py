@@ -42,7 +42,7 @@ class PoseFollowingWarp(nn.Module):
     neighbors move alike.
 
     Args:
-        correction: of the poses, of which something is learned.
+        correction: of the poses; it learns something.
         spatial_distortion: contraction of space, or None for a bounded scene.
         aabb: (2, 3) box of the fields.
 

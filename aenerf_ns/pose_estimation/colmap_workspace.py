@@ -75,23 +75,19 @@ class ColmapWorkspace:
         num_frames: number of frames.
         seed: of COLMAP's random samples.
         progress: shows each step.
-
-    Attributes:
-        database: COLMAP's file of features and matches.
-        images: the folder of the frames.
     """
 
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
-        self.folder, self.images, self.database = folder, folder / "images", folder / "database.db"
-        self.images.mkdir()
+        self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
+        self._images.mkdir()
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
-        self.seed = seed
-        self.progress = progress
+        self._seed = seed
+        self._progress = progress
 
     def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
         """Write the frames as image files for COLMAP."""
         named = zip(self._names, frames, strict=True)
-        for name, frame in self.progress.track(named, total=len(self._names), description="Collecting frames"):
+        for name, frame in self._progress.track(named, total=len(self._names), description="Collecting frames"):
             origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
             with read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
                 if image.size != size:
@@ -101,7 +97,7 @@ class ColmapWorkspace:
                         "give the intrinsics of the frames as they are",
                     )
                 require_8_bits(image, origin)
-                image.convert("L" if image.mode == "L" else "RGB").save(self.images / name)
+                image.convert("L" if image.mode == "L" else "RGB").save(self._images / name)
 
     def find_features(self, camera: CameraIntrinsics | None) -> None:
         import pycolmap
@@ -116,10 +112,10 @@ class ColmapWorkspace:
         # COLMAP's own limits suit photographs of many megapixels. This one, and those of the mapper below, suit frames
         # of a fraction of a megapixel.
         extraction.sift.peak_threshold = 0.004
-        with self.step("Finding features"):
+        with self._step("Finding features"):
             pycolmap.extract_features(
-                self.database,
-                self.images,
+                self._database,
+                self._images,
                 camera_mode=pycolmap.CameraMode.SINGLE,
                 reader_options=reader,
                 extraction_options=extraction,
@@ -133,20 +129,20 @@ class ColmapWorkspace:
         matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
         verification = pycolmap.TwoViewGeometryOptions()
         matching.use_gpu, matching.num_threads = False, 1
-        pairing.match_list_path = self.folder / "pairs.txt"
+        pairing.match_list_path = self._folder / "pairs.txt"
         pairing.match_list_path.write_text("\n".join(pairs), encoding="utf-8")
-        verification.ransac.random_seed = self.seed
-        with self.step("Matching frames"):
-            pycolmap.match_image_pairs(self.database, matching, pairing, verification, device=pycolmap.Device.cpu)
+        verification.ransac.random_seed = self._seed
+        with self._step("Matching frames"):
+            pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
 
     def hold_out_matches(self, share: float) -> HeldOutMatches:
         """Take the matches of a share of the pairs of frames out of the database, to judge models by."""
         import pycolmap
 
-        with contextlib.closing(pycolmap.Database.open(self.database)) as database:
+        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
             camera = database.read_all_cameras()[0]
             pair_ids, geometries = database.read_two_view_geometries()
-            chosen = np.random.default_rng(self.seed).random(len(pair_ids)) < share
+            chosen = np.random.default_rng(self._seed).random(len(pair_ids)) < share
             matches = []
             for pair_id, geometry, is_chosen in zip(pair_ids, geometries, chosen, strict=True):
                 if not is_chosen or len(geometry.inlier_matches) == 0:
@@ -166,18 +162,18 @@ class ColmapWorkspace:
         import pycolmap
 
         options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self.seed
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self._seed
         options.num_threads = options.mapper.num_threads = 1
         options.ba_refine_focal_length = options.ba_refine_extra_params = refine_intrinsics
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
         options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = 15, 50
         options.extract_colors = False
         output = self._new_folder("models")
-        with self.step("Placing frames", len(self._names)) as task:
+        with self._step("Placing frames", len(self._names)) as task:
             models = pycolmap.incremental_mapping(
-                self.database, self.images, output, options, next_image_callback=lambda: self.progress.advance(task)
+                self._database, self._images, output, options, next_image_callback=lambda: self._progress.advance(task)
             )
-        return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+        return _largest_first(models)
 
     def reconstruct_globally(self) -> list[Any]:
         """Return the models of the global mapper (GLOMAP), the largest first. The intrinsics stay as given."""
@@ -185,15 +181,15 @@ class ColmapWorkspace:
 
         options = pycolmap.GlobalPipelineOptions()
         mapper = options.mapper
-        options.random_seed = mapper.random_seed = mapper.retriangulation.random_seed = self.seed
-        mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = self.seed
+        options.random_seed = mapper.random_seed = mapper.retriangulation.random_seed = self._seed
+        mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = self._seed
         options.num_threads = mapper.num_threads = 1
         mapper.global_positioning.use_gpu = False
         _keep_intrinsics(mapper.bundle_adjustment)
         output = self._new_folder("global models")
-        with self.step("Placing all frames at once"):
-            models = pycolmap.global_mapping(self.database, self.images, output, options)
-        return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+        with self._step("Placing all frames at once"):
+            models = pycolmap.global_mapping(self._database, self._images, output, options)
+        return _largest_first(models)
 
     def adjust(self, model: Any, max_pixels: float, max_degrees: float, max_iterations: int) -> Any:
         """Triangulate all matches again from the poses of a model, and adjust poses and points to them.
@@ -214,7 +210,7 @@ class ColmapWorkspace:
                 copied = pycolmap.Image(name=image.name, image_id=image.image_id, camera_id=camera.camera_id)
                 posed.add_image_with_trivial_frame(copied, image.cam_from_world())
         options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = options.triangulation.random_seed = self.seed
+        options.random_seed = options.triangulation.random_seed = self._seed
         options.num_threads, options.extract_colors = 1, False
         limits = options.triangulation
         options.mapper.filter_max_reproj_error = limits.complete_max_reproj_error = max_pixels
@@ -226,11 +222,11 @@ class ColmapWorkspace:
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = 1.0
         adjustment.ceres.solver_options.max_num_iterations = max_iterations
-        with self.step("Adjusting poses to all tracks"):
+        with self._step("Adjusting poses to all tracks"):
             posed = pycolmap.triangulate_points(
-                posed, self.database, self.images, self._new_folder("adjusted"), clear_points=True, options=options
+                posed, self._database, self._images, self._new_folder("adjusted"), clear_points=True, options=options
             )
-            # What pycolmap.bundle_adjustment does, which turns COLMAP's log on again.
+            # pycolmap.bundle_adjustment does the same, but it turns COLMAP's log on again.
             pycolmap.ObservationManager(posed).filter_observations_with_negative_depth()
             config = pycolmap.BundleAdjustmentConfig()
             for image in posed.images:
@@ -240,7 +236,7 @@ class ColmapWorkspace:
         return posed
 
     def _new_folder(self, name: str) -> Path:
-        folder = self.folder / name
+        folder = self._folder / name
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         return folder
@@ -249,23 +245,23 @@ class ColmapWorkspace:
         """Return the median number of features in a frame, and the number of pairs of frames that match."""
         import pycolmap
 
-        with contextlib.closing(pycolmap.Database.open(self.database)) as database:
+        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
             counts = [database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()]
             return statistics.median(counts) if counts else 0.0, database.num_verified_image_pairs()
 
     @contextlib.contextmanager
-    def step(self, description: str, total: int | None = None) -> Iterator[TaskID]:
+    def _step(self, description: str, total: int | None = None) -> Iterator[TaskID]:
         """Show the progress of a step, and keep COLMAP's log off the console."""
         import pycolmap
 
         level = pycolmap.logging.minloglevel
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-        task = self.progress.add_task(description, total=total)
+        task = self._progress.add_task(description, total=total)
         try:
             yield task
         finally:
             pycolmap.logging.minloglevel = level
-            self.progress.update(task, total=len(self._names), completed=len(self._names))
+            self._progress.update(task, total=len(self._names), completed=len(self._names))
 
 
 def _choose_pairs(num_frames: int) -> list[tuple[int, int]]:
@@ -275,6 +271,10 @@ def _choose_pairs(num_frames: int) -> list[tuple[int, int]]:
     keys = sorted({round(k) for k in np.linspace(0, num_frames - 1, min(num_frames, _NUM_KEY_FRAMES))})
     pairs |= {(i, j) for i in keys for j in keys if i < j}
     return sorted(pairs)
+
+
+def _largest_first(models: dict[int, Any]) -> list[Any]:
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _keep_intrinsics(adjustment: Any) -> None:

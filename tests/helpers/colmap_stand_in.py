@@ -1,4 +1,4 @@
-"""What stands in for COLMAP, which is tested by itself, in tests of commands that run it."""
+"""A stand-in for COLMAP in tests of commands. COLMAP itself is tested elsewhere."""
 
 from __future__ import annotations
 

@@ -6,8 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import tyro
@@ -36,17 +34,6 @@ def simulate(folder: Path, *options: str) -> Path:
     size = ("--width", "48", "--height", "36", "--train-images", "4", "--validation-views", "4", "--test-views", "3")
     tyro.cli(Simulate, args=["--output", str(folder), *size, *options]).main()
     return folder
-
-
-@contextmanager
-def chdir(folder: Path) -> Iterator[None]:
-    """Works in a folder for a while, as a command does that is started there: a run's paths are relative."""
-    before = Path.cwd()
-    os.chdir(folder)
-    try:
-        yield
-    finally:
-        os.chdir(before)
 
 
 def newest_config(folder: Path) -> Path:

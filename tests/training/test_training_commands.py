@@ -13,7 +13,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from helpers.commands import CPU, chdir, newest_config, run, simulate
+from helpers.commands import CPU, newest_config, run, simulate
 from helpers.small_trainings import own_log
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.scripts import train
@@ -119,7 +119,9 @@ def train_processes(room: Path, folder: Path, count: int, *options: str) -> list
     return [torch.load(folder / f"process_{rank}.pt", weights_only=True) for rank in range(count)]
 
 
-def test_two_processes_learn_the_same_from_different_pairs(room: Path, workspace: Path) -> None:
+def test_two_processes_learn_the_same_from_different_pairs(
+    room: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = workspace / "two"
     first, second = train_processes(
         room, folder, 2, "--max-num-iterations", "3", "--gradient-accumulation-steps.camera-opt", "1",
@@ -134,8 +136,8 @@ def test_two_processes_learn_the_same_from_different_pairs(room: Path, workspace
     assert (first["num_fits"], second["num_fits"]) == (2, 0)
     assert first["weights"]["camera_optimizer.twists.control_twists"].any()
     results = workspace / "two.json"
-    with chdir(folder):
-        Evaluate(newest_config(folder), results).main()
+    monkeypatch.chdir(folder)
+    Evaluate(newest_config(folder), results).main()
     learned = json.loads(results.read_text())["results"]
     assert learned["contrast_threshold_ratio"] != 1
     assert learned["pose_diagnosis"]["summary"].startswith("Pose correction: ")
@@ -225,14 +227,16 @@ def test_rendering_without_reference_views_starts_on_the_trajectory(
     assert video.stat().st_size > 0
 
 
-def test_evaluation_without_reference_views_is_of_poses(without_views: tuple[Path, Path], workspace: Path) -> None:
+def test_evaluation_without_reference_views_is_of_poses(
+    without_views: tuple[Path, Path], workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data, config = without_views
-    with chdir(workspace):
-        Evaluate(config, workspace / "none.json").main()
-        results = json.loads((workspace / "none.json").read_text())["results"]
-        assert results["num_views"] == 0
-        assert "psnr" not in results
-        assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 1
-        (data / "trajectory_ground_truth.txt").unlink()
-        with pytest.raises(DataError, match="it has no reference images to evaluate on"):
-            Evaluate(config, workspace / "again.json").main()
+    monkeypatch.chdir(workspace)
+    Evaluate(config, workspace / "none.json").main()
+    results = json.loads((workspace / "none.json").read_text())["results"]
+    assert results["num_views"] == 0
+    assert "psnr" not in results
+    assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 1
+    (data / "trajectory_ground_truth.txt").unlink()
+    with pytest.raises(DataError, match="it has no reference images to evaluate on"):
+        Evaluate(config, workspace / "again.json").main()
