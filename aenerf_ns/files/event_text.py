@@ -202,7 +202,7 @@ class CsvEventFile(TextEventFile):
 def parse_lines(
     text: bytes, with_commas: bool, slots: list[int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], int | None]:
-    """Parse lines of numbers, each of which ends with a newline. Skip empty lines, and comments after ``#``.
+    """Parse lines of numbers. Each line ends with a newline. Skip empty lines, and comments after ``#``.
 
     Args:
         text: the lines.

@@ -206,7 +206,7 @@ class PropheseeDatFile(EventReader):
 
 
 def _unwrap(time: NDArray[np.uint32], previous: int | None) -> NDArray[np.int64]:
-    """Return the (N,) microseconds of times of which only the lower 32 bits are known.
+    """Return (N,) microseconds for times whose lower 32 bits alone are known.
 
     Each time is the nearest to its predecessor. The one before the first is None at the beginning of a file.
     """

@@ -142,7 +142,7 @@ def with_chunks(name: str, make_chunks: Callable[[], bytes]) -> Change:
 
 
 def animation() -> bytes:
-    """A claim to be the first of 2^32 pictures, the next of which has no size."""
+    """A claim to be the first of 2^32 pictures. The next picture has no size."""
     return chunk(b"acTL", struct.pack(">II", 2**32 - 1, 0)) + chunk(b"fcTL", bytes(26))
 
 
