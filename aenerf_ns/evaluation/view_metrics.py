@@ -105,7 +105,7 @@ def view_files(run: TrainedRun) -> list[str]:
 def describe_views(
     run: TrainedRun, placed: Sequence[dict[str, float]], refined: Sequence[dict[str, float]] | None
 ) -> list[dict[str, Any]]:
-    """Describe each reference view, of which the metrics ``placed`` and perhaps ``refined`` are given, in plain values.
+    """Describe each reference view in plain values: its metrics ``placed`` and, where given, ``refined``.
 
     Returns:
         Of each view its ``file`` (:func:`view_files`), and its image metrics. Of a view on the trajectory ``time_ns``,

@@ -86,8 +86,7 @@ class _EventClock:
         counts = np.arange(self._count, self._count + len(events))
         if reverse:
             # A rise of light is a fall backwards.
-            backwards = {"x": events.x[::-1], "y": events.y[::-1], "p": -events.p[::-1]}
-            self._filter.add(replace(events, t=counts, **backwards))
+            self._filter.add(replace(events, x=events.x[::-1], y=events.y[::-1], t=counts, p=-events.p[::-1]))
         else:
             self._filter.add(replace(events, t=counts))
         self._count += len(events)
