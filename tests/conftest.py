@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numba
 import pytest
 import torch
 from hypothesis import settings
@@ -24,6 +25,10 @@ sys.path.append(str(Path(__file__).parents[1]))
 if not torch.cuda.is_available():
     # Before anything imports Triton: it then interprets its kernels on the CPU.
     os.environ["TRITON_INTERPRET"] = "1"
+
+# numba and PyTorch share one OpenMP: a simulation with two threads would leave PyTorch with two as well, and threads of
+# all workers would then wait for each other.
+numba.set_num_threads(1)
 
 # The same examples in every run of the suite, so that a failure is that of a change. Longer runs look for new ones.
 settings.register_profile("suite", derandomize="AENERF_FUZZ_EXAMPLES" not in os.environ)
@@ -68,17 +73,12 @@ def random_poses() -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def small_work() -> Iterator[None]:
-    """Render with one thread, because the pictures are too small to share, and compute light at few points."""
-    import numba
-
+    """Compute light at few points."""
     from aenerf_ns.simulator.rendering import mesh_repair
 
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mesh_repair, "NUM_CORNERS", 2000)
         yield
-    numba.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")
