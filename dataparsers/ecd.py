@@ -32,7 +32,7 @@ _DAVIS240C = 240, 180
 class EcdDataParserConfig(PublishedDataParserConfig):
     """Event Camera Dataset (text files)."""
 
-    markers = ("events.txt", "groundtruth.txt", "calib.txt")
+    markers = ("events.txt", "calib.txt")
     _target: type = field(default_factory=lambda: EcdDataParser)
     width: int | None = None
     """Pixel columns of the sensor. By default those of the images, or 240 (DAVIS240C) where there are none."""
@@ -46,18 +46,15 @@ class EcdDataParser(EventDataParser):
     config: EcdDataParserConfig
 
     def read_recording(self) -> Recording:
-        capture, images = self._read_all_but_poses()
-        reference = read_tum_trajectory(Path(self.config.data) / "groundtruth.txt")
+        capture, images = self.read_capture()
+        reference = read_tum_trajectory(self.poses_path())
         views = views_on_trajectory(images, reference)
-        return self.config.make_recording(reference, **vars(capture), reference_views=views, max_views=None)
+        return self.config.make_recording(reference, capture, reference_views=views, max_views=None)
 
-    def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        capture, images = self._read_all_but_poses()
-        has_poses = (Path(self.config.data) / "groundtruth.txt").exists()
-        return self.recording if has_poses else capture, images
+    def poses_path(self) -> Path:
+        return Path(self.config.data) / "groundtruth.txt"
 
-    def _read_all_but_poses(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        """Read the cameras, and the times in nanoseconds and the files of the images."""
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         folder = Path(self.config.data)
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
@@ -71,14 +68,8 @@ class EcdDataParser(EventDataParser):
         camera = _read_calibration(folder / "calib.txt", (width, height))
         if not images and None in stated:
             CONSOLE.print(f"The sensor's size {width} x {height} is a guess: if it is another, give width and height.")
-        capture = Capture(
-            event_file=TextEventFile(folder / "events.txt", width, height),
-            event_camera=camera,
-            sensor=self.config.sensor(SensorModel(0.5, 0.5)),
-            frame_camera=camera,
-            image_encoding="linear",
-        )
-        return capture, images
+        events = TextEventFile(folder / "events.txt", width, height)
+        return self.config.make_capture(SensorModel(0.5, 0.5), event_file=events, event_camera=camera), images
 
 
 def _read_calibration(path: Path, size: tuple[int, int]) -> CameraIntrinsics:

@@ -17,7 +17,7 @@ from aenerf_ns.files.kalibr import read_camchain
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
-from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 
 # The sequences do not contain their calibration. This is the authors' ("03_calib" in uzh-rpg/bundles-eds).
@@ -57,19 +57,22 @@ class EdsDataParser(EventDataParser):
     config: EdsDataParserConfig
 
     def read_recording(self) -> Recording:
+        reference = read_tum_trajectory(self.poses_path())
+        capture, images = self.read_capture()
+        views = views_on_trajectory(images, reference, self._calibration()[2])
+        return self.config.make_recording(reference, capture, reference_views=views)
+
+    def poses_path(self) -> Path:
+        return Path(self.config.data) / "stamped_groundtruth.txt"
+
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         folder = Path(self.config.data)
-        reference = read_tum_trajectory(folder / "stamped_groundtruth.txt")
-        event_camera, frame_camera, event_from_frame = self._calibration()
-        return self.config.make_recording(
-            reference,
-            SensorModel(),
-            event_file=Hdf5TableFile(folder / "events.h5", event_camera.width, event_camera.height, COLUMNS_AT_TOP),
-            event_camera=event_camera,
-            frame_camera=frame_camera,
-            reference_views=views_on_trajectory(
-                read_image_times(folder / "images", folder / "images_timestamps.txt", "us"), reference, event_from_frame
-            ),
-        )
+        camera, frame_camera, _ = self._calibration()
+        events = Hdf5TableFile(folder / "events.h5", camera.width, camera.height, COLUMNS_AT_TOP)
+        images = read_image_times(folder / "images", folder / "images_timestamps.txt", "us")
+        return self.config.make_capture(
+            SensorModel(), event_file=events, event_camera=camera, frame_camera=frame_camera
+        ), images
 
     def _calibration(self) -> tuple[CameraIntrinsics, CameraIntrinsics, Tensor]:
         """Return event camera, frame camera, and the (4, 4) motion from frame camera to event camera coordinates."""

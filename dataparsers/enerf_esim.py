@@ -19,7 +19,7 @@ from aenerf_ns.files.limits import list_files, require_one
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
-from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 
 
@@ -55,14 +55,12 @@ class EsimEventFolder(EventFile):
 class ENeRFEsimDataParserConfig(PublishedDataParserConfig):
     """E-NeRF's ESIM scenes."""
 
-    markers = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
+    markers = ("events/*.npy", "poses_bounds.npy")
     _target: type = field(default_factory=lambda: ENeRFEsimDataParser)
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:
-        return (
-            (data / "events").is_dir() and any(data.glob("*poses_all*.txt")) and (data / "poses_bounds.npy").is_file()
-        )
+        return (data / "events").is_dir() and (data / "poses_bounds.npy").is_file()
 
 
 class ENeRFEsimDataParser(EventDataParser):
@@ -71,20 +69,21 @@ class ENeRFEsimDataParser(EventDataParser):
     config: ENeRFEsimDataParserConfig
 
     def read_recording(self) -> Recording:
+        capture, images = self.read_capture()
+        reference = read_tum_trajectory(self.poses_path(), "ns")
+        return self.config.make_recording(reference, capture, reference_views=views_on_trajectory(images, reference))
+
+    def poses_path(self) -> Path:
+        folder = Path(self.config.data)
+        lists = sorted(folder.glob("*poses_all*.txt")) or [folder / "poses_all.txt"]
+        return require_one(lists, folder, "files *poses_all*.txt", "leave the poses of the scene only")
+
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         folder = Path(self.config.data)
         camera = _read_camera(folder / "poses_bounds.npy")
-        lists = sorted(folder.glob("*poses_all*.txt"))
-        poses = require_one(lists, folder, "files *poses_all*.txt", "leave the poses of the scene only")
-        reference = read_tum_trajectory(poses, "ns")
-        return self.config.make_recording(
-            reference,
-            SensorModel(),
-            event_file=EsimEventFolder(folder / "events", camera.width, camera.height),
-            event_camera=camera,
-            reference_views=views_on_trajectory(
-                read_image_times(folder / "images", folder / "images" / "image_stamps_ns.txt", "ns"), reference
-            ),
-        )
+        events = EsimEventFolder(folder / "events", camera.width, camera.height)
+        images = read_image_times(folder / "images", folder / "images" / "image_stamps_ns.txt", "ns")
+        return self.config.make_capture(SensorModel(), event_file=events, event_camera=camera), images
 
 
 def _read_camera(path: Path) -> CameraIntrinsics:

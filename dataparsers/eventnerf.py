@@ -23,7 +23,7 @@ from aenerf_ns.files.limits import list_files, read_text, require_one
 from aenerf_ns.files.text import TimeUnit, parse_numbers
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import ObjectDataParserConfig
-from aenerf_ns.recording.recording import Recording, ReferenceView, Split
+from aenerf_ns.recording.recording import Capture, Recording, ReferenceView, Split
 from aenerf_ns.recording.views import image_files, image_files_of_poses, views_on_trajectory
 
 # A DAVIS 346C.
@@ -70,14 +70,15 @@ class EvenPosesDataParserConfig(ObjectDataParserConfig):
 class EventNeRFDataParserConfig(EvenPosesDataParserConfig):
     """EventNeRF."""
 
-    markers = ("train/events/*.npz", "train/pose", "train/intrinsics")
+    markers = ("train/events/*.npz", "train/intrinsics")
     _target: type = field(default_factory=lambda: EventNeRFDataParser)
     color: bool = True
     """Whether the sensor has the color filter RGGB."""
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:
-        return any((split / "pose").is_dir() and (split / "intrinsics").is_dir() for split in _training_splits(data))
+        splits = (split for split in _training_splits(data) if (split / "intrinsics").is_dir())
+        return any((split / "pose").is_dir() or (split / "events").is_dir() for split in splits)
 
 
 class EventNeRFDataParser(EventDataParser):
@@ -89,32 +90,45 @@ class EventNeRFDataParser(EventDataParser):
     config: EventNeRFDataParserConfig
 
     def read_recording(self) -> Recording:
-        data = Path(self.config.data)
-        splits = [split for split in _training_splits(data) if (split / "pose").is_dir()]
-        split = require_one(splits, data, "training splits (train/pose)", "give the folder of one as --data")
-        camera = read_intrinsics(split / "intrinsics", _WIDTH, _HEIGHT)
-        # A trained run is opened without its events.
-        events = sorted((split / "events").glob("*.npz")) or [split / "events" / "events.npz"]
-        file = require_one(events, split / "events", "files *.npz", "leave the events of the scene only")
-        event_file = ArrayEventFile(file, _WIDTH, _HEIGHT, XYTP_MEMBERS, self.config.time_unit)
+        split = self._split()
+        capture, _ = self.read_capture()
         poses = _read_poses(split)
         # Pose i of N is at i / (N - 1) of the time of the last event.
-        reference = self.config.spread(poses, event_file, split / "pose", first=0)
+        reference = self.config.spread(poses, capture.event_file, split / "pose", first=0)
         # There may be no images.
         images = zip(reference.times.tolist(), image_files_of_poses(split / "rgb", len(poses)), strict=False)
         return self.config.make_recording(
             reference,
-            SensorModel(bayer_pattern="RGGB" if self.config.color else ""),
-            event_file=event_file,
-            event_camera=camera,
+            capture,
             reference_views={**views_on_trajectory(list(images), reference), **_held_out_views(split.parent)},
-            image_encoding="srgb",
             scene_box=self.config.scene_box(UNIT_SPHERE),
         )
 
+    def poses_path(self) -> Path:
+        return self._split() / "pose"
+
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
+        split = self._split()
+        # A trained run is opened without its events.
+        events = sorted((split / "events").glob("*.npz")) or [split / "events" / "events.npz"]
+        file = require_one(events, split / "events", "files *.npz", "leave the events of the scene only")
+        capture = self.config.make_capture(
+            SensorModel(bayer_pattern="RGGB" if self.config.color else ""),
+            event_file=ArrayEventFile(file, _WIDTH, _HEIGHT, XYTP_MEMBERS, self.config.time_unit),
+            event_camera=read_intrinsics(split / "intrinsics", _WIDTH, _HEIGHT),
+            image_encoding="srgb",
+        )
+        # The images have no times but those of the poses.
+        return capture, []
+
+    def _split(self) -> Path:
+        data = Path(self.config.data)
+        splits = [split for split in _training_splits(data) if (split / "intrinsics").is_dir()]
+        return require_one(splits, data, "training splits (train/intrinsics)", "give the folder of one as --data")
+
 
 def _training_splits(data: Path) -> list[Path]:
-    return [data] if (data / "pose").is_dir() else sorted(path for path in data.glob("train*") if path.is_dir())
+    return [data] if (data / "intrinsics").is_dir() else sorted(path for path in data.glob("train*") if path.is_dir())
 
 
 def _held_out_views(scene: Path) -> dict[Split, list[ReferenceView]]:

@@ -19,14 +19,14 @@ from aenerf_ns.files.transforms import EventCamera, Transforms, read_transforms,
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig, SensorOptions
-from aenerf_ns.recording.recording import SPLITS, Recording, ReferenceView, Split
+from aenerf_ns.recording.recording import SPLITS, Capture, Recording, ReferenceView, Split
 
 
 @dataclass
 class NativeDataParserConfig(SensorOptions, EventDataParserConfig):
     """aenerf-ns dataset folder."""
 
-    markers = ("transforms.json", "trajectory_estimated.txt")
+    markers = ("transforms.json", "trajectory_estimated.txt or events.h5")
     _target: type = field(default_factory=lambda: NativeDataParser)
     auto_scale_poses: bool | None = None
     """Scale the estimated poses to fit in a box of +/- 1. By default as the dataset states: aenerf convert and aenerf
@@ -35,6 +35,12 @@ class NativeDataParserConfig(SensorOptions, EventDataParserConfig):
     poses: Literal["estimated", "ground-truth"] = "estimated"
     """Which trajectory to train on. Training on the true one shows how much the errors of the estimated one cost."""
 
+    @classmethod
+    def recognizes(cls, data: Path) -> bool:
+        # Poses may be missing, and so may events, where a trained run is opened.
+        has_content = any((data / name).is_file() for name in ("trajectory_estimated.txt", "events.h5"))
+        return has_content and (data / "transforms.json").is_file()
+
 
 class NativeDataParser(EventDataParser):
     """Read a dataset folder that holds transforms.json, an event file and trajectory_estimated.txt."""
@@ -42,31 +48,46 @@ class NativeDataParser(EventDataParser):
     config: NativeDataParserConfig
 
     def read_recording(self) -> Recording:
-        folder = Path(self.config.data)
-        path = folder / "transforms.json"
-        meta, frame_camera = read_transforms(path)
+        path, meta, capture = self._read_all_but_poses()
         if self.config.auto_scale_poses is None:
             self.config.auto_scale_poses = meta.auto_scale_poses
-        event_camera = meta.event_camera.intrinsics()
-        true_poses = folder / "trajectory_ground_truth.txt"
-        trained_on = folder / "trajectory_estimated.txt" if self.config.poses == "estimated" else true_poses
-        trajectory = read_tum_trajectory(trained_on)
+        true_poses = path.with_name("trajectory_ground_truth.txt")
+        trajectory = read_tum_trajectory(self.poses_path())
         ground_truth = read_tum_trajectory(true_poses) if true_poses.exists() else None
-        if meta.event_camera.file is None:
-            raise DataError(path, "event_camera: missing field file", "name the file of the events there")
-        event_file = file_inside(folder, meta.event_camera.file, path)
         return Recording(
-            event_file=Hdf5EventFile(event_file, event_camera.width, event_camera.height),
-            event_camera=event_camera,
-            sensor=self._sensor(path, meta.event_camera),
+            **vars(capture),
             trajectory=trajectory,
-            frame_camera=frame_camera,
             reference_views=_read_views(path, meta, trajectory, ground_truth),
-            image_encoding=meta.image_encoding,
             scene_box=None if meta.scene_box is None else torch.tensor(meta.scene_box, dtype=torch.float64),
             ground_truth=ground_truth,
             max_pose_gap=meta.max_pose_gap_ns,
         )
+
+    def poses_path(self) -> Path:
+        return Path(self.config.data) / f"trajectory_{self.config.poses.replace('-', '_')}.txt"
+
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
+        path, meta, capture = self._read_all_but_poses()
+        timed = {frame.timestamp: frame.file_path for frame in meta.frames if frame.timestamp is not None}
+        return capture, [(time, file_inside(path.parent, name, path)) for time, name in sorted(timed.items())]
+
+    def _read_all_but_poses(self) -> tuple[Path, Transforms, Capture]:
+        """Return transforms.json, its content, and the cameras."""
+        path = Path(self.config.data) / "transforms.json"
+        meta, frame_camera = read_transforms(path)
+        camera = meta.event_camera.intrinsics()
+        if meta.event_camera.file is None:
+            raise DataError(path, "event_camera: missing field file", "name the file of the events there")
+        capture = Capture(
+            event_file=Hdf5EventFile(
+                file_inside(path.parent, meta.event_camera.file, path), camera.width, camera.height
+            ),
+            event_camera=camera,
+            sensor=self._sensor(path, meta.event_camera),
+            frame_camera=frame_camera,
+            image_encoding=meta.image_encoding,
+        )
+        return path, meta, capture
 
     def _sensor(self, path: Path, stated: EventCamera) -> SensorModel:
         """Return the sensor with the values of the options, and the dataset's values where the options give none."""

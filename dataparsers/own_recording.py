@@ -78,24 +78,28 @@ class OwnRecordingDataParser(EventDataParser):
     def read_recording(self) -> Recording:
         folder, config = Path(self.config.data), self.config
         capture, frame_from_event, timed = self._read_all_but_poses()
-        poses = folder / "trajectory.txt" if config.poses is None else config.poses
-        if config.colmap is not None or (config.poses is None and not poses.is_file() and (folder / "colmap").is_dir()):
-            model = folder / "colmap" if config.colmap is None else config.colmap
+        poses = self.poses_path()
+        if poses in (folder / "colmap", config.colmap):
             images = self._image_list(folder)
             if not timed:
                 raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
-            reference = _read_colmap(model, timed, images, frame_from_event)
+            reference = _read_colmap(poses, timed, images, frame_from_event)
         else:
             reference = read_tum_trajectory(poses)
         views = views_on_trajectory(
             timed, reference, torch.linalg.inv(frame_from_event), max_pose_gap=config.max_pose_gap_ns
         )
-        return config.make_recording(reference, **vars(capture), reference_views=views)
+        return config.make_recording(reference, capture, reference_views=views)
 
-    def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
+    def poses_path(self) -> Path:
         folder, config = Path(self.config.data), self.config
-        if config.poses or config.colmap or (folder / "trajectory.txt").is_file() or (folder / "colmap").is_dir():
-            return super().read_frames()
+        stated = config.colmap or config.poses
+        if stated is not None and not stated.exists():
+            raise DataError(stated, "there is no such file of poses", "correct the option, or leave it out")
+        trajectory, model = folder / "trajectory.txt", folder / "colmap"
+        return stated or (model if model.is_dir() and not trajectory.is_file() else trajectory)
+
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         capture, _, timed = self._read_all_but_poses()
         return capture, timed
 
@@ -108,10 +112,10 @@ class OwnRecordingDataParser(EventDataParser):
         calibration = read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
         images = self._image_list(folder)
         timed = read_image_list(images) if config.images is not None or images.is_file() else []
-        capture = Capture(
+        capture = config.make_capture(
+            calibration.sensor,
             event_file=self._event_file(folder, calibration.event_camera),
             event_camera=calibration.event_camera,
-            sensor=config.sensor(calibration.sensor),
             frame_camera=calibration.frame_camera,
             image_encoding=calibration.image_encoding,
         )

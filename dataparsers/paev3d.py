@@ -19,7 +19,7 @@ from aenerf_ns.files.event_arrays import open_npz_member, read_npy_header
 from aenerf_ns.files.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
 from aenerf_ns.files.limits import list_files, require_one
 from aenerf_ns.recording.dataparser import EventDataParser
-from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import image_files_of_poses, views_on_trajectory
 
 _WIDTH, _HEIGHT = 640, 480
@@ -45,26 +45,38 @@ class PAEv3DDataParser(EventDataParser):
     config: PAEv3DDataParserConfig
 
     def read_recording(self) -> Recording:
-        data = Path(self.config.data)
-        scene = require_one(_scenes(data), data, "scenes (H5_Files/SCENE)", "give the folder of one as --data")
-        root = scene.parents[1]
-        camera = read_intrinsics(root / "Intrinsics", _WIDTH, _HEIGHT)
-        event_file = Hdf5TableFile(scene / "event.h5", _WIDTH, _HEIGHT, TXYP_MATRIX, self.config.time_unit)
-        folder = root / "Render_info" / scene.name
+        capture, _ = self.read_capture()
+        folder = self.poses_path()
         poses = torch.stack([_read_camera_pose(file) for file in list_files(folder, "*.npz")])
         # The first pose is at the first event, the last pose at the last event.
-        reference = self.config.spread(poses @ OPENCV_TO_OPENGL, event_file, folder)
+        reference = self.config.spread(poses @ OPENCV_TO_OPENGL, capture.event_file, folder)
         # There may be no images.
         images = zip(reference.times.tolist(), image_files_of_poses(folder, len(poses)), strict=False)
         return self.config.make_recording(
             reference,
-            SensorModel(),
-            event_file=event_file,
-            event_camera=camera,
+            capture,
             reference_views=views_on_trajectory(list(images), reference),
-            image_encoding="srgb",
             scene_box=self.config.scene_box(UNIT_SPHERE),
         )
+
+    def poses_path(self) -> Path:
+        scene = self._scene()
+        return scene.parents[1] / "Render_info" / scene.name
+
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
+        scene = self._scene()
+        capture = self.config.make_capture(
+            SensorModel(),
+            event_file=Hdf5TableFile(scene / "event.h5", _WIDTH, _HEIGHT, TXYP_MATRIX, self.config.time_unit),
+            event_camera=read_intrinsics(scene.parents[1] / "Intrinsics", _WIDTH, _HEIGHT),
+            image_encoding="srgb",
+        )
+        # The images have no times but those of the poses.
+        return capture, []
+
+    def _scene(self) -> Path:
+        data = Path(self.config.data)
+        return require_one(_scenes(data), data, "scenes (H5_Files/SCENE)", "give the folder of one as --data")
 
 
 def _scenes(data: Path) -> list[Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ from aenerf_ns.files.tum_trajectory import poses_from_quaternions
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.images import open_image
 from aenerf_ns.recording.options import ObjectDataParserConfig
-from aenerf_ns.recording.recording import Recording, ReferenceView, Split
+from aenerf_ns.recording.recording import Capture, Recording, ReferenceView, Split
 from aenerf_ns.recording.views import IMAGE_SUFFIXES
 
 # The authors' configuration: half the side of the box around the synthetic scenes.
@@ -66,7 +66,7 @@ class _Views(msgspec.Struct):
 class RobustENeRFDataParserConfig(ObjectDataParserConfig):
     """Robust e-NeRF (raw_events.npz)."""
 
-    markers = ("raw_events.npz", "camera_poses.npz", "camera_calibration.npz")
+    markers = ("raw_events.npz", "camera_calibration.npz")
     _target: type = field(default_factory=lambda: RobustENeRFDataParser)
     auto_scale_poses: bool | None = True
     """Scale the estimated poses to fit in a box of +/- 1, where the scene has no box. The cameras of an object of 1.5
@@ -80,22 +80,27 @@ class RobustENeRFDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         folder = Path(self.config.data)
-        camera, stated = _read_calibration(folder / "camera_calibration.npz")
+        capture, _ = self.read_capture()
         frame_camera, views = _read_views(folder)
         # Only scenes simulated from Blender have this file.
         synthetic = (folder / "renderer_params.npz").is_file()
         return self.config.make_recording(
-            _read_poses(folder / "camera_poses.npz"),
-            stated,
-            event_file=ArrayEventFile(
-                folder / "raw_events.npz", camera.width, camera.height, POSITION_TIMESTAMP_POLARITY
-            ),
-            event_camera=camera,
-            frame_camera=camera if frame_camera is None else frame_camera,
+            _read_poses(self.poses_path()),
+            capture if frame_camera is None else replace(capture, frame_camera=frame_camera),
             reference_views={"train": [], **views},
             scene_box=self.config.scene_box(_HALF_EXTENT if synthetic else 0.0),
             image_background=(1.0, 1.0, 1.0),
         )
+
+    def poses_path(self) -> Path:
+        return Path(self.config.data) / "camera_poses.npz"
+
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
+        folder = Path(self.config.data)
+        camera, sensor = _read_calibration(folder / "camera_calibration.npz")
+        events = ArrayEventFile(folder / "raw_events.npz", camera.width, camera.height, POSITION_TIMESTAMP_POLARITY)
+        # The views have no times.
+        return self.config.make_capture(sensor, event_file=events, event_camera=camera), []
 
 
 def _read_calibration(path: Path) -> tuple[CameraIntrinsics, SensorModel]:

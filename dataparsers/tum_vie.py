@@ -109,19 +109,18 @@ class TumVieDataParser(EventDataParser):
 
     def read_recording(self) -> Recording:
         events, sequence, side = _choose(Path(self.config.data))
-        capture, imu_from_event, imu_from_frame = self._read_cameras(events, sequence, side)
+        capture, imu_from_event, imu_from_frame = self._read_cameras()
         # The motion capture gives the poses of its marker.
         path = _find_calibration(events.parent, f"mocap-imu-calibration{_calibration_set(sequence)}.json")
         imu_from_marker = read_json(path, _File[_Mocap]).value0.T_imu_marker.matrix(path)
         marker_from_event = torch.linalg.inv(imu_from_marker) @ imu_from_event
-        ground_truth_folder = events.parent / f"{sequence}-vi_gt_data"
-        markers = read_tum_trajectory(ground_truth_folder / "mocap_data.txt", "us")
-        reference = markers.transform(lambda poses: poses @ marker_from_event)
-        image_folder = ground_truth_folder / f"{side}_images"
+        mocap = self.poses_path()
+        reference = read_tum_trajectory(mocap, "us").transform(lambda poses: poses @ marker_from_event)
+        image_folder = mocap.parent / f"{side}_images"
         images = read_image_times(image_folder, image_folder / f"image_timestamps_{side}.txt", "us")
         return self.config.make_recording(
             reference,
-            **vars(capture),
+            capture,
             reference_views=views_on_trajectory(
                 images,
                 reference,
@@ -131,25 +130,27 @@ class TumVieDataParser(EventDataParser):
             max_pose_gap=self.config.max_pose_gap_ns,
         )
 
-    def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        events, sequence, side = _choose(Path(self.config.data))
-        if (events.parent / f"{sequence}-vi_gt_data" / "mocap_data.txt").is_file():
-            return super().read_frames()
-        return self._read_cameras(events, sequence, side)[0], []
+    def poses_path(self) -> Path:
+        events, sequence, _ = _choose(Path(self.config.data))
+        return events.parent / f"{sequence}-vi_gt_data" / "mocap_data.txt"
 
-    def _read_cameras(self, events: Path, sequence: str, side: str) -> tuple[Capture, Tensor, Tensor]:
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
+        # The images are of the other camera.
+        return self._read_cameras()[0], []
+
+    def _read_cameras(self) -> tuple[Capture, Tensor, Tensor]:
         """Read the cameras, and the (4, 4) motions from the event and the frame camera's coordinates to the IMU's."""
+        events, sequence, side = _choose(Path(self.config.data))
         path = _find_calibration(events.parent, f"camera-calibration{_calibration_set(sequence)}.json")
         cameras = read_json(path, _File[_Cameras]).value0
         (event_camera, imu_from_event), (frame_camera, imu_from_frame) = (
             _read_camera(path, cameras, index) for index in _INDICES[side]
         )
-        capture = Capture(
+        capture = self.config.make_capture(
+            _SENSOR,
             event_file=Hdf5TableFile(events, event_camera.width, event_camera.height, COLUMNS_IN_GROUP),
             event_camera=event_camera,
-            sensor=self.config.sensor(_SENSOR),
             frame_camera=frame_camera,
-            image_encoding="linear",
         )
         return capture, imu_from_event, imu_from_frame
 

@@ -27,7 +27,7 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
             not increase.
     """
-    require_file(path, "give the poses, or have them estimated: aenerf convert DATA --output FOLDER --poses events")
+    require_file(path)
     rows = read_rows(path, POSE_COLUMNS)
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")

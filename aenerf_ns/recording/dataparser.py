@@ -39,8 +39,9 @@ class EventDataParser(DataParser):
     """Hand a recording to Nerfstudio.
 
     Training cameras are poses on the estimated trajectory; evaluation cameras are the reference views of a split. A
-    format implements :meth:`read_recording`. A format that is found without being named also states its files in its
-    configuration (``markers``).
+    format implements :meth:`read_recording`. A format whose poses may be missing also implements :meth:`poses_path` and
+    :meth:`read_capture`. A format that is found without being named also states its files in its configuration
+    (``markers``).
     """
 
     config: EventDataParserConfig
@@ -55,10 +56,16 @@ class EventDataParser(DataParser):
             DataError: a file is missing or its content cannot be used.
         """
 
-    def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        """Read the frames that poses can be estimated from: the timed reference views.
+    def poses_path(self) -> Path | None:
+        """Return the file or folder of the dataset's poses, which may be missing. None: they cannot be missing."""
+        return None
 
-        A format whose poses may be missing overrides this method.
+    def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
+        """Read a dataset without poses: its cameras, and the times in nanoseconds and the files of its frames."""
+        raise NotImplementedError
+
+    def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
+        """Read what poses can be estimated from: the events, and the timed reference views.
 
         Returns:
             The recording, or its capture alone where it has no poses, and the frames in the order of time: nanoseconds
@@ -67,6 +74,9 @@ class EventDataParser(DataParser):
         Raises:
             DataError: a file is missing or its content cannot be used.
         """
+        with reading(Path(self.config.data)):
+            if self._lacks_poses():
+                return self.read_capture()
         views = [view for split in self.recording.reference_views.values() for view in split]
         timed = {view.time: view.file for view in views if view.time is not None}
         return self.recording, sorted(timed.items())
@@ -83,6 +93,12 @@ class EventDataParser(DataParser):
             raise DataError(str(self.config.data), f"max_pose_gap_ns is {longest}", "give a positive number")
         try:
             with reading(Path(self.config.data)):
+                if self._lacks_poses():
+                    raise DataError(
+                        str(self.poses_path()),
+                        "there are no such poses",
+                        "give them, or have them estimated: aenerf convert DATA --output FOLDER --poses events",
+                    )
                 recording = self.read_recording()
         except DataError as error:
             if self.guessed_format is None:
@@ -93,6 +109,11 @@ class EventDataParser(DataParser):
         if any(recording.reference_views.values()):
             self._check_lens(recording.frame_camera, "camera of the images")
         return recording
+
+    def _lacks_poses(self) -> bool:
+        # Where the whole dataset is missing, its reader says so.
+        path = self.poses_path()
+        return path is not None and Path(self.config.data).exists() and not path.exists()
 
     def scales_poses(self, recording: Recording) -> bool:
         """Return whether training scales the poses of a recording that this parser has read."""

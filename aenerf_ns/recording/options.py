@@ -16,7 +16,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.files.transforms import sensor_values
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
-from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import MAX_VIEWS
 
 
@@ -98,25 +98,33 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
         with value_errors_as_data_error(str(self.data), "correct it among the options"):
             return replace(stated, **sensor_values(self))
 
-    def make_recording(self, reference: Trajectory, sensor: SensorModel, **content: Any) -> Recording:
-        """Make a recording, with what the options state in place of the dataset's own poses and sensor.
-
-        Poses that the options give are the estimated ones, and the dataset's own are then true.
+    def make_capture(self, sensor: SensorModel, **content: Any) -> Capture:
+        """Make a capture, with what the options state in place of the dataset's own sensor.
 
         Args:
-            reference: the dataset's poses.
             sensor: the dataset's sensor, or the one assumed.
-            content: further attributes of :class:`~aenerf_ns.recording.recording.Recording`. By default the event
-                camera took the images, they are linear, and as many of them are used as of other published formats.
+            content: further attributes of :class:`~aenerf_ns.recording.recording.Capture`. By default the event camera
+                took the images, and they are linear.
 
         Raises:
             DataError: a value among the options is impossible.
         """
+        defaults = {"frame_camera": content["event_camera"], "image_encoding": "linear"}
+        return Capture(sensor=self.sensor(sensor), **{**defaults, **content})
+
+    def make_recording(self, reference: Trajectory, capture: Capture, **content: Any) -> Recording:
+        """Make a recording. Poses that the options give are the estimated ones, and the dataset's own are then true.
+
+        Args:
+            reference: the dataset's poses.
+            capture: the cameras and their events.
+            content: further attributes of :class:`~aenerf_ns.recording.recording.Recording`. By default as many images
+                are used as of other published formats.
+        """
         poses: dict[str, Any] = {"trajectory": reference}
         if self.trajectory is not None:
             poses = {"trajectory": read_tum_trajectory(self.trajectory), "ground_truth": reference}
-        defaults = {"frame_camera": content["event_camera"], "image_encoding": "linear", "max_views": MAX_VIEWS}
-        return Recording(sensor=self.sensor(sensor), **poses, **{**defaults, **content})
+        return Recording(**vars(capture), **poses, **{"max_views": MAX_VIEWS, **content})
 
 
 @dataclass

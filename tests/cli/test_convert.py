@@ -211,7 +211,7 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
     assert without.trajectory.times.tolist() == times
     assert [len(without.reference_views[split]) for split in ("train", "val", "test")] == [3, 2, 1]
     np.testing.assert_array_equal(columns(without)["t"], columns(with_truth)["t"])
-    with pytest.raises(DataError, match=r"groundtruth.txt: there is no such file"):
+    with pytest.raises(DataError, match=r"groundtruth.txt: there are no such poses"):
         convert(data, tmp_path / "given", format="ecd-data")
 
 

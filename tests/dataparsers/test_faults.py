@@ -90,7 +90,7 @@ NATIVE: dict[str, Fault] = {
     "pixel outside": (column("x", np.full(200, 6, np.uint16)), "events.h5", "x = 6"),
     "unsorted": (column("t", START + 10**9 - np.arange(200)), "events.h5", "before"),
     "no overlap": (column("t", np.arange(200)), "trajectory_estimated.txt", "do not overlap"),
-    "no poses": (remove("trajectory_estimated.txt"), "trajectory_estimated.txt", "no such file"),
+    "no poses": (remove("trajectory_estimated.txt"), "trajectory_estimated.txt", "no such poses"),
 }
 
 
@@ -106,7 +106,7 @@ LATE = write_text("groundtruth.txt", "5 0 0 0 0 0 0 1\n6 1 0 0 0 0 0 1\n")
 ECD: dict[str, Fault] = {
     "no folder": (shutil.rmtree, "made", "no such folder"),
     "no event file": (remove("events.txt"), "events.txt", "no such file"),
-    "no poses": (remove("groundtruth.txt"), "groundtruth.txt", "no such file"),
+    "no poses": (remove("groundtruth.txt"), "groundtruth.txt", "no such poses"),
     "no calibration": (remove("calib.txt"), "calib.txt", "no such file"),
     "missing image": (remove("images/1.png"), "images.txt", "images/1.png, which does not exist"),
     "no events": (write_text("events.txt", ""), "events.txt", "no events"),
@@ -142,7 +142,7 @@ def views(edit: Callable[[dict], object]) -> Change:
 
 ROBUST: dict[str, Fault] = {
     "no calibration": (remove(CALIBRATION), CALIBRATION, "no such file"),
-    "no poses": (remove(POSES), POSES, "no such file"),
+    "no poses": (remove(POSES), POSES, "no such poses"),
     "no events": (remove("raw_events.npz"), "raw_events.npz", "no such file"),
     "no intrinsics": (edit_npz(CALIBRATION, intrinsics=None), CALIBRATION, "no array intrinsics"),
     "flat intrinsics": (edit_npz(CALIBRATION, intrinsics=np.ones(9)), CALIBRATION, "intrinsics: expected `array`"),
@@ -175,7 +175,7 @@ def tum_cameras(edit: Callable[[dict], object]) -> Change:
 
 TUM_VIE: dict[str, Fault] = {
     "no events": (remove("*.h5"), "mocap-desk2-events_left.h5", "no such file"),
-    "no poses": (remove(f"{TRUTH}/mocap_data.txt"), "mocap_data.txt", "no such file"),
+    "no poses": (remove(f"{TRUTH}/mocap_data.txt"), "mocap_data.txt", "no such poses"),
     "no calibration": (remove("camera-*"), CAMERAS, "no such file"),
     "no hand-eye": (remove("mocap-imu*"), MOCAP, "no such file"),
     "pinhole": (tum_cameras(lambda m: m["intrinsics"][2].update(camera_type="ds")), CAMERAS, "[2].camera_type"),
@@ -191,7 +191,7 @@ TUM_VIE: dict[str, Fault] = {
 
 TIMES = "images_timestamps.txt"
 EDS: dict[str, Fault] = {
-    "no poses": (remove("stamped*"), "stamped_groundtruth.txt", "no such file"),
+    "no poses": (remove("stamped*"), "stamped_groundtruth.txt", "no such poses"),
     "no events": (remove("events.h5"), "events.h5", "no such file"),
     "no column": (put("events.h5", "p", None), "events.h5", "no dataset /p"),
     "five images": (write_text(TIMES, "1\n2\n3\n4\n5\n"), TIMES, "5 times for 3 images"),
@@ -285,7 +285,7 @@ OWN: dict[str, Fault] = {
     "no events": (remove("events.h5"), "made", "0 files events{.raw,"),
     "two event files": (write_text("events.csv", ""), "made", "2 files events"),
     "no calibration": (remove("calibration.json"), "made", "0 of calibration.json and camchain.yaml"),
-    "no poses": (remove("trajectory.txt"), "trajectory.txt", "no such file"),
+    "no poses": (remove("trajectory.txt"), "trajectory.txt", "no such poses"),
     "negative threshold": (NEGATIVE, "calibration.json", "positive_contrast_threshold"),
     "scaled mount": (mount(SCALED), "event_camera.T_frame_event", "not a rigid motion"),
     "missing image": (remove("images/00001.png"), "images.txt", "images/00001.png, which does not exist"),

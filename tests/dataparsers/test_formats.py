@@ -33,6 +33,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 
@@ -158,11 +159,45 @@ def test_errors_say_that_the_format_was_guessed(tmp_path: Path) -> None:
     # Another recording's folders, of the names that PAEv3D has.
     (tmp_path / "H5_Files" / "mine").mkdir(parents=True)
     guessed = AutomaticDataParserConfig(data=tmp_path).setup()
-    with pytest.raises(DataError, match=r"Intrinsics: .*the format paev3d-data was guessed: .* --format"):
+    with pytest.raises(DataError, match=r"Render_info.mine: .*the format paev3d-data was guessed: .* --format"):
         guessed.get_dataparser_outputs("train")
     with pytest.raises(DataError) as error:
         config_of("paev3d-data", tmp_path).setup().get_dataparser_outputs("train")
     assert "guessed" not in str(error.value)
+
+
+POSES = {
+    "robust-enerf-data": "camera_poses.npz",
+    "tum-vie-data": "mocap-desk2-vi_gt_data/mocap_data.txt",
+    "eds-data": "stamped_groundtruth.txt",
+    "enerf-esim-data": "scene_poses_all.txt",
+    "eventnerf-data": "train/pose",
+    "paev3d-data": "Render_info",
+    "event-recording-data": "trajectory.txt",
+}
+# Frames with times of their own.
+FRAMES = {"tum-vie-data": 0, "eds-data": 3, "enerf-esim-data": 3, "event-recording-data": 4}
+
+
+def test_poses_may_be_missing(written: tuple[str, Truth]) -> None:
+    name, truth = written
+    known = recording_of(config_of(name, truth.data))
+    poses = truth.data / POSES[name]
+    shutil.rmtree(poses) if poses.is_dir() else poses.unlink()
+    # The other files of EDS are those of many formats.
+    if name == "eds-data":
+        (truth.data / "calibration.json").write_text("{}")
+        assert recognize(truth.data) == "event-recording-data"
+    else:
+        assert recognize(truth.data) == name
+    parser = config_of(name, truth.data).setup()
+    with pytest.raises(DataError, match=r"no such poses; .* aenerf convert DATA --output FOLDER --poses events"):
+        parser.get_dataparser_outputs("train")
+    capture, frames = parser.read_frames()
+    assert not isinstance(capture, Recording)
+    assert len(frames) == FRAMES.get(name, 0)
+    assert (capture.event_camera, capture.sensor) == (known.event_camera, known.sensor)
+    assert capture.event_file.path == known.event_file.path
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -44,18 +44,6 @@ def test_tum_vie_has_two_calibrations_and_two_sides(tmp_path: Path, tum_vie_cali
     recording_of(config_of("tum-vie-data", folder / "office-maze-events_right.h5"))
 
 
-def test_tum_vie_without_poses(tmp_path: Path, tum_vie_calibration: Path) -> None:
-    config = config_of("tum-vie-data", write_tum_vie(tmp_path / "made", tum_vie_calibration).data)
-    known = recording_of(config)
-    (mocap,) = tmp_path.rglob("mocap_data.txt")
-    mocap.unlink()
-    with pytest.raises(DataError, match="aenerf convert DATA --output FOLDER --poses events"):
-        recording_of(config)
-    capture, frames = config.setup().read_frames()
-    assert not frames
-    assert (capture.event_camera, capture.sensor) == (known.event_camera, known.sensor)
-
-
 def test_tum_vie_views_are_those_of_the_frame_camera(tmp_path: Path, tum_vie_calibration: Path) -> None:
     truth = write_tum_vie(tmp_path / "made", tum_vie_calibration)
     recording = recording_of(config_of("tum-vie-data", truth.data))

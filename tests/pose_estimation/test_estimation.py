@@ -137,8 +137,8 @@ def test_find_poses_of_a_bare_recording(bare: Path, dataset: tuple[Path, str], t
 
 
 def test_name_the_command_that_finds_poses(bare: Path) -> None:
-    with pytest.raises(DataError, match=r"no such file.*aenerf convert .* --poses events"):
-        FORMATS[recognize(bare)].__class__(data=bare).setup().read_recording()
+    with pytest.raises(DataError, match=r"trajectory.txt: there are no such poses; .*aenerf convert .* --poses events"):
+        _ = FORMATS[recognize(bare)].__class__(data=bare).setup().recording
 
 
 def test_refuse_too_few_events(bare: Path, tmp_path: Path) -> None:
