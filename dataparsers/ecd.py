@@ -68,7 +68,7 @@ class EcdDataParser(EventDataParser):
         camera = _read_calibration(folder / "calib.txt", (width, height))
         if not images and None in stated:
             CONSOLE.print(f"The sensor's size {width} x {height} is a guess: if it is another, give width and height.")
-        events = TextEventFile(folder / "events.txt", width, height)
+        events = TextEventFile(folder / "events.txt", width, height, "s")
         return self.config.make_capture(SensorModel(0.5, 0.5), event_file=events, event_camera=camera), images
 
 

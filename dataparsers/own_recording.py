@@ -43,8 +43,8 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     event_topic: str | None = None
     """Topic of a bag, or number of the stream of an AEDAT4 file, where several hold events."""
     event_time_unit: TimeUnit | None = None
-    """Unit of the times in npz, npy and csv files, and in HDF5 files that state none. By default whole numbers are
-    microseconds and decimals seconds."""
+    """Unit of the times in npz, npy, csv and text files, and in HDF5 files that state none. By default whole numbers
+    are microseconds and decimals seconds."""
     calibration: Path | None = None
     """The cameras: calibration.json, or the camchain.yaml that Kalibr writes. By default the file of
     one of these names in the folder."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.events.filters import EventFilters, FilteredEventFile
-    from aenerf_ns.events.stream import EventFile, EventStream
+    from aenerf_ns.events.stream import EventStream
     from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
     from aenerf_ns.recording.dataparser import EventDataParser
     from aenerf_ns.recording.output_lock import OutputLock
@@ -94,6 +94,7 @@ class Convert(DatasetCommand):
 
     def _convert(self, parser: EventDataParser, filters: EventFilters, lock: OutputLock) -> None:
         from aenerf_ns.events.filters import FilteredEventFile
+        from aenerf_ns.recording.time_units import require_covered
         from aenerf_ns.recording.views import thin_views
 
         report = None
@@ -101,6 +102,7 @@ class Convert(DatasetCommand):
             recording, report = self._with_estimated_poses(*parser.read_frames(), filters.window)
         else:
             recording = parser.recording
+            parser.event_span(recording)
         events = FilteredEventFile(recording.event_file, filters)
         trajectory = _cut(recording, events, filters.window)
         views = {
@@ -124,7 +126,9 @@ class Convert(DatasetCommand):
             if report is not None:
                 writer.add_poses_report(report)
             copy_images(writer, recording, views)
-            num_read, num_written = _copy_events(recording.event_file, events, writer)
+            num_read, num_written, num_covered = _copy_events(recording, events, writer)
+            if self.poses == "given" and self.start_time_ns is None and self.end_time_ns is None:
+                require_covered(recording.event_file.path, num_written, num_covered)
         counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
         say(
             f"{self.output}: {num_written:,} of {num_read:,} events, {len(trajectory)} poses, images: {counts}.\n"
@@ -171,11 +175,12 @@ def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) ->
     return recording.trajectory if window == TimeWindow() else covered
 
 
-def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDatasetWriter) -> tuple[int, int]:
-    """Write the kept events, and count the events that were read and those that were written."""
+def _copy_events(recording: Recording, events: FilteredEventFile, writer: NativeDatasetWriter) -> tuple[int, int, int]:
+    """Write the kept events, and count the events that were read, those that were written, and those with a pose."""
     from aenerf_ns.events.filters import hot_pixel_summary
 
-    num_read = num_written = 0
+    source, known = recording.event_file, recording.trajectory.known_time()
+    num_read = num_written = num_covered = 0
 
     def read(description: str) -> Iterator[EventStream]:
         nonlocal num_read
@@ -188,11 +193,12 @@ def _copy_events(source: EventFile, events: FilteredEventFile, writer: NativeDat
     for chunk in events.filtered(read("Converting events")):
         writer.events.append(chunk)
         num_written += len(chunk)
+        num_covered += int(known.contains(chunk.t).sum())
     if num_written == 0:
         raise events.empty_error()
     if events.hot_pixels is not None and events.counts is not None:
         say(hot_pixel_summary(events.hot_pixels, events.counts))
-    return num_read, num_written
+    return num_read, num_written, num_covered
 
 
 def _with_poses(

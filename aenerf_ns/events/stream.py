@@ -183,6 +183,10 @@ class EventFile(ABC):
         """Return the number of events, or None if the file must be read through to count them."""
         return None
 
+    def assumed_unit(self) -> str | None:
+        """Return the unit of the times ("ns", "us", "ms" or "s") that is assumed, or None where it is stated."""
+        return None
+
     def require(self) -> None:
         """Raise a DataError if the file does not exist."""
         require_file(self.path)

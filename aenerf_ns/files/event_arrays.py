@@ -24,10 +24,10 @@ POSITION_TIMESTAMP_POLARITY = EventLayout(
     {"x": ("position", 0), "y": ("position", 1), "t": ("timestamp", None), "p": ("polarity", None)}, time_unit="ns"
 )
 # EventNeRF, and files that people write by themselves.
-XYTP_MEMBERS = EventLayout({name: (name, None) for name in "xytp"}, time_unit=None)
+XYTP_MEMBERS = EventLayout({name: (name, None) for name in "xytp"})
 # E-NeRF's ESIM, and files that people write by themselves.
-XYTP_MATRIX = EventLayout({name: ("", index) for index, name in enumerate("xytp")}, time_unit=None)
-_XYTP_RECORDS = EventLayout({name: ("", name) for name in "xytp"}, time_unit=None)
+XYTP_MATRIX = EventLayout({name: ("", index) for index, name in enumerate("xytp")})
+_XYTP_RECORDS = EventLayout({name: ("", name) for name in "xytp"})
 
 
 class ArrayEventFile(EventTableFile):

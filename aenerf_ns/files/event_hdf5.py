@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     import h5py
 
 _DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
-# Units that the native file may state. Its times are integers.
-_UNITS: tuple[TimeUnit, ...] = ("ns", "us", "ms")
 # The number of the HDF5 filter of Prophesee's compression of events.
 _ECF = 0x8ECF
 # Events collected before they are written: many small writes are slow.
@@ -36,13 +34,13 @@ def _columns_of(group: str) -> dict[str, tuple[str, None]]:
     return {name: (f"{group}{name}", None) for name in _DTYPES}
 
 
-_NATIVE = EventLayout(_columns_of("events/"), "ns", time_offset="time_offset")
+_NATIVE = EventLayout(_columns_of("events/"), "ns")
 # DSEC, and TUM-VIE, which has no offset.
 COLUMNS_IN_GROUP = EventLayout(_columns_of("events/"), time_offset="t_offset")
 # EDS.
 COLUMNS_AT_TOP = EventLayout(_columns_of(""), time_offset="t_offset")
 # PAEv3D.
-TXYP_MATRIX = EventLayout({name: ("events", index) for index, name in enumerate("txyp")}, time_unit=None)
+TXYP_MATRIX = EventLayout({name: ("events", index) for index, name in enumerate("txyp")})
 # Prophesee's Metavision.
 PROPHESEE_RECORDS = EventLayout({name: ("CD/events", name) for name in _DTYPES})
 
@@ -50,7 +48,11 @@ _LAYOUTS = (PROPHESEE_RECORDS, COLUMNS_IN_GROUP, COLUMNS_AT_TOP, TXYP_MATRIX)
 
 
 class Hdf5TableFile(EventTableFile):
-    """Read an HDF5 file of another project."""
+    """Read an HDF5 file.
+
+    The group of the times may have the attributes ``time_unit`` ("ns", "us", "ms" or "s") and ``time_offset`` (an
+    integer in that unit, added to every time).
+    """
 
     kind = "HDF5 file"
 
@@ -64,34 +66,40 @@ class Hdf5TableFile(EventTableFile):
             require_unpacked_size(self.path, "its events", size, packed)
             offset = _scalar(self._time_offset(file))
             if not isinstance(offset, (int, np.integer)):
-                raise DataError(self.path, f"its {self._layout.time_offset} is {offset!r}", "store an integer")
+                name = self._layout.time_offset or "time_offset"
+                raise DataError(self.path, f"its {name} is {offset!r}", "store an integer")
             yield {**arrays, "time_offset": int(offset)}
 
     def _time_offset(self, file: h5py.File) -> Any:
         name = self._layout.time_offset
         if name is None or name not in file:
-            return 0
+            return self._attributes(file).get("time_offset", 0)
         offset = _dataset(self.path, file, name)
         return None if offset is None else offset[()]
+
+    def _attributes(self, arrays: Mapping[str, Any]) -> Mapping[str, Any]:
+        return arrays[self._layout.columns["t"][0]].parent.attrs
+
+    def _stated_unit(self, arrays: Mapping[str, Any]) -> TimeUnit | None:
+        unit = _scalar(self._attributes(arrays).get("time_unit", super()._stated_unit(arrays)))
+        unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
+        if unit is not None and not (isinstance(unit, str) and unit in NANOSECONDS):
+            raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(NANOSECONDS)}")
+        if self._given_unit not in (None, unit):
+            raise DataError(
+                self.path, f"it states its time unit, {unit!r}, but {self._given_unit} was given", "leave it out"
+            )
+        return unit
 
 
 class Hdf5EventFile(Hdf5TableFile):
     """Read the native file: /events/{x u16, y u16, t i64, p i8}, with p = ±1.
 
-    The group /events may have the attributes ``time_unit`` ("ns", "us" or "ms") and ``time_offset`` (an integer in that
-    unit, added to every time).
-
-    Args:
-        path, width, height: see :class:`EventFile`.
-        time_unit: of the times where the file does not state it; "ns" by default.
+    Where it does not state a unit of the times, it is the nanosecond.
     """
 
-    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
+    def __init__(self, path: Path, width: int, height: int) -> None:
         super().__init__(path, width, height, _NATIVE)
-        self._given_unit = time_unit
-
-    def _time_offset(self, file: h5py.File) -> Any:
-        return file["events"].attrs.get("time_offset", 0)
 
     def _length(self, arrays: Mapping[str, Any]) -> int:
         for name, dtype in _DTYPES.items():
@@ -102,22 +110,11 @@ class Hdf5EventFile(Hdf5TableFile):
                 )
         return super()._length(arrays)
 
-    def _columns(self, arrays: Mapping[str, Any], first: int, last: int) -> dict[str, NDArray]:
+    def _columns(self, arrays: Mapping[str, Any], first: int, last: int | None) -> dict[str, NDArray]:
         columns = super()._columns(arrays, first, last)
         if not columns["p"].all():
             raise DataError(self.path, "an event has polarity 0", "store polarities as -1 and +1")
         return columns
-
-    def _tick(self, arrays: Mapping[str, Any]) -> int:
-        unit = _scalar(arrays["events/t"].parent.attrs.get("time_unit", self._given_unit or "ns"))
-        unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
-        if not isinstance(unit, str) or unit not in _UNITS:
-            raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(_UNITS)}")
-        if self._given_unit not in (None, unit):
-            raise DataError(
-                self.path, f"it states its time unit, {unit!r}, but {self._given_unit} was given", "leave it out"
-            )
-        return NANOSECONDS[unit]
 
 
 def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
@@ -125,16 +122,13 @@ def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | 
 
     Args:
         path, width, height: see :class:`EventFile`.
-        time_unit: of the times, where the format states none.
+        time_unit: of the times, where the file states none. By default whole numbers are microseconds and decimals
+            seconds.
 
     Raises:
         DataError: the file is missing or not HDF5, or holds no events in a known layout.
     """
     with bounded(path, "HDF5 file"), _open(path) as file:
-        columns = {name: _dataset(path, file, f"events/{name}") for name in _DTYPES}
-        native = all(column is not None and column.dtype == _DTYPES[name] for name, column in columns.items())
-        if native and not {"ms_to_idx", "t_offset"} & set(file):
-            return Hdf5EventFile(path, width, height, time_unit)
         for layout in _LAYOUTS:
             if all(_dataset(path, file, name) is not None for name in layout.arrays):
                 return Hdf5TableFile(path, width, height, layout, time_unit)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.files.limits import bounded, bounded_items
+from aenerf_ns.files.text import TimeUnit
 
 CHUNK = 1 << 20
 """Events that are read at once: 13 MB."""
@@ -47,6 +48,10 @@ class EventReader(EventFile):
         with bounded(self.path, self.kind, self.extra):
             return self._count()
 
+    def assumed_unit(self) -> TimeUnit | None:
+        with bounded(self.path, self.kind, self.extra):
+            return self._assumed_unit()
+
     @abstractmethod
     def _chunks(self) -> Iterator[EventStream]:
         """Yield the events in pieces that fit in memory."""
@@ -59,6 +64,10 @@ class EventReader(EventFile):
                 start = int(chunk.t[0]) if start is None else start
                 end = int(chunk.t[-1])
         return None if start is None or end is None else (start, end)
+
+    def _assumed_unit(self) -> TimeUnit | None:
+        """Return the unit of the times that is assumed, or None where the format, the file or the user states it."""
+        return None
 
     def _count(self) -> int | None:
         """Return the number of events, or None if the file must be read through to count them."""

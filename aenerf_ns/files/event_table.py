@@ -30,12 +30,12 @@ class EventLayout:
     Attributes:
         columns: for x, y, t and p the name of an array and the part of it: None for an array of numbers, the index of a
             column for a matrix, or the name of a field for an array of records.
-        time_unit: of the times, or None for the rule of :func:`guess_time_unit`.
+        time_unit: of the times, or None for the rule of :func:`guess_time_unit` where the file states none.
         time_offset: name of a number that is added to all times, in their unit, where there is one.
     """
 
     columns: Mapping[str, tuple[str, int | str | None]]
-    time_unit: TimeUnit | None = "us"
+    time_unit: TimeUnit | None = None
     time_offset: str | None = None
 
     @property
@@ -55,7 +55,7 @@ class EventTableFile(EventReader):
     ) -> None:
         super().__init__(path, width, height)
         self._layout = layout
-        self._time_unit = layout.time_unit if time_unit is None else time_unit
+        self._given_unit = time_unit
 
     @abstractmethod
     def open_arrays(self) -> AbstractContextManager[Mapping[str, Any]]:
@@ -108,7 +108,7 @@ class EventTableFile(EventReader):
             raise DataError(self.path, f"its columns have lengths {lengths}", "store all with the same length")
         return next(iter(lengths.values()))
 
-    def _columns(self, arrays: Mapping[str, Any], first: int, last: int) -> dict[str, NDArray]:
+    def _columns(self, arrays: Mapping[str, Any], first: int, last: int | None) -> dict[str, NDArray]:
         pieces = {name: arrays[name][first:last] for name in self._layout.arrays}
         columns = {}
         for column, (name, part) in self._layout.columns.items():
@@ -116,11 +116,20 @@ class EventTableFile(EventReader):
             columns[column] = piece if part is None else piece[part] if isinstance(part, str) else piece[:, part]
         return columns
 
+    def _assumed_unit(self) -> TimeUnit | None:
+        with self.open_arrays() as arrays:
+            return None if self._stated_unit(arrays) else self._guessed_unit(arrays)
+
+    def _stated_unit(self, arrays: Mapping[str, Any]) -> TimeUnit | None:
+        return self._given_unit or self._layout.time_unit
+
+    def _guessed_unit(self, arrays: Mapping[str, Any]) -> TimeUnit:
+        ends = ((0, SAMPLE), (max(self._length(arrays) - SAMPLE, 0), None))
+        return guess_time_unit(np.concatenate([self._columns(arrays, *end)["t"] for end in ends]))
+
     def _tick(self, arrays: Mapping[str, Any]) -> int:
         """Return the nanoseconds of the unit of the times."""
-        if self._time_unit is None:
-            return NANOSECONDS[guess_time_unit(self._columns(arrays, 0, SAMPLE)["t"])]
-        return NANOSECONDS[self._time_unit]
+        return NANOSECONDS[self._stated_unit(arrays) or self._guessed_unit(arrays)]
 
     def _read(self, arrays: Mapping[str, Any], first: int, last: int, tick: int) -> EventStream:
         return events_from_columns(
@@ -188,7 +197,7 @@ def events_from_columns(
     # NaN compares as false; no time is good where the offset alone is beyond the limit.
     good = (times >= -limit) & (times <= limit) if times.dtype.kind in "if" else (limit >= 0) & (times <= max(limit, 0))
     if not good.all():
-        raise error("t", ~good, "check the unit of the times and the order of the columns")
+        raise error("t", ~good, "check the unit of the times (--event-time-unit) and the order of the columns")
     if times.dtype.kind == "f":
         # The fraction apart, because nanoseconds since 1970 would be rounded.
         fraction = times.astype(np.float64) % 1

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventReader
-from aenerf_ns.files.event_table import SAMPLE, events_from_columns
+from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.files.limits import MAX_LINE
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
@@ -72,23 +72,41 @@ def _line_name(line: int, num_before: int | None) -> str:
 
 
 class TextEventFile(EventReader):
-    """Read events.txt: lines of t in seconds, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017)."""
+    """Read events.txt: lines of t, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017).
+
+    Args:
+        path, width, height: see :class:`EventFile`.
+        time_unit: of the times. By default whole numbers are microseconds and decimals seconds.
+    """
 
     with_commas = False
+
+    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
+        super().__init__(path, width, height)
+        self._time_unit = time_unit
 
     def _names(self, file: BinaryIO) -> list[str]:
         """Return the names of the columns, x, y, t and p among them. Read the header, if the format has one."""
         return ["t", "x", "y", "p"]
 
-    def _tick(self, time_fractions: NDArray[np.float64]) -> int:
-        """Return the nanoseconds of the unit of the times, given the (N,) fractional parts of the first ones."""
-        return NANOSECONDS["s"]
+    def _assumed_unit(self) -> TimeUnit | None:
+        return None if self._time_unit else self._unit
+
+    @cached_property
+    def _unit(self) -> TimeUnit:
+        """The unit of the times: stated, or assumed from the times at the beginning of the file and the last one."""
+        if self._time_unit:
+            return self._time_unit
+        with self.path.open("rb") as file:
+            names = self._names(file)
+            beginning = next(self._lines(file, names), None)
+            times = [lines.fraction[2] for lines in (beginning, self._last_line(file, names)) if lines is not None]
+        return "s" if any(fractions.any() for fractions in times) else "us"
 
     def _chunks(self) -> Iterator[EventStream]:
-        tick = None
+        tick = NANOSECONDS[self._unit]
         with self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
-                tick = tick or self._tick(lines.fraction[2, :SAMPLE])
                 yield self._events(lines, tick)
 
     def _time_span(self) -> tuple[int, int] | None:
@@ -97,13 +115,16 @@ class TextEventFile(EventReader):
             beginning = next(self._lines(file, names), None)
             if beginning is None:
                 return None
-            file.seek(max(self.path.stat().st_size - _TAIL_BYTES, 0))
-            last_row = next((line for line in reversed(file.read().splitlines()) if _is_row(line)), b"")
-        tick = self._tick(beginning.fraction[2, :SAMPLE])
+            last = self._last_line(file, names)
+        tick = NANOSECONDS[self._unit]
         first = replace(beginning, whole=beginning.whole[:, :1], fraction=beginning.fraction[:, :1])
-        last = self._parse_block(last_row + b"\n", None, names)
         start, end = (int(self._events(lines, tick).t[0]) for lines in (first, last))
         return start, end
+
+    def _last_line(self, file: BinaryIO, names: list[str]) -> _Lines:
+        file.seek(max(self.path.stat().st_size - _TAIL_BYTES, 0))
+        row = next((line for line in reversed(file.read().splitlines()) if _is_row(line)), b"")
+        return self._parse_block(row + b"\n", None, names)
 
     def _lines(self, file: BinaryIO, names: list[str]) -> Iterator[_Lines]:
         """Parse a file after its header, in pieces of at least one event."""
@@ -169,18 +190,9 @@ class TextEventFile(EventReader):
 
 
 class CsvEventFile(TextEventFile):
-    """Read comma-separated values. The first line names the columns in any order, x, y, t and p among them.
-
-    Args:
-        path, width, height: see :class:`EventFile`.
-        time_unit: of the times. By default whole numbers are microseconds and decimals seconds.
-    """
+    """Read comma-separated values. The first line names the columns in any order, x, y, t and p among them."""
 
     with_commas = True
-
-    def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
-        super().__init__(path, width, height)
-        self._time_unit = time_unit
 
     def _names(self, file: BinaryIO) -> list[str]:
         header = next((line for line in iter(lambda: self._line(file), b"") if _is_row(line)), b"").decode(
@@ -194,9 +206,6 @@ class CsvEventFile(TextEventFile):
                 "it must name the columns, x, y, t and p among them, separated by commas",
             )
         return names
-
-    def _tick(self, time_fractions: NDArray[np.float64]) -> int:
-        return NANOSECONDS[self._time_unit or ("s" if time_fractions.any() else "us")]
 
 
 def parse_lines(

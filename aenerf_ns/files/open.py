@@ -28,7 +28,7 @@ _FORMAT_OF_MAGIC = {
 _FORMAT_OF_SUFFIX = {".npz": "NumPy", ".npy": "NumPy", ".csv": "CSV", ".txt": "text"}
 _WITH_TOPICS = ("AEDAT4", "bag")
 # Formats that may leave the unit of the times open.
-_WITH_TIME_UNIT = ("HDF5", "NumPy", "CSV")
+_WITH_TIME_UNIT = ("HDF5", "NumPy", "CSV", "text")
 
 
 def open_event_file(
@@ -47,7 +47,7 @@ def open_event_file(
         path: the file, or the folder of a bag of ROS 2.
         width, height: size of the sensor in pixels; needed where the file does not state it.
         topic: the topic of a bag, or the number of the stream of an AEDAT4 file, where several hold events.
-        time_unit: of the times of HDF5, npz, npy and csv, where the file states none.
+        time_unit: of the times of HDF5, npz, npy, csv and text, where the file states none.
 
     Raises:
         DataError: the format is not known, or a size is not given and the file is missing or does not state it.
@@ -86,7 +86,7 @@ def open_event_file(
             return open_hdf5_events(path, *size, time_unit)
         if name == "NumPy":
             return open_array_events(path, *size, time_unit)
-        return CsvEventFile(path, *size, time_unit) if name == "CSV" else TextEventFile(path, *size)
+        return (CsvEventFile if name == "CSV" else TextEventFile)(path, *size, time_unit)
 
 
 def _read_beginning(path: Path) -> bytes:

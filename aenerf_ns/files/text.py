@@ -14,7 +14,7 @@ from aenerf_ns.files.limits import MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded,
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
-_UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
+UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
 POSE_COLUMNS = "t tx ty tz qx qy qz qw"
 """The columns of a trajectory in the format of the TUM RGB-D benchmark."""
@@ -74,7 +74,7 @@ def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[
         except ArithmeticError:
             good = False
         if not good:
-            name = _UNIT_NAMES[unit]
+            name = UNIT_NAMES[unit]
             raise DataError(
                 path, f"{field[:40]} is not a time in {name}", f"write plain decimal {name}, not another unit"
             )

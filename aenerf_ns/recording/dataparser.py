@@ -24,13 +24,11 @@ from aenerf_ns.recording.images import check_image
 from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import Capture, Recording, Split
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
+from aenerf_ns.recording.time_units import require_one_unit
 from aenerf_ns.recording.views import seconds_on_trajectory, thin_views, viewer_cameras, views_within
 
 # Extents of the trajectory. Nerfstudio's cameras are float32: further out they would be rounded by a pixel and more.
 _MAX_REFERENCE_DISTANCE = 1e4
-# Units that times may have had that were read as seconds. In the right unit more than a few poses lie among the events.
-_UNITS = {"milliseconds": 1_000, "microseconds": 1_000_000, "nanoseconds": 1_000_000_000}
-_MIN_POSES = 5
 # Limits of half the side and of the corners of a scene box, in the units of the poses, whatever these are.
 _MIN_BOX, _MAX_BOX = 1e-6, 1e6
 
@@ -195,6 +193,7 @@ class EventDataParser(DataParser):
                     image_encoding=recording.image_encoding,
                     bounded=recording.scene_box is not None,
                     frames=frames,
+                    is_whole=self.config.start_time_ns is None and self.config.end_time_ns is None,
                 )
             },
         )
@@ -209,8 +208,7 @@ class EventDataParser(DataParser):
         recording, config = self.recording, self.config
         start, end = config.start_time_ns, config.end_time_ns
         if start is None or end is None:
-            first, last = recording.event_file.ordered_time_span()
-            _require_seconds(recording.trajectory, first, last)
+            first, last = self.event_span(recording)
             start, end = first if start is None else start, last if end is None else end
         if start >= end:
             raise DataError(
@@ -221,6 +219,15 @@ class EventDataParser(DataParser):
         covered = recording.trajectory.crop(start, end)
         start, end = max(start, covered.start), min(end, covered.end)
         return TimeWindow(start, end, self._pose_gaps(recording, start, end))
+
+    def event_span(self, recording: Recording) -> tuple[int, int]:
+        """Return the times of the first and the last event of a recording that this parser has read, in nanoseconds.
+
+        Raises:
+            DataError: the events are missing, or fit the poses only if the times of either have another unit.
+        """
+        options = [name for name in ("event_time_unit", "time_unit") if hasattr(self.config, name)]
+        return require_one_unit(recording.event_file, recording.trajectory, *options or ("",))
 
     def resolved_config(self) -> EventDataParserConfig:
         """Return the configuration with the time window that is used, so that opening a trained run needs no events."""
@@ -273,28 +280,6 @@ class EventDataParser(DataParser):
                 )
             scale /= extent
         return transform, scale, torch.tensor([[-1.0] * 3, [1.0] * 3])
-
-
-def _require_seconds(trajectory: Trajectory, first: int, last: int) -> None:
-    """Raise a DataError if the poses fit the span of the events only if their times have another unit.
-
-    Args:
-        trajectory: the estimated trajectory.
-        first, last: times of the first and the last event in nanoseconds.
-    """
-    times = trajectory.times
-    for unit, factor in _UNITS.items():
-        scaled = times // factor
-        fitting = int(((scaled >= first) & (scaled <= last)).sum())
-        lasts_as_long = 10 * int(scaled[-1] - scaled[0]) > last - first
-        few = len(trajectory.knots_between(first, last)) < _MIN_POSES
-        if few and lasts_as_long and fitting >= max(_MIN_POSES, len(times) / 2):
-            raise DataError(
-                trajectory.source,
-                f"its poses last {trajectory.duration:g} s and the events {(last - first) * 1e-9:g} s, as if the times "
-                f"of the poses were in {unit}",
-                "write them in seconds",
-            )
 
 
 def _frames(recording: Recording, window: TimeWindow) -> tuple[tuple[int, Path], ...]:

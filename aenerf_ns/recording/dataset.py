@@ -21,6 +21,7 @@ from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import tracked
 from aenerf_ns.recording.pair_cache import PairFile
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
+from aenerf_ns.recording.time_units import require_covered
 
 # Events in a picture, as a share of the sensor's pixels: enough to show edges, too few to smear them.
 _PICTURE_DENSITY = 0.25
@@ -87,6 +88,7 @@ class EventDataset(InputDataset):
                 found = file.find() or self._read_events(file, usable, count)
         else:
             CONSOLE.print(f"{file.path.name}: {found[0].summary()}.")
+        self._require_covered(found[0].num_events, found[0].num_outside)
         return found
 
     def _read_events(
@@ -123,7 +125,13 @@ class EventDataset(InputDataset):
         chunks = pictures.watch(self._chunks(scene.event_file.count()))
         windows = sort_events(chunks, window=scene.window, usable=usable)
         CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.")
+        self._require_covered(len(windows.times) + windows.num_outside + windows.num_unusable, windows.num_outside)
         return windows, pictures.sums(*usable.shape)
+
+    def _require_covered(self, num_events: int, num_outside: int) -> None:
+        # Gaps of the poses are left out on purpose, and are most of some recordings.
+        if self.scene.is_whole and not self.scene.window.gaps:
+            require_covered(self.scene.event_file.path, num_events, num_events - num_outside)
 
     def _new_pictures(self) -> PolaritySums:
         """Make an accumulator of the events around each camera's time."""

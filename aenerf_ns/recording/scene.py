@@ -34,6 +34,7 @@ class SceneRecording:
         bounded: whether the dataset states a box that holds the whole scene.
         frames: times in nanoseconds within the window, and files, of the train split's images that the event camera's
             lens took at known times; none for the other splits. Only a method that says so trains on them.
+        is_whole: whether nobody chose the window: it follows from events and poses.
     """
 
     frame: Similarity
@@ -48,6 +49,7 @@ class SceneRecording:
     image_encoding: ImageEncoding
     bounded: bool
     frames: tuple[tuple[int, Path], ...] = ()
+    is_whole: bool = False
 
     @property
     def scale(self) -> float:

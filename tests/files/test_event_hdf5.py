@@ -26,12 +26,24 @@ def test_native_file_is_recognized(tmp_path: Path) -> None:
     with Hdf5EventWriter(tmp_path / "events.h5") as writer:
         writer.append(EventStream(**columns, width=WIDTH, height=HEIGHT))
     events = open_events(tmp_path / "events.h5")
-    assert isinstance(events, Hdf5EventFile)
-    # Its times are nanoseconds; those of a file with DSEC's index are microseconds whatever the types.
+    # Its attribute states nanoseconds. Without it whole times are microseconds, whatever the types.
     assert events.time_span()[0] == columns["t"][0]
+    assert events.assumed_unit() is None
     with h5py.File(tmp_path / "events.h5", "a") as file:
-        file["ms_to_idx"] = np.zeros(3)
+        del file["events"].attrs["time_unit"]
     assert open_events(tmp_path / "events.h5").time_span()[0] == columns["t"][0] * 1_000
+    assert open_events(tmp_path / "events.h5").assumed_unit() == "us"
+    # In a dataset folder they are nanoseconds.
+    assert Hdf5EventFile(tmp_path / "events.h5", WIDTH, HEIGHT).time_span()[0] == columns["t"][0]
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.uint8])
+def test_stated_unit_and_offset_count_whatever_the_types(dtype: type, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        for name in "xytp":
+            file[f"events/{name}"] = np.array([5, 7] if name == "t" else [1, 1], dtype)
+        file["events"].attrs.update(time_unit="ms", time_offset=10)
+    assert open_events(tmp_path / "events.h5").time_span() == (15_000_000, 17_000_000)
 
 
 def test_given_unit_counts_where_none_is_stated(tmp_path: Path) -> None:
@@ -40,15 +52,15 @@ def test_given_unit_counts_where_none_is_stated(tmp_path: Path) -> None:
         for name, dtype in columns.items():
             file[f"events/{name}"] = np.array([1, 1_000_000] if name == "t" else [1, 1], dtype)
     path = tmp_path / "events.h5"
-    assert open_hdf5_events(path, WIDTH, HEIGHT).time_span() == (1, 1_000_000)
-    assert open_hdf5_events(path, WIDTH, HEIGHT, "us").time_span() == (1_000, 1_000_000_000)
+    assert open_hdf5_events(path, WIDTH, HEIGHT).time_span() == (1_000, 1_000_000_000)
+    assert open_hdf5_events(path, WIDTH, HEIGHT, "ns").time_span() == (1, 1_000_000)
     with h5py.File(path, "a") as file:
         file["events"].attrs["time_unit"] = "ns"
     with pytest.raises(DataError, match="it states its time unit, 'ns', but us was given"):
         open_hdf5_events(path, WIDTH, HEIGHT, "us").time_span()
-    (tmp_path / "events.txt").write_text("0.1 1 2 1\n")
+    (tmp_path / "events.raw").write_text("% evt 2.0\n")
     with pytest.raises(DataError, match="its format has a time unit, but us was given"):
-        open_event_file(tmp_path / "events.txt", WIDTH, HEIGHT, time_unit="us")
+        open_event_file(tmp_path / "events.raw", WIDTH, HEIGHT, time_unit="us")
 
 
 def test_missing_filter_names_the_extra(tmp_path: Path) -> None:

@@ -1,0 +1,90 @@
+"""Whether the times of events and poses fit each other, or do so only if those of one have another unit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.text import UNIT_NAMES
+
+Span = tuple[int, int]
+
+_UNITS: list[str] = list(UNIT_NAMES)
+_NAMES = list(UNIT_NAMES.values())
+# Events do not fit poses if fewer poses lie among them, or if poses cover a smaller share of their time.
+_MIN_POSES, _MIN_COVERED = 10, 0.1
+# Two spans fit by chance less often, the more of the time that either covers is covered by both.
+_MIN_OVERLAP, _SURE_OVERLAP = 0.05, 0.9
+
+
+def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
+    """Return the times of the first and the last event in nanoseconds.
+
+    Args:
+        events: the events.
+        poses: their poses, whose times were read as seconds.
+        option: the dataparser's option for the unit of the events, or "" if it has none.
+
+    Raises:
+        DataError: the events are missing or out of order, or fit the poses only if the times of either have another
+            unit.
+    """
+    span = events.ordered_time_span()
+    covered = _common(span, (poses.start, poses.end))
+    is_given = len(poses.knots_between(*span)) >= _MIN_POSES and covered >= _MIN_COVERED * (span[1] - span[0])
+    power = unit_steps(span, (poses.start, poses.end), _SURE_OVERLAP if is_given else _MIN_OVERLAP)
+    if power is None:
+        return span
+    blamed, remedies = [], []
+    assumed = events.assumed_unit() if option else None
+    if assumed is not None and 0 <= _UNITS.index(assumed) + power < len(_UNITS):
+        index = _UNITS.index(assumed) + power
+        unit = _UNITS[index]
+        blamed.append(f"the events were in {_NAMES[index]}")
+        remedies.append(f"give --{option.replace('_', '-')} {unit} (in aenerf --format-options {option}={unit})")
+    if power > 0:
+        blamed.append(f"the poses were in {_NAMES[-1 - power]}")
+        remedies.append("write the times of the poses in seconds")
+    if not blamed:
+        return span
+    raise DataError(
+        poses.source if power > 0 else events.path,
+        f"the poses last {poses.duration:g} s and the events {(span[1] - span[0]) * 1e-9:g} s, as if the times of "
+        + ", or those of ".join(blamed),
+        ", or ".join(remedies),
+    )
+
+
+def require_covered(source: Path, num_events: int, num_covered: int) -> None:
+    """Raise a DataError for events of a whole recording of which hardly any have a pose."""
+    if num_covered < _MIN_COVERED * num_events:
+        raise DataError(
+            source,
+            f"only {num_covered:,} of its {num_events:,} events have a pose",
+            "check that events and poses share one clock and one unit of time; if this part is what you want, give its "
+            "--start-time-ns and --end-time-ns",
+        )
+
+
+def unit_steps(span: Span, reference: Span, min_overlap: float = _MIN_OVERLAP) -> int | None:
+    """Return by which power of 1000 a span of time must be multiplied to fit another one, or None if by none.
+
+    Args:
+        span, reference: first and last time, in nanoseconds.
+        min_overlap: share of the time that either covers, which both cover if they fit.
+    """
+    for power in (1, 2, 3, -1, -2, -3):
+        # With whole numbers: nanoseconds since 1970 have 19 digits.
+        factor = int(1000 ** abs(power))
+        first, last = (time * factor if power > 0 else time // factor for time in span)
+        total = max(last, reference[1]) - min(first, reference[0])
+        if _common((first, last), reference) > min_overlap * total:
+            return power
+    return None
+
+
+def _common(one: Span, other: Span) -> int:
+    """Return how long two spans overlap in nanoseconds; negative if they are apart."""
+    return min(one[1], other[1]) - max(one[0], other[0])
