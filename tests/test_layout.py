@@ -36,7 +36,9 @@ MAY_USE: dict[str, set[str]] = {
     "viewer": {"errors", "events", "camera", "files", "recording", "method", "evaluation"},
     "training": {"errors", "atomic_write", "recording", "supervision", "method", "evaluation", "viewer"},
     # What training and checking left behind, measured and shown.
-    "report": {"errors", "progress", "camera", "files", "supervision", "evaluation", "training", "checking"},
+    "report": {
+        "errors", "progress", "camera", "files", "recording", "supervision", "evaluation", "training", "checking"
+    },
     # Stands beside the method: only commands and benchmarks use it.
     "simulator": {"errors", "progress", "open3d_import", "events", "camera", "files", "pose_estimation"},
     # What other tools take from a trained run.

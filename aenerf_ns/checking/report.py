@@ -16,6 +16,7 @@ from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import progress_bar, tracked
+from aenerf_ns.recording.poses_report import read_poses_report
 from aenerf_ns.recording.recording import Recording
 
 _RATE_PARTS = 60
@@ -184,6 +185,9 @@ def _check_poses(result: CheckResult, recording: Recording, window: TimeWindow, 
         f"between two of them at most {degrees.max():.2g} degrees and {steps.max():.2g} of their units; the path "
         f"is {steps.sum():.3g} long"
     )
+    estimation = read_poses_report(trajectory)
+    if estimation is not None:
+        figures.append(f"How they were estimated: {estimation.summary}")
     if recording.ground_truth is not None:
         figures.append(f"True poses: {len(recording.ground_truth)}, for evaluation")
     covered = num_covered / statistics.num_events

@@ -18,6 +18,8 @@ from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.progress import tracked
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
+
     from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.events.filters import EventFilters, FilteredEventFile
@@ -94,12 +96,13 @@ class Convert(DatasetCommand):
 
     def _convert(self, parser: EventDataParser, filters: EventFilters, lock: OutputLock) -> None:
         from aenerf_ns.events.filters import FilteredEventFile
+        from aenerf_ns.recording.poses_report import POSES_PICTURE
         from aenerf_ns.recording.time_units import require_covered
         from aenerf_ns.recording.views import thin_views
 
-        report = None
+        report = picture = None
         if self.poses != "given":
-            recording, report = self._with_estimated_poses(*parser.read_frames(), filters.window)
+            recording, report, picture = self._with_estimated_poses(*parser.read_frames(), filters.window)
         else:
             recording = parser.recording
             parser.event_span(recording)
@@ -125,6 +128,8 @@ class Convert(DatasetCommand):
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is not None:
                 writer.add_poses_report(report)
+            if picture is not None:
+                picture.quantize().save(writer.other_file(POSES_PICTURE))
             copy_images(writer, recording, views)
             num_read, num_written, num_covered = _copy_events(recording, events, writer)
             if self.poses == "given" and self.start_time_ns is None and self.end_time_ns is None:
@@ -138,8 +143,8 @@ class Convert(DatasetCommand):
 
     def _with_estimated_poses(
         self, capture: Capture, images: list[tuple[int, Path]], window: TimeWindow
-    ) -> tuple[Recording, dict[str, Any]]:
-        """Estimate poses with COLMAP, and return the recording with them and COLMAP's report."""
+    ) -> tuple[Recording, dict[str, Any], Image | None]:
+        """Estimate poses with COLMAP, and return the recording with them, COLMAP's report and its picture."""
         from aenerf_ns.pose_estimation.from_events import estimate_poses_from_events
         from aenerf_ns.pose_estimation.from_frames import estimate_poses
 
@@ -203,14 +208,15 @@ def _copy_events(recording: Recording, events: FilteredEventFile, writer: Native
 
 def _with_poses(
     found: EstimatedPoses, capture: Capture, images: list[tuple[int, Path]]
-) -> tuple[Recording, dict[str, Any]]:
-    """Return the recording with estimated poses, and the report on them."""
+) -> tuple[Recording, dict[str, Any], Image | None]:
+    """Return the recording with estimated poses, the report on them, and a picture of them."""
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.pose_estimation.from_frames import compare_with_truth
     from aenerf_ns.recording.recording import Recording
     from aenerf_ns.recording.views import views_on_trajectory
 
     trajectory, report = found.trajectory, found.report()
+    paths = {"estimated": trajectory.camera_to_worlds.numpy()}
     say(found.summary())
     say(
         "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale, because images of one "
@@ -221,14 +227,17 @@ def _with_poses(
         knots = trajectory.knots_between(truth.start, truth.end)
         if len(knots) > 1:
             covered = Trajectory(knots, trajectory.interpolate(knots))
-            _, errors = compare_with_truth(covered, truth.interpolate(knots))
+            aligned, errors = compare_with_truth(covered, truth.interpolate(knots))
+            paths = {"given": truth.interpolate(knots).numpy(), "estimated": aligned.camera_to_worlds.numpy()}
             report["errors"] = errors
             say(
                 f"Compared with the given poses, which are kept as ground truth: mean errors "
                 f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units."
             )
         # The scene box is in the world of the given poses, and the longest gap is about the given poses.
-        return replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None), report
+        recording = replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None)
+        return recording, report, found.draw and found.draw(paths)
     placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
     views = views_on_trajectory(placed, trajectory)
-    return Recording(**vars(capture), trajectory=trajectory, reference_views=views), report
+    recording = Recording(**vars(capture), trajectory=trajectory, reference_views=views)
+    return recording, report, found.draw and found.draw(paths)

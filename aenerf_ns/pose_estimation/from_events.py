@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,6 +15,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile
 from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, trajectory_of
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
+from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
 from aenerf_ns.progress import progress_bar, tracked
 from aenerf_ns.reconstruction.batches import batches_of
 from aenerf_ns.reconstruction.two_sided import two_sided_images
@@ -104,4 +106,5 @@ def estimate_poses_from_events(
         images="images of the events",
         mapper=mapper,
         agreement=held_out.agreement(model),
+        draw=partial(draw_poses, pictures, observations_of(model, len(times))),
     )

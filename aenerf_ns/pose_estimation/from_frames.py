@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
@@ -47,6 +48,8 @@ class EstimatedPoses:
         images: what the frames are, for people to read.
         mapper: COLMAP's mapper whose model was taken, incremental or global.
         agreement: share of the matches kept apart that fit the poses; None where none were kept apart.
+        draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
+            the paths; None where the images were not kept.
     """
 
     frame_times: NDArray[np.int64]
@@ -60,6 +63,7 @@ class EstimatedPoses:
     images: str = "frames"
     mapper: str = "incremental"
     agreement: float | None = None
+    draw: Callable[[Mapping[str, NDArray[np.float64]]], Image.Image] | None = None
 
     def gaps(self) -> list[tuple[int, int, int]]:
         """Return first time, last time (nanoseconds) and number of frames of every run of frames without a pose."""
@@ -85,6 +89,7 @@ class EstimatedPoses:
             "seconds": self.seconds,
             "mapper": self.mapper,
             "agreement": self.agreement,
+            "summary": self.summary(),
         }
 
     def summary(self) -> str:

@@ -26,6 +26,7 @@ from aenerf_ns.files.output_paths import output_error
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
+from aenerf_ns.recording.poses_report import POSES_REPORT
 from aenerf_ns.recording.recording import SPLITS, Split
 from aenerf_ns.recording.views import IMAGE_LIST
 
@@ -140,7 +141,7 @@ class NativeDatasetWriter(_FolderWriter):
 
     def add_poses_report(self, report: dict[str, Any]) -> None:
         """Write how the estimated trajectory was made and what is known of its errors, for people to read."""
-        _write_json(self._partial / "poses_report.json", report)
+        _write_json(self._partial / POSES_REPORT, report)
 
     def other_file(self, name: str) -> Path:
         """Return the path at which another file of the folder can be written until the block ends."""

@@ -12,6 +12,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from aenerf_ns.evaluation.evaluate import evaluate
 from aenerf_ns.evaluation.run import TrainedRun
+from aenerf_ns.recording.poses_report import PosesReport, read_poses_report
 from aenerf_ns.report.pair_residuals import PairResiduals, measure_pair_residuals
 from aenerf_ns.report.poses import RunPoses, measure_poses
 from aenerf_ns.report.run_files import TrainingRecord, read_record, read_scalars
@@ -33,6 +34,7 @@ class RunReport:
         scalars: see :func:`~aenerf_ns.report.run_files.read_scalars`.
         pose_gaps_ns: first and last time of each gap of the poses.
         poses: along the trajectory.
+        estimation: how the given poses were estimated, None where the recording does not say.
         check: what ``aenerf check`` finds in the data, None where the events are no longer there.
         evaluation: what ``ns-eval`` writes as results.
         contrast: of each channel; see :func:`~aenerf_ns.report.view_pictures.picture_views`.
@@ -50,6 +52,7 @@ class RunReport:
     scalars: dict[str, tuple[list[int], list[float]]] | None
     pose_gaps_ns: list[list[int]]
     poses: RunPoses
+    estimation: PosesReport | None = None
     check: CheckResult | None = None
     evaluation: dict[str, Any] = field(default_factory=dict)
     contrast: list[float] = field(default_factory=list)
@@ -78,6 +81,8 @@ class RunReport:
                 "end_ns": events.end,
                 "rate": self.check.events_per_second,
             }
+        if self.estimation is not None:
+            data["estimation"] = self.estimation.summary
         if self.num_pairs is not None:
             data["pairs"] = self.num_pairs
         return {
@@ -120,6 +125,7 @@ def measure_run(
         read_scalars(folder),
         [list(gap) for gap in run.scene.window.gaps],
         measure_poses(run),
+        read_poses_report(run.recording.trajectory),
     )
     missing = report.missing
     if report.record is None:

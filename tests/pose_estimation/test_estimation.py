@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shutil
@@ -18,6 +19,7 @@ from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.formats import FORMATS, recognize
@@ -26,6 +28,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses, compare_with_truth, estimate_poses
+from aenerf_ns.pose_estimation.picture import draw_poses
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.paths import RoomPath
@@ -131,9 +134,34 @@ def test_find_poses_of_a_bare_recording(bare: Path, dataset: tuple[Path, str], t
     # Measured: 0.5 degrees and 9 mm on a path of 1.1 m.
     assert errors["rotation_error_degrees"] < 2
     assert errors["translation_error"] < 0.03
+    # It says how its poses were found.
+    with CONSOLE.capture() as checked, contextlib.suppress(SystemExit):
+        Check(tmp_path / "scene").main()
+    assert f"How they were estimated: {report['summary'].splitlines()[0]}" in " ".join(checked.get().split())
+    with Image.open(tmp_path / "scene" / "poses_report.png") as picture:
+        assert picture.size == (1456, 484)
     # The dataset can be trained on.
     scene = NativeDataParserConfig(data=tmp_path / "scene").setup().get_dataparser_outputs("train").metadata[SCENE_KEY]
     assert (scene.window.start, scene.window.end) == (found.start, found.end)
+
+
+def test_draw_tracks_and_paths() -> None:
+    images = [np.zeros((30, 40), np.uint8)] * 6
+    tracks = [(np.array([3, 8 + k]), np.array([[5.0 + k, 10], [30, 20]])) for k in range(6)]
+    poses = np.tile(np.eye(4)[:3], (6, 1, 1))
+    poses[:, 0, 3] = np.arange(6)
+    apart = poses.copy()
+    apart[:, 2, 3] = 1
+    picture = np.asarray(draw_poses(images, tracks, {"given": poses, "estimated": apart})).astype(int)
+    # The first panel has both tracks: one moves right, the other is seen once.
+    panel = picture[:240, :320]
+    colored = np.ptp(panel, axis=-1) > 100
+    assert colored[80, 40:72].all()
+    assert colored[155:165, 235:245].sum() == 9
+    # Each path in its color.
+    paths = picture[:, 972:]
+    for color in ((214, 39, 40), (31, 119, 180)):
+        assert (np.abs(paths - color).sum(-1) == 0).sum() > 300
 
 
 def test_name_the_command_that_finds_poses(bare: Path) -> None:

@@ -13,6 +13,7 @@ from PIL import Image
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.report import CheckResult
 from aenerf_ns.events.statistics import EventStatistics
+from aenerf_ns.recording.poses_report import PosesReport
 from aenerf_ns.report.comparison import paired_differences, views_left_out
 from aenerf_ns.report.measuring import RunReport
 from aenerf_ns.report.page import make_page
@@ -72,6 +73,7 @@ def make_report(name: str, **changes: Any) -> RunReport:
         "scalars": {"Train Loss Dict/reconstruction_loss": ([0, 1], [1.0, 0.5])},
         "pose_gaps_ns": [[1, 2]],
         "check": CheckResult(events, ["Events: 1000"], [HOSTILE], warped=cast(WarpedEvents, Drawing())),
+        "estimation": PosesReport(HOSTILE, picture()),
         "num_pairs": "1000 pairs",
         "poses": RunPoses(2, [0.0, 1.0], {"estimated": path, "true": path}, [1.0, 1.0], [0.0, 0.0],
                           {"estimated": kinds, "corrected": kinds}, {"estimated": over_time},
@@ -99,7 +101,7 @@ def test_page_shows_everything_escaped() -> None:
     assert body.count("&lt;script&gt;alert(&#34;&amp;&#34;)") > 8
     # Eight plots: curves, rate, trajectory, errors, correction, changes, tiles, lengths.
     assert body.count('class="plotly-graph-div"') == 8
-    assert body.count('<img alt="" src="data:image/jpeg;base64,') == 5
+    assert body.count('<img alt="" src="data:image/jpeg;base64,') == 6
     targets = re.findall(r'<a href="#(\w+)">', body)
     assert len(targets) == 8
     assert all(f'<h2 id="{target}">' in body for target in targets)
@@ -133,5 +135,5 @@ def test_page_compares_runs_on_shared_views() -> None:
     assert "Left out: 1 of a, 1 of b." in page
     # The same data once, and four pictures for each run.
     assert page.count("All that aenerf check says") == 1
-    assert page.count("<figure>") == 1 + 2 * 4
+    assert page.count("<figure>") == 2 + 2 * 4
     assert "No test view is in all runs" in page_of([first, second], [])

@@ -1,0 +1,49 @@
+"""What a dataset folder says of how its poses were estimated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+from PIL import Image
+
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.files.json_file import read_json
+from aenerf_ns.recording.images import open_image
+
+POSES_REPORT, POSES_PICTURE = "poses_report.json", "poses_report.png"
+
+
+class _File(msgspec.Struct):
+    """The one field of the report that is read. Reports of earlier versions lack it."""
+
+    summary: str | None = None
+
+
+@dataclass(frozen=True)
+class PosesReport:
+    """How poses were estimated: in one line, and as a picture where one was drawn."""
+
+    summary: str
+    picture: Image.Image | None
+
+
+def read_poses_report(trajectory: Trajectory) -> PosesReport | None:
+    """Read the report beside the estimated poses of a dataset folder; None for other poses, and where there is none.
+
+    Raises:
+        DataError: the report or its picture cannot be read.
+    """
+    path = Path(trajectory.source)
+    report, picture = path.with_name(POSES_REPORT), path.with_name(POSES_PICTURE)
+    if path.name != "trajectory_estimated.txt" or not report.is_file():
+        return None
+    summary = read_json(report, _File).summary
+    if summary is None:
+        return None
+    drawn = None
+    if picture.is_file():
+        with open_image(picture) as image:
+            drawn = image.convert("RGB")
+    return PosesReport(" ".join(summary.split()), drawn)
