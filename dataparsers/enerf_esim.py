@@ -30,7 +30,10 @@ class EsimEventFolder(EventFile):
         # The order is that of the numbers in the names, which may lack leading zeros.
         paths = list_files(self.path, "*.npy")
         paths.sort(key=lambda path: [int(number) for number in re.findall(r"\d+", path.name)])
-        return [ArrayEventFile(path, self.width, self.height, XYTP_MATRIX, "ns") for path in paths]
+        files = [ArrayEventFile(path, self.width, self.height, XYTP_MATRIX, "ns") for path in paths]
+        for file in files:
+            file.drop_malformed, file.left_out = self.drop_malformed, self.left_out
+        return files
 
     def require(self) -> None:
         if not self.path.is_dir():

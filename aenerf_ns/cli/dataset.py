@@ -65,8 +65,8 @@ def _with_options(config: EventDataParserConfig, name: str, options: Sequence[st
     from aenerf_ns.recording.options import EventDataParserConfig
 
     # Commands keep the world of the recording, so options that place it in a scene have no effect. The longest gap
-    # between poses belongs to the recording.
-    without_effect = {option.name for option in fields(EventDataParserConfig)} - {"max_pose_gap_ns"}
+    # between poses and malformed events belong to the recording.
+    without_effect = {option.name for option in fields(EventDataParserConfig)} - {"max_pose_gap_ns", "drop_malformed"}
     known = [option.name for option in fields(config) if option.name not in without_effect]
     config = copy(config)
     for option in options:

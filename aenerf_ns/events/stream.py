@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError, require_file
+from aenerf_ns.events.left_out import LeftOut
 from aenerf_ns.events.sensor import require_event_sensor_size
+
+UNSORTED_REMEDY = (
+    "a few such events can be left out (--drop-malformed); many mean that the times overflowed, or, in a table of your "
+    "own, that it is not sorted by time"
+)
+"""How to mend events that are out of order."""
 
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 
@@ -123,7 +130,7 @@ def _unsorted(source: str | Path, index: int, time: int, previous: int) -> DataE
     return DataError(
         source,
         f"event {index} is at {time} ns, before the event ahead of it at {previous} ns",
-        "sort the events by time",
+        UNSORTED_REMEDY,
     )
 
 
@@ -138,15 +145,23 @@ class EventFile(ABC):
         width: number of pixel columns of the sensor.
         height: number of pixel rows of the sensor.
 
+    Attributes:
+        drop_malformed: leave out, count and name events outside the sensor or out of order, in place of raising an
+            error, as long as they are few.
+
     Raises:
         DataError: no event sensor has so many pixels.
     """
+
+    drop_malformed = False
 
     def __init__(self, path: Path, width: int, height: int) -> None:
         require_event_sensor_size(width, height, path)
         self.path = path
         self.width = width
         self.height = height
+        self.left_out = LeftOut()
+        self._told = ""
 
     @abstractmethod
     def read_chunks(self) -> Iterator[EventStream]:
@@ -175,7 +190,7 @@ class EventFile(ABC):
             raise DataError(
                 self.path,
                 f"its last event, at {last} ns, is before its first, at {first} ns",
-                "sort the events by time",
+                UNSORTED_REMEDY,
             )
         return first, last
 
@@ -202,6 +217,7 @@ class EventFile(ABC):
             DataError: the file is missing, empty or out of order, or an event is malformed.
         """
         self.require()
+        self.left_out = LeftOut()
         total, last_time = 0, None
         for chunk in self.read_chunks():
             if len(chunk) == 0:
@@ -211,5 +227,10 @@ class EventFile(ABC):
             last_time = int(chunk.t[-1])
             total += len(chunk)
             yield chunk
+        if self.drop_malformed:
+            self.left_out.require_few(self.path, total)
+        if self.left_out.summary() != self._told:
+            self._told = self.left_out.summary()
+            print(f"{self.path.name}: events that are left out: {self._told}.")
         if total == 0:
             raise self.empty_error()

@@ -35,11 +35,13 @@ class EventReader(EventFile):
     extra = ""
 
     def read_chunks(self) -> Iterator[EventStream]:
+        self.left_out.last_time = None
         yield from bounded_items(self._chunks(), self.path, self.kind, self.extra)
 
     def time_span(self) -> tuple[int, int]:
         with bounded(self.path, self.kind, self.extra):
-            span = self._time_span()
+            # Only what is read as a whole tells which events are well-formed.
+            span = EventReader._time_span(self) if self.drop_malformed else self._time_span()
         if span is None:
             raise self.empty_error()
         return span
@@ -59,6 +61,7 @@ class EventReader(EventFile):
     def _time_span(self) -> tuple[int, int] | None:
         """Return the times of the first and the last event in nanoseconds, or None without events."""
         start = end = None
+        self.left_out.last_time = None
         for chunk in self._chunks():
             if len(chunk):
                 start = int(chunk.t[0]) if start is None else start
@@ -74,6 +77,13 @@ class EventReader(EventFile):
         return None
 
     def _stream(self, columns: Columns) -> EventStream:
+        """Return the events of columns, without malformed ones where these are left out."""
+        if self.drop_malformed:
+            x, y, t, _ = columns
+            inside = (x < self.width) & (y < self.height)
+            self.left_out.add("outside the sensor", ~inside, lambda i: f"at x = {x[i]}, y = {y[i]}, {t[i]} ns")
+            inside[inside] = self.left_out.add_out_of_order(t[inside])
+            columns = tuple(column[inside] for column in columns)  # type: ignore[assignment]
         return EventStream(*columns, self.width, self.height, self.path)
 
 

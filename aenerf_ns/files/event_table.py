@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.events.left_out import LeftOut
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.files.event_reader import CHUNK, EventReader
+from aenerf_ns.files.event_reader import CHUNK, Columns, EventReader
 from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
@@ -132,7 +133,7 @@ class EventTableFile(EventReader):
         return NANOSECONDS[self._stated_unit(arrays) or self._guessed_unit(arrays)]
 
     def _read(self, arrays: Mapping[str, Any], first: int, last: int, tick: int) -> EventStream:
-        return events_from_columns(
+        columns = events_from_columns(
             self._columns(arrays, first, last),
             width=self.width,
             height=self.height,
@@ -140,7 +141,9 @@ class EventTableFile(EventReader):
             offset=arrays.get("time_offset", 0),
             source=self.path,
             describe_event=lambda index: f"event {first + index}",
+            left_out=self.left_out if self.drop_malformed else None,
         )
+        return self._stream(columns)
 
 
 def guess_time_unit(times: NDArray) -> TimeUnit:
@@ -158,8 +161,9 @@ def events_from_columns(
     fraction: NDArray[np.float64] | None = None,
     source: str | Path,
     describe_event: Callable[[int], str] = "event {}".format,
-) -> EventStream:
-    """Return the events of columns of any numeric type.
+    left_out: LeftOut | None = None,
+) -> Columns:
+    """Return x, y, t in nanoseconds and p = ±1 of events in columns of any numeric type.
 
     Args:
         columns: x, y, t and p, (N,) each. Polarities are 0 and 1, or −1 and 1.
@@ -169,35 +173,53 @@ def events_from_columns(
         fraction: (N,) added to the times, in their unit, where the times are integers; between −1 and 1.
         source: names the origin of the columns, for messages.
         describe_event: says which event one is in the source, for messages.
+        left_out: takes the events with a value that no event can have, which are then left out.
 
     Raises:
-        DataError: a value is not one that an event can have.
+        DataError: a value is not one that an event can have, and there is no ``left_out``.
     """
     for name in "xytp":
         if columns[name].dtype.kind not in "iufb":
             raise DataError(source, f"column {name} has type {columns[name].dtype}", "store numbers")
 
-    def error(name: str, bad: NDArray[np.bool_], remedy: str) -> DataError:
-        index = int(np.argmax(bad))
-        return DataError(source, f"{describe_event(index)} has {name} = {columns[name][index]:g}", remedy)
+    kept = np.ones(len(columns["t"]), bool)
 
-    pixels = {}
+    def require(name: str, good: NDArray[np.bool_], remedy: str) -> None:
+        if good.all():
+            return
+        if left_out is None:
+            index = int(np.argmin(good))
+            raise DataError(source, f"{describe_event(index)} has {name} = {columns[name][index]:g}", remedy)
+        left_out.add(f"with an impossible {name}", kept & ~good, lambda i: f"{describe_event(i)}, {columns[name][i]:g}")
+        kept[~good] = False
+
     for name, size in (("x", width), ("y", height)):
         values = columns[name]
         good = (values >= 0) & (values < size)
         if values.dtype.kind == "f":
             good &= values == np.floor(values)
-        if not good.all():
-            remedy = f"it must be a whole number below {size}: check the sensor size and the order of the columns"
-            raise error(name, ~good, remedy)
-        pixels[name] = values.astype(np.uint16)
+        remedy = f"it must be a whole number below {size}: check the sensor size and the order of the columns"
+        require(name, good, remedy)
 
     times, polarities = columns["t"], columns["p"]
     limit = MAX_TIME // tick - abs(offset)
     # NaN compares as false; no time is good where the offset alone is beyond the limit.
     good = (times >= -limit) & (times <= limit) if times.dtype.kind in "if" else (limit >= 0) & (times <= max(limit, 0))
-    if not good.all():
-        raise error("t", ~good, "check the unit of the times (--event-time-unit) and the order of the columns")
+    require("t", good, "check the unit of the times (--event-time-unit) and the order of the columns")
+
+    # Written with care for booleans and unsigned integers.
+    positive, zero = polarities == 1, polarities == 0
+    good = positive | zero | (polarities == -1)
+    require("p", good, "polarities are 0 and 1, or -1 and 1: check the order of the columns")
+    if zero.any() and (good & ~positive & ~zero).any():
+        index = int(np.argmax(zero))
+        remedy = "there are events of polarity -1 beside it: use 0 and 1, or -1 and 1"
+        raise DataError(source, f"{describe_event(index)} has p = 0", remedy)
+
+    if not kept.all():
+        columns = {name: column[kept] for name, column in columns.items()}
+        fraction = None if fraction is None else fraction[kept]
+        times, positive = times[kept], positive[kept]
     if times.dtype.kind == "f":
         # The fraction apart, because nanoseconds since 1970 would be rounded.
         fraction = times.astype(np.float64) % 1
@@ -205,14 +227,5 @@ def events_from_columns(
     nanoseconds = (times.astype(np.int64) + offset) * tick
     if fraction is not None:
         nanoseconds += np.rint(fraction * tick).astype(np.int64)
-
-    # Written with care for booleans and unsigned integers.
-    positive, zero = polarities == 1, polarities == 0
-    good = positive | zero | (polarities == -1)
-    if not good.all():
-        raise error("p", ~good, "polarities are 0 and 1, or -1 and 1: check the order of the columns")
-    negative = ~positive
-    if zero.any() and (negative & ~zero).any():
-        raise error("p", zero, "there are events of polarity -1 beside it: use 0 and 1, or -1 and 1")
-    p = np.where(positive, np.int8(1), np.int8(-1))
-    return EventStream(pixels["x"], pixels["y"], nanoseconds, p, width, height, source)
+    x, y = (columns[name].astype(np.uint16) for name in "xy")
+    return x, y, nanoseconds, np.where(positive, np.int8(1), np.int8(-1))

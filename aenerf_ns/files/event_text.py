@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -90,11 +90,10 @@ class TextEventFile(EventReader):
         return ["t", "x", "y", "p"]
 
     def _assumed_unit(self) -> TimeUnit | None:
-        return None if self._time_unit else self._unit
+        return None if self._time_unit else self._unit()
 
-    @cached_property
     def _unit(self) -> TimeUnit:
-        """The unit of the times: stated, or assumed from the times at the beginning of the file and the last one."""
+        """Return the unit of the times: stated, or assumed from the times at the beginning of the file and the last."""
         if self._time_unit:
             return self._time_unit
         with self.path.open("rb") as file:
@@ -104,7 +103,7 @@ class TextEventFile(EventReader):
         return "s" if any(fractions.any() for fractions in times) else "us"
 
     def _chunks(self) -> Iterator[EventStream]:
-        tick = NANOSECONDS[self._unit]
+        tick = NANOSECONDS[self._unit()]
         with self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
                 yield self._events(lines, tick)
@@ -116,7 +115,7 @@ class TextEventFile(EventReader):
             if beginning is None:
                 return None
             last = self._last_line(file, names)
-        tick = NANOSECONDS[self._unit]
+        tick = NANOSECONDS[self._unit()]
         first = replace(beginning, whole=beginning.whole[:, :1], fraction=beginning.fraction[:, :1])
         start, end = (int(self._events(lines, tick).t[0]) for lines in (first, last))
         return start, end
@@ -178,7 +177,7 @@ class TextEventFile(EventReader):
         columns = {}
         for name, whole, fraction in zip(_COLUMNS, lines.whole, lines.fraction, strict=True):
             columns[name] = whole + fraction if name != "t" and fraction.any() else whole
-        return events_from_columns(
+        events = events_from_columns(
             columns,
             width=self.width,
             height=self.height,
@@ -186,7 +185,9 @@ class TextEventFile(EventReader):
             fraction=lines.fraction[2],
             source=self.path,
             describe_event=lines.line_of,
+            left_out=self.left_out if self.drop_malformed else None,
         )
+        return self._stream(events)
 
 
 class CsvEventFile(TextEventFile):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numba
@@ -16,7 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.events.left_out import LeftOut
 from aenerf_ns.files.event_reader import CHUNK, Columns
+
+TIME_HIGH = 0x8
+"""The kind of word that holds the upper bits of a time, in both encodings."""
 
 # Events that one word can hold.
 _MAX_PER_WORD = 12
@@ -27,6 +32,8 @@ _UNKNOWN = np.iinfo(np.int64).min
 
 _EVT2_HIGH_BITS = 28
 _EVT3_HIGH_BITS = 12
+# Cameras of Lucid fill packets with this word.
+_PADDING = 0x9999
 # Upper bits of a time that are up to this many steps of 4.096 ms below the last ones go back in time, and the file is
 # rejected. Any other upper bits are ahead, by up to 16.7 s.
 _EVT3_BEHIND = 16
@@ -115,7 +122,7 @@ def _decode_evt3(words, position, x, y, t, p, n, state):
                         p[n] = polarity
                         n += 1
                 base += length
-        elif kind != 0x7 and kind != 0xA and kind != 0xE and kind != 0xF:
+        elif kind != 0x7 and kind != 0xA and kind != 0xE and kind != 0xF and word != _PADDING:
             break
         position += 1
     state[_HIGH], state[_LOW], state[_ROW], state[_BASE], state[_POLARITY] = high, low, row, base, polarity
@@ -133,11 +140,72 @@ class Encoding:
     name: str
     dtype: np.dtype
     decode: Callable
+    high_bits: int
+    """Upper bits of a time that a word holds."""
+    max_steps: int
+    """Steps of the upper bits in 65 ms: cameras send them far more often."""
+
+    def kinds(self, words: NDArray) -> NDArray:
+        """Return the upper 4 bits of words, which tell their kinds."""
+        return words >> 8 * self.dtype.itemsize - 4
 
 
 # Words without events (triggers, and words of vendors) are skipped. Undocumented kinds of words are errors.
-EVT2 = Encoding("EVT 2.0", np.dtype("<u4"), _decode_evt2)
-EVT3 = Encoding("EVT 3.0", np.dtype("<u2"), _decode_evt3)
+EVT2 = Encoding("EVT 2.0", np.dtype("<u4"), _decode_evt2, _EVT2_HIGH_BITS, 1 << 10)
+EVT3 = Encoding("EVT 3.0", np.dtype("<u2"), _decode_evt3, _EVT3_HIGH_BITS, 1 << 4)
+
+
+def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_out: LeftOut) -> Iterator[NDArray]:
+    """Blank out upper bits of a time that differ from those before and after them, which fit each other, and the events
+    that they would date.
+
+    One such word would move all later events by up to a lap of the time. At the end of a file, upper bits that jump are
+    blanked out as well, because none confirm them.
+
+    Args:
+        blocks: (N,) words in pieces, which may end anywhere.
+        encoding: of the words.
+        left_out: takes the events that are blanked out.
+    """
+    mask = (1 << encoding.high_bits) - 1
+    held, last = np.zeros(0, encoding.dtype), None
+    num_before = 0
+    for block in chain(blocks, (None,)):
+        words = held if block is None else np.concatenate([held, block])
+        where = np.flatnonzero(encoding.kinds(words) == TIME_HIGH)
+        # The last upper bits wait for the next ones.
+        end = len(words) if block is None or len(where) == 0 else int(where[-1])
+        if len(where):
+            high = (words[where] & mask).astype(np.int64)
+            before = np.concatenate([high[:1] if last is None else [last], high[:-1]])
+            steps = (high - before) & mask
+            steps_after = (high[1:] - before[:-1]) & mask
+            damaged = np.flatnonzero((steps_after <= encoding.max_steps) & (steps[:-1] > steps_after)).tolist()
+            if block is None and steps[-1] > encoding.max_steps:
+                damaged.append(len(where) - 1)
+            for index in damaged:
+                part = words[where[index] : where[index + 1] if index + 1 < len(where) else None]
+                number = _blank_out(part, encoding)
+                if number:
+                    left_out.add_number("after a damaged time", number, f"at word {num_before + where[index]}")
+            last = next((int(high[i]) for i in range(len(high) - 2, -1, -1) if i not in damaged), last)
+        yield words[:end]
+        held = words[end:]
+        num_before += end
+
+
+def _blank_out(words: NDArray, encoding: Encoding) -> int:
+    """Make words that hold a time or events such that hold nothing, and return the number of the events."""
+    kinds = encoding.kinds(words)
+    if encoding is EVT2:
+        has_events = kinds <= 0x1
+        number = int(has_events.sum())
+    else:
+        has_events = (kinds == 0x2) | (kinds == 0x4) | (kinds == 0x5)
+        vectors = words[kinds == 0x4] & 0xFFF, words[kinds == 0x5] & 0xFF
+        number = int((kinds == 0x2).sum()) + sum(int(word).bit_count() for part in vectors for word in part)
+    words[has_events | (kinds == TIME_HIGH)] = 0xF << 8 * encoding.dtype.itemsize - 4
+    return number
 
 
 def decode_words(

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +21,17 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import CHUNK, EventReader, resolve_sensor_size
 
+if TYPE_CHECKING:
+    from aenerf_ns.files.evt_words import Encoding
+
 HEADER_BYTES = 1 << 16
 """Far more bytes than any header has."""
 
 BLOCK = 1 << 20
 """Words of a RAW file that are read at once."""
 
-# The kind of word that holds the upper bits of a time, in the upper 4 bits of a word in both encodings. Cameras send
-# one at least every 5 ms, in which no camera sends this many words.
-_TIME_HIGH, _MAX_TIMELESS = 0x8, 1 << 20
+# Cameras send the upper bits of a time at least every 5 ms, in which no camera sends this many words.
+_MAX_TIMELESS = 1 << 20
 
 # A record of a DAT file: microseconds, then 14 bits of x, 14 of y and 4 of polarity.
 _RECORD = np.dtype([("time", "<u4"), ("address", "<u4")])
@@ -109,19 +112,23 @@ class PropheseeRawFile(EventReader):
 
     def _chunks(self) -> Iterator[EventStream]:
         # Imported lazily: every command of every method imports this module, and numba is slow to import.
-        from aenerf_ns.files.evt_words import EVT2, EVT3, decode_words, initial_state
+        from aenerf_ns.files.evt_words import EVT2, EVT3, decode_words, initial_state, without_damaged_times
 
         encoding = EVT2 if self._encoding == "EVT2" else EVT3
-        for columns in decode_words(self._blocks(encoding.dtype), encoding, initial_state(), self.path):
+        blocks = without_damaged_times(self._blocks(encoding), encoding, self.left_out)
+        for columns in decode_words(blocks, encoding, initial_state(), self.path):
             yield self._stream(columns)
 
-    def _blocks(self, dtype: np.dtype) -> Iterator[NDArray]:
+    def _blocks(self, encoding: Encoding) -> Iterator[NDArray]:
+        from aenerf_ns.files.evt_words import TIME_HIGH
+
+        dtype = encoding.dtype
         if (self.path.stat().st_size - self._begin) % dtype.itemsize:
             raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
         with self.path.open("rb") as file:
             file.seek(self._begin)
             while len(block := np.fromfile(file, dtype, BLOCK)):
-                if len(block) >= _MAX_TIMELESS and not (block >> 8 * dtype.itemsize - 4 == _TIME_HIGH).any():
+                if len(block) >= _MAX_TIMELESS and not (encoding.kinds(block) == TIME_HIGH).any():
                     raise DataError(
                         self.path,
                         f"{len(block):,} words without the upper bits of a time end at byte {file.tell():,}",

@@ -1,6 +1,6 @@
 """Events in bags of ROS 1 and ROS 2: arrays of events, and packets of encoded events.
 
-* ``dvs_msgs/EventArray``, and ``prophesee_event_msgs/EventArray`` with the same fields:
+* ``dvs_msgs/EventArray``, and those of ``dv_ros_msgs`` and ``prophesee_event_msgs`` with the same fields:
   https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
 * ``event_camera_msgs/EventPacket``: https://github.com/ros-event-camera/event_camera_msgs
 
@@ -37,7 +37,7 @@ BAG_MAGIC = (_ROS1_MAGIC, b"SQLite format 3\0", b"\x89MCAP0\r\n")
 _MCAP_MAGIC, _MCAP_FOOTER = BAG_MAGIC[2], 0x02
 
 _PACKET_TYPE = "event_camera_msgs/msg/EventPacket"
-_ARRAY_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+_ARRAY_TYPES = tuple(f"{name}/msg/EventArray" for name in ("dvs_msgs", "dv_ros_msgs", "prophesee_event_msgs"))
 # ROS 1 serializes an event without padding. ROS 2 aligns each number to its size; see `_aligned_events`.
 _EVENT_FIELDS = {"x": "<u2", "y": "<u2", "seconds": "<u4", "nanoseconds": "<u4", "polarity": "?"}
 _PACKED_EVENT = np.dtype(list(_EVENT_FIELDS.items()))

@@ -74,7 +74,9 @@ class EventDataParser(DataParser):
         """
         with reading(Path(self.config.data)):
             if self._lacks_poses():
-                return self.read_capture()
+                capture, frames = self.read_capture()
+                capture.event_file.drop_malformed = self.config.drop_malformed
+                return capture, frames
         views = [view for split in self.recording.reference_views.values() for view in split]
         timed = {view.time: view.file for view in views if view.time is not None}
         return self.recording, sorted(timed.items())
@@ -103,6 +105,7 @@ class EventDataParser(DataParser):
                 raise
             hint = f"the format {self.guessed_format} was guessed: where it is another, name it, in aenerf as --format"
             raise DataError(error.source, error.problem, f"{error.remedy} ({hint})") from None
+        recording.event_file.drop_malformed = self.config.drop_malformed
         self._check_lens(recording.event_camera, "event camera")
         if any(recording.reference_views.values()):
             self._check_lens(recording.frame_camera, "camera of the images")

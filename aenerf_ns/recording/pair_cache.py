@@ -27,6 +27,8 @@ from aenerf_ns.events.stream import EventFile
 _VERSION = 1
 # The end of the file: length of the description as JSON in front of it, and this word.
 _WORD = b"aenerf-pairs"
+# What a reader of events has beside its options.
+_NOT_OPTIONS = ("path", "left_out", "_told")
 _NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "int")
 
 
@@ -40,7 +42,7 @@ class PairFile:
 
     def __init__(self, events: EventFile, made_from: Mapping[str, Any]) -> None:
         self.path = events.path.with_name(events.path.name + ".pairs")
-        options = {name: repr(value) for name, value in vars(events).items() if name != "path"}
+        options = {name: repr(value) for name, value in vars(events).items() if name not in _NOT_OPTIONS}
         stated = {"version": _VERSION, "files": _stamps(events.path), "reader": options, **made_from}
         # JSON turns tuples into lists: compare what reading the file gives.
         self._made_from = json.loads(json.dumps(stated))

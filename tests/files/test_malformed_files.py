@@ -146,7 +146,7 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "npz: fractional pixel": (replaced("y", ZEROS + 0.5), "event 0 has y = 0.5; it must be a whole number"),
     "npz: three polarities": (replaced("p", np.arange(N) % 3 - 1), "event 1 has p = 0; .* -1 beside it"),
     "npz: NaN time": (replaced("t", np.full(N, np.nan)), "event 0 has t = nan; check the unit"),
-    "npz: unsorted": (replaced("t", T[::-1].copy()), "sort the events by time"),
+    "npz: unsorted": (replaced("t", T[::-1].copy()), "not sorted by time"),
     "h5: missing": (None, "there is no such file"),
     "h5: of text": (b"x y", "not a readable HDF5 file"),
     "h5: no events in HDF5": (replaced("p", None), "it holds t, x, y; events must be in"),

@@ -19,7 +19,7 @@ def evt2(rows: Rows) -> bytes:
     for x, y, t, p in rows:
         if (t >> 6) != high:
             high = t >> 6
-            words.append(0x8 << 28 | high & 0xFFFFFFF)
+            words += [0x8 << 28 | high & 0xFFFFFFF] * 2
         words.append((p > 0) << 28 | (t & 0x3F) << 22 | x << 11 | y)
     header = f"% evt 2.0\n% geometry {WIDTH}x{HEIGHT}\n% end\n".encode()
     return header + np.array(words, "<u4").tobytes()

@@ -1,0 +1,80 @@
+"""Events that a reader leaves out because they are malformed: which these are, and how many."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.errors import DataError
+
+# Of more than this share a file is not a recording with a few faults, but read wrongly. A few events are always few.
+_MAX_SHARE, _FEW = 0.001, 10
+
+
+class LeftOut:
+    """Counts the events that are left out while a file is read, by the reason.
+
+    Attributes:
+        last_time: nanoseconds of the last event that was kept, or None.
+    """
+
+    def __init__(self) -> None:
+        self.last_time: int | None = None
+        self._counts: dict[str, int] = {}
+        self._first: dict[str, str] = {}
+
+    def add(self, reason: str, bad: NDArray[np.bool_], describe: Callable[[int], str]) -> None:
+        """Count the events of a piece that are left out for a reason; ``describe`` says where one is."""
+        if bad.any():
+            self.add_number(reason, int(bad.sum()), describe(int(np.argmax(bad))))
+
+    def add_number(self, reason: str, number: int, where: str) -> None:
+        """Count events that are left out for a reason, the first of them at a place."""
+        self._counts[reason] = self._counts.get(reason, 0) + number
+        self._first.setdefault(reason, where)
+
+    def add_out_of_order(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Count the fewest events whose absence leaves (N,) times in order, and return which to keep."""
+        keep = np.ones(len(times), bool) if self.last_time is None else times >= self.last_time
+        if (np.diff(times[keep]) < 0).any():
+            keep[keep] = _longest_ordered(times[keep])
+        self.add("out of order", ~keep, lambda index: f"at {times[index]} ns")
+        if keep.any():
+            self.last_time = int(times[keep][-1])
+        return keep
+
+    def summary(self) -> str:
+        """Describe in words what is left out; empty if it is nothing."""
+        return ", ".join(f"{n:,} {reason} (the first {self._first[reason]})" for reason, n in self._counts.items())
+
+    def require_few(self, source: Path, num_kept: int) -> None:
+        """Raise a DataError if so many events are left out that the file must have been read wrongly."""
+        number = sum(self._counts.values())
+        if number > max(_FEW, _MAX_SHARE * (num_kept + number)):
+            raise DataError(
+                source,
+                f"{number:,} of its {num_kept + number:,} events are malformed: {self.summary()}",
+                "only a thousandth may be left out: check the sensor's size, the format and the unit of the times",
+            )
+
+
+def _longest_ordered(times: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which of (N,) times are in the longest subsequence that never decreases."""
+    # For each length, the smallest time that ends such a subsequence, and its index.
+    ends: list[int] = []
+    indices: list[int] = []
+    before = np.empty(len(times), np.int64)
+    for index, time in enumerate(times.tolist()):
+        length = bisect_right(ends, time)
+        before[index] = indices[length - 1] if length else -1
+        ends[length : length + 1], indices[length : length + 1] = [time], [index]
+    keep = np.zeros(len(times), bool)
+    index = indices[-1]
+    while index >= 0:
+        keep[index] = True
+        index = int(before[index])
+    return keep

@@ -1,0 +1,168 @@
+"""A few malformed events, which can be left out: they are counted and named, and the others are read as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tyro
+from helpers.bag_writers import ARRAY, array_message, write_bag
+from helpers.event_file_checks import read
+from helpers.event_file_writers import HEADER2, HEADER3, HEIGHT, WIDTH, Rows, aedat4_file, dat, evt2, evt3, words
+from helpers.own_recordings import random_events, write_calibration, write_poses
+
+from aenerf_ns.cli.convert import Convert
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.open import open_event_file
+
+ROWS: Rows = [(i % WIDTH, i % HEIGHT, 100_000 + 10 * i, 1 - 2 * (i % 2)) for i in range(5000)]
+
+
+def as_hdf5(path: Path, rows: Rows) -> None:
+    with h5py.File(path, "w") as file:
+        for name, column, dtype in zip("xytp", zip(*rows, strict=True), "HHqb", strict=True):
+            file[f"events/{name}"] = np.array(column, dtype)
+
+
+def as_npz(path: Path, rows: Rows) -> None:
+    np.savez(path, **dict(zip("xytp", np.array(rows).T, strict=True)))
+
+
+def as_text(path: Path, rows: Rows) -> None:
+    path.write_text("".join(f"{t} {x} {y} {p > 0:d}\n" for x, y, t, p in rows))
+
+
+def as_csv(path: Path, rows: Rows) -> None:
+    path.write_text("x,y,t,p\n" + "".join(f"{x},{y},{t},{p}\n" for x, y, t, p in rows))
+
+
+def as_bag(path: Path, rows: Rows) -> None:
+    messages = [(i, array_message(rows[i : i + 100])) for i in range(0, len(rows), 100)]
+    write_bag(path, {"/events": (ARRAY, messages)})
+
+
+def in_bytes(encode: Callable[[Rows], bytes]) -> Callable[[Path, Rows], None]:
+    return lambda path, rows: path.write_bytes(encode(rows)) and None
+
+
+WRITERS = {
+    ".h5": as_hdf5,
+    ".npz": as_npz,
+    ".txt": as_text,
+    ".csv": as_csv,
+    ".bag": as_bag,
+    ".dat": in_bytes(dat),
+    ".aedat4": in_bytes(aedat4_file),
+    ".evt2.raw": in_bytes(evt2),
+    ".evt3.raw": in_bytes(evt3),
+}
+
+
+def opened(path: Path) -> EventFile:
+    states_size = path.suffix in (".dat", ".aedat4", ".raw", ".bag")
+    return open_event_file(path) if states_size else open_event_file(path, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_leave_out_a_few_malformed_events(suffix: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = folder / f"faults{suffix}"
+    early, late, outside = (7, 7, 100_010, 1), (7, 7, 149_000, 1), (1, HEIGHT + 3, 120_000, 1)
+    rows = [*ROWS[:1000], early, *ROWS[1000:2000], outside, *ROWS[2000:4000], late, *ROWS[4000:]]
+    if suffix == ".evt2.raw":
+        # Its upper bits cannot go back and forth without looking damaged.
+        rows.remove(late)
+    WRITERS[suffix](path, rows)
+    with pytest.raises(DataError, match=r"drop-malformed|check the sensor size"):
+        read(opened(path))
+    file = opened(path)
+    file.drop_malformed = True
+    np.testing.assert_array_equal(read(file)[:, 2], [t * 1000 for _, _, t, _ in ROWS])
+    assert file.time_span() == (ROWS[0][2] * 1000, ROWS[-1][2] * 1000)
+    said = capsys.readouterr().out
+    assert "out of order (the first at 100010000 ns)" in said
+    assert (
+        f"y = {HEIGHT + 3}" in said
+        or f"impossible y (the first {'line' if suffix in ('.txt', '.csv') else 'event'}" in said
+    )
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".dat"])
+def test_refuse_many_malformed_events(suffix: str, folder: Path) -> None:
+    path = folder / f"shuffled{suffix}"
+    WRITERS[suffix](path, [ROWS[i] for i in np.random.default_rng(0).permutation(len(ROWS))])
+    file = opened(path)
+    file.drop_malformed = True
+    with pytest.raises(DataError, match=r"of its 5,000 events are malformed.*only a thousandth"):
+        read(file)
+
+
+def evt3_of(*values: int) -> bytes:
+    return HEADER3 + words("<u2", *values)
+
+
+def evt2_of(*values: int) -> bytes:
+    return HEADER2 + words("<u4", *values)
+
+
+def after_an_event(*values: int) -> bytes:
+    return evt3_of(0x8010, 0x6001, 1, 0x2001, *values)
+
+
+FIRST, NEXT = 0x10001, 0x10003
+DAMAGED = {
+    # Words, the times in microseconds of the events that are left, and how many are left out.
+    "evt3: ahead": (after_an_event(0x8810, 0x2001, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 1),
+    "evt3: one step ahead": (after_an_event(0x8011, 0x2001, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 1),
+    "evt3: one step back": (after_an_event(0x800F, 0x2001, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 1),
+    "evt3: at a step": (after_an_event(0x8A00, 0x2001, 0x2002, 0x8011, 0x6003, 0x2001), [FIRST, 0x11003], 2),
+    "evt3: at the end": (after_an_event(0x8810, 0x2001, 0x2002), [FIRST], 2),
+    "evt3: vectors": (after_an_event(0x3001, 0x8810, 0x4005, 0x5003, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 4),
+    "evt3: a pause": (after_an_event(0x8810, 0x8810, 0x6003, 0x2001), [FIRST, 0x810003], 0),
+    "evt2: ahead": (evt2_of(0x80000010, 0x10000801, 0x88000010, 0x10000801, 0x80000010, 0x10400801), [1024, 1025], 1),
+    "evt2: back": (evt2_of(0x80000010, 0x10000801, 0x80000002, 0x10000801, 0x80000010, 0x10400801), [1024, 1025], 1),
+    "evt2: a pause": (evt2_of(0x80000010, 0x10000801, 0x80008010, 0x80008010, 0x10400801), [1024, 0x200401], 0),
+}
+
+
+@pytest.mark.parametrize("block", [1, 4, 1000])
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_damaged_time_does_not_move_later_events(
+    kind: str, block: int, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("aenerf_ns.files.prophesee.BLOCK", block)
+    content, times, number = DAMAGED[kind]
+    path = folder / "damaged.raw"
+    path.write_bytes(content)
+    assert (read(open_event_file(path))[:, 2] // 1000).tolist() == times
+    said = capsys.readouterr().out
+    assert (f"{number} after a damaged time (the first at word" in said) == (number > 0)
+
+
+def test_skip_padding_of_lucid_cameras(folder: Path) -> None:
+    path = folder / "padded.raw"
+    path.write_bytes(evt3_of(0x8010, 0x6001, 1, 0x2001, 0x9999, 0x9999, 0x6002, 0x2002, 0x9999))
+    assert (read(open_event_file(path))[:, 2] // 1000).tolist() == [0x10001, 0x10002]
+    path.write_bytes(evt3_of(0x8010, 0x6001, 1, 0x2001, 0x9998))
+    with pytest.raises(DataError, match="is 0x9998, which EVT 3"):
+        read(open_event_file(path))
+
+
+def test_convert_leaves_out_malformed_events(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    events = random_events()
+    write_calibration(tmp_path / "calibration.json")
+    write_poses(tmp_path / "trajectory.txt")
+    events["y"][17] = 306
+    events["t"] = np.round(events["t"] * 1e6).astype(np.int64)
+    events["t"][[500, 501]] -= 100_000
+    np.savez(tmp_path / "events.npz", **events)
+    words = [str(tmp_path), "--output", str(tmp_path / "made")]
+    with pytest.raises(DataError, match="event 17 has y = 306"):
+        tyro.cli(Convert, args=words).main()
+    tyro.cli(Convert, args=[*words, "--drop-malformed"]).main()
+    said = capsys.readouterr().out
+    assert "1 with an impossible y (the first event 17, 306), 2 out of order (the first at " in said
+    assert "1,997 of 1,997 events" in said
