@@ -194,7 +194,10 @@ def test_format_takes_options(name: str, options: tuple[str, ...], values: dict[
 @pytest.mark.parametrize(
     ("option", "part"),
     [
-        ("nonsense=1", "not an option of ecd-data; write KEY=VALUE with one of max_pose_gap_ns, positive"),
+        (
+            "nonsense=1",
+            "not an option of ecd-data; write KEY=VALUE with one of max_pose_gap_ns, drop_malformed, positive",
+        ),
         ("F", "not an option of ecd-data; write KEY=VALUE"),
         # Commands keep the world of the recording.
         ("scale_factor=2", "not an option of ecd-data"),

@@ -84,10 +84,7 @@ def test_leave_out_a_few_malformed_events(suffix: str, folder: Path, capsys: pyt
     assert file.time_span() == (ROWS[0][2] * 1000, ROWS[-1][2] * 1000)
     said = capsys.readouterr().out
     assert "out of order (the first at 100010000 ns)" in said
-    assert (
-        f"y = {HEIGHT + 3}" in said
-        or f"impossible y (the first {'line' if suffix in ('.txt', '.csv') else 'event'}" in said
-    )
+    assert f"y = {HEIGHT + 3}" in said or "impossible y (the first " in said
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".dat"])
