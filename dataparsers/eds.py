@@ -13,7 +13,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_AT_TOP, Hdf5TableFile
-from aenerf_ns.files.kalibr import read_camchain
+from aenerf_ns.files.kalibr import motion_between, read_camchain
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
@@ -82,9 +82,7 @@ class EdsDataParser(EventDataParser):
         cameras = read_camchain(path)
         if not {"cam0", "cam1"} <= set(cameras):
             raise DataError(path, f"its cameras are {', '.join(cameras)}", "it must hold cam0 and cam1")
-        frame_camera, _ = cameras["cam0"]
-        event_camera, event_from_frame = cameras["cam1"]
-        return event_camera, frame_camera, event_from_frame
+        return cameras["cam1"].lens, cameras["cam0"].lens, motion_between(path, cameras, "cam0", "cam1")
 
 
 eds_dataparser = DataParserSpecification(

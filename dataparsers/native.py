@@ -10,12 +10,20 @@ import torch
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.files.limits import file_inside
-from aenerf_ns.files.transforms import EventCamera, Transforms, read_transforms, rigid_motion, sensor_values
+from aenerf_ns.files.transforms import (
+    EventCamera,
+    Transforms,
+    frame_from_event,
+    read_transforms,
+    rigid_motion,
+    sensor_values,
+)
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig, SensorOptions
@@ -57,7 +65,7 @@ class NativeDataParser(EventDataParser):
         return Recording(
             **vars(capture),
             trajectory=trajectory,
-            reference_views=_read_views(path, meta, trajectory, ground_truth),
+            reference_views=_read_views(path, meta, capture.frame_camera, trajectory, ground_truth),
             scene_box=None if meta.scene_box is None else torch.tensor(meta.scene_box, dtype=torch.float64),
             ground_truth=ground_truth,
             max_pose_gap=meta.max_pose_gap_ns,
@@ -100,11 +108,13 @@ class NativeDataParser(EventDataParser):
 
 
 def _read_views(
-    path: Path, meta: Transforms, trajectory: Trajectory, ground_truth: Trajectory | None
+    path: Path, meta: Transforms, lens: CameraIntrinsics, trajectory: Trajectory, ground_truth: Trajectory | None
 ) -> dict[Split, list[ReferenceView]]:
     """Return the images of each split. A frame that has a time but no pose gets the reference trajectory's pose."""
     reference = trajectory if ground_truth is None else ground_truth
-    mount = rigid_motion(path, "event_camera.T_frame_event", meta.event_camera.T_frame_event)
+    mount = torch.eye(4, dtype=torch.float64)
+    if meta.event_camera.T_frame_event is not None or any(frame.transform_matrix is None for frame in meta.frames):
+        mount = frame_from_event(path, meta.event_camera, lens)
     views: dict[str, ReferenceView] = {}
     known: set[str] = set()
     for index, frame in enumerate(meta.frames):

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.kalibr import read_camchain
-from aenerf_ns.files.transforms import read_transforms, rigid_motion, sensor_values
+from aenerf_ns.files.kalibr import motion_between, read_camchain
+from aenerf_ns.files.transforms import frame_from_event, read_transforms, sensor_values
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,8 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
         meta, lens = read_transforms(path)
         with value_errors_as_data_error(path):
             sensor = SensorModel(**sensor_values(meta.event_camera))
-        frame_from_event = rigid_motion(path, "event_camera.T_frame_event", meta.event_camera.T_frame_event)
-        return Calibration(meta.event_camera.intrinsics(), lens, frame_from_event, sensor, meta.image_encoding)
+        motion = frame_from_event(path, meta.event_camera, lens)
+        return Calibration(meta.event_camera.intrinsics(), lens, motion, sensor, meta.image_encoding)
     cameras = read_camchain(path)
     if event_camera is None and len(cameras) > 1:
         raise DataError(path, f"its cameras are {', '.join(cameras)}", "name that of the events as --event-camera")
@@ -56,6 +55,5 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
     for name in (event_name, frame_name):
         if name not in cameras:
             raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
-    event, event_from_first = cameras[event_name]
-    frame, frame_from_first = cameras[frame_name]
-    return Calibration(event, frame, frame_from_first @ torch.linalg.inv(event_from_first), SensorModel(), "linear")
+    motion = motion_between(path, cameras, event_name, frame_name)
+    return Calibration(cameras[event_name].lens, cameras[frame_name].lens, motion, SensorModel(), "linear")

@@ -31,7 +31,7 @@ _MAX_LINE = 1 << 24
 _MAX_IMAGES = 200_000
 _MAX_TEXT_BYTES = 1 << 32
 
-Row = tuple[str, list[float]]
+Row = tuple[str, list[float], int]
 
 
 def read_colmap_poses(model: Path) -> dict[str, Tensor]:
@@ -55,11 +55,20 @@ def read_colmap_poses(model: Path) -> dict[str, Tensor]:
             rows = list(_read_binary(path, file) if path == binary else _read_text(path, file))
     if not rows:
         raise DataError(path, "it has no image", "reconstruct again")
-    if len(dict(rows)) < len(rows):
+    names, columns, cameras = zip(*rows, strict=True)
+    if len(set(names)) < len(names):
         raise _damaged(path, "it names an image twice")
-    values = np.array([values for _, values in rows])
+    # Each image has its own camera where COLMAP was not told that there is one.
+    num_cameras = len(set(cameras))
+    if 1 < num_cameras < len(names):
+        raise DataError(
+            path,
+            f"its images are of {num_cameras} cameras, and how these are mounted on the event camera is not known",
+            "give a model of the images of one camera",
+        )
+    values = np.array(columns)
     world_to_camera = poses_from_quaternions(path, values[:, 4:7], values[:, [1, 2, 3, 0]])
-    return dict(zip([name for name, _ in rows], torch.linalg.inv(world_to_camera), strict=True))
+    return dict(zip(names, torch.linalg.inv(world_to_camera), strict=True))
 
 
 def _read_binary(path: Path, file: BinaryIO) -> Iterator[Row]:
@@ -69,7 +78,7 @@ def _read_binary(path: Path, file: BinaryIO) -> Iterator[Row]:
         if count > min(_MAX_IMAGES, size // _IMAGE.size):
             raise _damaged(path, f"its header states {count:,} images, but it has {size:,} bytes")
         for index in range(count):
-            _, *values, _ = _IMAGE.unpack(file.read(_IMAGE.size))
+            _, *values, camera = _IMAGE.unpack(file.read(_IMAGE.size))
             if not any(values[:4]):
                 raise _damaged(path, f"image {index + 1} has no rotation")
             begin = file.tell()
@@ -82,7 +91,7 @@ def _read_binary(path: Path, file: BinaryIO) -> Iterator[Row]:
             if end_of_image > size:
                 raise _damaged(path, f"it ends within the {num_features:,} features of image {index + 1}")
             file.seek(end_of_image)
-            yield name.decode("utf-8", "replace"), values
+            yield name.decode("utf-8", "replace"), values, camera
     except struct.error:
         raise _damaged(path, "it ends within an image") from None
 
@@ -104,8 +113,8 @@ def _read_text(path: Path, file: BinaryIO) -> Iterator[Row]:
             if not fields:
                 continue
             try:
-                _, *values, _ = (float(field) for field in fields[:9])
-                yield fields[9], values
+                _, *values, camera = (float(field) for field in fields[:9])
+                yield fields[9], values, int(camera)
             except (ValueError, IndexError):
                 raise _damaged(path, f"line {number} is not an image: {line[:40]!r}") from None
         is_pose = not is_pose

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,9 +39,16 @@ class _Camera(msgspec.Struct, kw_only=True):
         return CameraIntrinsics.from_opencv(self.resolution, self.intrinsics, distortion, self.distortion_model)
 
 
-def read_camchain(path: Path) -> dict[str, tuple[CameraIntrinsics, Tensor]]:
-    """Read the cameras of a camchain by name: each lens, and the (4, 4) float64 matrix that takes points from the
-    first camera's coordinates to its own.
+@dataclass(frozen=True)
+class ChainCamera:
+    """A camera of a camchain: its lens, and the (4, 4) float64 motion from the camera before it, None if not stated."""
+
+    lens: CameraIntrinsics
+    from_previous: Tensor | None
+
+
+def read_camchain(path: Path) -> dict[str, ChainCamera]:
+    """Read the cameras of a camchain by name, in the order of the chain.
 
     Raises:
         DataError: the file is missing or malformed, or a camera model is not supported.
@@ -50,11 +58,28 @@ def read_camchain(path: Path) -> dict[str, tuple[CameraIntrinsics, Tensor]]:
     chain = {name: value for name, value in chain.items() if isinstance(value, dict)}
     if not chain:
         raise DataError(path, "it holds no camera", _REMEDY)
-    cameras: dict[str, tuple[CameraIntrinsics, Tensor]] = {}
-    from_first = torch.eye(4, dtype=torch.float64)
-    for name in sorted(chain):
+    cameras: dict[str, ChainCamera] = {}
+    # cam10 follows cam9.
+    for name in sorted(chain, key=lambda name: (len(name), name)):
         camera = convert(path, chain[name], _Camera, _REMEDY, name)
-        if cameras:
-            from_first = rigid_motion(path, f"{name}.T_cn_cnm1", camera.T_cn_cnm1) @ from_first
-        cameras[name] = (camera.lens(), from_first)
+        stated = camera.T_cn_cnm1 is not None
+        motion = rigid_motion(path, f"{name}.T_cn_cnm1", camera.T_cn_cnm1) if stated else None
+        cameras[name] = ChainCamera(camera.lens(), motion)
     return cameras
+
+
+def motion_between(path: Path, cameras: dict[str, ChainCamera], source: str, target: str) -> Tensor:
+    """Return the (4, 4) float64 motion from one camera's to another one's coordinates.
+
+    Raises:
+        DataError: the chain does not state the motion between two cameras on the way.
+    """
+    names = list(cameras)
+    first, last = sorted((names.index(source), names.index(target)))
+    motion = torch.eye(4, dtype=torch.float64)
+    for name in names[first + 1 : last + 1]:
+        step = cameras[name].from_previous
+        if step is None:
+            raise DataError(path, f"{name} has no T_cn_cnm1", "calibrate both cameras in one run of Kalibr, or add it")
+        motion = step @ motion
+    return motion if names.index(source) == first else torch.linalg.inv(motion)

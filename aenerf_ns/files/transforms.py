@@ -13,6 +13,7 @@ from torch import Tensor
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import require_rigid
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
 
@@ -114,14 +115,26 @@ def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
     return meta, convert(path, values, FrameCamera).intrinsics()
 
 
-def rigid_motion(path: Path, name: str, matrix: Matrix | None) -> Tensor:
-    """Return the (4, 4) float64 matrix that a file has under a name, the identity for None.
+def frame_from_event(path: Path, camera: EventCamera, frame_lens: CameraIntrinsics) -> Tensor:
+    """Return the (4, 4) float64 motion from the event camera's to the frame camera's coordinates.
 
     Raises:
-        DataError: it is not a rotation and a translation.
+        DataError: it is missing, and the lenses say that these are two cameras; or it is no motion.
+    """
+    if camera.T_frame_event is None and camera.intrinsics() == frame_lens:
+        return torch.eye(4, dtype=torch.float64)
+    return rigid_motion(path, "event_camera.T_frame_event", camera.T_frame_event)
+
+
+def rigid_motion(path: Path, name: str, matrix: Matrix | None) -> Tensor:
+    """Return the (4, 4) float64 matrix that a file has under a name.
+
+    Raises:
+        DataError: it is missing, or not a rotation and a translation.
     """
     if matrix is None:
-        return torch.eye(4, dtype=torch.float64)
+        remedy = "state how the one camera is mounted on the other (4 x 4); a beam splitter is the identity"
+        raise DataError(path, f"{name} is missing", remedy)
     motion = torch.tensor(matrix, dtype=torch.float64)
     require_rigid(motion[None], f"{path}: {name}")
     return motion

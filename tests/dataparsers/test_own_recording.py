@@ -95,3 +95,38 @@ def test_colmap_model_gives_poses_of_its_images(place: str, tmp_path: Path, caps
     # The images are where COLMAP put them.
     for view, pose in zip(recording.reference_views["train"], truth.poses[[0, 5, 10]], strict=True):
         np.testing.assert_allclose(view.camera_to_world.numpy(), pose, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("pair", [("cam0", "cam1"), ("cam1", "cam0")])
+def test_refuse_a_mount_that_the_camchain_lacks(pair: tuple[str, str], tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    (truth.data / "calibration.json").unlink()
+    chain = {name: {k: v for k, v in camera.items() if k != "T_cn_cnm1"} for name, camera in CAMCHAIN.items()}
+    (truth.data / "camchain.yaml").write_text(yaml.dump(chain))
+    with pytest.raises(DataError, match="cam1 has no T_cn_cnm1"):
+        recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera=pair[0], frame_camera=pair[1]))
+    # One camera needs no mount.
+    recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera=pair[0]))
+
+
+def test_refuse_a_mount_that_the_calibration_lacks(tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    path = truth.data / "calibration.json"
+    calibration = {**CALIBRATION, "w": 80, "h": 60, "fl_x": 70.0, "fl_y": 71.0, "cx": 40.0, "cy": 30.0}
+    calibration["event_camera"] = {k: v for k, v in CALIBRATION["event_camera"].items() if k != "T_frame_event"}
+    path.write_text(json.dumps(calibration))
+    with pytest.raises(DataError, match="T_frame_event is missing; state how the one camera is mounted on the other"):
+        recording_of(OwnRecordingDataParserConfig(data=truth.data))
+    calibration["event_camera"]["T_frame_event"] = np.eye(4).tolist()
+    path.write_text(json.dumps(calibration))
+    recording_of(OwnRecordingDataParserConfig(data=truth.data))
+
+
+def test_refuse_a_colmap_model_of_several_cameras(tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    (truth.data / "trajectory.txt").unlink()
+    write_colmap(truth.data / "colmap", truth.poses[[0, 5, 10]], [f"{index:05d}.png" for index in range(3)])
+    path = truth.data / "colmap" / "images.txt"
+    path.write_text(path.read_text().replace("1 00002.png", "2 00002.png"))
+    with pytest.raises(DataError, match="its images are of 2 cameras, and how these are mounted"):
+        recording_of(OwnRecordingDataParserConfig(data=truth.data))
