@@ -15,7 +15,7 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.calibration import read_calibration
-from aenerf_ns.files.colmap import read_colmap_poses
+from aenerf_ns.files.colmap import read_colmap_focal_shares, read_colmap_poses
 from aenerf_ns.files.limits import require_one
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit
@@ -26,6 +26,8 @@ from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_trajectory
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml")
+# COLMAP's own estimate may be off by some percent.
+_MAX_FOCAL_RATIO = 1.15
 
 
 @dataclass
@@ -83,7 +85,7 @@ class OwnRecordingDataParser(EventDataParser):
             images = self._image_list(folder)
             if not timed:
                 raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
-            reference = _read_colmap(poses, timed, images, frame_from_event)
+            reference = _read_colmap(poses, timed, images, frame_from_event, capture.frame_camera)
         else:
             reference = read_tum_trajectory(poses)
         views = views_on_trajectory(
@@ -140,10 +142,21 @@ class OwnRecordingDataParser(EventDataParser):
         return open_event_file(config.events, camera.width, camera.height, config.event_topic, config.event_time_unit)
 
 
-def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor) -> Trajectory:
+def _read_colmap(
+    model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor, lens: CameraIntrinsics
+) -> Trajectory:
     """Return the event camera's trajectory: a pose for each image that a COLMAP model places."""
     folders = [folder for folder in (model, model / "sparse" / "0", model / "0") if any(folder.glob("images.*"))]
-    poses = read_colmap_poses(folders[0] if folders else model)
+    model = folders[0] if folders else model
+    poses = read_colmap_poses(model)
+    for share in read_colmap_focal_shares(model):
+        if not 1 / _MAX_FOCAL_RATIO < share * lens.width / lens.fx < _MAX_FOCAL_RATIO:
+            raise DataError(
+                model,
+                f"its focal length is {share * lens.width:.4g} px, that of the calibration {lens.fx:.4g} px",
+                "estimate the poses again with the calibrated lens (aenerf convert --poses colmap), or correct the "
+                "calibration",
+            )
     known: dict[int, Tensor] = {}
     for name, pose in poses.items():
         times = [time for time, file in timed if file.as_posix().endswith(f"/{name}")]
@@ -154,7 +167,7 @@ def _read_colmap(model: Path, timed: list[tuple[int, Path]], images: Path, frame
     if len(order) < len(timed):
         CONSOLE.print(f"COLMAP placed {len(order)} of the {len(timed)} images: poses are interpolated between these.")
     frames = torch.stack([known[time] for time in order])
-    return Trajectory(order, frames @ frame_from_event, folders[0])
+    return Trajectory(order, frames @ frame_from_event, model)
 
 
 own_recording_dataparser = DataParserSpecification(

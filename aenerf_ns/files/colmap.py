@@ -17,12 +17,16 @@ import torch
 from torch import Tensor
 
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.limits import require_at_most
+from aenerf_ns.files.limits import MAX_TABLE_BYTES, require_at_most
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions
 
 # The image's number, its world-to-camera rotation as qw qx qy qz and translation, and its camera's number.
 _IMAGE = struct.Struct("<I7dI")
 _COUNT = struct.Struct("<Q")
+# The camera's number, the number of its model, width, height, and the first parameter, which is a focal length.
+_CAMERA = struct.Struct("<IiQQd")
+# Parameters of the models, by their numbers.
+_NUM_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)
 # A feature holds x, y and the number of its 3D point.
 _FEATURE_BYTES = 24
 _MAX_NAME = 4096
@@ -69,6 +73,33 @@ def read_colmap_poses(model: Path) -> dict[str, Tensor]:
     values = np.array(columns)
     world_to_camera = poses_from_quaternions(path, values[:, 4:7], values[:, [1, 2, 3, 0]])
     return dict(zip(names, torch.linalg.inv(world_to_camera), strict=True))
+
+
+def read_colmap_focal_shares(model: Path) -> list[float]:
+    """Return the focal length of each camera in a model, as a share of the width of its images.
+
+    Raises:
+        DataError: the file is damaged. There are no cameras if it is missing.
+    """
+    with reading(model):
+        binary, text = model / "cameras.bin", model / "cameras.txt"
+        path = binary if binary.is_file() else text
+        if not path.is_file():
+            return []
+        require_at_most(path, MAX_TABLE_BYTES)
+        content = path.read_bytes()
+    try:
+        if path == text:
+            rows = [line.split() for line in content.decode("utf-8", "replace").splitlines()]
+            return [float(row[4]) / int(row[2]) for row in rows if row and not row[0].startswith("#")]
+        shares, position = [], _COUNT.size
+        for _ in range(*_COUNT.unpack_from(content)):
+            _, kind, width, _, focal = _CAMERA.unpack_from(content, position)
+            shares.append(focal / width)
+            position += _CAMERA.size + 8 * (_NUM_PARAMETERS[kind] - 1)
+        return shares
+    except (struct.error, ValueError, IndexError, ZeroDivisionError) as error:
+        raise _damaged(path, f"a camera cannot be read: {error}") from None
 
 
 def _read_binary(path: Path, file: BinaryIO) -> Iterator[Row]:

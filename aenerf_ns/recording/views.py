@@ -14,8 +14,9 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.limits import file_inside
-from aenerf_ns.files.text import TimeUnit, parse_times, read_rows
+from aenerf_ns.files.text import UNIT_NAMES, TimeUnit, parse_times, read_rows
 from aenerf_ns.recording.recording import ReferenceView, Split
+from aenerf_ns.recording.time_units import unit_steps
 
 IMAGE_LIST = "images.txt"
 """The file in a folder that holds, on each line, a time in seconds and an image."""
@@ -61,8 +62,11 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
         with reading(file):
             if not file.is_file():
                 raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
-    times = parse_times(path, [row[0] for row in rows])
-    return list(zip(times.tolist(), files, strict=True))
+    times = parse_times(path, [row[0] for row in rows]).tolist()
+    if len(set(times)) < len(times):
+        seconds = max(times, key=times.count) * 1e-9
+        raise DataError(path, f"several images are at {seconds:.9f} s", "give each image its own time, with all digits")
+    return list(zip(times, files, strict=True))
 
 
 def read_image_times(folder: Path, path: Path, unit: TimeUnit) -> list[tuple[int, Path]]:
@@ -107,6 +111,8 @@ def views_on_trajectory(
     """
     known = trajectory.known_time(max_pose_gap)
     kept = [(time, file) for time, file in images if known.contains(time)]
+    if len(kept) <= max(1, len(images) // 10):
+        _require_seconds([time for time, _ in images], images[0][1].parent if images else Path(), trajectory)
     if len(kept) < len(images):
         CONSOLE.print(
             f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses."
@@ -114,6 +120,19 @@ def views_on_trajectory(
     mount = torch.eye(4, dtype=torch.float64) if event_from_frame is None else event_from_frame
     views = [ReferenceView(file, homogeneous(trajectory.interpolate(time)) @ mount, time) for time, file in kept]
     return {"train": views, "val": views[::2], "test": views[1::2]}
+
+
+def _require_seconds(times: list[int], source: Path, trajectory: Trajectory) -> None:
+    """Raise a DataError if images were taken on a trajectory only if their times have another unit than seconds."""
+    power = unit_steps((min(times), max(times)), (trajectory.start, trajectory.end)) if len(times) > 1 else None
+    if power is not None and power < 0:
+        seconds = (max(times) - min(times)) * 1e-9
+        raise DataError(
+            source,
+            f"the poses last {trajectory.duration:g} s and the images {seconds:g} s, as if the times of the images "
+            f"were in {list(UNIT_NAMES.values())[power - 1]}",
+            "write them in seconds",
+        )
 
 
 def views_within(views: list[ReferenceView], window: TimeWindow) -> list[ReferenceView]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from helpers.own_recordings import random_events, write_calibration, write_poses
 from helpers.published_datasets import (
     CALIBRATION,
     CAMCHAIN,
@@ -18,6 +20,7 @@ from helpers.published_datasets import (
     write_colmap,
     write_own,
 )
+from PIL import Image
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.dataparsers.formats import recognize
@@ -129,4 +132,42 @@ def test_refuse_a_colmap_model_of_several_cameras(tmp_path: Path) -> None:
     path = truth.data / "colmap" / "images.txt"
     path.write_text(path.read_text().replace("1 00002.png", "2 00002.png"))
     with pytest.raises(DataError, match="its images are of 2 cameras, and how these are mounted"):
+        recording_of(OwnRecordingDataParserConfig(data=truth.data))
+
+
+@pytest.mark.parametrize("unit", [10**3, 10**6, 10**9])
+def test_name_the_unit_of_the_images_times(unit: int, tmp_path: Path) -> None:
+    write_calibration(tmp_path / "calibration.json")
+    write_poses(tmp_path / "trajectory.txt")
+    np.savez(tmp_path / "events.npz", **random_events())
+    for index in range(4):
+        Image.new("L", (96, 72)).save(tmp_path / f"{index}.png")
+    (tmp_path / "images.txt").write_text("".join(f"{index * unit // 2} {index}.png\n" for index in range(4)))
+    name = {10**3: "milliseconds", 10**6: "microseconds", 10**9: "nanoseconds"}[unit]
+    with pytest.raises(DataError, match=f"as if the times of the images were in {name}"):
+        recording_of(OwnRecordingDataParserConfig(data=tmp_path))
+    (tmp_path / "images.txt").write_text("".join(f"{index // 2} {index}.png\n" for index in range(4)))
+    with pytest.raises(DataError, match=r"several images are at 0\.000000000 s"):
+        recording_of(OwnRecordingDataParserConfig(data=tmp_path))
+
+
+@pytest.mark.parametrize("is_binary", [False, True])
+def test_refuse_a_focal_length_of_colmap_that_is_not_the_calibrated_one(is_binary: bool, tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    (truth.data / "trajectory.txt").unlink()
+    write_colmap(truth.data / "colmap", truth.poses[[0, 5, 10]], [f"{index:05d}.png" for index in range(3)])
+    recording = recording_of(OwnRecordingDataParserConfig(data=truth.data))
+    focal, width = recording.frame_camera.fx, recording.frame_camera.width
+    # Images of half the size: the share of the width counts.
+    for factor in (1.05, 1.4):
+        values = [factor * focal / 2, factor * focal / 2, width / 4, 10]
+        if is_binary:
+            camera = struct.pack("<QIiQQ4d", 1, 1, 1, width // 2, 20, *values)
+            (truth.data / "colmap" / "cameras.bin").write_bytes(camera)
+        else:
+            text = f"# one\n1 PINHOLE {width // 2} 20 {' '.join(map(str, values))}\n"
+            (truth.data / "colmap" / "cameras.txt").write_text(text)
+        if factor == 1.05:
+            recording_of(OwnRecordingDataParserConfig(data=truth.data))
+    with pytest.raises(DataError, match=r"its focal length is .* px, that of the calibration"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data))
