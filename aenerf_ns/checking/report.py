@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from aenerf_ns.camera.alignment import rotation_angle
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.checking.contrast import WarpedEvents, choose_runs, contrast_of
+from aenerf_ns.checking.frames import FrameChanges
 from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
 from aenerf_ns.events.stream import EventStream
@@ -29,6 +30,8 @@ class CheckLimits:
     """A figure beyond its limit is a problem."""
 
     min_polarity_share: float = 0.02
+    min_correlation: float = -0.1
+    """Of the polarities with the change from frame to frame."""
     max_repeated_share: float = 0.05
     max_hot_pixel_share: float = 0.01
     min_covered_share: float = 0.5
@@ -89,9 +92,11 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     Raises:
         DataError: the events cannot be read.
     """
-    statistics, num_covered = _count_events(recording, window)
+    changes = FrameChanges(recording, window)
+    statistics, num_covered = _count_events(recording, window, changes)
     result = CheckResult(statistics)
     _check_events(result)
+    _check_polarity(result, changes.correlation())
     _check_poses(result, recording, window, num_covered)
     if num_covered < _LIMITS.min_events:
         result.figures.append(
@@ -109,8 +114,8 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     return result
 
 
-def _count_events(recording: Recording, window: TimeWindow) -> tuple[EventStatistics, int]:
-    """Return statistics of the events, and the number of events that have a pose."""
+def _count_events(recording: Recording, window: TimeWindow, changes: FrameChanges) -> tuple[EventStatistics, int]:
+    """Return statistics of the events, and the number of events that have a pose; hand all on to ``changes``."""
     file = recording.event_file
     num_covered = 0
 
@@ -118,6 +123,7 @@ def _count_events(recording: Recording, window: TimeWindow) -> tuple[EventStatis
         nonlocal num_covered
         for chunk in tracked(file.chunks(), "Reading events", file.count()):
             num_covered += int(window.contains(chunk.t).sum())
+            changes.add(chunk)
             yield chunk
 
     statistics = event_statistics(chunks(), file.width, file.height, file.time_span(), _RATE_PARTS)
@@ -169,6 +175,17 @@ def _check_events(result: CheckResult) -> None:
     if share > _LIMITS.max_hot_pixel_share:
         problems.append(
             f"hot pixels make {share:.1%} of the events: leave them out with aenerf convert --drop-hot-pixels"
+        )
+
+
+def _check_polarity(result: CheckResult, correlation: float | None) -> None:
+    if correlation is None:
+        return
+    result.figures.append(f"Correlation of the polarities with the change from frame to frame: {correlation:+.2f}")
+    if correlation < _LIMITS.min_correlation:
+        result.problems.append(
+            f"events fall where the frames become brighter (correlation {correlation:+.2f}): the polarities look "
+            "reversed. Write p as -p, unless the frames are negatives or have another clock"
         )
 
 

@@ -57,6 +57,8 @@ class ColorFit:
         self._read_reference_views = read_reference_views
         # Chosen once: otherwise every fit would read the images again.
         self._pixels: _Pixels | None = None
+        # What was last printed.
+        self._was_reversed: bool | None = None
         if model.color_correction.protocol == "affine-test":
             CONSOLE.print(
                 "[yellow]Color correction affine-test is fitted on the test views themselves: only to compare with "
@@ -81,6 +83,11 @@ class ColorFit:
             correction.stretch(log_radiance)
         else:
             correction.fit(log_radiance, pixels.radiance[:count], len(cameras), rough=share < 1)
+            if share == 1 and correction.is_reversed != self._was_reversed:
+                self._was_reversed = correction.is_reversed
+                color = "[yellow]" if correction.is_reversed else ""
+                slopes = ", ".join(f"{slope:+.2f}" for slope in correction.scale.tolist())
+                CONSOLE.print(f"{color}Color correction: {correction.description}; slope {slopes}.", soft_wrap=True)
 
     def _choose_pixels(self, split: Literal["val", "test"]) -> _Pixels:
         """Choose random pixels of all reference views of a split, or of the training cameras where there are none."""

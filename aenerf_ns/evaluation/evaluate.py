@@ -17,6 +17,7 @@ from aenerf_ns.evaluation.view_metrics import (
     describe_views,
     measure_reference_views,
 )
+from aenerf_ns.method.color_correction import AffineColorCorrection
 
 
 def evaluate(run: TrainedRun, output: Path | None = None, with_deviations: bool = True) -> dict[str, Any]:
@@ -46,6 +47,8 @@ def evaluate(run: TrainedRun, output: Path | None = None, with_deviations: bool 
         metrics = average_metrics(placed, with_deviations)
         _require_finite(metrics, run)
     metrics["color_correction"] = model.color_correction.description
+    if isinstance(model.color_correction, AffineColorCorrection):
+        metrics["color_correction_slope"] = model.color_correction.scale.tolist()
     metrics["num_views"] = len(placed)
     metrics["pose_correction"] = correction.config.mode
     metrics |= correction.offsets()

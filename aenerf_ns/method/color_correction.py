@@ -87,7 +87,13 @@ class AffineColorCorrection(nn.Module):
         if self.num_views == 0:
             name = {"val": "validation", "test": "test"}[self.split]
             return f"percentile stretch, no {name} views (protocol {self.protocol})"
-        return f"{self.protocol}, fitted on {self._fitted_on}"
+        warning = ", with a negative slope, as if the events' polarities were reversed" if self.is_reversed else ""
+        return f"{self.protocol}, fitted on {self._fitted_on}{warning}"
+
+    @property
+    def is_reversed(self) -> bool:
+        """Whether bright references were rendered dark, as they are if the polarities of the events are reversed."""
+        return int(self.num_views) > 0 and float(self.scale.mean()) < 0
 
     @property
     def _fitted_on(self) -> str:

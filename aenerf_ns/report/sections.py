@@ -52,6 +52,9 @@ def state_verdict(report: RunReport) -> list[str]:
     if report.views:
         lines.append(f"{_describe_metrics(found)} (mean ± standard deviation of {len(report.views)} test views).")
         lines.append(f"The test cameras are placed by: {found['test_poses']}. Colors: {found['color_correction']}.")
+        if "color_correction_slope" in found:
+            slopes = ", ".join(f"{slope:+.2f}" for slope in found["color_correction_slope"])
+            lines.append(f"Slope of the colors over the rendered log-radiance: {slopes}.")
         if "refined_test_poses" in found:
             lines.append(
                 f"With test cameras that are refined photometrically, which looks at the test images: "

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents
+from aenerf_ns.checking.frames import FrameChanges
 from aenerf_ns.checking.hypotheses import clock_hypothesis
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.simulate import Simulate
@@ -41,7 +42,7 @@ PART = 2_600_000_000
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("check") / "room"
-    Simulate(folder, width=64, height=48, max_displacement=1.0, train_images=2, validation_views=1, test_views=1).main()
+    Simulate(folder, width=64, height=48, max_displacement=1.0, train_images=6, validation_views=1, test_views=1).main()
     return folder
 
 
@@ -401,3 +402,23 @@ def test_unreadable_data_is_one_line_and_status_2(room: Path, tmp_path: Path, ca
         error = capsys.readouterr().err
         assert error.count("\n") == 1
         assert str(data) in error
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_polarities_are_compared_with_the_frames(sign: int, shorter: Path) -> None:
+    events = all_events(open_native(shorter))
+    rewrite(shorter, replace(events, p=np.int8(sign) * events.p))
+    status, output = run(shorter)
+    assert f"change from frame to frame: {'+' if sign > 0 else '-'}0.9" in output
+    assert ("the polarities look reversed" in output) == (sign < 0)
+    assert status == (0 if sign > 0 else 1), output
+
+
+def test_polarities_are_compared_with_real_frames(slider_depth: Path) -> None:
+    recording = open_ecd(slider_depth)
+    changes = FrameChanges(recording, recording.trajectory.known_time())
+    for chunk in recording.event_file.chunks():
+        changes.add(chunk)
+    correlation = changes.correlation()
+    assert correlation is not None
+    assert correlation > 0.7

@@ -73,6 +73,16 @@ def black_level(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return log_radiance, b * torch.exp(a * log_radiance) - c
 
 
+def test_reversed_polarities_are_named() -> None:
+    radiance = torch.linspace(0.1, 0.9, 50)[:, None]
+    correction = AffineColorCorrection(1, "linear")
+    assert not correction.is_reversed
+    correction.fit(radiance.log(), radiance, num_views=2)
+    assert "reversed" not in correction.description
+    correction.fit(-radiance.log(), radiance, num_views=2)
+    assert "negative slope, as if the events' polarities were reversed" in correction.description
+
+
 def test_translated_gamma_recovers_exponent_gain_and_black_level() -> None:
     affine, gamma = AffineColorCorrection(3, "srgb"), TranslatedGammaColorCorrection(3, "srgb")
     for correction in (affine, gamma):
