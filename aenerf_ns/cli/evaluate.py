@@ -7,17 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aenerf_ns.cli.console import say
-from aenerf_ns.cli.trained_run import RunPath, open_run
+from aenerf_ns.cli.trained_run import RunCommand, open_run
 from aenerf_ns.files.output_paths import creating, require_absent, require_writable
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 
 
 @dataclass
-class Evaluate:
+class Evaluate(RunCommand):
     """Compare a trained run's renderings with the test views, as ns-eval does and in the same JSON layout, optionally
     under another protocol than the run's. Nothing in the run's folder changes."""
 
-    load_config: RunPath
     output: Path
     """JSON file to write."""
     color_correction: ColorCorrectionProtocol | None = None
@@ -35,7 +34,7 @@ class Evaluate:
             require_writable(self.render_output / "0000.png", "--render-output")
         if self.nerfbaselines is not None:
             require_absent(self.nerfbaselines, "--nerfbaselines")
-        config, run, checkpoint = open_run(self.load_config)
+        config, run, checkpoint = open_run(self.load_config, self.data)
         from aenerf_ns.evaluation.color_fit import replace_color_correction
         from aenerf_ns.evaluation.evaluate import evaluate
 

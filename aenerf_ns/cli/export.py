@@ -9,7 +9,7 @@ from typing import Literal
 
 from aenerf_ns.cli.console import say
 from aenerf_ns.cli.ranges import RATES, require_range
-from aenerf_ns.cli.trained_run import RunPath, open_run
+from aenerf_ns.cli.trained_run import RunCommand, open_run
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import creating, require_absent, require_writable
 
@@ -19,11 +19,10 @@ _MAX_POINTS, _MAX_VIEWS = 10_000_000, 10_000
 
 
 @dataclass
-class ExportTrajectory:
+class ExportTrajectory(RunCommand):
     """Write the poses of a trained run in TUM format: t tx ty tz qx qy qz qw, in seconds, camera-to-world, OpenCV axes,
     in the world and the units of the recording."""
 
-    load_config: RunPath
     output: Path
     """Text file to write."""
     poses: Literal["corrected", "estimated", "ground-truth"] = "corrected"
@@ -37,7 +36,7 @@ class ExportTrajectory:
         if self.rate is not None:
             require_range("rate", self.rate, *RATES)
         require_writable(self.output)
-        _, run, _ = open_run(self.load_config, test_mode="inference")
+        _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
         import torch
 
         from aenerf_ns.camera.trajectory import Trajectory
@@ -65,12 +64,11 @@ class ExportTrajectory:
 
 
 @dataclass
-class ExportCameras:
+class ExportCameras(RunCommand):
     """Write the cameras of a recording's images, at the corrected poses of a trained run, so that a trainer of splats
     or NeRFs starts from them: a COLMAP model (sparse/0), transforms.json, and points of the scene. All are in the world
     and the units of the recording. The images are linked."""
 
-    load_config: RunPath
     output: Path
     """Folder to create."""
     copy: bool = False
@@ -82,7 +80,7 @@ class ExportCameras:
         """Load the run and write cameras, points and images."""
         require_absent(self.output)
         require_range("num-points", self.num_points, 1, _MAX_POINTS)
-        _, run, _ = open_run(self.load_config, test_mode="inference")
+        _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
         from aenerf_ns.export.camera_model_files import IMAGE_FOLDER, write_cameras
         from aenerf_ns.export.placing import place_views
         from aenerf_ns.export.rendering import observe_points
@@ -107,11 +105,10 @@ class ExportCameras:
 
 
 @dataclass
-class ExportFrames:
+class ExportFrames(RunCommand):
     """Render frames and depths from the corrected poses at chosen times, and write them with their times and their
     cameras as export-cameras does, in the world and the units of the recording."""
 
-    load_config: RunPath
     output: Path
     """Folder to create."""
     rate: float | None = None
@@ -129,7 +126,7 @@ class ExportFrames:
             if self.times:
                 raise DataError("aenerf export-frames", "--rate and --times are given", "leave out one of the two")
             require_range("rate", self.rate, *RATES)
-        _, run, _ = open_run(self.load_config, test_mode="inference")
+        _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
         from aenerf_ns.export.frames import export_frames
         from aenerf_ns.export.times import times_at_rate, times_from_seconds
 
@@ -143,11 +140,10 @@ class ExportFrames:
 
 
 @dataclass
-class ExportMesh:
+class ExportMesh(RunCommand):
     """Fuse the depths that a trained run renders along its corrected trajectory in a truncated signed distance field,
     and write the surface as a colored mesh, in the world and the units of the recording."""
 
-    load_config: RunPath
     output: Path
     """Mesh file to write: .ply, .glb or .obj."""
     resolution: int = 256
@@ -163,7 +159,7 @@ class ExportMesh:
         require_writable(self.output)
         require_range("resolution", self.resolution, 8, 2048)
         require_range("num-views", self.num_views, 1, _MAX_VIEWS)
-        _, run, _ = open_run(self.load_config, test_mode="inference")
+        _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
         from aenerf_ns.export.mesh import extract_mesh
 
         mesh = extract_mesh(run, self.num_views, self.resolution)
@@ -174,12 +170,11 @@ class ExportMesh:
 
 
 @dataclass
-class ExportVideo:
+class ExportVideo(RunCommand):
     """Write a video along the corrected trajectory of a trained run. Beside each other it shows the recorded events,
     the events that the rendering triggers, the rendering, its depth, and the last image that was taken on the
     trajectory, where there are images."""
 
-    load_config: RunPath
     output: Path
     """Video file to write, ending with .mp4."""
     rate: float = 50.0
@@ -194,7 +189,7 @@ class ExportVideo:
         require_range("rate", self.rate, *RATES)
         require_range("frame-rate", self.frame_rate, 0.1, 1000)
         require_writable(self.output)
-        _, run, _ = open_run(self.load_config, test_mode="inference")
+        _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
         from aenerf_ns.cli.video_file import write_video
         from aenerf_ns.export.times import times_at_rate
         from aenerf_ns.export.video import render_panels

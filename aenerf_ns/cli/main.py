@@ -26,7 +26,9 @@ COMMANDS = {
     "export-video": "export:ExportVideo",
 }
 """Modules and classes of the commands by name. Only the chosen one is imported."""
-_POSITIONAL = ("--data", "--video", "--load-config")
+_POSITIONAL = ("--video", "--load-config")
+# Of these commands the dataset is the positional argument. Others take it as an option.
+_OF_DATASETS = ("convert", "check", "reconstruct")
 
 
 def main() -> None:
@@ -59,7 +61,8 @@ def _with_positional_first(words: Sequence[str]) -> Sequence[str]:
     """Turn ``--data DATA``, as users of ns-train type it, into the positional argument after the command's name."""
     for index, word in enumerate(words):
         option, equals, value = word.partition("=")
-        if index > 0 and option.replace("_", "-") in _POSITIONAL:
+        names = (*_POSITIONAL, "--data") if words[0] in _OF_DATASETS else _POSITIONAL
+        if index > 0 and option.replace("_", "-") in names:
             rest = words[index + 1 :] if equals else words[index + 2 :]
             given = [value] if equals else words[index + 1 : index + 2]
             return [words[0], *given, *words[1:index], *rest]

@@ -31,6 +31,8 @@ class ReportCommand:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """The runs: each by its config.yml or its folder."""
+    data: Path | None = None
+    """Where the dataset of the runs is now, if it was moved."""
     output: Path = Path("report")
     """Folder to write to. Files of an earlier report there are replaced."""
     allow_different_protocols: bool = False
@@ -51,7 +53,7 @@ class ReportCommand:
         # Measuring takes long, and only one run at a time is sure to fit in the memory. So the runs are opened twice.
         opened: list[tuple[TrainerConfig, Protocol]] = []
         for run in self.runs:
-            config, opened_run, _ = open_run(run)
+            config, opened_run, _ = open_run(run, self.data)
             opened.append((config, comparison.read_protocol(opened_run)))
             del opened_run
             gc.collect()
@@ -67,7 +69,7 @@ class ReportCommand:
         shared = comparison.shared_views(protocols)
         reports: list[RunReport] = []
         for run, name in zip(self.runs, names, strict=True):
-            config, opened_run, _ = open_run(run)
+            config, opened_run, _ = open_run(run, self.data)
             # The views of the first run, so that the same ones are beside each other.
             shown = reports[0].chosen if reports and shared else None
             reports.append(measure_run(name, config, opened_run, shared, shown))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -9,7 +10,7 @@ import tyro
 
 from aenerf_ns.cli.config_safety import require_known_names
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.output_paths import require_run
+from aenerf_ns.files.output_paths import require_dataset, require_run
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -25,11 +26,23 @@ RunPath = Annotated[
 """The run that a command works on."""
 
 
-def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tuple[TrainerConfig, TrainedRun, Path]:
+@dataclass
+class RunCommand:
+    """A command that works on a trained run."""
+
+    load_config: RunPath
+    data: Path | None = field(default=None, kw_only=True)
+    """Where the dataset of the run is now, if it was moved."""
+
+
+def open_run(
+    run: Path, data: Path | None = None, test_mode: Literal["test", "inference"] = "test"
+) -> tuple[TrainerConfig, TrainedRun, Path]:
     """Open a trained run.
 
     Args:
-        run: the run's config.yml, or its folder.
+        run: the run's config.yml, or its folder. Its checkpoints are beside it.
+        data: where its dataset is now, or None where it was trained.
         test_mode: see :class:`~aenerf_ns.training.pipeline.AENeRFPipeline`.
 
     Returns:
@@ -47,7 +60,7 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
 
     try:
         opened, pipeline, checkpoint, _ = eval_setup(
-            config, test_mode=test_mode, update_config_callback=_require_checkpoints
+            config, test_mode=test_mode, update_config_callback=lambda saved: _at_its_place(saved, config, data)
         )
     except DataError:
         raise
@@ -61,14 +74,32 @@ def open_run(run: Path, test_mode: Literal["test", "inference"] = "test") -> tup
     for name, value in pipeline.named_parameters():
         if not value.isfinite().all():
             raise DataError(
-                checkpoint, f"its {name} is not finite", "remove it if there is an earlier one, or train again"
+                checkpoint, f"its {name} is not finite", "move it away if there is an earlier one, or train again"
             )
     return opened, pipeline.trained_run(), checkpoint
 
 
-def _require_checkpoints(config: TrainerConfig) -> TrainerConfig:
-    """Raise a DataError for a run without checkpoints, of which the framework complains in several lines."""
+def _at_its_place(config: TrainerConfig, path: Path, data: Path | None) -> TrainerConfig:
+    """Tell a configuration where its file and its dataset are now.
+
+    Raises:
+        DataError: there are no checkpoints, of which the framework complains in several lines.
+    """
+    config.__dict__["opened_folder"] = path.absolute().parent
     folder = config.get_checkpoint_dir()
     if not folder.is_dir():
-        raise DataError(folder, "there is no such folder", "copy the run's checkpoints, or train again")
+        raise DataError(folder, "there is no such folder", "copy the run's checkpoints beside its config.yml")
+    dataparser = getattr(config.pipeline.datamanager, "dataparser", None)
+    if dataparser is None:
+        return config
+    before = Path(dataparser.data)
+    if data is None and not before.exists():
+        raise DataError(before, "the dataset of the run is not there", "say where it is now with --data")
+    if data is not None:
+        require_dataset(data)
+        # It would take the place of the dataparser's.
+        config.pipeline.datamanager.data = None
+        for option, value in list(vars(dataparser).items()):
+            if isinstance(value, Path) and value.is_relative_to(before):
+                setattr(dataparser, option, data.absolute() / value.relative_to(before))
     return config

@@ -15,7 +15,7 @@ def require_dataset(data: Path) -> None:
     """Raise a DataError if a dataset's folder does not exist or may not be read."""
     with reading(data):
         if not data.exists():
-            raise DataError(data, "there is no such folder", "give the folder of a dataset as --data")
+            raise DataError(data, "there is no such folder", "give the folder of a dataset, or link it to this place")
 
 
 def require_run(run: Path) -> Path:

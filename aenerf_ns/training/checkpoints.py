@@ -19,14 +19,16 @@ def checkpoint_to_load(folder: Path, step: int | None = None) -> Path:
     """Return the checkpoint of a step, or the newest whole one. Newer ones that are broken are named on the console.
 
     Args:
-        folder: the folder of a run's checkpoints.
+        folder: a run, or its folder of checkpoints.
         step: the step in the checkpoint's name, or None.
 
     Raises:
         DataError: there is no such checkpoint, or it is broken.
     """
     if not folder.is_dir():
-        raise DataError(folder, "there is no such folder", "give the folder nerfstudio_models of a trained run")
+        raise DataError(folder, "there is no such folder", "give the folder of a trained run")
+    if not _newest_first(folder) and (folder / "nerfstudio_models").is_dir():
+        folder /= "nerfstudio_models"
     if step is not None:
         path = folder / f"step-{step:09d}.ckpt"
         require_whole(path)
@@ -42,7 +44,7 @@ def checkpoint_to_load(folder: Path, step: int | None = None) -> Path:
             return path
         broken.append(f"{path.name} ({fault})")
     problem = f"none of its checkpoints is whole: {'; '.join(broken)}" if broken else "it holds no checkpoint"
-    raise DataError(folder, problem, "remove it and train again")
+    raise DataError(folder, problem, "give the folder of another run, or train again")
 
 
 def require_whole(path: Path) -> None:

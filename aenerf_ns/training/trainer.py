@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -40,6 +41,10 @@ class AENeRFTrainerConfig(TrainerConfig):
         for group in self.optimizers.values():
             if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, RelativeCosineSchedulerConfig)):
                 group["scheduler"].max_steps = self.schedule_length or self.max_num_iterations
+
+    def get_base_dir(self) -> Path:
+        """Return the folder of the run: where its config.yml is, for commands that open it, wherever it was trained."""
+        return self.__dict__.get("opened_folder") or _folder_of_opened_run() or super().get_base_dir()
 
     @property
     def load_step(self) -> int | None:
@@ -78,6 +83,15 @@ class AENeRFTrainerConfig(TrainerConfig):
             for name, value in numbers.items():
                 if value < 1:
                     raise DataError("ns-train", f"--{name} {value}", "give one or more")
+
+
+def _folder_of_opened_run() -> Path | None:
+    """Return the folder of the config.yml that a command of Nerfstudio opens: it tells the configuration no path."""
+    if Path(sys.argv[0]).name not in ("ns-eval", "ns-render", "ns-export", "ns-viewer"):
+        return None
+    words = [word.rpartition("=")[2] for word in sys.argv[1:]]
+    configs = [Path(word).absolute() for word in words if word.endswith("config.yml") and Path(word).is_file()]
+    return configs[0].parent if configs else None
 
 
 class AENeRFTrainer(Trainer):
@@ -199,5 +213,5 @@ def _not_written(path: str | Path, error: OSError | RuntimeError) -> SystemExit:
         # The message of torch's writer says nothing of the disk.
         free = shutil.disk_usage(Path(path).parents[1]).free
         problem = f"{str(error).splitlines()[0]}; {free / 1e6:.1f} MB are free"
-    remedy = "make room or choose another --output-dir, then resume with --load-dir <run>/nerfstudio_models"
+    remedy = "make room or choose another --output-dir, then resume with --load-dir <run>"
     return SystemExit(f"Error: {path}: it cannot be written ({problem}), training stopped; {remedy}")

@@ -132,7 +132,8 @@ def test_a_broken_newest_checkpoint_is_named_and_passed_over(
 def test_a_checkpoint_that_is_not_there_is_one_line(run: Path, tmp_path: Path) -> None:
     folder = run / "nerfstudio_models"
     with pytest.raises(DataError, match=r"step-000000009.ckpt: .*No such file.*--load-step 3"):
-        checkpoint_to_load(folder, 9)
+        # The folder of the run holds that of the checkpoints.
+        checkpoint_to_load(run, 9)
     with pytest.raises(DataError, match="nothing: there is no such folder"):
         checkpoint_to_load(tmp_path / "nothing")
     for path in folder.iterdir():
@@ -141,7 +142,7 @@ def test_a_checkpoint_that_is_not_there_is_one_line(run: Path, tmp_path: Path) -
         checkpoint_to_load(folder)
     shutil.rmtree(folder)
     folder.mkdir()
-    with pytest.raises(DataError, match="it holds no checkpoint"):
+    with pytest.raises(DataError, match="it holds no checkpoint; give the folder of another run"):
         checkpoint_to_load(folder)
 
 
