@@ -25,7 +25,7 @@ from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_trajectory
 
-_CALIBRATIONS = ("calibration.json", "camchain.yaml")
+_CALIBRATIONS = ("calibration.json", "camchain.yaml", "camera_info.yaml")
 # COLMAP's own estimate may be off by some percent.
 _MAX_FOCAL_RATIO = 1.15
 
@@ -48,8 +48,8 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     """Unit of the times in npz, npy, csv and text files, and in HDF5 files that state none. By default whole numbers
     are microseconds and decimals seconds."""
     calibration: Path | None = None
-    """The cameras: calibration.json, or the camchain.yaml that Kalibr writes. By default the file of
-    one of these names in the folder."""
+    """The cameras: calibration.json, the camchain.yaml that Kalibr writes, or the camera_info.yaml of one camera that
+    ROS writes. By default the file of one of these names in the folder."""
     event_camera: str | None = None
     """Name of the event camera in a camchain of several cameras, such as cam1."""
     frame_camera: str | None = None

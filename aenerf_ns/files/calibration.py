@@ -4,15 +4,32 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import msgspec
+import torch
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.json_file import convert
 from aenerf_ns.files.kalibr import motion_between, read_camchain
+from aenerf_ns.files.plain_yaml import read_plain_yaml
 from aenerf_ns.files.transforms import frame_from_event, read_transforms, sensor_values
+
+
+class _Values(msgspec.Struct):
+    data: list[float]
+
+
+class _CameraInfo(msgspec.Struct):
+    image_width: int
+    image_height: int
+    camera_matrix: _Values
+    distortion_coefficients: _Values
+    distortion_model: str = "plumb_bob"
 
 
 @dataclass(frozen=True)
@@ -31,7 +48,7 @@ class Calibration:
 
 
 def read_calibration(path: Path, event_camera: str | None = None, frame_camera: str | None = None) -> Calibration:
-    """Read calibration.json, or the camchain that Kalibr writes.
+    """Read calibration.json, the camchain that Kalibr writes, or the camera_info that ROS writes for one camera.
 
     Args:
         path: the file, which is JSON if its suffix is .json.
@@ -47,6 +64,10 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
             sensor = SensorModel(**sensor_values(meta.event_camera))
         motion = frame_from_event(path, meta.event_camera, lens)
         return Calibration(meta.event_camera.intrinsics(), lens, motion, sensor, meta.image_encoding)
+    content = read_plain_yaml(path)
+    if isinstance(content, dict) and "camera_matrix" in content:
+        lens = _camera_info(path, content)
+        return Calibration(lens, lens, torch.eye(4, dtype=torch.float64), SensorModel(), "linear")
     cameras = read_camchain(path)
     if event_camera is None and len(cameras) > 1:
         raise DataError(path, f"its cameras are {', '.join(cameras)}", "name that of the events as --event-camera")
@@ -57,3 +78,15 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
             raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
     motion = motion_between(path, cameras, event_name, frame_name)
     return Calibration(cameras[event_name].lens, cameras[frame_name].lens, motion, SensorModel(), "linear")
+
+
+def _camera_info(path: Path, content: dict[str, Any]) -> CameraIntrinsics:
+    """Return the lens of ROS's camera_info, with the names of camera_calibration_parsers."""
+    info = convert(path, content, _CameraInfo, "give the file that ROS's camera calibration wrote")
+    matrix = info.camera_matrix.data
+    with value_errors_as_data_error(path):
+        if len(matrix) != 9:
+            raise ValueError(f"its camera_matrix has {len(matrix)} numbers, not 9")
+        pinhole = (matrix[0], matrix[4], matrix[2], matrix[5])
+        size = (info.image_width, info.image_height)
+        return CameraIntrinsics.from_opencv(size, pinhole, info.distortion_coefficients.data, info.distortion_model)

@@ -26,9 +26,15 @@ from aenerf_ns.files.limits import MAX_LINE
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
 _COLUMNS = "xytp"
+_ALIASES = {"timestamp": "t", "ts": "t", "time": "t", "polarity": "p", "pol": "p"}
+# Of lines without names: the order of the Event Camera Dataset, that of Metavision's CSV, and that of arrays.
+_ORDERS = ("txyp", "xypt", "xytp")
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 BLOCK = 1 << 22
 """Bytes that are read at once: about 150,000 events."""
 
+# The beginning of a file, from which the order of its columns is known.
+_SAMPLE_BYTES = 1 << 16
 # Longer than any line of a file of events.
 _TAIL_BYTES = 4096
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -63,8 +69,13 @@ class _Lines:
 
 
 def _is_row(line: bytes) -> bool:
-    """Tell whether a line is neither empty nor a comment."""
-    return bool(line.split(b"#", 1)[0].strip())
+    """Tell whether a line is neither empty nor a comment, such as Metavision's %geometry."""
+    return bool(line.split(b"#", 1)[0].strip()) and not line.startswith(b"%")
+
+
+def has_commas(beginning: bytes) -> bool:
+    """Tell from the beginning of a file of text whether commas separate its numbers."""
+    return b"," in next((line for line in beginning.split(b"\n") if _is_row(line)), b"")
 
 
 def _line_name(line: int, num_before: int | None) -> str:
@@ -72,7 +83,10 @@ def _line_name(line: int, num_before: int | None) -> str:
 
 
 class TextEventFile(EventReader):
-    """Read events.txt: lines of t, x, y and p, with polarity 0 or 1 (Mueggler et al. 2017).
+    """Read lines of t, x, y and p, with polarity 0 or 1, or -1 or 1 (Mueggler et al. 2017).
+
+    The first line may hold the width and the height of the sensor, as E2VID's has, or names of the columns, which may
+    then have any order. Without names, x, y, p, t or x, y, t, p are read where nothing else fits.
 
     Args:
         path, width, height: see :class:`EventFile`.
@@ -86,8 +100,63 @@ class TextEventFile(EventReader):
         self._time_unit = time_unit
 
     def _names(self, file: BinaryIO) -> list[str]:
-        """Return the names of the columns, x, y, t and p among them. Read the header, if the format has one."""
-        return ["t", "x", "y", "p"]
+        """Return the names of the columns, x, y, t and p among them. Read the header, if there is one."""
+        if file.read(len(_BYTE_ORDER_MARK)) != _BYTE_ORDER_MARK:
+            file.seek(0)
+        begin = file.tell()
+        while line := self._line(file):
+            if _is_row(line):
+                break
+            begin = file.tell()
+        fields = line.split(b"#")[0].replace(b",", b" ").split()
+        if re.match(rb"\s*[A-Za-z_\"]", line):
+            return self._named(line.decode("utf-8", "replace"))
+        if len(fields) == 2 and b" ".join(fields) == b"%d %d" % (self.width, self.height):
+            begin = file.tell()
+        elif len(fields) == 2 and all(field.isdigit() for field in fields):
+            found = " x ".join(field.decode() for field in fields)
+            raise DataError(
+                self.path,
+                f"its first line says {found} pixels, the calibration {self.width} x {self.height}",
+                "give the calibration of this sensor",
+            )
+        file.seek(begin)
+        order = self._order(file)
+        file.seek(begin)
+        return order
+
+    def _named(self, header: str) -> list[str]:
+        names = [name.strip().strip('"').lower() for name in (header.split(",") if "," in header else header.split())]
+        names = [_ALIASES.get(name, name) for name in names]
+        if not set(_COLUMNS) <= set(names):
+            raise self._unnamed(header)
+        return names
+
+    def _order(self, file: BinaryIO) -> list[str]:
+        """Return the columns of lines without names, the order of the Event Camera Dataset unless another one fits."""
+        text = file.read(_SAMPLE_BYTES)
+        text = text[: text.rfind(b"\n") + 1] or text + b"\n"
+        whole, fraction, _ = parse_lines(text, self.with_commas, [0, 1, 2, 3])
+        fitting = []
+        for order in _ORDERS:
+            x, y, t, p = (order.index(name) for name in _COLUMNS)
+            if (
+                not fraction[[x, y, p]].any()
+                and ((whole[[x, y]] >= 0) & (whole[[x, y]] < [[self.width], [self.height]])).all()
+                and np.isin(whole[p], (-1, 0, 1)).all()
+                and (np.diff(whole[t] + fraction[t]) >= 0).all()
+            ):
+                fitting.append(order)
+        if self.with_commas and whole.shape[1] > 0 and len(fitting) != 1:
+            raise self._unnamed(text.split(b"\n")[0].decode("utf-8", "replace"))
+        return list((fitting or _ORDERS)[0])
+
+    def _unnamed(self, line: str) -> DataError:
+        return DataError(
+            self.path,
+            f"its first line is {line.strip()[:60]!r}",
+            "it must name the columns, x, y, t and p among them, separated by commas or blanks",
+        )
 
     def _assumed_unit(self) -> TimeUnit | None:
         return None if self._time_unit else self._unit()
@@ -166,14 +235,6 @@ class TextEventFile(EventReader):
         return DataError(self.path, f"{line_name} has {names[bad]} = {value}", "write plain decimal numbers")
 
     def _events(self, lines: _Lines, tick: int) -> EventStream:
-        negative = lines.whole[3] < 0
-        if negative.any() and not self.with_commas:
-            row = int(np.argmax(negative))
-            raise DataError(
-                self.path,
-                f"{lines.line_of(row)} has p = {lines.whole[3, row]}",
-                "polarities are 0 or 1 in this format",
-            )
         columns = {}
         for name, whole, fraction in zip(_COLUMNS, lines.whole, lines.fraction, strict=True):
             columns[name] = whole + fraction if name != "t" and fraction.any() else whole
@@ -191,22 +252,9 @@ class TextEventFile(EventReader):
 
 
 class CsvEventFile(TextEventFile):
-    """Read comma-separated values. The first line names the columns in any order, x, y, t and p among them."""
+    """Read comma-separated values."""
 
     with_commas = True
-
-    def _names(self, file: BinaryIO) -> list[str]:
-        header = next((line for line in iter(lambda: self._line(file), b"") if _is_row(line)), b"").decode(
-            "utf-8", "replace"
-        )
-        names = [name.strip().strip('"').lower() for name in header.split(",")]
-        if not set(_COLUMNS) <= set(names):
-            raise DataError(
-                self.path,
-                f"its first line is {header.strip()[:60]!r}",
-                "it must name the columns, x, y, t and p among them, separated by commas",
-            )
-        return names
 
 
 def parse_lines(

@@ -179,7 +179,7 @@ def read_text(path: Path, max_bytes: int) -> str:
         require_at_most(path, max_bytes)
         content = path.read_bytes()
     try:
-        return content.decode("utf-8")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(path, f"not text in UTF-8 ({error.reason} at byte {error.start})", "save it as UTF-8") from None
 

@@ -10,7 +10,7 @@ from aenerf_ns.files.aedat4 import Aedat4File
 from aenerf_ns.files.event_arrays import open_array_events
 from aenerf_ns.files.event_hdf5 import open_hdf5_events
 from aenerf_ns.files.event_reader import resolve_sensor_size
-from aenerf_ns.files.event_text import CsvEventFile, TextEventFile
+from aenerf_ns.files.event_text import CsvEventFile, TextEventFile, has_commas
 from aenerf_ns.files.limits import bounded
 from aenerf_ns.files.prophesee import HEADER_BYTES, PropheseeDatFile, PropheseeHeader, PropheseeRawFile
 from aenerf_ns.files.rosbag import BAG_MAGIC, RosbagEventFile
@@ -86,7 +86,7 @@ def open_event_file(
             return open_hdf5_events(path, *size, time_unit)
         if name == "NumPy":
             return open_array_events(path, *size, time_unit)
-        return (CsvEventFile if name == "CSV" else TextEventFile)(path, *size, time_unit)
+        return (CsvEventFile if has_commas(beginning) else TextEventFile)(path, *size, time_unit)
 
 
 def _read_beginning(path: Path) -> bytes:

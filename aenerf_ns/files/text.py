@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from decimal import Decimal
 from pathlib import Path
 from typing import Literal
@@ -10,18 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.limits import MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
+from aenerf_ns.files.limits import MAX_LINE, MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
+
+# The name of the first column in a first line of names.
+_NAME = re.compile(r"[\"']?(t|ts|time\w*|stamp)\b", re.IGNORECASE)
 
 POSE_COLUMNS = "t tx ty tz qx qy qz qw"
 """The columns of a trajectory in the format of the TUM RGB-D benchmark."""
 
 
 def read_rows(path: Path, columns: str) -> list[list[str]]:
-    """Read rows of fields between white space. Leave out empty lines and comments after #.
+    """Read rows of fields between white space or commas. Leave out empty lines, comments after #, and a first line of
+    names.
 
     Raises:
         DataError: the file is missing, cannot be read or has too many rows, or a row does not have the fields that
@@ -29,20 +34,28 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     """
     expected = len(columns.split())
     rows: list[list[str]] = []
-    with bounded(path, "table of numbers"), path.open(encoding="utf-8", errors="replace") as file:
+    with bounded(path, "table of numbers"), path.open(encoding="utf-8-sig", errors="replace") as file:
         require_at_most(path, MAX_TABLE_BYTES)
         for number, line in enumerate(file, start=1):
-            fields = line.split("#", 1)[0].split()
-            if not fields:
+            line = line.split("#", 1)[0]
+            fields = line.split()
+            if "," in line and (len(fields) != expected or fields[0].endswith(",")):
+                fields = [field.strip() for field in line.rstrip().split(",")]
+            if not fields or (not rows and len(fields) == expected and _NAME.match(fields[0])):
                 continue
             if len(fields) != expected:
-                raise DataError(
-                    path, f"line {number} has {len(fields)} fields", f"each line must hold the {expected}: {columns}"
-                )
+                remedy = f"each line must hold the {expected}, between blanks or commas: {columns}"
+                raise DataError(path, f"line {number} has {len(fields)} fields", remedy)
             if len(rows) == MAX_ROWS:
                 raise DataError(path, f"it has more than {MAX_ROWS:,} rows", "cut the recording, or leave rows out")
             rows.append(fields)
     return rows
+
+
+def read_first_line(path: Path) -> str:
+    """Read the first line of a table, where its columns may be named."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        return file.readline(MAX_LINE)
 
 
 def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:

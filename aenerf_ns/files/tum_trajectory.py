@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,15 @@ from torch import Tensor
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError, require_file
-from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
+from aenerf_ns.files.text import (
+    POSE_COLUMNS,
+    TimeUnit,
+    format_seconds,
+    parse_numbers,
+    parse_times,
+    read_first_line,
+    read_rows,
+)
 
 # Trajectories are commonly printed with six or more digits, so quaternions have rounding errors.
 _MAX_NORM_ERROR = 1e-3
@@ -21,7 +30,8 @@ _MAX_NORM_ERROR = 1e-3
 def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     """Read camera-to-world poses, with the axes of the file, from lines of t tx ty tz qx qy qz qw.
 
-    Some datasets have the same rows with other units of the times. # starts a comment.
+    Some datasets have the same rows with other units of the times. # starts a comment. The first line may name the
+    columns, and then counts: EuRoC's has nanoseconds and qw first.
 
     Raises:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
@@ -31,8 +41,12 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     rows = read_rows(path, POSE_COLUMNS)
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
-    times = parse_times(path, [row[0] for row in rows], unit)
+    header = read_first_line(path)
+    stated = re.match(r"\W*\w+ *\[(ns|us|ms|s)\]", header)
+    times = parse_times(path, [row[0] for row in rows], stated[1] if stated else unit)  # type: ignore[arg-type]
     values = parse_numbers(path, [row[1:] for row in rows])
+    if re.search(r"q\w*w.*q\w*x", header):
+        values = values[:, [0, 1, 2, 4, 5, 6, 3]]
     return Trajectory(times, poses_from_quaternions(path, values[:, :3], values[:, 3:]), path)
 
 

@@ -171,3 +171,16 @@ def test_refuse_a_focal_length_of_colmap_that_is_not_the_calibrated_one(is_binar
             recording_of(OwnRecordingDataParserConfig(data=truth.data))
     with pytest.raises(DataError, match=r"its focal length is .* px, that of the calibration"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data))
+
+
+def test_read_the_camera_info_of_ros(tmp_path: Path) -> None:
+    (tmp_path / "camera_info.yaml").write_text(
+        "image_width: 96\nimage_height: 72\ncamera_name: dvs\n"
+        "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [90.0, 0.0, 47.5, 0.0, 91.0, 35.5, 0.0, 0.0, 1.0]\n"
+        "distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n"
+        "  data: [-0.1, 0.01, 0.0, 0.0, 0.0]\n"
+    )
+    write_poses(tmp_path / "trajectory.txt")
+    np.savez(tmp_path / "events.npz", **random_events())
+    recording = recording_of(OwnRecordingDataParserConfig(data=tmp_path))
+    assert recording.event_camera == CameraIntrinsics(96, 72, 90.0, 91.0, 48.0, 36.0, distortion=(-0.1, 0.01, 0, 0, 0))

@@ -113,3 +113,34 @@ def test_no_text_crashes_the_reader(
             read(open_events(path))
         except DataError as error:
             assert "\n" not in str(error)  # noqa: PT017
+
+
+PLAIN = [(31, 62, 500_004, 0), (58, 17, 500_010, 1), (56, 21, 500_011, 0)]
+SPELLINGS = {
+    "bom.csv": "\ufeffx,y,t,p\n" + "".join(f"{x},{y},{t},{p}\n" for x, y, t, p in PLAIN),
+    "bom.txt": "\ufeff" + "".join(f"{t} {x} {y} {p}\n" for x, y, t, p in PLAIN),
+    "metavision.csv": "".join(f"{x},{y},{p},{t}\n" for x, y, t, p in PLAIN),
+    "geometry.csv": "%geometry:96,72\n" + "".join(f"{x},{y},{p},{t}\n" for x, y, t, p in PLAIN),
+    "e2vid.txt": "96 72\n" + "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for x, y, t, p in PLAIN),
+    "plus_minus.txt": "".join(f"{t / 1e6:.6f} {x} {y} {2 * p - 1}\n" for x, y, t, p in PLAIN),
+    "microseconds.txt": "".join(f"{t} {x} {y} {p}\n" for x, y, t, p in PLAIN),
+    "commas.txt": "".join(f"{t / 1e6:.6f},{x},{y},{p}\n" for x, y, t, p in PLAIN),
+    "named.txt": "timestamp x y polarity\n" + "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for x, y, t, p in PLAIN),
+    "xytp.txt": "".join(f"{x} {y} {t} {p}\n" for x, y, t, p in PLAIN),
+    "aliases.csv": "polarity,x,y,ts\n" + "".join(f"{p},{x},{y},{t}\n" for x, y, t, p in PLAIN),
+}
+
+
+@pytest.mark.parametrize("name", SPELLINGS)
+def test_read_the_spellings_that_are_unambiguous(name: str, tmp_path: Path) -> None:
+    file = open_event_file(written(tmp_path / name, SPELLINGS[name]), 96, 72)
+    (events,) = file.chunks()
+    expected = [(x, y, 1000 * t, 2 * p - 1) for x, y, t, p in PLAIN]
+    assert list(zip(events.x, events.y, events.t, events.p, strict=True)) == expected
+    assert file.time_span() == (expected[0][2], expected[-1][2])
+
+
+def test_refuse_the_size_of_another_sensor(tmp_path: Path) -> None:
+    path = written(tmp_path / "events.txt", SPELLINGS["e2vid.txt"])
+    with pytest.raises(DataError, match="its first line says 96 x 72 pixels, the calibration 48 x 36"):
+        next(open_event_file(path, 48, 36).chunks())

@@ -160,7 +160,7 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "h5: ECF": (lambda path: write_with_filter(path, 0x8ECF), "ECF filter: .* set HDF5_PLUGIN_PATH to its folder"),
     "h5: another filter": (lambda path: write_with_filter(path, 40_000), r"pip install 'aenerf-ns\[hdf5-"),
     "csv: missing": (None, "there is no such file"),
-    "csv: empty": (b"", "its first line is ''; it must name the columns"),
+    "csv: empty": (b"", "the file holds no events"),
     "csv: without header": (b"1,2,3,1\n", "first line is '1,2,3,1'; it must name"),
     "csv: without events": (b"x,y,t,p\n", "the file holds no events"),
     "csv: with a word": (b"x,y,t,p\n1,2,now,1\n", "line 2 has t = now; write"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 from helpers.small_datasets import make_trajectory
 
@@ -24,3 +25,24 @@ def test_seconds_are_exact() -> None:
     parsed = parse_times(Path("t"), texts)
     assert parsed.tolist() == [1_600_000_000_123_456_789, 0, 1, -500_000_000, 12_000_000_000]
     assert parse_times(Path("t"), [format_seconds(int(t)) for t in parsed]).tolist() == parsed.tolist()
+
+
+POSE = "3.5 -0.25 1.5 -0.5 0.5 0.5 0.5"
+POSES = {
+    "byte-order mark": f"\ufeff0.492 {POSE}\n0.496 {POSE}\n",
+    "commas": f"0.492 {POSE}\n0.496 {POSE}\n".replace(" ", ","),
+    "commas and blanks": f"0.492 {POSE}\n0.496 {POSE}\n".replace(" ", ", "),
+    "names": f"timestamp tx ty tz qx qy qz qw\n0.492 {POSE}\n0.496 {POSE}\n",
+    "EuRoC": "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n"
+    "492000000,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n496000000,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
+    "w first": "t,tx,ty,tz,qw,qx,qy,qz\n0.492,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n0.496,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
+}
+
+
+@pytest.mark.parametrize("spelling", POSES)
+def test_read_the_spellings_that_are_unambiguous(spelling: str, tmp_path: Path) -> None:
+    (tmp_path / "plain.txt").write_text(f"0.492 {POSE}\n0.496 {POSE}\n")
+    (tmp_path / "poses.txt").write_text(POSES[spelling], encoding="utf-8")
+    plain, read = (read_tum_trajectory(tmp_path / name) for name in ("plain.txt", "poses.txt"))
+    assert read.times.tolist() == plain.times.tolist() == [492_000_000, 496_000_000]
+    assert (read.camera_to_worlds == plain.camera_to_worlds).all()
