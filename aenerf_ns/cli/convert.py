@@ -50,8 +50,9 @@ class Convert(DatasetCommand):
 
     output: Path
     """Dataset folder to create."""
-    poses: Literal["given", "colmap", "events"] = "given"
-    """given: take the dataset's poses. colmap: have COLMAP estimate poses from the recording's frames. events: have it
+    poses: Literal["given", "refined", "colmap", "events"] = "given"
+    """given: take the dataset's poses. refined: correct them by the motion of features in images that are made of the
+    events, as far as these know better. colmap: have COLMAP estimate poses from the recording's frames. events: have it
     estimate poses from images that are made of the events, for a recording without frames or of fast motion. Estimated
     poses have no metric scale. Given poses are then kept as ground truth, to compare with."""
     start_time_ns: int | None = None
@@ -105,7 +106,9 @@ class Convert(DatasetCommand):
         from aenerf_ns.recording.views import thin_views
 
         report = picture = None
-        if self.poses != "given":
+        if self.poses == "refined":
+            recording, report, picture = _with_refined_poses(parser.recording, filters.window, self.data, self.seed)
+        elif self.poses != "given":
             recording, report, picture = self._with_estimated_poses(*parser.read_frames(), filters.window)
         else:
             recording = parser.recording
@@ -166,6 +169,38 @@ class Convert(DatasetCommand):
         kept = [(time, file) for time, file in images if window.contains(time)]
         times, files = [time for time, _ in kept], [file for _, file in kept]
         return _with_poses(estimate_poses(files, times, capture.frame_camera, self.data, self.seed), capture, kept)
+
+
+def _with_refined_poses(
+    recording: Recording, window: TimeWindow, data: Path, seed: int
+) -> tuple[Recording, dict[str, Any], Image]:
+    """Refine the poses, and return the recording with them, the report on them, and a picture."""
+    from aenerf_ns.camera.alignment import pose_errors
+    from aenerf_ns.pose_estimation.from_poses import refine_poses
+    from aenerf_ns.recording.views import move_views
+
+    given, truth = recording.trajectory, recording.ground_truth
+    found = refine_poses(recording, window, data, seed)
+    report = found.report()
+    say(found.summary())
+    paths = {"given": given.camera_to_worlds.numpy(), "refined": found.trajectory.camera_to_worlds.numpy()}
+    if truth is None:
+        views = {
+            split: move_views(views, given, found.trajectory) for split, views in recording.reference_views.items()
+        }
+        recording = replace(recording, reference_views=views)
+    else:
+        knots = given.knots_covered_by(truth)
+        before, after = (
+            pose_errors(poses.interpolate(knots), truth.interpolate(knots)) for poses in (given, found.trajectory)
+        )
+        report |= {"errors_given": before, "errors": after}
+        say(
+            f"Compared with the ground truth: mean errors {before['rotation_error_degrees']:.2f} degrees and "
+            f"{before['translation_error']:.2g} as given, {after['rotation_error_degrees']:.2f} degrees and "
+            f"{after['translation_error']:.2g} refined."
+        )
+    return replace(recording, trajectory=found.trajectory), report, found.draw(paths)
 
 
 def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) -> Trajectory:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import statistics
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -191,24 +191,25 @@ class ColmapWorkspace:
             models = pycolmap.global_mapping(self._database, self._images, output, options)
         return _largest_first(models)
 
-    def adjust(self, model: Any, max_pixels: float, max_degrees: float, max_iterations: int) -> Any:
-        """Triangulate all matches again from the poses of a model, and adjust poses and points to them.
+    def triangulate(self, poses: Mapping[int, NDArray[np.float64]], max_pixels: float, max_degrees: float) -> Any:
+        """Return the model of all matches between frames of given poses.
 
         Args:
-            model: its poses; intrinsics stay as they are.
+            poses: (3, 4) camera-to-world, OpenCV camera axes, by the index of the frame.
             max_pixels: reprojection error beyond which an observation belongs to no point.
             max_degrees: the same as an angle between rays.
-            max_iterations: of the bundle adjustment.
         """
         import pycolmap
 
+        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+            numbers = {image.name: image.image_id for image in database.read_all_images()}
+            (camera,) = database.read_all_cameras()
         posed = pycolmap.Reconstruction()
-        (camera,) = model.cameras.values()
         posed.add_camera_with_trivial_rig(camera)
-        for image in model.images.values():
-            if image.has_pose:
-                copied = pycolmap.Image(name=image.name, image_id=image.image_id, camera_id=camera.camera_id)
-                posed.add_image_with_trivial_frame(copied, image.cam_from_world())
+        for index, pose in poses.items():
+            name = self._names[index]
+            image = pycolmap.Image(name=name, image_id=numbers[name], camera_id=camera.camera_id)
+            posed.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose).inverse())
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = options.triangulation.random_seed = self._seed
         options.num_threads, options.extract_colors = 1, False
@@ -216,22 +217,42 @@ class ColmapWorkspace:
         options.mapper.filter_max_reproj_error = limits.complete_max_reproj_error = max_pixels
         limits.merge_max_reproj_error = max_pixels
         limits.create_max_angle_error = limits.continue_max_angle_error = max_degrees
+        with self._step("Triangulating tracks"):
+            posed = pycolmap.triangulate_points(
+                posed,
+                self._database,
+                self._images,
+                self._new_folder("triangulated"),
+                clear_points=True,
+                options=options,
+            )
+            pycolmap.ObservationManager(posed).filter_observations_with_negative_depth()
+        return posed
+
+    def adjust(self, model: Any, max_pixels: float, max_degrees: float, max_iterations: int) -> Any:
+        """Triangulate all matches again from the poses of a model, and adjust poses and points to them.
+
+        Args:
+            model: its poses; intrinsics stay as they are.
+            max_pixels: as for :meth:`triangulate`.
+            max_degrees: likewise.
+            max_iterations: of the bundle adjustment.
+        """
+        import pycolmap
+
+        posed = self.triangulate(poses_of(model), max_pixels, max_degrees)
         adjustment = pycolmap.BundleAdjustmentOptions()
         _keep_intrinsics(adjustment)
         # Tracks of images of events are often wrong.
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = 1.0
         adjustment.ceres.solver_options.max_num_iterations = max_iterations
+        config = pycolmap.BundleAdjustmentConfig()
+        for image in posed.images:
+            config.add_image(image)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         with self._step("Adjusting poses to all tracks"):
-            posed = pycolmap.triangulate_points(
-                posed, self._database, self._images, self._new_folder("adjusted"), clear_points=True, options=options
-            )
             # pycolmap.bundle_adjustment does the same, but it turns COLMAP's log on again.
-            pycolmap.ObservationManager(posed).filter_observations_with_negative_depth()
-            config = pycolmap.BundleAdjustmentConfig()
-            for image in posed.images:
-                config.add_image(image)
-            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
             pycolmap.create_default_bundle_adjuster(adjustment, config, posed).solve()
         return posed
 
@@ -284,6 +305,15 @@ def _keep_intrinsics(adjustment: Any) -> None:
     adjustment.ceres.solver_options.num_threads = 1
 
 
+def poses_of(model: Any) -> dict[int, NDArray[np.float64]]:
+    """Return the (3, 4) camera-to-world poses, with OpenCV camera axes, by the index of the frame."""
+    return {
+        int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
+        for image in model.images.values()
+        if image.has_pose
+    }
+
+
 def trajectory_of(model: Any, times: NDArray[np.int64], source: str | Path) -> Trajectory:
     """Return the camera-to-world poses of the frames that a model places, with OpenCV camera axes.
 
@@ -292,10 +322,6 @@ def trajectory_of(model: Any, times: NDArray[np.int64], source: str | Path) -> T
         times: (N,) of all frames in nanoseconds.
         source: the file or folder of the frames, for messages.
     """
-    poses = {
-        int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
-        for image in model.images.values()
-        if image.has_pose
-    }
+    poses = poses_of(model)
     indices = sorted(poses)
     return Trajectory(times[indices], torch.from_numpy(np.stack([poses[i] for i in indices])), source)

@@ -5,29 +5,20 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
-
-import numpy as np
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.filters import EventFilters, FilteredEventFile
-from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, trajectory_of
+from aenerf_ns.pose_estimation.colmap_workspace import trajectory_of
+from aenerf_ns.pose_estimation.event_images import match_event_images
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
-from aenerf_ns.progress import progress_bar, tracked
-from aenerf_ns.reconstruction.batches import batches_of
-from aenerf_ns.reconstruction.two_sided import two_sided_images
 from aenerf_ns.recording.recording import Capture
 
-EVENTS_PER_PIXEL = 1.05
-"""Events between two images, as a share of the sensor's pixels."""
 # Share of the pairs of images whose matches judge the models, and are used for nothing else.
 _HELD_OUT = 0.05
 # Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, and iterations.
 _ROUNDS = ((12.0, 8.0, 30), (8.0, 5.0, 30), (5.0, 3.0, 30), (4.0, 2.0, 60))
-_MIN_IMAGES = 3
 
 
 def estimate_poses_from_events(
@@ -35,11 +26,10 @@ def estimate_poses_from_events(
 ) -> EstimatedPoses:
     """Estimate the poses of an event camera from its events, on the CPU.
 
-    Images are made of the events (:func:`~aenerf_ns.reconstruction.two_sided.two_sided_images`) whenever the picture
-    has got about one event per pixel, so there are more of them where the camera moves fast. COLMAP finds and matches
-    features in them. Its incremental and its global mapper place the images, and adjust them in some rounds. The
-    poses that more of the matches kept apart agree with are taken. Intrinsics stay as they are. A seed
-    gives the same poses again, to the last bit on one machine with one version of COLMAP.
+    COLMAP matches images that are made of the events (:func:`match_event_images`). Its incremental and its global
+    mapper place the images, and adjust them in some rounds. The poses that more of the matches kept apart agree with
+    are taken. Intrinsics stay as they are. A seed gives the same poses again, to the last bit on one machine with one
+    version of COLMAP.
 
     Args:
         capture: the events and the camera's intrinsics.
@@ -51,28 +41,7 @@ def estimate_poses_from_events(
         DataError: there are too few events for three images, or COLMAP places no images.
     """
     begin = time.perf_counter()
-    camera, events = capture.event_camera, capture.event_file
-    num_events = int(EVENTS_PER_PIXEL * camera.width * camera.height)
-    # Pixels that fire by themselves would be features that do not move.
-    kept = FilteredEventFile(events, EventFilters(start=window.start, end=window.end, hot_pixels=True))
-    kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
-    chunks = kept.filtered(tracked(events.chunks(), "Making images of the events", events.count()))
-    images = list(two_sided_images(batches_of(chunks, num_events), capture.sensor))
-    if len(images) < _MIN_IMAGES:
-        raise DataError(
-            events.path,
-            f"its events make {len(images)} images of {num_events:,} events each",
-            f"poses can be estimated from {_MIN_IMAGES} images or more: record for longer, or widen the time window",
-        )
-    times = np.array([moment for moment, _ in images], np.int64)
-    # Events of one time may end one image and begin the next.
-    later = np.append(True, np.diff(times) > 0)
-    times, pictures = times[later], [image for (_, image), is_later in zip(images, later, strict=True) if is_later]
-    with TemporaryDirectory() as folder, progress_bar() as progress:
-        workspace = ColmapWorkspace(Path(folder), len(times), seed, progress)
-        workspace.add_frames(pictures, (camera.width, camera.height), source)
-        workspace.find_features(camera)
-        workspace.match()
+    with match_event_images(capture, window, source, seed) as (workspace, times, pictures):
         features, pairs = workspace.count_features_and_pairs()
         held_out = workspace.hold_out_matches(_HELD_OUT)
         found = {"incremental": workspace.reconstruct(False), "global": workspace.reconstruct_globally()}
@@ -97,7 +66,7 @@ def estimate_poses_from_events(
     return EstimatedPoses(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),
-        camera=camera,
+        camera=capture.event_camera,
         model_sizes=[model.num_reg_images() for model in found[mapper]],
         num_points=model.num_points3D(),
         reprojection_error=model.compute_mean_reprojection_error(),

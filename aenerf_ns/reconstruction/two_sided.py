@@ -19,12 +19,15 @@ _DECAY = 0.12
 neither do the images on the camera's speed."""
 # The backward filter starts this number of events per pixel after the image: e^-3 of what lies further is left.
 _LOOK_AHEAD = 25.0
+# Events per pixel by which an image shows the past. Light that has changed by less than a threshold has no event yet. A
+# time in place of a number of events would depend on the camera's speed.
+_LAG = 0.1
 # Pixels: standard deviation of a Gaussian, and the percentiles of the picture that are shown black and white.
 _BLUR, _PERCENTILES = 0.8, (1.0, 99.0)
 
 
 def two_sided_images(batches: Iterable[EventStream], sensor: SensorModel) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield the time in nanoseconds and the (height, width) image at the end of each batch of a stream.
+    """Yield the time in nanoseconds and the (height, width) image of each batch of a stream: at its end, less a lag.
 
     A pixel's state adds up contrast thresholds, forwards up to the image and backwards, with reversed polarities, down
     to it; both forget with the number of events in the picture. Their mean has no ghosts of what was seen before.
@@ -63,7 +66,8 @@ def _finish(
             both = state
         else:
             both = (state + backward.state()) / 2
-        images.append((int(batch.t[-1]), _display(both)))
+        lag = round(_LAG * batch.width * batch.height)
+        images.append((int(batch.t[max(len(batch) - 1 - lag, 0)]), _display(both)))
         backward.add(batch, reverse=True)
     return images[::-1]
 

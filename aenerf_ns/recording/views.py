@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -63,9 +64,6 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
             if not file.is_file():
                 raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
     times = parse_times(path, [row[0] for row in rows]).tolist()
-    if len(set(times)) < len(times):
-        seconds = max(times, key=times.count) * 1e-9
-        raise DataError(path, f"several images are at {seconds:.9f} s", "give each image its own time, with all digits")
     return list(zip(times, files, strict=True))
 
 
@@ -109,10 +107,18 @@ def views_on_trajectory(
     Returns:
         All views as train views, and the same alternating between the validation and the test split.
     """
+    times = [time for time, _ in images]
+    if len(set(times)) < len(times):
+        seconds = max(times, key=times.count) * 1e-9
+        raise DataError(
+            images[0][1].parent,
+            f"several images are at {seconds:.9f} s",
+            "give each image its own time, with all digits",
+        )
     known = trajectory.known_time(max_pose_gap)
     kept = [(time, file) for time, file in images if known.contains(time)]
     if len(kept) <= max(1, len(images) // 10):
-        _require_seconds([time for time, _ in images], images[0][1].parent if images else Path(), trajectory)
+        _require_seconds(times, images[0][1].parent if images else Path(), trajectory)
     if len(kept) < len(images):
         CONSOLE.print(
             f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses."
@@ -175,3 +181,15 @@ def spread_evenly(items: Sequence[Item], max_items: int) -> list[Item]:
     """Return at most ``max_items`` of the items, evenly spread from the first to the last."""
     count = min(len(items), max_items)
     return [items[round(i * (len(items) - 1) / max(count - 1, 1))] for i in range(count)]
+
+
+def move_views(views: Sequence[ReferenceView], given: Trajectory, refined: Trajectory) -> list[ReferenceView]:
+    """Move views of known times as the poses at these times move from one trajectory to another, in one world."""
+    known = given.known_time()
+    moved = []
+    for view in views:
+        if view.time is not None and known.contains(view.time):
+            before, after = (homogeneous(path.interpolate([view.time])[0]) for path in (given, refined))
+            view = replace(view, camera_to_world=after @ torch.linalg.inv(before) @ view.camera_to_world)
+        moved.append(view)
+    return moved

@@ -1,0 +1,67 @@
+"""Images of the events, with their features matched by COLMAP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.errors import DataError
+from aenerf_ns.events.filters import EventFilters, FilteredEventFile
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace
+from aenerf_ns.progress import progress_bar, tracked
+from aenerf_ns.reconstruction.batches import batches_of
+from aenerf_ns.reconstruction.two_sided import two_sided_images
+from aenerf_ns.recording.recording import Capture
+
+# Events between two images, as a share of the sensor's pixels.
+_EVENTS_PER_PIXEL = 1.05
+_MIN_IMAGES = 3
+
+
+@contextmanager
+def match_event_images(
+    capture: Capture, window: TimeWindow, source: str | Path, seed: int
+) -> Iterator[tuple[ColmapWorkspace, NDArray[np.int64], list[NDArray[np.uint8]]]]:
+    """Make images of the events whenever the picture has got about one event per pixel, and match their features.
+
+    Args:
+        capture: the events and the camera's intrinsics.
+        window: events outside it are left out.
+        source: the dataset, for messages.
+        seed: of COLMAP's random samples.
+
+    Yields:
+        COLMAP's workspace, and the (N,) times in nanoseconds, increasing, and the images, (height, width) each.
+
+    Raises:
+        DataError: there are too few events for three images.
+    """
+    camera, events = capture.event_camera, capture.event_file
+    num_events = int(_EVENTS_PER_PIXEL * camera.width * camera.height)
+    # Pixels that fire by themselves would be features that do not move.
+    kept = FilteredEventFile(events, EventFilters(start=window.start, end=window.end, hot_pixels=True))
+    kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
+    chunks = kept.filtered(tracked(events.chunks(), "Making images of the events", events.count()))
+    images = list(two_sided_images(batches_of(chunks, num_events), capture.sensor))
+    if len(images) < _MIN_IMAGES:
+        raise DataError(
+            events.path,
+            f"its events make {len(images)} images of {num_events:,} events each",
+            f"poses can be estimated from {_MIN_IMAGES} images or more: record for longer, or widen the time window",
+        )
+    times = np.array([moment for moment, _ in images], np.int64)
+    # Events of one time may end one image and begin the next.
+    later = np.append(True, np.diff(times) > 0)
+    times, pictures = times[later], [image for (_, image), is_later in zip(images, later, strict=True) if is_later]
+    with TemporaryDirectory() as folder, progress_bar() as progress:
+        workspace = ColmapWorkspace(Path(folder), len(times), seed, progress)
+        workspace.add_frames(pictures, (camera.width, camera.height), source)
+        workspace.find_features(camera)
+        workspace.match()
+        yield workspace, times, pictures

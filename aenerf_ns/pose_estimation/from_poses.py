@@ -1,0 +1,145 @@
+"""Camera poses from given poses and the events: refined where feature tracks in images of the events know better."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
+from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, move_poses, tracks_of
+from aenerf_ns.pose_estimation.event_images import match_event_images
+from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
+from aenerf_ns.pose_estimation.refinement import PoseRefinement
+from aenerf_ns.recording.recording import Recording
+
+# Pixels and degrees that an observation may be off, round by round.
+_ROUNDS = ((12.0, 8.0), (8.0, 5.0), (5.0, 3.0), *[(4.0, 2.0)] * 5)
+_MIN_TRACKS = 50
+
+
+@dataclass(frozen=True)
+class RefinedPoses:
+    """Given poses, corrected by tracks.
+
+    Attributes:
+        trajectory: at the times of the given poses, in their world.
+        times: (N,) times of the images in nanoseconds.
+        num_tracks: scene points that images see.
+        twists: (N, 6) corrections at the images: translations in the units of the poses, rotation vectors in radians.
+        is_weak: (N,) whether the tracks say little of the pose, so that it is nearly as given.
+        seconds: how long it took.
+        draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
+            the paths.
+    """
+
+    trajectory: Trajectory
+    times: NDArray[np.int64]
+    num_tracks: int
+    twists: Array
+    is_weak: NDArray[np.bool_]
+    seconds: float
+    draw: Callable[[Mapping[str, Array]], Image.Image]
+
+    def weak_stretches(self) -> list[tuple[int, int]]:
+        """Return the first and last times in nanoseconds of runs of images whose tracks say little of their poses."""
+        edges = np.flatnonzero(np.diff(self.is_weak, prepend=False, append=False))
+        return [
+            (int(self.times[first]), int(self.times[end - 1]))
+            for first, end in zip(edges[::2], edges[1::2], strict=True)
+        ]
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures as plain values for JSON."""
+        return {
+            "images": len(self.times),
+            "tracks": self.num_tracks,
+            "correction_degrees": self._moved()[0],
+            "correction_translation": self._moved()[1],
+            "weak_stretches_ns": self.weak_stretches(),
+            "seconds": self.seconds,
+            "summary": self.summary(),
+        }
+
+    def summary(self) -> str:
+        """Return a line of figures."""
+        degrees, translation = self._moved()
+        line = (
+            f"Poses refined: {self.num_tracks:,} tracks in {len(self.times)} images of the events move them by "
+            f"{degrees:.2g} degrees and {translation:.2g} of their units (root mean square)"
+        )
+        if self.is_weak.any():
+            line += f"; of {self.is_weak.mean():.0%} of the images the tracks say little, and their poses stay as given"
+        return line
+
+    def _moved(self) -> tuple[float, float]:
+        """Return the root mean square angle in degrees, and length, of the corrections."""
+        length, angle = np.sqrt(np.square(self.twists).reshape(-1, 2, 3).sum(-1).mean(0))
+        return float(np.rad2deg(angle)), float(length)
+
+
+def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, seed: int = 0) -> RefinedPoses:
+    """Refine the poses of a recording by its events, on the CPU.
+
+    COLMAP matches images that are made of the events (:func:`match_event_images`), and triangulates tracks from the
+    poses. The poses then follow the tracks, as far as these are to be trusted more
+    (:class:`~aenerf_ns.pose_estimation.refinement.PoseRefinement`), in some rounds. Intrinsics stay as they are. Given
+    poses between images are moved as their neighbors are. A seed gives the same poses again, to the last bit on one
+    machine with one version of COLMAP.
+
+    Args:
+        recording: its events, poses and intrinsics.
+        window: events outside it are left out.
+        source: the dataset, for messages.
+        seed: of COLMAP's random samples.
+
+    Raises:
+        DataError: there are too few events for three images with a pose, or too few tracks.
+    """
+    begin = time.perf_counter()
+    given = recording.trajectory
+    with match_event_images(recording, window, source, seed) as (workspace, all_times, pictures):
+        images = np.flatnonzero(given.known_time(recording.max_pose_gap).contains(all_times))
+        times = all_times[images]
+        poses = given.interpolate(times).numpy() if len(images) else np.zeros((0, 3, 4))
+
+        def triangulate(poses: Array, limits: tuple[float, float]) -> tuple[Any, Tracks]:
+            model = workspace.triangulate(dict(zip(images.tolist(), poses, strict=True)), *limits)
+            if model.num_points3D() < _MIN_TRACKS:
+                raise DataError(
+                    source,
+                    f"{model.num_points3D()} tracks of {len(images)} images of the events fit its poses",
+                    "poses are refined where the camera moves sideways and sees textured surfaces, and their errors "
+                    "are a few degrees; try aenerf check, or estimate poses anew (--poses events)",
+                )
+            return model, tracks_of(model, images.tolist())
+
+        model, tracks = triangulate(poses, _ROUNDS[0])
+        offsets = tracks.positions[tracks.points] - poses[tracks.images, :, 3]
+        depth = float(np.median(np.linalg.norm(offsets, axis=1)))
+        refinement = PoseRefinement((times - times[0]) * 1e-9, poses, depth, seed)
+        refinement.follow(tracks)
+        for limits in _ROUNDS[1:]:
+            model, tracks = triangulate(refinement.poses, limits)
+            refinement.follow(tracks)
+    twists = np.stack([np.interp(given.times.numpy(), times, column) for column in refinement.twists.T], -1)
+    moved = torch.from_numpy(move_poses(given.camera_to_worlds.numpy(), twists))
+    return RefinedPoses(
+        trajectory=Trajectory(given.times, moved, given.source),
+        times=times,
+        num_tracks=model.num_points3D(),
+        twists=refinement.twists,
+        is_weak=refinement.is_weak(),
+        seconds=time.perf_counter() - begin,
+        draw=partial(draw_poses, pictures, observations_of(model, len(pictures))),
+    )

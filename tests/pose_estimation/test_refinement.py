@@ -1,0 +1,131 @@
+"""Poses that follow tracks: the arithmetic, on tracks whose errors are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from aenerf_ns.camera.alignment import pose_errors
+from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.pose_estimation.bundle_adjustment import TrackAdjustment, Tracks, move_poses
+from aenerf_ns.pose_estimation.refinement import PoseRefinement
+from aenerf_ns.simulator.paths import look_at
+
+FOCAL, COUNT, POINTS = 100.0, 40, 400
+SECONDS = np.linspace(0, 1.2, COUNT)
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    """(40, 3, 4) poses on an arc around the points."""
+    eyes = [(2.5 * np.sin(turn), -2.5 * np.cos(turn), 0.3 * np.sin(5 * turn)) for turn in SECONDS]
+    return np.stack([look_at(eye, (0.0, 0.0, 0.0))[:3] for eye in eyes])
+
+
+def tracks_of(truth: np.ndarray, pixels: float, given: np.ndarray, count: int = COUNT) -> Tracks:
+    """Tracks of 400 points whose features are off by some pixels, each seen in 8 to 20 of the first images in a row.
+
+    The points lie where the given poses put their first and last feature.
+    """
+    generator = np.random.default_rng(0)
+    positions = generator.uniform(-1, 1, (POINTS, 3))
+    first = generator.integers(0, count - 8, POINTS)
+    length = np.minimum(generator.integers(8, 21, POINTS), count - first)
+    points = np.repeat(np.arange(POINTS), length)
+    images = np.concatenate([np.arange(a, a + n) for a, n in zip(first, length, strict=True)])
+    local = np.einsum("mji,mj->mi", truth[images, :, :3], positions[points] - truth[images, :, 3])
+    rays = local[:, :2] / local[:, 2:] + generator.normal(size=(len(images), 2)) * pixels / FOCAL
+    starts = np.cumsum(length) - length
+    ends = starts + length - 1
+    directions, origins = [], []
+    for rows in (starts, ends):
+        through = np.concatenate([rays[rows], np.ones((POINTS, 1))], 1)
+        directions.append(np.einsum("mij,mj->mi", given[images[rows], :, :3], through))
+        origins.append(given[images[rows], :, 3])
+    # The middle of the shortest line between the two rays.
+    system = np.stack([directions[0], -directions[1]], -1)
+    offsets = origins[1] - origins[0]
+    depths = np.stack([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(system, offsets, strict=True)])
+    met = [origins[k] + directions[k] * depths[:, k, None] for k in (0, 1)]
+    return Tracks(images, points, rays, (met[0] + met[1]) / 2, FOCAL)
+
+
+def refine(truth: np.ndarray, given: np.ndarray, pixels: float, count: int = COUNT) -> PoseRefinement:
+    refinement = PoseRefinement(SECONDS, given, depth=2.5, seed=0)
+    for _ in range(3):
+        refinement.follow(tracks_of(truth, pixels, refinement.poses, count))
+    return refinement
+
+
+def errors(poses: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    found = pose_errors(torch.from_numpy(poses), torch.from_numpy(truth))
+    return found["rotation_error_degrees"], found["translation_error"]
+
+
+def noisy(truth: np.ndarray, degrees: float, translation: float) -> np.ndarray:
+    path = Trajectory((SECONDS * 1e9).astype(np.int64), torch.from_numpy(truth))
+    return perturb(path, degrees, translation, 0.2, seed=1).camera_to_worlds.numpy()
+
+
+def test_gradient_and_hessian_are_those_of_the_cost(truth: np.ndarray) -> None:
+    given = noisy(truth, 0.3, 0.01)
+    tracks = tracks_of(truth, 0.0, given)
+    generator = np.random.default_rng(1)
+    direction = generator.normal(size=(COUNT, 6))
+
+    def gradient(step: float) -> np.ndarray:
+        adjustment = TrackAdjustment(tracks, 0)
+        poses = move_poses(given, step * direction)
+        adjustment.adjust_points(poses, 30)
+        return adjustment.linearize(poses).gradient
+
+    def cost(step: float) -> float:
+        adjustment = TrackAdjustment(tracks, 0)
+        poses = move_poses(given, step * direction)
+        adjustment.adjust_points(poses, 30)
+        positions = adjustment.positions[tracks.points]
+        local = np.einsum("mji,mj->mi", poses[tracks.images, :, :3], positions - poses[tracks.images, :, 3])
+        squares = np.square(FOCAL * (local[:, :2] / local[:, 2:] - tracks.rays)).sum(1)
+        return 0.5 * np.log1p(squares).sum()
+
+    slope = (cost(1e-5) - cost(-1e-5)) / 2e-5
+    assert gradient(0.0) @ direction.ravel() == pytest.approx(slope, rel=1e-3)
+    # At the true poses the errors are zero, and Gauss and Newton's Hessian is exact.
+    exact = TrackAdjustment(tracks_of(truth, 0.0, truth), 0)
+    exact.adjust_points(truth, 5)
+    hessian = exact.linearize(truth).hessian
+    moved = move_poses(truth, 1e-5 * direction)
+    exact.adjust_points(moved, 5)
+    np.testing.assert_allclose(
+        exact.linearize(moved).gradient, 1e-5 * hessian @ direction.ravel(), atol=2e-3 * np.abs(hessian).max() * 1e-5
+    )
+
+
+@pytest.mark.parametrize(("degrees", "left"), [(0.5, 0.75), (2.5, 0.2)])
+def test_wrong_poses_follow_the_tracks(truth: np.ndarray, degrees: float, left: float) -> None:
+    given = noisy(truth, degrees, 0.03 * degrees)
+    refinement = refine(truth, given, pixels=0.3)
+    before, after = errors(given, truth), errors(refinement.poses, truth)
+    assert after[0] < left * before[0]
+    assert after[1] < (left + 0.2) * before[1]
+    assert not refinement.is_weak().any()
+
+
+def test_exact_poses_stay(truth: np.ndarray) -> None:
+    refinement = refine(truth, truth, pixels=0.6)
+    degrees, distance = errors(refinement.poses, truth)
+    assert degrees < 0.02
+    assert distance < 0.002
+    assert refinement.is_weak().all()
+
+
+def test_poses_without_tracks_stay_as_given(truth: np.ndarray) -> None:
+    given = noisy(truth, 2.5, 0.08)
+    refinement = refine(truth, given, pixels=0.3, count=26)
+    assert not refinement.is_weak()[:20].any()
+    assert refinement.is_weak()[36:].all()
+    assert errors(refinement.poses[:26], truth[:26])[0] < 0.3 * errors(given[:26], truth[:26])[0]
+    # As given, but for what the last images with tracks tell of the next ones.
+    assert np.abs(refinement.twists[36:]).max() < 0.3 * np.abs(refinement.twists).max()
