@@ -10,7 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from aenerf_ns.camera.alignment import rotation_angle
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents, choose_runs, contrast_of
 from aenerf_ns.checking.frames import FrameChanges
 from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
@@ -30,7 +32,7 @@ class CheckLimits:
     """A figure beyond its limit is a problem."""
 
     min_polarity_share: float = 0.02
-    min_correlation: float = -0.1
+    min_correlation: float = -0.4
     """Of the polarities with the change from frame to frame."""
     max_repeated_share: float = 0.05
     max_hot_pixel_share: float = 0.01
@@ -43,9 +45,28 @@ class CheckLimits:
     noise_deviations: float = 4.0
     noise_factor: float = 1.5
     """Contrast above that of the shuffled events by these standard deviations and by this factor is not noise."""
-    max_elsewhere_share: float = 0.2
-    """Share of the slices that clearly fit another meaning of the poses. With right poses there is none on the
-    recordings of the tests, and with the poses of another path about half."""
+    min_slices: int = 2
+    """One slice alone gives no verdict."""
+    min_share_in_favor: float = 0.5
+    """Share of the slices that, each by itself, must clearly fit another meaning of the poses for it to be named."""
+    max_elsewhere_share: float = 0.3
+    """Share of the slices that clearly fit another meaning of the poses, and not all the same one. With the poses of
+    another path it is about half."""
+    outlier_share: float = 1e-3
+    """Share of the events at each side that does not count for the extent of the events."""
+    corner_share: float = 0.02
+    filled_share: float = 0.75
+    """Events that begin at the corner, within the first share of the sensor, and end within the second do not fill
+    it."""
+    half_share: float = 0.52
+    """Nor do events that end within this share, wherever they begin: what is in the middle reaches beyond it."""
+    max_principal_point: float = 0.2
+    """Distance of the principal point from the middle, as a share of the sensor."""
+    equal_poses: float = 1e-12
+    max_still_share: float = 0.05
+    """Share of the events that fall between equal poses."""
+    jump_factor: float = 5
+    """A jump is faster than the steps around it, and than the median, by this factor."""
     min_events: int = 2_000
     """Fewer events give no contrast."""
     min_tile_contrast: float = 0.5
@@ -98,6 +119,7 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     _check_events(result)
     _check_polarity(result, changes.correlation())
     _check_poses(result, recording, window, num_covered)
+    is_simple = _check_lens(result, recording.event_camera) | _check_steps(result, recording.trajectory, window)
     if num_covered < _LIMITS.min_events:
         result.figures.append(
             f"Contrast of warped events: not computed, because only {num_covered} events have a pose."
@@ -107,7 +129,7 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     with progress_bar() as progress:
         progress.add_task("Warping events", total=None)
         result.warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
-        poses_fit = _check_contrast(result, result.warped)
+        poses_fit = _check_contrast(result, result.warped, is_simple)
     # Poses that do not fit give wrong depths.
     depth = _check_depth(result, result.warped, recording, scale) if poses_fit else None
     _describe_motion(result, recording, depth)
@@ -231,8 +253,65 @@ def _check_poses(result: CheckResult, recording: Recording, window: TimeWindow, 
             )
 
 
-def _check_contrast(result: CheckResult, warped: WarpedEvents) -> bool:
-    """Compare the given poses with the alternatives and with shuffled events, and return whether the poses fit."""
+def _check_lens(result: CheckResult, camera: CameraIntrinsics) -> bool:
+    """Compare the lens with the sensor and with where the events are, and return whether there is a problem."""
+    height, width = result.statistics.counts.shape
+    num_problems = len(result.problems)
+    # A hot pixel may lie anywhere.
+    rows, columns = (
+        np.searchsorted(np.cumsum(counts), np.array([_LIMITS.outlier_share, 1 - _LIMITS.outlier_share]) * counts.sum())
+        for counts in (result.statistics.counts.sum(1), result.statistics.counts.sum(0))
+    )
+    begin, end = (np.array([columns[i] / width, rows[i] / height]) for i in (0, 1))
+    if (end < _LIMITS.half_share).all() or ((begin < _LIMITS.corner_share).all() and end.min() < _LIMITS.filled_share):
+        result.problems.append(
+            f"all events lie in the first {columns[1] + 1} x {rows[1] + 1} of {width} x {height} pixels: if they were "
+            "binned or cropped, give the intrinsics of that size (binned by 2: half the focal lengths and the "
+            "principal point)"
+        )
+    shares = camera.cx / width, camera.cy / height
+    if any(abs(share - 0.5) > _LIMITS.max_principal_point for share in shares):
+        result.problems.append(
+            f"the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of {width} x {height} pixels, "
+            "as of another resolution: check the intrinsics, unless this is a part of a larger sensor"
+        )
+    return len(result.problems) > num_problems
+
+
+def _check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow) -> bool:
+    """Look for poses that stand still while there are events, or jump, and return whether there is a problem."""
+    num_problems = len(result.problems)
+    times, poses = trajectory.times.numpy(), trajectory.camera_to_worlds
+    still = np.flatnonzero(((poses[1:] - poses[:-1]).abs().flatten(1).amax(1) < _LIMITS.equal_poses).numpy())
+    segment = np.searchsorted(times, result.statistics.pair_times[:, 1]) - 1
+    share = float(np.isin(segment, still).mean()) if len(segment) else 0.0
+    if share > _LIMITS.max_still_share:
+        result.problems.append(
+            f"{share:.1%} of the events fall between poses that are equal (the first at {times[still[0]]} ns): "
+            "tracking may have been lost there, or poses were repeated; leave these poses out, and see "
+            "--max-pose-gap-ns"
+        )
+    seconds = np.diff(times) * 1e-9
+    jumps = np.zeros(len(seconds), bool)
+    for steps in (rotation_angle(poses[:-1], poses[1:]), poses[..., 3].diff(dim=0).norm(dim=-1)):
+        rates = steps.numpy() / seconds
+        padded = np.pad(rates, 3, mode="edge")
+        around = np.max([padded[3 + k : 3 + k + len(rates)] for k in (-3, -2, 2, 3)], 0)
+        jumps |= (rates > _LIMITS.jump_factor * around) & (rates > _LIMITS.jump_factor * np.median(rates))
+    jumps &= window.contains(times[:-1]) & window.contains(times[1:])
+    if jumps.any():
+        result.problems.append(
+            f"the poses jump (steps: {jumps.sum()}, the first after {times[:-1][jumps][0]} ns): tracking may have been "
+            "lost there, or placeholders stand among the poses; leave these poses out"
+        )
+    return len(result.problems) > num_problems
+
+
+def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -> bool:
+    """Compare the given poses with the alternatives and with shuffled events, and return whether the poses fit.
+
+    ``is_simple`` says that a simpler problem was found, which may be the reason of all that this finds.
+    """
     still, alternatives = warped.compare_without_motion(), warped.compare_alternatives()
     shuffled = warped.shuffled_contrasts()
     figures, problems = result.figures, result.problems
@@ -249,14 +328,25 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents) -> bool:
     if clocks:
         figures.append(f"  clearly less if the clock of the poses is off by {min(map(abs, clocks)) * 1e-9:g} s")
     noise = max(mean + _LIMITS.noise_deviations * deviation, _LIMITS.noise_factor * mean)
-    better = [c for c in alternatives if c.is_clearly_better and c.contrast > noise]
+    if is_simple or num_slices < _LIMITS.min_slices:
+        reason = "what is wrong above" if is_simple else "too few events"
+        figures.append(f"Because of {reason}, the contrast does not tell whether poses, lens and clock are right.")
+        return not is_simple
+    better = [
+        c
+        for c in alternatives
+        if c.is_clearly_better
+        and c.contrast > noise
+        and len(c.slices_in_favor) >= max(_LIMITS.min_slices, _LIMITS.min_share_in_favor * num_slices)
+    ]
     if better:
         best = better[0]
         same = [c for c in better[1:] if best.is_like(c) and not c.hypothesis.clock_offset]
         others = "".join(f"; or as if {c.hypothesis.name}: {c.hypothesis.remedy}" for c in same)
         problems.append(
-            f"the events look as if {best.hypothesis.name} (contrast {best.contrast:.3f} instead of "
-            f"{best.given:.3f}): {best.hypothesis.remedy}{others}"
+            f"the events look as if {best.hypothesis.name} (contrast {best.contrast:.3f} instead of {best.given:.3f}, "
+            f"clearly in {len(best.slices_in_favor)} of {num_slices} slices). First make sure of the lens and the size "
+            f"of the sensor. If that may be, {best.hypothesis.remedy}{others}"
         )
         return False
     inconclusive = [c.hypothesis.name for c in alternatives if c.is_inconclusive and not c.hypothesis.clock_offset]
@@ -274,7 +364,7 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents) -> bool:
             f"shuffled {mean:.3f} +/- {deviation:.3f}): they are noise, or the poses are of another recording: check "
             "the polarities, the order of the columns and the poses"
         )
-    elif len(in_favor_of_others) > _LIMITS.max_elsewhere_share * num_slices:
+    elif len(in_favor_of_others) > max(_LIMITS.max_elsewhere_share * num_slices, _LIMITS.min_slices):
         problems.append(
             f"{len(in_favor_of_others)} of {num_slices} slices of the events clearly fit another meaning of the poses, "
             "and not all the same one: the poses are of another recording, or wrong in places"

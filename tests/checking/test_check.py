@@ -422,3 +422,63 @@ def test_polarities_are_compared_with_real_frames(slider_depth: Path) -> None:
     correlation = changes.correlation()
     assert correlation is not None
     assert correlation > 0.7
+
+
+def with_placeholders(poses: torch.Tensor) -> torch.Tensor:
+    poses = poses.clone()
+    poses[40::50] = torch.eye(4, dtype=poses.dtype)
+    return poses
+
+
+def with_lost_tracking(poses: torch.Tensor) -> torch.Tensor:
+    poses = poses.clone()
+    poses[200:400] = poses[200]
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (with_placeholders, "the poses jump (steps: "),
+        (with_lost_tracking, "of the events fall between poses that are equal (the first at 800000000 ns)"),
+    ],
+)
+def test_wrong_poses_in_places_are_no_wrong_axes(change: Callable, problem: str, shorter: Path) -> None:
+    path = shorter / "trajectory_estimated.txt"
+    write_tum_trajectory(path, read_tum_trajectory(path).transform(change))
+    status, output = run(shorter)
+    assert status == 1
+    assert problem in output
+    assert "as if" not in output.split("problem")[-1]
+    assert "the contrast does not tell whether poses, lens and clock are right" in output
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        (
+            {"width": 128, "height": 96, "cx": 64.0, "cy": 48.0},
+            "all events lie in the first 64 x 48 of 128 x 96 pixels",
+        ),
+        ({"cx": 320.0, "cy": 240.0}, "the principal point (320, 240) is far from the middle of 64 x 48 pixels"),
+    ],
+)
+def test_a_lens_of_another_size_is_no_wrong_axes(changes: dict, problem: str, shorter: Path) -> None:
+    path = shorter / "transforms.json"
+    meta = json.loads(path.read_text())
+    meta["event_camera"] |= changes
+    path.write_text(json.dumps(meta))
+    status, output = run(shorter)
+    assert status == 1
+    assert problem in output
+    assert "as if" not in output.split("problem")[-1]
+
+
+def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(room, tmp_path / "room")
+    rewrite(folder, all_events(open_native(folder))[:3500])
+    path = folder / "trajectory_estimated.txt"
+    write_tum_trajectory(path, read_tum_trajectory(path).transform(lambda poses: poses @ axes(1, -1, -1)))
+    _, output = run(folder)
+    assert "as if" not in output.split("problem")[-1]
+    assert "Because of too few events, the contrast does not tell" in output
