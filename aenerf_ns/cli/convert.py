@@ -131,7 +131,8 @@ class Convert(DatasetCommand):
                     f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor",
                     "begin it at an even column and row, so that its first pixel is red",
                 )
-        with open_writer(lock, parser, recording, camera, recording.frame_camera) as writer:
+        has_metric_poses = self.poses in ("given", "refined")
+        with open_writer(lock, parser, recording, camera, recording.frame_camera, has_metric_poses) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is not None:
                 writer.add_poses_report(report)

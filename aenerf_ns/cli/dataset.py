@@ -95,8 +95,12 @@ def open_writer(
     recording: Recording,
     event_camera: CameraIntrinsics,
     frame_camera: CameraIntrinsics,
+    has_metric_poses: bool = True,
 ) -> NativeDatasetWriter:
-    """Open a dataset folder for what a command makes of a recording, in the world of the recording."""
+    """Open a dataset folder for what a command makes of a recording, in the world of the recording.
+
+    Poses without metric scale are scaled in training, whatever the format of the recording does.
+    """
     from aenerf_ns.recording.writer import NativeDatasetWriter
 
     longest_gap = parser.config.max_pose_gap_ns
@@ -109,7 +113,7 @@ def open_writer(
         max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
         frame_camera=frame_camera,
         # Near and far planes keep their units.
-        auto_scale_poses=parser.scales_poses(recording),
+        auto_scale_poses=parser.scales_poses(recording) or not has_metric_poses,
     )
 
 
