@@ -94,6 +94,7 @@ class NativeDataParser(EventDataParser):
             sensor=self._sensor(path, meta.event_camera),
             frame_camera=frame_camera,
             image_encoding=meta.image_encoding,
+            intrinsics_origin=meta.event_camera.intrinsics_origin,
         )
         return path, meta, capture
 

@@ -13,8 +13,9 @@ from torch import Tensor
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
-from aenerf_ns.files.calibration import read_calibration
+from aenerf_ns.files.calibration import Calibration, read_calibration
 from aenerf_ns.files.colmap import read_colmap_focal_shares, read_colmap_poses
 from aenerf_ns.files.limits import require_one
 from aenerf_ns.files.open import SUFFIXES, open_event_file
@@ -36,7 +37,7 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
 
     markers = (
         f"events{{{','.join(SUFFIXES)}}}",
-        " or ".join(_CALIBRATIONS),
+        f"{' or '.join(_CALIBRATIONS)}, where there is one",
         "poses in trajectory.txt or a COLMAP model in colmap, where there are any",
     )
     _target: type = field(default_factory=lambda: OwnRecordingDataParser)
@@ -66,10 +67,10 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:
-        # Poses may be missing: they can be estimated.
-        has_events = any((data / f"events{suffix}").is_file() for suffix in SUFFIXES)
+        # Poses and calibration may be missing: they can be estimated. Events may, where a trained run is opened.
         has_poses = (data / "trajectory.txt").is_file() or (data / "colmap").is_dir()
-        return any((data / name).is_file() for name in _CALIBRATIONS) and (has_events or has_poses)
+        has_calibration = any((data / name).is_file() for name in _CALIBRATIONS)
+        return any((data / f"events{suffix}").is_file() for suffix in SUFFIXES) or (has_calibration and has_poses)
 
 
 class OwnRecordingDataParser(EventDataParser):
@@ -111,35 +112,45 @@ class OwnRecordingDataParser(EventDataParser):
         folder, config = Path(self.config.data), self.config
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder of the recording as --data")
-        calibration = read_calibration(self._calibration_file(folder), config.event_camera, config.frame_camera)
+        calibration = self._read_calibration(folder)
         images = self._image_list(folder)
         timed = read_image_list(images) if config.images is not None or images.is_file() else []
         capture = config.make_capture(
             calibration.sensor,
-            event_file=self._event_file(folder, calibration.event_camera),
+            event_file=self._event_file(folder, calibration.event_camera.width, calibration.event_camera.height),
             event_camera=calibration.event_camera,
             frame_camera=calibration.frame_camera,
             image_encoding=calibration.image_encoding,
+            intrinsics_origin=calibration.intrinsics_origin,
         )
         return capture, calibration.frame_from_event, timed
 
     def _image_list(self, folder: Path) -> Path:
         return folder / IMAGE_LIST if self.config.images is None else self.config.images
 
-    def _calibration_file(self, folder: Path) -> Path:
-        if self.config.calibration is not None:
-            return self.config.calibration
-        found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
-        return require_one(found, folder, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
+    def _read_calibration(self, folder: Path) -> Calibration:
+        config, file = self.config, self.config.calibration
+        if file is None:
+            found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
+            if not found:
+                return _guess_calibration(self._event_file(folder))
+            file = require_one(found, folder, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
+        return read_calibration(file, config.event_camera, config.frame_camera)
 
-    def _event_file(self, folder: Path, camera: CameraIntrinsics) -> EventFile:
+    def _event_file(self, folder: Path, width: int | None = None, height: int | None = None) -> EventFile:
         config = self.config
         if config.events is None:
             files = sorted(folder / f"events{suffix}" for suffix in SUFFIXES)
             files = [file for file in files if file.is_file()]
             # Stored, so that opening a trained run needs no events.
             config.events = require_one(files, folder, f"files events{{{','.join(SUFFIXES)}}}", "give one as --events")
-        return open_event_file(config.events, camera.width, camera.height, config.event_topic, config.event_time_unit)
+        return open_event_file(config.events, width, height, config.event_topic, config.event_time_unit)
+
+
+def _guess_calibration(events: EventFile) -> Calibration:
+    """Return a guess for a camera of which no more is known than the size that the event file states."""
+    camera = CameraIntrinsics.guess(events.width, events.height)
+    return Calibration(camera, camera, torch.eye(4, dtype=torch.float64), SensorModel(), "linear", "guessed")
 
 
 def _read_colmap(

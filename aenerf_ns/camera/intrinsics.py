@@ -15,6 +15,9 @@ from torch import Tensor
 
 LensModel = Literal["radial_tangential", "fisheye"]
 
+Origin = Literal["given", "estimated", "guessed"]
+"""Where intrinsics come from."""
+
 # The parameters of each lens model, in OpenCV's order.
 _PARAMETERS: dict[LensModel, tuple[str, ...]] = {
     "radial_tangential": ("k1", "k2", "p1", "p2", "k3"),
@@ -104,6 +107,12 @@ class CameraIntrinsics:
             raise ValueError(f"{self.lens_model} distortion takes {expected} numbers, not {len(self.distortion)}")
 
     @classmethod
+    def guess(cls, width: int, height: int) -> CameraIntrinsics:
+        """Make a camera whose lens is not known, with COLMAP's first guess of the focal length."""
+        focal_length = 1.2 * max(width, height)
+        return cls(width, height, focal_length, focal_length, width / 2, height / 2)
+
+    @classmethod
     def from_opencv(
         cls,
         size: tuple[float, float],
@@ -150,6 +159,15 @@ class CameraIntrinsics:
             "cy": self.cy,
             **dict(zip(_PARAMETERS[self.lens_model], self.distortion, strict=True)),
         }
+
+    def summary(self) -> str:
+        """Return focal length and distortion for people to read."""
+        distortion = ", ".join(
+            f"{name} {value:.3g}"
+            for name, value in zip(_PARAMETERS[self.lens_model], self.distortion, strict=True)
+            if value
+        )
+        return f"focal length {self.fx:.1f} px, {distortion or 'no distortion'}"
 
     def to_colmap(self) -> tuple[str, list[float]]:
         """Return COLMAP's simplest model of the lens, and its parameters. Its pixels count from the edge, too."""

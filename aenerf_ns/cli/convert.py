@@ -169,7 +169,9 @@ class Convert(DatasetCommand):
             )
         kept = [(time, file) for time, file in images if window.contains(time)]
         times, files = [time for time, _ in kept], [file for _, file in kept]
-        return _with_poses(estimate_poses(files, times, capture.frame_camera, self.data, self.seed), capture, kept)
+        lens = capture.event_camera
+        camera = (lens.width, lens.height) if capture.intrinsics_origin == "guessed" else lens
+        return _with_poses(estimate_poses(files, times, camera, self.data, self.seed), capture, kept)
 
 
 def _with_refined_poses(
@@ -256,6 +258,12 @@ def _with_poses(
     from aenerf_ns.recording.views import views_on_trajectory
 
     trajectory, report = found.trajectory, found.report()
+    if capture.intrinsics_origin == "guessed":
+        if capture.frame_camera == capture.event_camera:
+            capture = replace(capture, frame_camera=found.camera)
+        capture = replace(capture, event_camera=found.camera, intrinsics_origin="estimated")
+        report["intrinsics"] = found.camera.to_transforms()
+        say(f"The intrinsics were estimated with the poses: {found.camera.summary()}.")
     paths = {"estimated": trajectory.camera_to_worlds.numpy()}
     say(found.summary())
     say(

@@ -114,6 +114,7 @@ def open_writer(
         frame_camera=frame_camera,
         # Near and far planes keep their units.
         auto_scale_poses=parser.scales_poses(recording) or not has_metric_poses,
+        has_estimated_intrinsics=recording.intrinsics_origin == "estimated",
     )
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.intrinsics import CameraIntrinsics, Origin
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.json_file import convert
@@ -45,6 +45,7 @@ class Calibration:
     frame_from_event: Tensor
     sensor: SensorModel
     image_encoding: ImageEncoding
+    intrinsics_origin: Origin = "given"
 
 
 def read_calibration(path: Path, event_camera: str | None = None, frame_camera: str | None = None) -> Calibration:
@@ -62,8 +63,9 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
         meta, lens = read_transforms(path)
         with value_errors_as_data_error(path):
             sensor = SensorModel(**sensor_values(meta.event_camera))
-        motion = frame_from_event(path, meta.event_camera, lens)
-        return Calibration(meta.event_camera.intrinsics(), lens, motion, sensor, meta.image_encoding)
+        camera = meta.event_camera
+        motion = frame_from_event(path, camera, lens)
+        return Calibration(camera.intrinsics(), lens, motion, sensor, meta.image_encoding, camera.intrinsics_origin)
     content = read_plain_yaml(path)
     if isinstance(content, dict) and "camera_matrix" in content:
         lens = _camera_info(path, content)

@@ -98,7 +98,8 @@ def resolve_sensor_size(
     given = (width, height)
     width, height = (own if size is None else size for size, own in zip(given, stated or (None, None), strict=True))
     if width is None or height is None:
-        raise DataError(path, "the file does not state the size of its sensor", "give its width and height in pixels")
+        remedy = "give its width and height in pixels, for a recording of your own in calibration.json"
+        raise DataError(path, "the file does not state the size of its sensor", remedy)
     if stated is not None and (width, height) != stated:
         raise DataError(
             path,

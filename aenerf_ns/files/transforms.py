@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.intrinsics import CameraIntrinsics, Origin
 from aenerf_ns.camera.trajectory import require_rigid
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
 
@@ -47,6 +47,13 @@ class _Camera(msgspec.Struct, kw_only=True):
         return CameraIntrinsics.from_transforms(self.width, self.height, msgspec.structs.asdict(self))
 
 
+class _Size(msgspec.Struct):
+    """All that a file must state of an event camera whose lens is not known."""
+
+    width: int
+    height: int
+
+
 class FrameCamera(_Camera, kw_only=True):
     """The camera that took the images, whose keys stand at the top of the file."""
 
@@ -58,6 +65,7 @@ class EventCamera(_Camera, kw_only=True):
     """The event camera and its sensor. ``T_frame_event`` takes points from its coordinates to the frame camera's."""
 
     file: str | None = None
+    intrinsics_origin: Origin = "given"
     positive_contrast_threshold: float | None = None
     negative_contrast_threshold: float | None = None
     refractory_period_ns: int = 0
@@ -103,12 +111,19 @@ def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
     """Read transforms.json or calibration.json.
 
     Returns:
-        The file, and the lens of the camera that took the images: the event camera's where the file states no other.
+        The file, and the lens of the camera that took the images: the event camera's where the file states no other. An
+        event camera without any intrinsics has a guessed lens.
 
     Raises:
         DataError: the file is missing or malformed, or a value is impossible.
     """
     values = read_json(path, dict)
+    camera = values.get("event_camera")
+    if isinstance(camera, dict) and camera.keys().isdisjoint(("fl_x", "fl_y", "cx", "cy")):
+        size = convert(path, camera, _Size, name="event_camera")
+        with value_errors_as_data_error(path):
+            guess = CameraIntrinsics.guess(size.width, size.height)
+        values["event_camera"] = {**camera, **guess.to_transforms(), "intrinsics_origin": "guessed"}
     meta = convert(path, values, Transforms)
     if "w" not in values and not meta.frames:
         return meta, meta.event_camera.intrinsics()

@@ -79,6 +79,7 @@ class ColmapWorkspace:
 
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
         self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
+        self._pairs = folder / "pairs.txt"
         self._images.mkdir()
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
         self._seed = seed
@@ -127,13 +128,52 @@ class ColmapWorkspace:
 
         pairs = [f"{self._names[i]} {self._names[j]}" for i, j in _choose_pairs(len(self._names))]
         matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
-        verification = pycolmap.TwoViewGeometryOptions()
+        verification = self._verification()
         matching.use_gpu, matching.num_threads = False, 1
-        pairing.match_list_path = self._folder / "pairs.txt"
-        pairing.match_list_path.write_text("\n".join(pairs), encoding="utf-8")
-        verification.ransac.random_seed = self._seed
+        pairing.match_list_path = self._pairs
+        self._pairs.write_text("\n".join(pairs), encoding="utf-8")
         with self._step("Matching frames"):
             pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
+
+    def estimate_intrinsics(self, rounds: Iterable[tuple[float, float, int]]) -> CameraIntrinsics | None:
+        """Estimate one focal length and the radial distortion k1 from all matches, and use them from here on.
+
+        Args:
+            rounds: limits of the adjustments, as :meth:`adjust` takes them.
+
+        Returns:
+            The intrinsics; None where the mapper places no frames.
+        """
+        import pycolmap
+
+        models = self.reconstruct(refine_intrinsics=True)
+        if not models:
+            return None
+        model = models[0]
+        for limits in rounds:
+            self._store_intrinsics(model)
+            model = self.adjust(model, *limits, refine_intrinsics=True)
+        self._store_intrinsics(model)
+        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+            database.clear_two_view_geometries()
+        with self._step("Verifying matches"):
+            pycolmap.verify_matches(self._database, self._pairs, self._verification())
+        return intrinsics_of(model)
+
+    def _store_intrinsics(self, model: Any) -> None:
+        import pycolmap
+
+        (camera,) = model.cameras.values()
+        camera.has_prior_focal_length = True
+        with contextlib.closing(pycolmap.Database.open(self._database)) as database:
+            database.update_camera(camera)
+
+    def _verification(self) -> Any:
+        import pycolmap
+
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = self._seed
+        return options
 
     def hold_out_matches(self, share: float) -> HeldOutMatches:
         """Take the matches of a share of the pairs of frames out of the database, to judge models by."""
@@ -229,20 +269,24 @@ class ColmapWorkspace:
             pycolmap.ObservationManager(posed).filter_observations_with_negative_depth()
         return posed
 
-    def adjust(self, model: Any, max_pixels: float, max_degrees: float, max_iterations: int) -> Any:
+    def adjust(
+        self, model: Any, max_pixels: float, max_degrees: float, max_iterations: int, refine_intrinsics: bool = False
+    ) -> Any:
         """Triangulate all matches again from the poses of a model, and adjust poses and points to them.
 
         Args:
-            model: its poses; intrinsics stay as they are.
+            model: its poses.
             max_pixels: as for :meth:`triangulate`.
             max_degrees: likewise.
             max_iterations: of the bundle adjustment.
+            refine_intrinsics: whether to adjust focal length and distortion too.
         """
         import pycolmap
 
         posed = self.triangulate(poses_of(model), max_pixels, max_degrees)
         adjustment = pycolmap.BundleAdjustmentOptions()
         _keep_intrinsics(adjustment)
+        adjustment.refine_focal_length = adjustment.refine_extra_params = refine_intrinsics
         # Tracks of images of events are often wrong.
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = 1.0
@@ -312,6 +356,14 @@ def poses_of(model: Any) -> dict[int, NDArray[np.float64]]:
         for image in model.images.values()
         if image.has_pose
     }
+
+
+def intrinsics_of(model: Any) -> CameraIntrinsics:
+    """Return the intrinsics that a model has: those of COLMAP's SIMPLE_RADIAL, which it estimates."""
+    (camera,) = model.cameras.values()
+    focal_length, cx, cy, k1 = (float(value) for value in camera.params)
+    distortion = (k1, 0.0, 0.0, 0.0, 0.0)
+    return CameraIntrinsics(camera.width, camera.height, focal_length, focal_length, cx, cy, distortion=distortion)
 
 
 def trajectory_of(model: Any, times: NDArray[np.int64], source: str | Path) -> Trajectory:

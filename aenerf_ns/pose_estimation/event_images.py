@@ -62,6 +62,6 @@ def match_event_images(
     with TemporaryDirectory() as folder, progress_bar() as progress:
         workspace = ColmapWorkspace(Path(folder), len(times), seed, progress)
         workspace.add_frames(pictures, (camera.width, camera.height), source)
-        workspace.find_features(camera)
+        workspace.find_features(None if capture.intrinsics_origin == "guessed" else camera)
         workspace.match()
         yield workspace, times, pictures

@@ -28,8 +28,8 @@ def estimate_poses_from_events(
 
     COLMAP matches images that are made of the events (:func:`match_event_images`). Its incremental and its global
     mapper place the images, and adjust them in some rounds. The poses that more of the matches kept apart agree with
-    are taken. Intrinsics stay as they are. A seed gives the same poses again, to the last bit on one machine with one
-    version of COLMAP.
+    are taken. Intrinsics stay as they are; where they are only guessed, one focal length and the radial distortion k1
+    are estimated first. A seed gives the same poses again, to the last bit on one machine with one version of COLMAP.
 
     Args:
         capture: the events and the camera's intrinsics.
@@ -42,6 +42,9 @@ def estimate_poses_from_events(
     """
     begin = time.perf_counter()
     with match_event_images(capture, window, source, seed) as (workspace, times, pictures):
+        camera = capture.event_camera
+        if capture.intrinsics_origin == "guessed":
+            camera = workspace.estimate_intrinsics(_ROUNDS) or camera
         features, pairs = workspace.count_features_and_pairs()
         held_out = workspace.hold_out_matches(_HELD_OUT)
         found = {"incremental": workspace.reconstruct(False), "global": workspace.reconstruct_globally()}
@@ -66,7 +69,7 @@ def estimate_poses_from_events(
     return EstimatedPoses(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),
-        camera=capture.event_camera,
+        camera=camera,
         model_sizes=[model.num_reg_images() for model in found[mapper]],
         num_points=model.num_points3D(),
         reprojection_error=model.compute_mean_reprojection_error(),

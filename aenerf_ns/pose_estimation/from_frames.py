@@ -19,7 +19,7 @@ from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, trajectory_of
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, intrinsics_of, trajectory_of
 from aenerf_ns.progress import progress_bar
 
 # Beyond these errors, a pose is not inaccurate but wrong: COLMAP put the camera elsewhere.
@@ -163,9 +163,7 @@ def estimate_poses(
         )
     model = models[0]
     if given is None:
-        (found,) = model.cameras.values()
-        focal_length, cx, cy, k1 = (float(value) for value in found.params)
-        given = CameraIntrinsics(*size, focal_length, focal_length, cx, cy, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
+        given = intrinsics_of(model)
     return EstimatedPoses(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),

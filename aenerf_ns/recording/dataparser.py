@@ -31,6 +31,7 @@ from aenerf_ns.recording.views import seconds_on_trajectory, thin_views, viewer_
 _MAX_REFERENCE_DISTANCE = 1e4
 # Limits of half the side and of the corners of a scene box, in the units of the poses, whatever these are.
 _MIN_BOX, _MAX_BOX = 1e-6, 1e6
+_ESTIMATE = "aenerf convert DATA --output FOLDER --poses events"
 
 
 class EventDataParser(DataParser):
@@ -77,17 +78,27 @@ class EventDataParser(DataParser):
                 capture, frames = self.read_capture()
                 capture.event_file.drop_malformed = self.config.drop_malformed
                 return capture, frames
-        views = [view for split in self.recording.reference_views.values() for view in split]
+        views = [view for split in self._recording.reference_views.values() for view in split]
         timed = {view.time: view.file for view in views if view.time is not None}
-        return self.recording, sorted(timed.items())
+        return self._recording, sorted(timed.items())
 
-    @cached_property
+    @property
     def recording(self) -> Recording:
         """The recording, read once.
 
         Raises:
-            DataError: a file is missing or its content cannot be used.
+            DataError: a file is missing or its content cannot be used, or the lens is not known.
         """
+        if self._recording.intrinsics_origin == "guessed":
+            raise DataError(
+                str(self.config.data),
+                "the intrinsics of the event camera are not known",
+                f"calibrate it, or have them estimated together with poses: {_ESTIMATE}",
+            )
+        return self._recording
+
+    @cached_property
+    def _recording(self) -> Recording:
         longest = self.config.max_pose_gap_ns
         if longest is not None and longest <= 0:
             raise DataError(str(self.config.data), f"max_pose_gap_ns is {longest}", "give a positive number")
@@ -97,7 +108,7 @@ class EventDataParser(DataParser):
                     raise DataError(
                         str(self.poses_path()),
                         "there are no such poses",
-                        "give them, or have them estimated: aenerf convert DATA --output FOLDER --poses events",
+                        f"give them, or have them estimated: {_ESTIMATE}",
                     )
                 recording = self.read_recording()
         except DataError as error:

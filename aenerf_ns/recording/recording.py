@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from torch import Tensor
 
 from aenerf_ns.camera.image_encoding import ImageEncoding
-from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.intrinsics import CameraIntrinsics, Origin
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile
@@ -46,6 +46,8 @@ class Capture:
         sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
         frame_camera: the lens of the camera that took the images.
         image_encoding: whether the images' values are sRGB or linear in radiance.
+        intrinsics_origin: where the event camera's lens comes from. A guessed one has to be estimated together with the
+            poses.
     """
 
     event_file: EventFile
@@ -53,6 +55,7 @@ class Capture:
     sensor: SensorModel
     frame_camera: CameraIntrinsics
     image_encoding: ImageEncoding
+    intrinsics_origin: Origin = field(default="given", kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,7 @@ class NativeDatasetWriter(_FolderWriter):
         scene_box: (2, 3) corners of a box that holds the scene, or None for a scene without bounds.
         frame_camera: the lens of the camera that took the images; by default the event camera's.
         auto_scale_poses: whether training scales the poses by default.
+        has_estimated_intrinsics: whether the event camera's lens was estimated together with the poses.
     """
 
     def __init__(
@@ -108,6 +109,7 @@ class NativeDatasetWriter(_FolderWriter):
         max_pose_gap: int | None = None,
         frame_camera: CameraIntrinsics | None = None,
         auto_scale_poses: bool = True,
+        has_estimated_intrinsics: bool = False,
     ) -> None:
         super().__init__(folder)
         frame_camera = event_camera if frame_camera is None else frame_camera
@@ -121,6 +123,8 @@ class NativeDatasetWriter(_FolderWriter):
             "frames": [],
             **{f"{split}_filenames": [] for split in SPLITS},
         }
+        if has_estimated_intrinsics:
+            self._meta["event_camera"]["intrinsics_origin"] = "estimated"
         if not auto_scale_poses:
             self._meta["auto_scale_poses"] = False
         if scene_box is not None:

@@ -284,7 +284,7 @@ OWN: dict[str, Fault] = {
     "no folder": (shutil.rmtree, "made", "no such folder"),
     "no events": (remove("events.h5"), "made", "0 files events{.raw,"),
     "two event files": (write_text("events.csv", ""), "made", "2 files events"),
-    "no calibration": (remove("calibration.json"), "made", "0 of calibration.json and camchain.yaml"),
+    "no calibration": (remove("calibration.json"), "events.h5", "does not state the size of its sensor"),
     "no poses": (remove("trajectory.txt"), "trajectory.txt", "no such poses"),
     "negative threshold": (NEGATIVE, "calibration.json", "positive_contrast_threshold"),
     "scaled mount": (mount(SCALED), "event_camera.T_frame_event", "not a rigid motion"),

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from helpers.event_file_writers import HEIGHT, WIDTH, evt3
 from helpers.own_recordings import random_events, write_calibration, write_poses
 from helpers.published_datasets import (
     CALIBRATION,
@@ -27,6 +28,7 @@ from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.recording.recording import Recording
 
 
 def test_own_recordings_have_views_at_their_times(tmp_path: Path) -> None:
@@ -57,6 +59,39 @@ def test_own_recording_from_files_anywhere(tmp_path: Path) -> None:
     assert_same_poses(recording.trajectory.camera_to_worlds, truth.poses)
     assert len(recording.reference_views["train"]) == 3
     assert recording.event_file.time_span()[0] == EPOCH * 1_000
+
+
+def test_intrinsics_may_be_missing(tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    file = truth.data / "calibration.json"
+    meta = json.loads(file.read_text())
+    lens = {"fl_x", "fl_y", "cx", "cy", "k1", "p2"}
+    meta["event_camera"] = {key: value for key, value in meta["event_camera"].items() if key not in lens}
+    file.write_text(json.dumps(meta))
+    parser = OwnRecordingDataParserConfig(data=truth.data).setup()
+    with pytest.raises(DataError, match=r"intrinsics .* are not known; calibrate it, or .* --poses events"):
+        parser.get_dataparser_outputs("train")
+    # Poses that are given can still be compared with.
+    recording, frames = parser.read_frames()
+    assert isinstance(recording, Recording)
+    assert recording.intrinsics_origin == "guessed"
+    assert (recording.event_camera.width, recording.event_camera.height) == (60, 40)
+    assert recording.sensor == SensorModel(0.3, 0.2, 100)
+    assert len(frames) == 3
+    # A part of a lens is a mistake.
+    meta["event_camera"]["fl_x"] = 50.0
+    file.write_text(json.dumps(meta))
+    with pytest.raises(DataError, match="missing required field `fl_y`"):
+        parser.read_recording()
+
+
+def test_an_event_file_that_states_its_size_is_enough(tmp_path: Path) -> None:
+    (tmp_path / "events.raw").write_bytes(evt3([(3, 4, 100_000, 1), (5, 6, 200_000, -1)]))
+    assert recognize(tmp_path) == "event-recording-data"
+    capture, frames = OwnRecordingDataParserConfig(data=tmp_path).setup().read_frames()
+    assert not frames
+    assert capture.intrinsics_origin == "guessed"
+    assert (capture.event_camera.width, capture.event_camera.height) == (WIDTH, HEIGHT)
 
 
 def test_camchain_places_both_cameras(tmp_path: Path) -> None:
