@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import io
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -36,6 +38,10 @@ def main() -> None:
 
     Bad arguments end the process with exit status 2, bad data with one line and exit status 1, or 2 for ``check``.
     """
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal without UTF-8 shows question marks.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     words = _with_positional_first(sys.argv[1:])
     names = words[:1] if words and words[0] in COMMANDS else COMMANDS
     command = tyro.extras.subcommand_cli_from_dict(
@@ -46,6 +52,9 @@ def main() -> None:
     )
     try:
         command.main()
+    except KeyboardInterrupt:
+        print("Stopped.", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)
     except DataError as error:
         print(f"Error: {error}", file=sys.stderr)
         sys.exit(getattr(command, "error_status", 1))

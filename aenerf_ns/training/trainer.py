@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import shutil
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -114,6 +116,8 @@ class AENeRFTrainer(Trainer):
             elif config.load_checkpoint is not None:
                 require_whole(config.load_checkpoint)
         self._record: RunRecord | None = None
+        # The number of the signal that asked the training to stop, or 0.
+        self._stopped_by = 0
         super().__init__(replace(config, **changes), local_rank, world_size)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -131,7 +135,9 @@ class AENeRFTrainer(Trainer):
             framework.add_writer(ScalarWriter(self.base_dir))
             self._record = RunRecord(self.base_dir, self.config.machine.seed, self._steps)
             # After the last checkpoint, and before the viewer waits for the user to end it.
-            self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._record_end))
+            places = TrainingCallbackLocation
+            self.callbacks.append(TrainingCallback([places.AFTER_TRAIN], self._record_end))
+            self.callbacks.append(TrainingCallback([places.AFTER_TRAIN_ITERATION], self._stop_if_asked))
             with _one_line_if_not_written(self.base_dir / "config.yml") as path, atomic_write(path) as partial:
                 partial.write_text(yaml.dump(self._resolved_config()), "utf8")
 
@@ -144,13 +150,46 @@ class AENeRFTrainer(Trainer):
 
     def train(self) -> None:
         """Train the model, and record how far that came."""
-        with _full_disk_as_one_line(self.base_dir):
+        with _full_disk_as_one_line(self.base_dir), self._stopping_after_a_step():
             try:
                 super().train()
             except BaseException:
                 if self._record is not None:
                     self._record.write("stopped", self.step - self._steps.start)
                 raise
+
+    @contextmanager
+    def _stopping_after_a_step(self) -> Iterator[None]:
+        """Let the first interrupt, by the keyboard or by SIGTERM, take effect when a step is complete."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        before = {number: signal.getsignal(number) for number in numbers}
+
+        def stop(number: int, _: object) -> None:
+            if self._record is None or self._stopped_by:
+                # Nothing is being trained, or the user does not want to wait.
+                raise KeyboardInterrupt
+            self._stopped_by = number
+            # A training that the viewer paused takes no further step by itself.
+            self.training_state = "training"
+
+        for number in numbers:
+            signal.signal(number, stop)
+        try:
+            yield
+        finally:
+            for number in numbers:
+                signal.signal(number, before[number])
+
+    def _stop_if_asked(self, step: int) -> None:
+        if self._stopped_by and self._record is not None:
+            self.save_checkpoint(step)
+            self._record.write("stopped", step + 1 - self._steps.start)
+            self._record = None
+            print(f"Stopped after step {step}. Go on with the same command and --load-dir {self.base_dir}", flush=True)
+            raise SystemExit(128 + self._stopped_by)
 
     def _record_end(self, step: int) -> None:
         # Once: the user ends the viewer of a finished training by an interrupt.

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.dataset import DatasetCommand, training_command
 from aenerf_ns.cli.main import COMMANDS, load_command, main
 from aenerf_ns.errors import DataError
@@ -231,3 +232,33 @@ def test_exporter_of_nerfstudio_starts_without_libusb() -> None:
 
 if __name__ == "__main__":
     answer_all()
+
+
+def test_an_interrupt_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(self: Check) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Check, "main", interrupted)
+    monkeypatch.setattr("sys.argv", ["aenerf", "check", "somewhere"])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err == "Stopped.\n"
+
+
+def test_a_terminal_without_utf_8_and_folders_that_cannot_be_written(tmp_path: Path) -> None:
+    code = (
+        "import os; os.access = lambda *_: False\n"
+        "import aenerf_ns, sys\n"
+        "print(os.environ['NUMBA_CACHE_DIR'])\n"
+        "from aenerf_ns.cli import main\n"
+        "from aenerf_ns.cli.check import Check\n"
+        "Check.main = lambda self: print(chr(0x2588))\n"
+        "sys.argv = ['aenerf', 'check', 'F']\n"
+        "main.main()\n"
+    )
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    folder, shown = done.stdout.splitlines()
+    assert "aenerf-ns-numba-" in folder
+    assert shown == "?"
