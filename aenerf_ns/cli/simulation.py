@@ -59,7 +59,7 @@ class SimulationCommand:
     """Time for which a pixel is blind after each event, in nanoseconds."""
     noise: tyro.conf.OmitArgPrefixes[SensorNoise] = field(default_factory=SensorNoise)
     bayer_pattern: BayerPattern = ""
-    """RGGB for a color sensor."""
+    """Color filters of a color sensor: of the first two pixels of the first row, then of the second."""
     max_displacement: float = 0.5
     """Pixels that 99 % of the picture may move between two rendered frames, or between two frames along the flow."""
     train_images: int = 50

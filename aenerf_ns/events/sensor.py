@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 
-BayerPattern = Literal["", "RGGB"]
+BayerPattern = Literal["", "RGGB", "BGGR", "GRBG", "GBRG"]
 
 
 # The largest event sensors have 1 million pixels. The directions of so many pixels take 0.5 GB for a moment.
@@ -20,9 +20,6 @@ _MAX_PIXELS = 1 << 22
 _THRESHOLDS = (1e-4, 1e3)
 # Nanoseconds. Refractory periods are microseconds to milliseconds long.
 _MAX_REFRACTORY_PERIOD = 10**12
-
-# Color filter (0 red, 1 green, 2 blue) of the 2 x 2 pixels that repeat: [row % 2, column % 2].
-RGGB = np.array([[0, 1], [1, 2]], dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,8 @@ class SensorModel:
         positive_contrast_threshold: C+, the rise of log-radiance that triggers an event of polarity +1.
         negative_contrast_threshold: C−, the fall of log-radiance (a positive number) that triggers one of polarity −1.
         refractory_period: τ in nanoseconds. A pixel is blind for this time after each of its events.
-        bayer_pattern: "RGGB" for a color sensor whose pixel (0, 0) is red, "" for a monochrome one.
+        bayer_pattern: the color filters of the first two pixels of the first row and of the second, "RGGB" where pixel
+            (0, 0) is red; "" for a monochrome sensor.
 
     Raises:
         ValueError: a threshold is below 1e-4 or above 1e3, the refractory period is negative or beyond 1000 s, or the
@@ -54,13 +52,19 @@ class SensorModel:
             raise ValueError(
                 f"refractory_period must be from 0 to {_MAX_REFRACTORY_PERIOD:g} ns, not {self.refractory_period:g}"
             )
-        if self.bayer_pattern not in ("", "RGGB"):
-            raise ValueError(f'bayer_pattern must be "" or "RGGB", not "{self.bayer_pattern}"')
+        if self.bayer_pattern not in get_args(BayerPattern):
+            known = ", ".join(f'"{pattern}"' for pattern in get_args(BayerPattern))
+            raise ValueError(f'bayer_pattern must be one of {known}, not "{self.bayer_pattern}"')
 
     @property
     def num_channels(self) -> int:
         """Number of radiance channels the sensor sees: 1 for a monochrome sensor, 3 for a color one."""
         return 3 if self.bayer_pattern else 1
+
+    @property
+    def color_filter(self) -> NDArray[np.int64]:
+        """The (2, 2) channels (0 red, 1 green, 2 blue) of the filters of a color sensor: [row % 2, column % 2]."""
+        return np.array(["RGB".index(color) for color in self.bayer_pattern]).reshape(2, 2)
 
     def channel(self, x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the radiance channel that each pixel's filter passes.
@@ -74,7 +78,7 @@ class SensorModel:
         """
         if not self.bayer_pattern:
             return np.zeros(len(x), dtype=np.int64)
-        return RGGB[y % 2, x % 2].astype(np.int64)
+        return self.color_filter[y % 2, x % 2]
 
 
 def require_event_sensor_size(

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.reconstruction.batches import batches_of
 from aenerf_ns.reconstruction.high_pass import HighPassFilter
@@ -43,12 +43,12 @@ class FilteredImages:
 
     def __init__(self, width: int, height: int, sensor: SensorModel) -> None:
         self._filter = HighPassFilter(width, height, sensor)
-        self._has_color = bool(sensor.bayer_pattern)
+        self._pattern = sensor.bayer_pattern
 
     def image(self, events: EventStream) -> NDArray[np.uint8]:
         """Return the next image; see :class:`ImageSource`."""
         values = self._filter.image(events)
-        return demosaic(values) if self._has_color else _gray_to_rgb(values)
+        return demosaic(values, self._pattern) if self._pattern else _gray_to_rgb(values)
 
 
 class NetworkImages:
@@ -65,7 +65,7 @@ class NetworkImages:
 
     def __init__(self, network: E2VID | FireNet, sensor: SensorModel, device: torch.device | str) -> None:
         self._network = network.to(device)
-        self._has_color = bool(sensor.bayer_pattern)
+        self._pattern = sensor.bayer_pattern
         self._device = device
         self._states: dict[str, Any] = {}
 
@@ -73,13 +73,13 @@ class NetworkImages:
         """Return the next image; see :class:`ImageSource`."""
         voxels = normalize(voxel_grid(events, NUM_BINS))
         gray = self._run("all", voxels)
-        if not self._has_color:
+        if not self._pattern:
             return _gray_to_rgb(gray)
         mosaic = np.empty_like(gray)
         for row in range(2):
             for column in range(2):
                 mosaic[row::2, column::2] = self._run(f"{row}{column}", voxels[:, row::2, column::2])
-        return _replace_lightness(demosaic(mosaic), gray)
+        return _replace_lightness(demosaic(mosaic, self._pattern), gray)
 
     @torch.no_grad()
     def _run(self, name: str, voxels: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -113,9 +113,9 @@ def images_of(
         yield int(batch.t[-1]), source.image(batch)
 
 
-def demosaic(mosaic: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Interpolate the (height, width, 3) RGB picture of a (height, width) RGGB mosaic linearly."""
-    return np.asarray(cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB), np.uint8)
+def demosaic(mosaic: NDArray[np.uint8], pattern: BayerPattern) -> NDArray[np.uint8]:
+    """Interpolate the (height, width, 3) RGB picture of a (height, width) mosaic of a Bayer pattern linearly."""
+    return np.asarray(cv2.cvtColor(mosaic, getattr(cv2, f"COLOR_Bayer{pattern}2RGB")), np.uint8)
 
 
 def _replace_lightness(picture: NDArray[np.uint8], gray: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.camera.image_encoding import LUMINANCE
-from aenerf_ns.events.sensor import RGGB, SensorModel
+from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.simulator.options import SensorNoise
 
 _MIN_CONTRAST_THRESHOLD = 0.01
@@ -198,7 +198,7 @@ class EventSimulator:
         self._channel_weights = np.array(LUMINANCE)
         if sensor.bayer_pattern:
             y, x = np.indices((height, width))
-            self._channel_weights = np.eye(3)[np.asarray(RGGB)[y & 1, x & 1]]
+            self._channel_weights = np.eye(3)[sensor.color_filter[y & 1, x & 1]]
         self._leak = noise.leak_rate * sensor.positive_contrast_threshold * 1e-9
         self._rng = np.random.default_rng(seed)
         spread = noise.contrast_threshold_spread

@@ -238,7 +238,7 @@ def test_bayer_channels_follow_the_raw_pixel() -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [(0.0, 0.25), (0.25, -1.0), (float("nan"), 0.25), (0.25, 0.25, -1), (0.25, 0.25, 0, "BGGR")]
+    "values", [(0.0, 0.25), (0.25, -1.0), (float("nan"), 0.25), (0.25, 0.25, -1), (0.25, 0.25, 0, "RGBG")]
 )
 def test_impossible_sensors_are_refused(values: tuple) -> None:
     with pytest.raises(ValueError, match="must"):

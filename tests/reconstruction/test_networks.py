@@ -11,7 +11,7 @@ import torch
 from helpers.streams import make_stream
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.reconstruction.images import FilteredImages, NetworkImages, demosaic, images_of
 from aenerf_ns.reconstruction.layers import ConvGRU, ConvLSTM
@@ -205,11 +205,13 @@ def test_padding_is_removed() -> None:
     assert np.unravel_index(image[..., 0].argmax(), (9, 13)) == (2, 3)
 
 
-def test_demosaic_one_color() -> None:
-    mosaic = np.zeros((6, 8), np.uint8)
-    mosaic[::2, ::2], mosaic[1::2, 1::2] = 200, 50
-    mosaic[::2, 1::2] = mosaic[1::2, ::2] = 120
-    assert (demosaic(mosaic) == [200, 120, 50]).all()
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_demosaic_one_color(pattern: BayerPattern) -> None:
+    rows, columns = np.indices((6, 8)).reshape(2, -1)
+    channels = SensorModel(bayer_pattern=pattern).channel(columns, rows)
+    mosaic = np.array([200, 120, 50], np.uint8)[channels].reshape(6, 8)
+    assert ["RGB"[channel] for channel in channels[[0, 1, 8, 9]]] == list(pattern)
+    assert (demosaic(mosaic, pattern) == [200, 120, 50]).all()
 
 
 def test_filter_sees_colors() -> None:
