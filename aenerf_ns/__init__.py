@@ -7,7 +7,6 @@ also for users who run another method. Import what you need from its modules.
 import os
 import tempfile
 import warnings
-from pathlib import Path
 
 __version__ = "0.2.0"
 
@@ -15,6 +14,7 @@ __version__ = "0.2.0"
 warnings.filterwarnings("ignore", r"(?s).*TBB threading layer")
 warnings.filterwarnings("ignore", r"`torch\.(jit\.script|cuda\.amp)", FutureWarning)
 
-if not any(os.access(place, os.W_OK) for place in (Path(__file__).parent, Path.home())):
+# Path.home() raises for a user without a home.
+if not any(os.access(place, os.W_OK) for place in (os.path.dirname(__file__), os.path.expanduser("~"))):
     # numba keeps what it compiles beside the package or in the home, and raises where it can write neither.
     os.environ.setdefault("NUMBA_CACHE_DIR", f"{tempfile.gettempdir()}/aenerf-ns-numba-{os.getuid()}")

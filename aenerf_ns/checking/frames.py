@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.recording.images import read_image
+from aenerf_ns.recording.images import check_image, read_image
 from aenerf_ns.recording.recording import Recording
 
 # Pairs of frames that are compared. More do not change the result.
@@ -31,9 +31,8 @@ class FrameChanges:
         times = sorted(files) if recording.frame_camera == recording.event_camera else []
         starts = np.unique(np.linspace(0, len(times) - 2, _MAX_PAIRS).astype(int)) if len(times) > 1 else []
         self._spans = [(times[i], times[i + 1]) for i in starts]
-        self._files = files
-        camera = recording.event_camera
-        self._sums = np.zeros((len(self._spans), camera.height, camera.width))
+        self._files, self._camera = files, recording.event_camera
+        self._sums = np.zeros((len(self._spans), self._camera.height, self._camera.width))
 
     def add(self, events: EventStream) -> None:
         """Add a piece of the stream of events."""
@@ -56,6 +55,8 @@ class FrameChanges:
         return float(np.corrcoef(events[seen], frames[seen])[0, 1])
 
     def _change(self, start: int, end: int) -> NDArray[np.float64]:
+        for time in (start, end):
+            check_image(self._files[time], self._camera)
         before, after = (
             np.log(np.asarray(read_image(self._files[time]).convert("L"), np.float64) + _EPSILON)
             for time in (start, end)
