@@ -24,7 +24,7 @@ from aenerf_ns.pose_estimation.refinement import PoseRefinement
 from aenerf_ns.recording.recording import Recording
 
 # Pixels and degrees that an observation may be off, round by round.
-_ROUNDS = ((12.0, 8.0), (8.0, 5.0), (5.0, 3.0), *[(4.0, 2.0)] * 5)
+_ROUNDS = ((12.0, 8.0), (8.0, 5.0), (5.0, 3.0), *[(4.0, 2.0)] * 4)
 _MIN_TRACKS = 50
 
 

@@ -17,8 +17,9 @@ from PIL import Image
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors
 from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import rotation_from_vector
-from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.cli.simulate import Simulate
@@ -26,10 +27,12 @@ from aenerf_ns.dataparsers.formats import FORMATS, recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses, compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
+from aenerf_ns.recording.recording import ReferenceView
 from aenerf_ns.recording.scene import SCENE_KEY
+from aenerf_ns.recording.views import move_views
 from aenerf_ns.simulator.open_scene import open_scene
 from aenerf_ns.simulator.paths import RoomPath
 from aenerf_ns.simulator.scene import SimulationScene
@@ -143,6 +146,42 @@ def test_find_poses_of_a_bare_recording(bare: Path, dataset: tuple[Path, str], t
     # The dataset can be trained on.
     scene = NativeDataParserConfig(data=tmp_path / "scene").setup().get_dataparser_outputs("train").metadata[SCENE_KEY]
     assert (scene.window.start, scene.window.end) == (found.start, found.end)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 2.0])
+def test_refine_given_poses(dataset: tuple[Path, str], tmp_path: Path, degrees: float) -> None:
+    given = tmp_path / "given"
+    shutil.copytree(dataset[0], given)
+    truth = read_tum_trajectory(given / "trajectory_ground_truth.txt")
+    write_tum_trajectory(given / "trajectory_estimated.txt", perturb(truth, degrees, degrees * 0.03, 0.15, seed=2))
+    with CONSOLE.capture() as output:
+        Convert(given, output=tmp_path / "scene", poses="refined").main()
+    report = json.loads((tmp_path / "scene" / "poses_report.json").read_text())
+    assert report["summary"].split(";")[0] in " ".join(output.get().split())
+    before, after = (report[name]["rotation_error_degrees"] for name in ("errors_given", "errors"))
+    refined = read_tum_trajectory(tmp_path / "scene" / "trajectory_estimated.txt")
+    found = pose_errors(refined.camera_to_worlds, truth.interpolate(refined.times))
+    assert found["rotation_error_degrees"] == pytest.approx(after, abs=1e-4)
+    assert (report["correction_degrees"] > 0.5) == (degrees > 0)
+    assert after < 0.1 + 0.6 * before
+    with Image.open(tmp_path / "scene" / "poses_report.png") as picture:
+        assert picture.size == (1456, 484)
+
+
+def test_views_move_with_the_poses() -> None:
+    times = np.arange(3) * FRAME
+    given = Trajectory(times, torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+    moved = given.camera_to_worlds.clone()
+    moved[..., 3] += torch.tensor([0.0, 0.0, 1.0])
+    moved[..., :3] = rotation_from_vector(torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64))
+    # A camera beside the event camera, and an image that was not taken on the trajectory.
+    beside = torch.eye(4, dtype=torch.float64)
+    beside[0, 3] = 0.2
+    views = [ReferenceView(Path("a.png"), beside, FRAME), ReferenceView(Path("b.png"), beside, None)]
+    on_path, elsewhere = move_views(views, given, Trajectory(times, moved))
+    expected = homogeneous(moved[1]) @ beside
+    torch.testing.assert_close(on_path.camera_to_world, expected)
+    assert elsewhere == views[1]
 
 
 def test_draw_tracks_and_paths() -> None:

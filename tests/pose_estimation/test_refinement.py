@@ -110,7 +110,7 @@ def test_wrong_poses_follow_the_tracks(truth: np.ndarray, degrees: float, left: 
     before, after = errors(given, truth), errors(refinement.poses, truth)
     assert after[0] < left * before[0]
     assert after[1] < (left + 0.2) * before[1]
-    assert not refinement.is_weak().any()
+    assert refinement.is_weak().mean() < 0.3
 
 
 def test_exact_poses_stay(truth: np.ndarray) -> None:
