@@ -120,6 +120,7 @@ class Run:
         seed: of the training.
         options: of ns-train.
         images: options of aenerf reconstruct, where the run trains on images made by it.
+        convert: options of aenerf convert, where the run trains on the dataset that it makes.
     """
 
     table: str
@@ -130,6 +131,7 @@ class Run:
     seed: int
     options: tuple[str, ...]
     images: tuple[str, ...] = ()
+    convert: tuple[str, ...] = ()
 
     @property
     def true_poses(self) -> bool:
@@ -139,7 +141,7 @@ class Run:
     @property
     def name(self) -> str:
         """Name of the files: scene, speed, row, seed and a digest of the other options."""
-        unique = digest((self.dataset.name, self.method, str(self.steps), *self.options, *self.images))
+        unique = digest((self.dataset.name, self.method, str(self.steps), *self.options, *self.images, *self.convert))
         row = self.row.replace(",", "").replace(" + ", "+").replace(" ", "-")
         return f"{scene_name(self.dataset.scene)}_{self.dataset.speed}_{row}_seed{self.seed}_{unique}"
 

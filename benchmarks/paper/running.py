@@ -77,9 +77,10 @@ class Runner:
         data = self._dataset(run.dataset)
         # A training that was killed leaves files.
         shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)
-        if run.images:
-            name = f"{data.name}_images_{digest(run.images)}"
-            data = self._make_dataset(name, "reconstruct", str(data.resolve()), *run.images)
+        for command, options in (("reconstruct", run.images), ("convert", run.convert)):
+            if options:
+                name = f"{data.name}_{command}_{digest(options)}"
+                data = self._make_dataset(name, command, str(data.resolve()), *options)
         training = self._train(run, data)
         evaluation = self._folder / "runs" / run.name / "evaluation.json"
         made = json.loads(evaluation.read_text("utf8"))
@@ -99,6 +100,7 @@ class Runner:
             "simulate": shlex.join(("aenerf", "simulate", *run.dataset.command)),
             "train": shlex.join(training),
             "reconstruct": shlex.join(run.images),
+            "convert": shlex.join(run.convert),
             "train_seconds": round(made["train_seconds"]),
             "poses_report": _read(data / "poses_report.json"),
             # JSON has no NaN.

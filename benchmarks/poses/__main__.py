@@ -4,9 +4,10 @@
     python -m benchmarks.poses --scenes-folder scenes --work work --output benchmarks/results/poses_cpu2.json
     python -m benchmarks.poses --split choose --variants density="--pipeline.model.average-init-density 3" ...
 
-Each recording is trained with its wrong poses and, as a control, with its true poses. Every variant of the settings is
-trained on the same recordings with the same seeds. The runs are made as those of ``benchmarks.paper``, in the folder
-``--work``, where finished runs are found again. See ``scenes.py`` for the recordings.
+Each recording is trained with its wrong poses, with these refined by its events, with poses found from its events alone
+and, as a control, with its true poses. Every variant of the settings is trained on the same recordings with the same
+seeds. The runs are made as those of ``benchmarks.paper``, in the folder ``--work``, where finished runs are found again.
+See ``scenes.py`` for the recordings.
 """
 
 from __future__ import annotations
@@ -36,12 +37,14 @@ from benchmarks.poses.scenes import SCENES, Split, scene_argument
 from benchmarks.runs import run_benchmark, write_result
 
 _OFF = ("--pipeline.model.camera-optimizer.mode", "off")
-# Row of the run, and options of ns-train.
-_CASES = {
-    "noise, corrected": ("corrected", ()),
-    "noise, not corrected": ("not corrected", _OFF),
-    "true poses, corrected": (f"corrected{ON_TRUE_POSES}", ()),
-    "true poses": (f"not corrected{ON_TRUE_POSES}", _OFF),
+# Row of the run, options of ns-train, and options of aenerf convert.
+_CASES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "noise, corrected": ("corrected", (), ()),
+    "noise, not corrected": ("not corrected", _OFF, ()),
+    "noise, refined, corrected": ("refined, corrected", (), ("--poses", "refined")),
+    "from nothing, corrected": ("from nothing, corrected", (), ("--poses", "events")),
+    "true poses, corrected": (f"corrected{ON_TRUE_POSES}", (), ()),
+    "true poses": (f"not corrected{ON_TRUE_POSES}", _OFF, ()),
 }
 _DEFAULT = "default"
 LAGS = (0.1, 0.2, 0.4, 0.8)
@@ -100,9 +103,9 @@ class Poses:
         runner, runs = Runner(self.work, "cpu"), []
 
         def measure(name: str, case: str, variant: str, seed: int) -> dict[str, Any] | None:
-            row, of_case = _CASES[case]
+            row, of_case, convert = _CASES[case]
             options = (*of_case, *shlex.split(variants[variant]))
-            run = Run("poses", row, datasets[name], self.method, self.steps, seed, options)
+            run = Run("poses", row, datasets[name], self.method, self.steps, seed, options, convert=convert)
             made = runner.make(run)
             if made is None:
                 return None
