@@ -8,9 +8,11 @@ import json
 import shutil
 from pathlib import Path
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from helpers.small_trainings import train_small_model
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
@@ -22,6 +24,7 @@ from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
+from aenerf_ns.cli.export import ExportVideo
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.formats import FORMATS, recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -116,36 +119,64 @@ def test_colmap_estimates_intrinsics(room: SimulationScene) -> None:
 
 @pytest.fixture(scope="module")
 def bare(dataset: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The events of the dataset and its calibration, without frames and poses."""
+    """The events of the dataset and the size of its sensor, without lens, frames and poses."""
     folder = tmp_path_factory.mktemp("bare")
-    meta = json.loads((dataset[0] / "transforms.json").read_text())
-    (folder / "calibration.json").write_text(json.dumps({"event_camera": meta["event_camera"]}))
+    (folder / "calibration.json").write_text(json.dumps({"event_camera": {"width": 160, "height": 120}}))
     shutil.copy(dataset[0] / "events.h5", folder)
     return folder
 
 
-def test_find_poses_of_a_bare_recording(bare: Path, dataset: tuple[Path, str], tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def found(bare: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a dataset "data", whose poses and lens were found from its events, and what the command printed."""
+    folder = tmp_path_factory.mktemp("found")
     with CONSOLE.capture() as output:
-        Convert(bare, output=tmp_path / "scene", poses="events").main()
-    report = json.loads((tmp_path / "scene" / "poses_report.json").read_text())
+        Convert(bare, output=folder / "data", poses="events").main()
+    return folder, output.get()
+
+
+def test_find_poses_and_lens_of_a_bare_recording(
+    found: tuple[Path, str], dataset: tuple[Path, str], room: SimulationScene
+) -> None:
+    folder, output = found[0] / "data", found[1]
+    report = json.loads((folder / "poses_report.json").read_text())
     assert report["registered_frames"] >= report["frames"] - 1 > 9
     assert report["agreement"] > 0.8
-    assert "images of the events registered" in output.get()
-    found = read_tum_trajectory(tmp_path / "scene" / "trajectory_estimated.txt")
+    assert "images of the events registered" in output
+    trajectory = read_tum_trajectory(folder / "trajectory_estimated.txt")
     truth = read_tum_trajectory(dataset[0] / "trajectory_ground_truth.txt")
-    errors = pose_errors(found.camera_to_worlds, truth.interpolate(found.times))
+    errors = pose_errors(trajectory.camera_to_worlds, truth.interpolate(trajectory.times))
     # Measured: 0.5 degrees and 9 mm on a path of 1.1 m.
     assert errors["rotation_error_degrees"] < 2
     assert errors["translation_error"] < 0.03
-    # It says how its poses were found.
+    # It says how its poses and its lens were found.
     with CONSOLE.capture() as checked, contextlib.suppress(SystemExit):
-        Check(tmp_path / "scene").main()
-    assert f"How they were estimated: {report['summary'].splitlines()[0]}" in " ".join(checked.get().split())
-    with Image.open(tmp_path / "scene" / "poses_report.png") as picture:
+        Check(folder).main()
+    told = " ".join(checked.get().split())
+    assert f"How they were estimated: {report['summary'].splitlines()[0]}" in told
+    assert "The intrinsics were estimated with the poses: focal length" in told
+    lens = json.loads((folder / "transforms.json").read_text())["event_camera"]
+    assert lens["intrinsics_origin"] == "estimated"
+    # Measured: 5 % too long on this short path.
+    assert lens["fl_x"] == lens["fl_y"] == pytest.approx(room.intrinsics(160, 120)[0], rel=0.1)
+    with Image.open(folder / "poses_report.png") as picture:
         assert picture.size == (1456, 484)
-    # The dataset can be trained on.
-    scene = NativeDataParserConfig(data=tmp_path / "scene").setup().get_dataparser_outputs("train").metadata[SCENE_KEY]
-    assert (scene.window.start, scene.window.end) == (found.start, found.end)
+    # The dataset can be trained on. Its world has COLMAP's scale, which training changes.
+    outputs = NativeDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
+    assert outputs.cameras.camera_to_worlds[..., 3].abs().max() == pytest.approx(1, rel=0.1)
+    scene = outputs.metadata[SCENE_KEY]
+    assert (scene.window.start, scene.window.end) == (trajectory.start, trajectory.end)
+
+
+@pytest.mark.slow
+def test_from_a_bare_recording_to_a_video(found: tuple[Path, str], tmp_path: Path) -> None:
+    trainer = train_small_model(found[0], "run", 2)
+    trainer.config.save_config()
+    ExportVideo(trainer.base_dir, tmp_path / "video.mp4", rate=10).main()
+    width, height = next(imageio_ffmpeg.read_frames(str(tmp_path / "video.mp4")))["size"]
+    # Events, rendered events, rendering and depth beside each other.
+    assert width > 4 * 160
+    assert height > 120
 
 
 @pytest.mark.parametrize("degrees", [0.0, 2.0])
