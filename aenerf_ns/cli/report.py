@@ -31,12 +31,12 @@ class ReportCommand:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """The runs: each by its config.yml or its folder."""
-    data: Path | None = None
-    """Where the dataset of the runs is now, if it was moved."""
     output: Path = Path("report")
     """Folder to write to. Files of an earlier report there are replaced."""
     allow_different_protocols: bool = False
     """Compare runs although they were measured differently. The page then says how."""
+    data: Path | None = None
+    """Where the dataset of the runs is now, if it was moved."""
 
     def main(self) -> None:
         """Measure the runs and write the page."""

@@ -112,7 +112,7 @@ ECD: dict[str, Fault] = {
     "no events": (write_text("events.txt", ""), "events.txt", "no events"),
     "five fields": (event("0.03 1 2 0 9"), "events.txt", "line 3 has 5 fields"),
     "a word": (event("0.03 one 2 0"), "events.txt", "line 3 has x = one"),
-    "two kinds of polarity": (event("0.03 1 2 -1"), "events.txt", "events of polarity -1 beside it"),
+    "two kinds of polarity": (event("0.03 1 2 -1"), "events.txt", "line 2 has p = 0"),
     "pixel outside": (event("0.03 6 3 1"), "events.txt", "line 3 has x = 6"),
     "negative pixel": (event("0.03 5 -1 1"), "events.txt", "line 3 has y = -1"),
     "fractional pixel": (event("0.03 2.5 1 1"), "events.txt", "line 3 has x = 2.5"),
