@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -136,7 +136,10 @@ def frame_from_event(path: Path, camera: EventCamera, frame_lens: CameraIntrinsi
     Raises:
         DataError: it is missing, and the lenses say that these are two cameras; or it is no motion.
     """
-    if camera.T_frame_event is None and camera.intrinsics() == frame_lens:
+    lens = camera.intrinsics()
+    # The images may be undistorted ones of the same sensor.
+    undistorted = replace(frame_lens, lens_model=lens.lens_model, distortion=lens.distortion)
+    if camera.T_frame_event is None and undistorted == lens:
         return torch.eye(4, dtype=torch.float64)
     return rigid_motion(path, "event_camera.T_frame_event", camera.T_frame_event)
 
