@@ -21,7 +21,8 @@ from aenerf_ns.recording.recording import Capture
 
 # Events between two images, as a share of the sensor's pixels.
 _EVENTS_PER_PIXEL = 1.05
-_MIN_IMAGES = 3
+MIN_IMAGES = 3
+"""Images that poses are estimated from, at least."""
 
 
 @contextmanager
@@ -49,11 +50,11 @@ def match_event_images(
     kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
     chunks = kept.filtered(tracked(events.chunks(), "Making images of the events", events.count()))
     images = list(two_sided_images(batches_of(chunks, num_events), capture.sensor))
-    if len(images) < _MIN_IMAGES:
+    if len(images) < MIN_IMAGES:
         raise DataError(
             events.path,
             f"its events make {len(images)} images of {num_events:,} events each",
-            f"poses can be estimated from {_MIN_IMAGES} images or more: record for longer, or widen the time window",
+            f"poses can be estimated from {MIN_IMAGES} images or more: record for longer, or widen the time window",
         )
     times = np.array([moment for moment, _ in images], np.int64)
     # Events of one time may end one image and begin the next.

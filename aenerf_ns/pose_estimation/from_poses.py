@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, move_poses, tracks_of
-from aenerf_ns.pose_estimation.event_images import match_event_images
+from aenerf_ns.pose_estimation.event_images import MIN_IMAGES, match_event_images
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
 from aenerf_ns.pose_estimation.refinement import PoseRefinement
 from aenerf_ns.recording.recording import Recording
@@ -26,6 +27,7 @@ from aenerf_ns.recording.recording import Recording
 # Pixels and degrees that an observation may be off, round by round.
 _ROUNDS = ((12.0, 8.0), (8.0, 5.0), (5.0, 3.0), *[(4.0, 2.0)] * 4)
 _MIN_TRACKS = 50
+_MAX_IMAGES = 1000
 
 
 @dataclass(frozen=True)
@@ -110,8 +112,16 @@ def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, s
     given = recording.trajectory
     with match_event_images(recording, window, source, seed) as (workspace, all_times, pictures):
         images = np.flatnonzero(given.known_time(recording.max_pose_gap).contains(all_times))
+        # Time and memory grow with the number's third and second power.
+        images = images[:: math.ceil(len(images) / _MAX_IMAGES) or 1]
+        if len(images) < MIN_IMAGES:
+            raise DataError(
+                source,
+                f"{len(images)} of {len(all_times)} images of its events are within its poses",
+                "check that events and poses share one clock: aenerf check",
+            )
         times = all_times[images]
-        poses = given.interpolate(times).numpy() if len(images) else np.zeros((0, 3, 4))
+        poses = given.interpolate(times).numpy()
 
         def triangulate(poses: Array, limits: tuple[float, float]) -> tuple[Any, Tracks]:
             model = workspace.triangulate(dict(zip(images.tolist(), poses, strict=True)), *limits)

@@ -6,8 +6,8 @@
 
 Each recording is trained with its wrong poses, with these refined by its events, with poses found from its events alone
 and, as a control, with its true poses. Every variant of the settings is trained on the same recordings with the same
-seeds. The runs are made as those of ``benchmarks.paper``, in the folder ``--work``, where finished runs are found again.
-See ``scenes.py`` for the recordings.
+seeds. The runs are made as those of ``benchmarks.paper``, in the folder ``--work``, where finished runs are found
+again. See ``scenes.py`` for the recordings.
 """
 
 from __future__ import annotations

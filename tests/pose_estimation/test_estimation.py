@@ -199,6 +199,17 @@ def test_refine_given_poses(dataset: tuple[Path, str], tmp_path: Path, degrees: 
         assert picture.size == (1456, 484)
 
 
+def test_refuse_poses_beside_the_events(dataset: tuple[Path, str], tmp_path: Path) -> None:
+    given = tmp_path / "given"
+    shutil.copytree(dataset[0], given)
+    truth = read_tum_trajectory(given / "trajectory_ground_truth.txt")
+    first = truth.times < truth.start + 20_000_000
+    cut = Trajectory(truth.times[first], truth.camera_to_worlds[first])
+    write_tum_trajectory(given / "trajectory_estimated.txt", cut)
+    with pytest.raises(DataError, match=r"of .* images of its events are within its poses; .*aenerf check"):
+        Convert(given, output=tmp_path / "scene", poses="refined").main()
+
+
 def test_views_move_with_the_poses() -> None:
     times = np.arange(3) * FRAME
     given = Trajectory(times, torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
