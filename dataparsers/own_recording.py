@@ -86,7 +86,7 @@ class OwnRecordingDataParser(EventDataParser):
             images = self._image_list(folder)
             if not timed:
                 raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
-            reference = _read_colmap(poses, timed, images, frame_from_event, capture.frame_camera)
+            reference = _read_colmap(poses, timed, images, frame_from_event, capture)
         else:
             reference = read_tum_trajectory(poses)
         views = views_on_trajectory(
@@ -154,18 +154,21 @@ def _guess_calibration(events: EventFile) -> Calibration:
 
 
 def _read_colmap(
-    model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor, lens: CameraIntrinsics
+    model: Path, timed: list[tuple[int, Path]], images: Path, frame_from_event: Tensor, capture: Capture
 ) -> Trajectory:
     """Return the event camera's trajectory: a pose for each image that a COLMAP model places."""
     folders = [folder for folder in (model, model / "sparse" / "0", model / "0") if any(folder.glob("images.*"))]
     model = folders[0] if folders else model
     poses = read_colmap_poses(model)
-    for share in read_colmap_focal_shares(model):
+    lens = capture.frame_camera
+    # A lens that is only guessed says nothing of the model's.
+    shares = [] if capture.intrinsics_origin == "guessed" else read_colmap_focal_shares(model)
+    for share in shares:
         if not 1 / _MAX_FOCAL_RATIO < share * lens.width / lens.fx < _MAX_FOCAL_RATIO:
             raise DataError(
                 model,
                 f"its focal length is {share * lens.width:.4g} px, that of the calibration {lens.fx:.4g} px",
-                "estimate the poses again with the calibrated lens (aenerf convert --poses colmap), or correct the "
+                "move this folder away and estimate the poses again (aenerf convert --poses colmap), or correct the "
                 "calibration",
             )
     known: dict[int, Tensor] = {}

@@ -127,7 +127,6 @@ class TumVieDataParser(EventDataParser):
                 torch.linalg.inv(imu_from_event) @ imu_from_frame,
                 max_pose_gap=self.config.max_pose_gap_ns,
             ),
-            max_pose_gap=self.config.max_pose_gap_ns,
         )
 
     def poses_path(self) -> Path:

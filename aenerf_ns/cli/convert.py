@@ -106,13 +106,14 @@ class Convert(DatasetCommand):
         from aenerf_ns.recording.views import thin_views
 
         report = picture = None
-        if self.poses == "refined":
-            recording, report, picture = _with_refined_poses(parser.recording, filters.window, self.data, self.seed)
-        elif self.poses != "given":
-            recording, report, picture = self._with_estimated_poses(*parser.read_frames(), filters.window)
-        else:
+        has_given_poses = self.poses in ("given", "refined")
+        if has_given_poses:
             recording = parser.recording
             parser.event_span(recording)
+            if self.poses == "refined":
+                recording, report, picture = _with_refined_poses(recording, filters.window, self.data, self.seed)
+        else:
+            recording, report, picture = self._with_estimated_poses(*parser.read_frames(), filters.window)
         events = FilteredEventFile(recording.event_file, filters)
         trajectory = _cut(recording, events, filters.window)
         views = {
@@ -131,8 +132,7 @@ class Convert(DatasetCommand):
                     f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor",
                     "begin it at an even column and row, so that its first pixel is red",
                 )
-        has_metric_poses = self.poses in ("given", "refined")
-        with open_writer(lock, parser, recording, camera, recording.frame_camera, has_metric_poses) as writer:
+        with open_writer(lock, parser, recording, camera, recording.frame_camera, has_given_poses) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is not None:
                 writer.add_poses_report(report)
@@ -140,7 +140,7 @@ class Convert(DatasetCommand):
                 picture.quantize().save(writer.other_file(POSES_PICTURE))
             copy_images(writer, recording, views)
             num_read, num_written, num_covered = _copy_events(recording, events, writer)
-            if self.poses == "given" and self.start_time_ns is None and self.end_time_ns is None:
+            if has_given_poses and self.start_time_ns is None and self.end_time_ns is None:
                 require_covered(recording.event_file.path, num_written, num_covered)
         counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
         say(

@@ -103,14 +103,13 @@ def open_writer(
     """
     from aenerf_ns.recording.writer import NativeDatasetWriter
 
-    longest_gap = parser.config.max_pose_gap_ns
     return NativeDatasetWriter(
         lock,
         event_camera,
         recording.sensor,
         recording.image_encoding,
         scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
-        max_pose_gap=recording.max_pose_gap if longest_gap is None else longest_gap,
+        max_pose_gap=recording.max_pose_gap,
         frame_camera=frame_camera,
         # Near and far planes keep their units.
         auto_scale_poses=parser.scales_poses(recording) or not has_metric_poses,

@@ -65,8 +65,8 @@ class Reconstruct(DatasetCommand):
 
         recording = parser.recording
         source = self._source(recording)
-        camera, longest_gap = recording.event_camera, parser.config.max_pose_gap_ns
-        known = recording.trajectory.known_time(recording.max_pose_gap if longest_gap is None else longest_gap)
+        camera = recording.event_camera
+        known = recording.trajectory.known_time(recording.max_pose_gap)
         with open_writer(lock, parser, recording, camera, camera) as writer:
             writer.add_trajectories(recording.trajectory, recording.ground_truth)
             _add_reference_views(recording, writer)

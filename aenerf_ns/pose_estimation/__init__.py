@@ -1,1 +1,1 @@
-"""Poses of a recording from its frames: COLMAP's structure from motion, and frames of a video."""
+"""Poses of a recording from its frames or its events, or refined by them."""

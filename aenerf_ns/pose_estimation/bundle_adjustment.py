@@ -109,34 +109,17 @@ class TrackAdjustment:
     def adjust_points(self, poses: Array, iterations: int) -> None:
         """Move the points alone."""
         for _ in range(iterations):
-            self.linearize(poses)
-            self.move_points(np.zeros(6 * len(poses)))
+            self._eliminate_points(poses)
+            self._move_points(self._pull)
 
     def linearize(self, poses: Array) -> PoseInformation:
         """Return what the tracks say of poses (N, 3, 4), camera-to-world, by Gauss and Newton's method."""
-        tracks = self._tracks
-        images, points, count = tracks.images, tracks.points, len(poses)
-        rotations = poses[images, :, :3]
-        local = np.einsum("mji,mj->mi", rotations, self.positions[points] - poses[images, :, 3])
-        depths = np.maximum(local[:, 2], 1e-9)
-        errors = tracks.focal_length * (local[:, :2] / depths[:, None] - tracks.rays)
-        weights = 1 / (1 + np.square(errors / _LOSS_SCALE).sum(1))
-        # A point behind the camera says nothing.
-        weights[local[:, 2] <= 0] = 0
-        projection = np.zeros((len(images), 2, 3))
-        projection[:, 0, 0] = projection[:, 1, 1] = tracks.focal_length / depths
-        projection[:, :, 2] = -tracks.focal_length * local[:, :2] / np.square(depths)[:, None]
+        images, points, count = self._tracks.images, self._tracks.points, len(poses)
+        local, errors, weights, projection, of_point = self._eliminate_points(poses)
         # A camera that turns by w moves a point y in its frame by the cross product of y and w.
         of_pose = np.concatenate([-projection, np.cross(projection, local[:, None])], -1)
-        of_point = projection @ rotations.transpose(0, 2, 1)
-        weighted = weights[:, None, None] * of_pose
-        of_point_only = _sum_by(
-            points, weights[:, None, None] * of_point.transpose(0, 2, 1) @ of_point, len(self.positions)
-        )
-        # Keeps points of vanishing parallax in place.
-        of_point_only += np.eye(3) * (1e-6 * np.trace(of_point_only, axis1=1, axis2=2)[:, None, None] + 1e-12)
-        self._inverse_root = np.linalg.inv(np.linalg.cholesky(of_point_only))
-        mixed = weighted.transpose(0, 2, 1) @ of_point @ self._inverse_root[points].transpose(0, 2, 1)
+        weighted = (weights * of_pose).transpose(0, 2, 1)
+        mixed = weighted @ of_point @ self._inverse_root[points].transpose(0, 2, 1)
         rows = 6 * images[:, None, None] + np.arange(6)[:, None]
         columns = 3 * points[:, None, None] + np.arange(3)
         indices = [np.broadcast_to(index, mixed.shape).ravel() for index in (rows, columns)]
@@ -144,20 +127,45 @@ class TrackAdjustment:
         self._mixed = sparse.csr_matrix((mixed.ravel(), tuple(indices)), shape)
         hessian = -(self._mixed @ self._mixed.T).toarray()
         blocks = hessian.reshape(count, 6, count, 6)
-        blocks[range(count), :, range(count)] += _sum_by(images, weighted.transpose(0, 2, 1) @ of_pose, count)
-        point_gradient = _sum_by(
-            points, np.einsum("mab,ma->mb", weights[:, None, None] * of_point, errors), len(self.positions)
-        )
-        self._pull = np.einsum("pij,pj->pi", self._inverse_root, point_gradient)
-        parts = np.einsum("mab,ma->mb", weighted, errors) - np.einsum("mab,mb->ma", mixed, self._pull[points])
+        blocks[range(count), :, range(count)] += _sum_by(images, weighted @ of_pose, count)
+        parts = (weighted @ errors - mixed @ self._pull[points])[..., 0]
         group_gradients = _sum_by(self._groups[points] * count + images, parts, (self._groups.max() + 1) * count)
         group_gradients = group_gradients.reshape(-1, 6 * count)
         return PoseInformation(hessian, group_gradients.sum(0), group_gradients)
 
     def move_points(self, twists: Array) -> None:
         """Move the points to where they belong after twists (6 N,) of the poses that were linearized last."""
-        pulls = self._pull + (self._mixed.T @ twists).reshape(-1, 3)
-        self.positions = self.positions - np.einsum("pji,pj->pi", self._inverse_root, pulls)
+        self._move_points(self._pull + (self._mixed.T @ twists).reshape(-1, 3, 1))
+
+    def _eliminate_points(self, poses: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Linearize the points alone: the inverse root of each point's Hessian, and its pull at the point.
+
+        Returns:
+            (M, 3) points in the frames of their cameras, (M, 2, 1) errors in pixels, (M, 1, 1) robust weights, and the
+            (M, 2, 3) derivatives of the errors by the points in the cameras' frames and in the world.
+        """
+        tracks, count = self._tracks, len(self.positions)
+        rotations = poses[tracks.images, :, :3]
+        local = np.einsum("mji,mj->mi", rotations, self.positions[tracks.points] - poses[tracks.images, :, 3])
+        depths = np.maximum(local[:, 2], 1e-9)
+        errors = tracks.focal_length * (local[:, :2] / depths[:, None] - tracks.rays)
+        weights = 1 / (1 + np.square(errors / _LOSS_SCALE).sum(1))
+        # A point behind the camera says nothing.
+        weights[local[:, 2] <= 0] = 0
+        projection = np.zeros((len(local), 2, 3))
+        projection[:, 0, 0] = projection[:, 1, 1] = tracks.focal_length / depths
+        projection[:, :, 2] = -tracks.focal_length * local[:, :2] / np.square(depths)[:, None]
+        of_point = projection @ rotations.transpose(0, 2, 1)
+        weighted = (weights[:, None, None] * of_point).transpose(0, 2, 1)
+        hessians = _sum_by(tracks.points, weighted @ of_point, count)
+        # Keeps points of vanishing parallax in place.
+        hessians += np.eye(3) * (1e-6 * np.trace(hessians, axis1=1, axis2=2)[:, None, None] + 1e-12)
+        self._inverse_root = np.linalg.inv(np.linalg.cholesky(hessians))
+        self._pull = self._inverse_root @ _sum_by(tracks.points, weighted @ errors[..., None], count)
+        return local, errors[..., None], weights[:, None, None], projection, of_point
+
+    def _move_points(self, pulls: Array) -> None:
+        self.positions = self.positions - (self._inverse_root.transpose(0, 2, 1) @ pulls)[..., 0]
 
 
 def _sum_by(index: NDArray[np.int64], values: Array, size: int) -> Array:

@@ -42,19 +42,19 @@ def estimate_poses_from_events(
     """
     begin = time.perf_counter()
     with match_event_images(capture, window, source, seed) as (workspace, times, pictures):
-        camera = capture.event_camera
-        if capture.intrinsics_origin == "guessed":
-            camera = workspace.estimate_intrinsics(_ROUNDS) or camera
+        is_calibrated = capture.intrinsics_origin != "guessed"
+        camera = capture.event_camera if is_calibrated else workspace.estimate_intrinsics(_ROUNDS)
         features, pairs = workspace.count_features_and_pairs()
         held_out = workspace.hold_out_matches(_HELD_OUT)
         found = {"incremental": workspace.reconstruct(False), "global": workspace.reconstruct_globally()}
         models: dict[str, Any] = {mapper: models[0] for mapper, models in found.items() if models}
-        if not models:
+        if camera is None or not models:
             raise DataError(
                 source,
                 f"COLMAP places none of {len(times)} images of the events: they have {features:.0f} features (median), "
                 f"and {pairs} pairs of images match",
-                "poses need a camera that moves sideways and sees textured surfaces; check the calibration too",
+                "poses need a camera that moves sideways and sees textured surfaces; "
+                + ("check the calibration too" if is_calibrated else "a calibration helps"),
             )
         for limits in _ROUNDS:
             models = {mapper: workspace.adjust(model, *limits) for mapper, model in models.items()}

@@ -39,7 +39,7 @@ class RefinedPoses:
         times: (N,) times of the images in nanoseconds.
         num_tracks: scene points that images see.
         twists: (N, 6) corrections at the images: translations in the units of the poses, rotation vectors in radians.
-        is_weak: (N,) whether the tracks say little of the pose, so that it is nearly as given.
+        is_weak: (N,) whether the tracks know no better than the given pose, which nearly stays.
         seconds: how long it took.
         draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
             the paths.
@@ -54,7 +54,7 @@ class RefinedPoses:
     draw: Callable[[Mapping[str, Array]], Image.Image]
 
     def weak_stretches(self) -> list[tuple[int, int]]:
-        """Return the first and last times in nanoseconds of runs of images whose tracks say little of their poses."""
+        """Return the first and last times in nanoseconds of runs of images whose given poses nearly stay."""
         edges = np.flatnonzero(np.diff(self.is_weak, prepend=False, append=False))
         return [
             (int(self.times[first]), int(self.times[end - 1]))
@@ -63,11 +63,12 @@ class RefinedPoses:
 
     def report(self) -> dict[str, Any]:
         """Return the figures as plain values for JSON."""
+        degrees, translation = self._moved()
         return {
             "images": len(self.times),
             "tracks": self.num_tracks,
-            "correction_degrees": self._moved()[0],
-            "correction_translation": self._moved()[1],
+            "correction_degrees": degrees,
+            "correction_translation": translation,
             "weak_stretches_ns": self.weak_stretches(),
             "seconds": self.seconds,
             "summary": self.summary(),
@@ -81,7 +82,8 @@ class RefinedPoses:
             f"{degrees:.2g} degrees and {translation:.2g} of their units (root mean square)"
         )
         if self.is_weak.any():
-            line += f"; of {self.is_weak.mean():.0%} of the images the tracks say little, and their poses stay as given"
+            share = f"{self.is_weak.mean():.0%}"
+            line += f"; for {share} of the images the tracks know no better than the given poses, which nearly stay"
         return line
 
     def _moved(self) -> tuple[float, float]:
@@ -110,6 +112,10 @@ def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, s
     """
     begin = time.perf_counter()
     given = recording.trajectory
+    # Images of other times would be matched for nothing.
+    window = TimeWindow(max(given.start, window.start), min(given.end, window.end))
+    if window.start >= window.end:
+        raise DataError(source, "none of its poses are in the time window", "widen it")
     with match_event_images(recording, window, source, seed) as (workspace, all_times, pictures):
         images = np.flatnonzero(given.known_time(recording.max_pose_gap).contains(all_times))
         # Time and memory grow with the number's third and second power.
@@ -117,7 +123,7 @@ def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, s
         if len(images) < MIN_IMAGES:
             raise DataError(
                 source,
-                f"{len(images)} of {len(all_times)} images of its events are within its poses",
+                f"only {len(images)} of {len(all_times)} images of its events are from the time of its poses",
                 "check that events and poses share one clock: aenerf check",
             )
         times = all_times[images]
@@ -142,6 +148,7 @@ def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, s
         for limits in _ROUNDS[1:]:
             model, tracks = triangulate(refinement.poses, limits)
             refinement.follow(tracks)
+    observations = observations_of(model, len(pictures))
     twists = np.stack([np.interp(given.times.numpy(), times, column) for column in refinement.twists.T], -1)
     moved = torch.from_numpy(move_poses(given.camera_to_worlds.numpy(), twists))
     return RefinedPoses(
@@ -151,5 +158,5 @@ def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, s
         twists=refinement.twists,
         is_weak=refinement.is_weak(),
         seconds=time.perf_counter() - begin,
-        draw=partial(draw_poses, pictures, observations_of(model, len(pictures))),
+        draw=partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images]),
     )

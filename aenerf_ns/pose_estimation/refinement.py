@@ -71,7 +71,10 @@ class PoseRefinement:
             adjustment.adjust_points(self.poses, 2)
 
     def is_weak(self) -> NDArray[np.bool_]:
-        """Return for each of the N images whether the tracks leave its orientation about as uncertain as it was."""
+        """Return for each of the N images whether the tracks leave its orientation about as uncertain as it was.
+
+        They do so where there are few of them, and everywhere if the given poses are good.
+        """
         prior = self._times_prior(np.eye(self.twists.size))
         gained = prior @ lu_solve(self._factors(), self._weight @ prior)
         variances, gains = (matrix.diagonal().reshape(-1, 6)[:, 3:].sum(1) for matrix in (prior, gained))
@@ -114,4 +117,4 @@ class PoseRefinement:
         pulls = information.group_gradients.reshape(-1, *self.twists.shape) * self._units
         blocks = np.einsum("ncmc,c->nm", information.hessian.reshape(*self.twists.shape * 2), np.square(self._units))
         pulled = np.einsum("gnc,nm,gmc->", pulls, covariance, pulls, optimize=True)
-        return _COHERENCE * max(float(pulled / np.sum(covariance * blocks)), _MIN_VARIANCE)
+        return _COHERENCE * max(_MIN_VARIANCE, float(pulled / max(np.sum(covariance * blocks), 1e-30)))

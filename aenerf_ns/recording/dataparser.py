@@ -116,6 +116,8 @@ class EventDataParser(DataParser):
                 raise
             hint = f"the format {self.guessed_format} was guessed: where it is another, name it, in aenerf as --format"
             raise DataError(error.source, error.problem, f"{error.remedy} ({hint})") from None
+        if longest is not None:
+            recording = replace(recording, max_pose_gap=longest)
         recording.event_file.drop_malformed = self.config.drop_malformed
         self._check_lens(recording.event_camera, "event camera")
         if any(recording.reference_views.values()):
@@ -249,8 +251,7 @@ class EventDataParser(DataParser):
 
     def _pose_gaps(self, recording: Recording, start: int, end: int) -> tuple[tuple[int, int], ...]:
         """Return where within the time window the poses are too far apart for interpolation."""
-        longest = self.config.max_pose_gap_ns
-        longest = recording.max_pose_gap if longest is None else longest
+        longest = recording.max_pose_gap
         gaps = [gap for gap in recording.trajectory.known_time(longest).gaps if gap[0] < end and gap[1] > start]
         if longest is not None and gaps:
             seconds = sum(last - first for first, last in gaps) * 1e-9

@@ -34,8 +34,16 @@ def steps_of(trainer: Trainer) -> range:
     too, counts the steps before the checkpoint among them since commit 4d73c4e6.
     """
     start, count = trainer._start_step, trainer.config.max_num_iterations
-    counts_earlier_steps = "max_num_iterations - self._start_step" in inspect.getsource(Trainer.train)
-    return range(start, count if counts_earlier_steps else start + count)
+    return range(start, count if _counts_earlier_steps() else start + count)
+
+
+def iterations_to_reach(end: int, step: int) -> int:
+    """Return the ``max_num_iterations`` with which a run that resumes after a step ends ahead of step ``end``."""
+    return end if _counts_earlier_steps() else end - step - 1
+
+
+def _counts_earlier_steps() -> bool:
+    return "max_num_iterations - self._start_step" in inspect.getsource(Trainer.train)
 
 
 def add_writer(new_writer: writer.Writer) -> None:

@@ -172,6 +172,7 @@ class AENeRFTrainer(Trainer):
                 # Nothing is being trained, or the user does not want to wait.
                 raise KeyboardInterrupt
             self._stopped_by = number
+            print("Stopping after this step. Once more stops at once, without a checkpoint.", flush=True)
             # A training that the viewer paused takes no further step by itself.
             self.training_state = "training"
 
@@ -188,7 +189,12 @@ class AENeRFTrainer(Trainer):
             self.save_checkpoint(step)
             self._record.write("stopped", step + 1 - self._steps.start)
             self._record = None
-            print(f"Stopped after step {step}. Go on with the same command and --load-dir {self.base_dir}", flush=True)
+            left = framework.iterations_to_reach(self._steps.stop, step)
+            print(
+                f"Stopped after step {step}. Go on with the same command, and after the method's name "
+                f"--load-dir {self.base_dir} --max-num-iterations {left}",
+                flush=True,
+            )
             raise SystemExit(128 + self._stopped_by)
 
     def _record_end(self, step: int) -> None:

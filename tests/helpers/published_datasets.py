@@ -333,7 +333,7 @@ def config_of(name: str, data: Path, **options: object) -> EventDataParserConfig
 
 
 def recording_of(config: EventDataParserConfig) -> Recording:
-    return config.setup().read_recording()
+    return config.setup().recording
 
 
 def assert_same_poses(actual: torch.Tensor, expected: NDArray[np.float64], tolerance: float = 1e-9) -> None:

@@ -206,7 +206,7 @@ def test_refuse_poses_beside_the_events(dataset: tuple[Path, str], tmp_path: Pat
     first = truth.times < truth.start + 20_000_000
     cut = Trajectory(truth.times[first], truth.camera_to_worlds[first])
     write_tum_trajectory(given / "trajectory_estimated.txt", cut)
-    with pytest.raises(DataError, match=r"of .* images of its events are within its poses; .*aenerf check"):
+    with pytest.raises(DataError, match=r"its events make . images"):
         Convert(given, output=tmp_path / "scene", poses="refined").main()
 
 

@@ -99,4 +99,6 @@ def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint(
     record = json.loads(file.read_text())
     assert (record["state"], record["steps"]) == ("stopped", 6)
     assert (file.parent / "nerfstudio_models" / "step-000000005.ckpt").is_file()
-    assert f"Stopped after step 5. Go on with the same command and --load-dir {file.parent}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Stopped after step 5. Go on with the same command" in said
+    assert f"--load-dir {file.parent} --max-num-iterations 6" in said
