@@ -119,6 +119,7 @@ def train_processes(room: Path, folder: Path, count: int, *options: str) -> list
     return [torch.load(folder / f"process_{rank}.pt", weights_only=True) for rank in range(count)]
 
 
+@pytest.mark.slow
 def test_two_processes_learn_the_same_from_different_pairs(
     room: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,7 +191,7 @@ def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Pa
     assert "Traceback" not in output
     errors = [line for line in output.splitlines() if line.startswith("Error: ")]
     assert len(errors) == 1
-    assert "nothing: there is no such folder; give the folder of a dataset as --data" in errors[0]
+    assert "nothing: there is no such folder" in errors[0]
 
 
 def test_training_that_diverges_ends_with_one_line(room: Path, workspace: Path) -> None:
