@@ -105,16 +105,24 @@ class Convert(DatasetCommand):
         from aenerf_ns.recording.time_units import require_covered
         from aenerf_ns.recording.views import thin_views
 
-        report = picture = None
         has_given_poses = self.poses in ("given", "refined")
+        capture, images = (parser.recording, []) if has_given_poses else parser.read_frames()
+        # Refused before poses are found, which may take hours.
+        events = FilteredEventFile(capture.event_file, filters)
+        if self.region is not None and capture.sensor.bayer_pattern and (self.region[0] % 2 or self.region[1] % 2):
+            raise DataError(
+                "aenerf convert",
+                f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor",
+                "begin it at an even column and row, so that the Bayer pattern begins there as on the whole sensor",
+            )
+        report = picture = None
         if has_given_poses:
             recording = parser.recording
             parser.event_span(recording)
             if self.poses == "refined":
                 recording, report, picture = _with_refined_poses(recording, filters.window, self.data, self.seed)
         else:
-            recording, report, picture = self._with_estimated_poses(*parser.read_frames(), filters.window)
-        events = FilteredEventFile(recording.event_file, filters)
+            recording, report, picture = self._with_estimated_poses(capture, images, filters.window)
         trajectory = _cut(recording, events, filters.window)
         views = {
             split: thin_views(
@@ -126,12 +134,6 @@ class Convert(DatasetCommand):
         camera = recording.event_camera
         if self.region is not None:
             camera = camera.crop(*self.region)
-            if recording.sensor.bayer_pattern and (self.region[0] % 2 or self.region[1] % 2):
-                raise DataError(
-                    "aenerf convert",
-                    f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor",
-                    "begin it at an even column and row, so that its first pixel is red",
-                )
         with open_writer(lock, parser, recording, camera, recording.frame_camera, has_given_poses) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
             if report is not None:
@@ -183,17 +185,17 @@ def _with_refined_poses(
     from aenerf_ns.recording.views import move_views
 
     given, truth = recording.trajectory, recording.ground_truth
+    knots = None if truth is None else given.knots_covered_by(truth)
     found = refine_poses(recording, window, data, seed)
     report = found.report()
     say(found.summary())
     paths = {"given": given.camera_to_worlds.numpy(), "refined": found.trajectory.camera_to_worlds.numpy()}
-    if truth is None:
+    if truth is None or knots is None:
         views = {
             split: move_views(views, given, found.trajectory) for split, views in recording.reference_views.items()
         }
         recording = replace(recording, reference_views=views)
     else:
-        knots = given.knots_covered_by(truth)
         before, after = (
             pose_errors(poses.interpolate(knots), truth.interpolate(knots)) for poses in (given, found.trajectory)
         )

@@ -27,6 +27,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
 from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -233,6 +234,8 @@ def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
         ({"end_time_ns": START - 1}, "events are from .* all outside the time window; widen"),
         ({"start_time_ns": 5, "end_time_ns": 4}, "time window ends at 4 ns, before"),
         ({"pixel_share": 1e-9}, "no event is left; widen"),
+        ({"poses": "events", "region": (0, 0, 7, 4)}, "region of interest 0 0 7 4 .* beyond its 6 x 4 pixels"),
+        ({"poses": "refined", "region": (1, 0, 4, 4)}, "from pixel 1 0 of a color sensor; begin it at an even"),
         ({"poses": "colmap", "end_time_ns": START + 1}, "1 frames; poses can be estimated from two"),
     ],
 )
@@ -242,6 +245,15 @@ def test_impossible_options_are_one_line(options: dict, message: str, tmp_path: 
         convert(data, tmp_path / "converted", **options)
     assert "\n" not in str(error.value)
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def test_poses_are_refined_only_where_the_truth_is_of_their_time(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
+    late = Trajectory(truth.times + 10**12, truth.camera_to_worlds)
+    write_tum_trajectory(data / "trajectory_ground_truth.txt", late)
+    with pytest.raises(DataError, match=r"trajectory_ground_truth\.txt: .* do not cover two of the estimated"):
+        convert(data, tmp_path / "converted", poses="refined")
 
 
 @pytest.mark.parametrize(
