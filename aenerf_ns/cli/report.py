@@ -36,7 +36,7 @@ class ReportCommand:
     allow_different_protocols: bool = False
     """Compare runs although they were measured differently. The page then says how."""
     data: Path | None = None
-    """Where the dataset of the runs is now, if it was moved."""
+    """Where the dataset of the runs is now, if it was moved: one dataset for all runs."""
 
     def main(self) -> None:
         """Measure the runs and write the page."""
@@ -57,6 +57,12 @@ class ReportCommand:
             opened.append((config, comparison.read_protocol(opened_run)))
             del opened_run
             gc.collect()
+        if self.data is not None and len({config.__dict__["data_at_training"] for config, _ in opened}) > 1:
+            raise DataError(
+                "aenerf report",
+                "--data names one dataset, but the runs were trained on several",
+                "leave it out, and link the datasets to where they were",
+            )
         names = _names([config for config, _ in opened])
         protocols = [protocol for _, protocol in opened]
         mixed = comparison.protocol_differences(names, protocols)

@@ -93,6 +93,7 @@ def _at_its_place(config: TrainerConfig, path: Path, data: Path | None) -> Train
     if dataparser is None:
         return config
     before = Path(dataparser.data)
+    config.__dict__["data_at_training"] = before.absolute()
     if data is None and not before.exists():
         raise DataError(before, "the dataset of the run is not there", "say where it is now with --data")
     if data is not None:

@@ -179,6 +179,11 @@ def test_a_run_opens_wherever_it_and_its_data_are(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("sys.argv", words)
     main()
     assert output.exists()
+    other = shutil.copytree(renamed, tmp_path / "other")
+    text = (other / "config.yml").read_text()
+    (other / "config.yml").write_text(text.replace(f"- {data.name}\n", "- another\n"))
+    with pytest.raises(DataError, match="--data names one dataset, but the runs were trained on several"):
+        ReportCommand((renamed, other), tmp_path / "report", data=moved).main()
 
 
 def not_finite(key: str, value: object) -> object:
