@@ -13,8 +13,9 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_arrays import XYTP_MATRIX, ArrayEventFile, load_npy
+from aenerf_ns.files.event_reader import EventReader
 from aenerf_ns.files.limits import list_files, require_one
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
@@ -23,7 +24,7 @@ from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 
 
-class EsimEventFolder(EventFile):
+class EsimEventFolder(EventReader):
     """A folder of .npy files with rows of x, y, t in nanoseconds and p: one stream, in the order of the names."""
 
     def _files(self) -> list[ArrayEventFile]:
@@ -39,18 +40,15 @@ class EsimEventFolder(EventFile):
         if not self.path.is_dir():
             raise DataError(self.path, "there is no such folder of events", "check the path of the dataset")
 
-    def read_chunks(self) -> Iterator[EventStream]:
+    def _chunks(self) -> Iterator[EventStream]:
         for file in self._files():
             yield from file.read_chunks()
 
-    def time_span(self) -> tuple[int, int]:
-        self.require()
+    def _time_span(self) -> tuple[int, int] | None:
         files = [file for file in self._files() if file.count()]
-        if not files:
-            raise self.empty_error()
-        return files[0].time_span()[0], files[-1].time_span()[1]
+        return (files[0].time_span()[0], files[-1].time_span()[1]) if files else None
 
-    def count(self) -> int:
+    def _count(self) -> int:
         return sum(file.count() or 0 for file in self._files())
 
 

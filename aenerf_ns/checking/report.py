@@ -226,7 +226,7 @@ def _check_poses(result: CheckResult, recording: Recording, window: TimeWindow, 
     )
     estimation = read_poses_report(trajectory)
     if estimation is not None:
-        figures.append(f"How they were estimated: {estimation.summary}")
+        figures.append(f"How they were found: {estimation.summary}")
     if recording.intrinsics_origin == "estimated":
         figures.append(f"The intrinsics were estimated with the poses: {recording.event_camera.summary()}")
     if recording.ground_truth is not None:

@@ -15,8 +15,8 @@ from aenerf_ns.events.left_out import LeftOut
 from aenerf_ns.events.sensor import require_event_sensor_size
 
 UNSORTED_REMEDY = (
-    "a few such events can be left out (--drop-malformed); many mean that the times overflowed, or, in a table of your "
-    "own, that it is not sorted by time"
+    "a few such events can be left out (--drop-malformed); many such events mean that times overflowed or that your "
+    "table is not sorted by time"
 )
 """How to mend events that are out of order."""
 

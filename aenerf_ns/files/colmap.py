@@ -25,8 +25,8 @@ _IMAGE = struct.Struct("<I7dI")
 _COUNT = struct.Struct("<Q")
 # The camera's number, the number of its model, width, height, and the first parameter, which is a focal length.
 _CAMERA = struct.Struct("<IiQQd")
-# Parameters of the models, by their numbers.
-_NUM_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)
+# Parameters of the models that begin with a focal length, by their numbers.
+_NUM_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6)
 # A feature holds x, y and the number of its 3D point.
 _FEATURE_BYTES = 24
 _MAX_NAME = 4096
@@ -79,7 +79,7 @@ def read_colmap_focal_shares(model: Path) -> list[float]:
     """Return the focal length of each camera in a model, as a share of the width of its images.
 
     Raises:
-        DataError: the file is damaged. There are no cameras if it is missing.
+        DataError: the file is damaged. There are no cameras if it is missing, and none from one of an unknown model on.
     """
     with reading(model):
         binary, text = model / "cameras.bin", model / "cameras.txt"
@@ -95,6 +95,8 @@ def read_colmap_focal_shares(model: Path) -> list[float]:
         shares, position = [], _COUNT.size
         for _ in range(*_COUNT.unpack_from(content)):
             _, kind, width, _, focal = _CAMERA.unpack_from(content, position)
+            if not 0 <= kind < len(_NUM_PARAMETERS):
+                break
             shares.append(focal / width)
             position += _CAMERA.size + 8 * (_NUM_PARAMETERS[kind] - 1)
         return shares

@@ -35,12 +35,11 @@ class EventReader(EventFile):
     extra = ""
 
     def read_chunks(self) -> Iterator[EventStream]:
-        self.left_out.last_time = None
         yield from bounded_items(self._chunks(), self.path, self.kind, self.extra)
 
     def time_span(self) -> tuple[int, int]:
         with bounded(self.path, self.kind, self.extra):
-            # Only what is read as a whole tells which events are well-formed.
+            # Only what is read as a whole tells which events are well-formed, and whether the others are few.
             span = EventReader._time_span(self) if self.drop_malformed else self._time_span()
         if span is None:
             raise self.empty_error()
@@ -60,13 +59,8 @@ class EventReader(EventFile):
 
     def _time_span(self) -> tuple[int, int] | None:
         """Return the times of the first and the last event in nanoseconds, or None without events."""
-        start = end = None
-        self.left_out.last_time = None
-        for chunk in self._chunks():
-            if len(chunk):
-                start = int(chunk.t[0]) if start is None else start
-                end = int(chunk.t[-1])
-        return None if start is None or end is None else (start, end)
+        ends = [(int(chunk.t[0]), int(chunk.t[-1])) for chunk in self.chunks()]
+        return ends[0][0], ends[-1][1]
 
     def _assumed_unit(self) -> TimeUnit | None:
         """Return the unit of the times that is assumed, or None where the format, the file or the user states it."""

@@ -211,7 +211,8 @@ def events_from_columns(
     positive, zero = polarities == 1, polarities == 0
     good = positive | zero | (polarities == -1)
     require("p", good, "polarities are 0 and 1, or -1 and 1: check the order of the columns")
-    if zero.any() and (good & ~positive & ~zero).any():
+    zero &= kept
+    if zero.any() and (kept & ~positive & ~zero).any():
         index = int(np.argmax(zero))
         remedy = "there are events of polarity -1 beside it: use 0 and 1, or -1 and 1"
         raise DataError(source, f"{describe_event(index)} has p = 0", remedy)

@@ -35,6 +35,8 @@ BLOCK = 1 << 22
 
 # The beginning of a file, from which the order of its columns is known.
 _SAMPLE_BYTES = 1 << 16
+# Share of the events there that fit the order of the columns, where malformed events are left out.
+_LEFT_OUT_FITS = 0.99
 # Longer than any line of a file of events.
 _TAIL_BYTES = 4096
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -75,7 +77,8 @@ def _is_row(line: bytes) -> bool:
 
 def has_commas(beginning: bytes) -> bool:
     """Tell from the beginning of a file of text whether commas separate its numbers."""
-    return b"," in next((line for line in beginning.split(b"\n") if _is_row(line)), b"")
+    row = next((line for line in beginning.split(b"\n") if _is_row(line)), b"")
+    return b"," in row.split(b"#", 1)[0]
 
 
 def _line_name(line: int, num_before: int | None) -> str:
@@ -140,12 +143,14 @@ class TextEventFile(EventReader):
         fitting = []
         for order in _ORDERS:
             x, y, t, p = (order.index(name) for name in _COLUMNS)
-            if (
-                not fraction[[x, y, p]].any()
-                and ((whole[[x, y]] >= 0) & (whole[[x, y]] < [[self.width], [self.height]])).all()
-                and np.isin(whole[p], (-1, 0, 1)).all()
-                and (np.diff(whole[t] + fraction[t]) >= 0).all()
-            ):
+            time = whole[t] + fraction[t]
+            good = (
+                (fraction[[x, y, p]] == 0).all(0)
+                & ((whole[[x, y]] >= 0) & (whole[[x, y]] < [[self.width], [self.height]])).all(0)
+                & np.isin(whole[p], (-1, 0, 1))
+                & (np.diff(time, prepend=time[:1]) >= 0)
+            )
+            if good.sum() >= (_LEFT_OUT_FITS if self.drop_malformed else 1) * len(good):
                 fitting.append(order)
         if self.with_commas and whole.shape[1] > 0 and len(fitting) != 1:
             raise self._unnamed(text.split(b"\n")[0].decode("utf-8", "replace"))
@@ -159,32 +164,31 @@ class TextEventFile(EventReader):
         )
 
     def _assumed_unit(self) -> TimeUnit | None:
-        return None if self._time_unit else self._unit()
+        return None if self._time_unit else self._unit(self._ends())
 
-    def _unit(self) -> TimeUnit:
-        """Return the unit of the times: stated, or assumed from the times at the beginning of the file and the last."""
-        if self._time_unit:
-            return self._time_unit
+    def _ends(self) -> list[_Lines]:
+        """Parse the beginning of the file and its last line; none of them without events."""
         with self.path.open("rb") as file:
             names = self._names(file)
             beginning = next(self._lines(file, names), None)
-            times = [lines.fraction[2] for lines in (beginning, self._last_line(file, names)) if lines is not None]
-        return "s" if any(fractions.any() for fractions in times) else "us"
+            return [] if beginning is None else [beginning, self._last_line(file, names)]
+
+    def _unit(self, ends: list[_Lines]) -> TimeUnit:
+        """Return the unit of the times: stated, or assumed from those at the ends of the file."""
+        return self._time_unit or ("s" if any(lines.fraction[2].any() for lines in ends) else "us")
 
     def _chunks(self) -> Iterator[EventStream]:
-        tick = NANOSECONDS[self._unit()]
+        tick = NANOSECONDS[self._unit(self._ends())]
         with self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
                 yield self._events(lines, tick)
 
     def _time_span(self) -> tuple[int, int] | None:
-        with self.path.open("rb") as file:
-            names = self._names(file)
-            beginning = next(self._lines(file, names), None)
-            if beginning is None:
-                return None
-            last = self._last_line(file, names)
-        tick = NANOSECONDS[self._unit()]
+        ends = self._ends()
+        if not ends:
+            return None
+        beginning, last = ends
+        tick = NANOSECONDS[self._unit(ends)]
         first = replace(beginning, whole=beginning.whole[:, :1], fraction=beginning.fraction[:, :1])
         start, end = (int(self._events(lines, tick).t[0]) for lines in (first, last))
         return start, end

@@ -15,7 +15,8 @@ def require_dataset(data: Path) -> None:
     """Raise a DataError if a dataset's folder does not exist or may not be read."""
     with reading(data):
         if not data.exists():
-            raise DataError(data, "there is no such folder", "give the folder of a dataset, or link it to this place")
+            remedy = "give the folder of a dataset; one that was moved may be linked to this place"
+            raise DataError(data, "there is no such folder", remedy)
 
 
 def require_run(run: Path) -> Path:

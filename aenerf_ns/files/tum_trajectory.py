@@ -45,7 +45,7 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     stated = re.match(r"\W*\w+ *\[(ns|us|ms|s)\]", header)
     times = parse_times(path, [row[0] for row in rows], stated[1] if stated else unit)  # type: ignore[arg-type]
     values = parse_numbers(path, [row[1:] for row in rows])
-    if re.search(r"q\w*w.*q\w*x", header):
+    if re.findall(r"\bq\w*?([wxyz])\b", header)[:4] == list("wxyz"):
         values = values[:, [0, 1, 2, 4, 5, 6, 3]]
     return Trajectory(times, poses_from_quaternions(path, values[:, :3], values[:, 3:]), path)
 

@@ -1,4 +1,4 @@
-"""What a dataset folder says of how its poses were estimated."""
+"""What a dataset folder says of how its poses were estimated or refined."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class _File(msgspec.Struct):
 
 @dataclass(frozen=True)
 class PosesReport:
-    """How poses were estimated: in one line, and as a picture where one was drawn."""
+    """How poses were estimated or refined: in one line, and as a picture where one was drawn."""
 
     summary: str
     picture: Image.Image | None
 
 
 def read_poses_report(trajectory: Trajectory) -> PosesReport | None:
-    """Read the report beside the estimated poses of a dataset folder; None for other poses, and where there is none.
+    """Read the report beside poses that ``aenerf convert`` found; None for other poses, and where there is no report.
 
     Raises:
         DataError: the report or its picture cannot be read.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -109,7 +110,7 @@ def views_on_trajectory(
     """
     times = [time for time, _ in images]
     if len(set(times)) < len(times):
-        seconds = max(times, key=times.count) * 1e-9
+        seconds = Counter(times).most_common(1)[0][0] * 1e-9
         raise DataError(
             images[0][1].parent,
             f"several images are at {seconds:.9f} s",
@@ -137,7 +138,7 @@ def _require_seconds(times: list[int], source: Path, trajectory: Trajectory) -> 
             source,
             f"the poses last {trajectory.duration:g} s and the images {seconds:g} s, as if the times of the images "
             f"were in {list(UNIT_NAMES.values())[power - 1]}",
-            "write them in seconds",
+            "write the times of the images in seconds",
         )
 
 

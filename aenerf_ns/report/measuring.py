@@ -34,7 +34,7 @@ class RunReport:
         scalars: see :func:`~aenerf_ns.report.run_files.read_scalars`.
         pose_gaps_ns: first and last time of each gap of the poses.
         poses: along the trajectory.
-        estimation: how the given poses were estimated, None where the recording does not say.
+        estimation: how the given poses were estimated or refined, None where the recording does not say.
         check: what ``aenerf check`` finds in the data, None where the events are no longer there.
         evaluation: what ``ns-eval`` writes as results.
         contrast: of each channel; see :func:`~aenerf_ns.report.view_pictures.picture_views`.

@@ -21,6 +21,7 @@ from helpers.published_datasets import (
     write_colmap,
     write_own,
 )
+from helpers.small_datasets import make_trajectory
 from PIL import Image
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -29,6 +30,7 @@ from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.views import views_on_trajectory
 
 
 def test_own_recordings_have_views_at_their_times(tmp_path: Path) -> None:
@@ -184,6 +186,10 @@ def test_name_the_unit_of_the_images_times(unit: int, tmp_path: Path) -> None:
     (tmp_path / "images.txt").write_text("".join(f"{index // 2} {index}.png\n" for index in range(4)))
     with pytest.raises(DataError, match=r"several images are at 0\.000000000 s"):
         recording_of(OwnRecordingDataParserConfig(data=tmp_path))
+    # In no time, however many there are.
+    many = [(min(time, 199_998), tmp_path / "0.png") for time in range(200_000)]
+    with pytest.raises(DataError, match=r"several images are at 0\.000199998 s"):
+        views_on_trajectory(many, make_trajectory())
 
 
 @pytest.mark.parametrize("is_binary", [False, True])
@@ -197,7 +203,10 @@ def test_refuse_a_focal_length_of_colmap_that_is_not_the_calibrated_one(is_binar
     for factor in (1.05, 1.4):
         values = [factor * focal / 2, factor * focal / 2, width / 4, 10]
         if is_binary:
-            camera = struct.pack("<QIiQQ4d", 1, 1, 1, width // 2, 20, *values)
+            # Behind one of a lens that COLMAP has since version 4, and ahead of one that it may get.
+            later = struct.pack("<IiQQ16d", 1, 11, width // 2, 20, *values[:2], *[0.0] * 14)
+            camera = struct.pack("<IiQQ4d", 1, 1, width // 2, 20, *values)
+            camera = struct.pack("<Q", 3) + later + camera + struct.pack("<IiQQ", 3, 99, 8, 9) + bytes(8)
             (truth.data / "colmap" / "cameras.bin").write_bytes(camera)
         else:
             text = f"# one\n1 PINHOLE {width // 2} 20 {' '.join(map(str, values))}\n"

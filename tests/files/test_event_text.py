@@ -115,6 +115,15 @@ def test_no_text_crashes_the_reader(
             assert "\n" not in str(error)  # noqa: PT017
 
 
+@pytest.mark.parametrize("text", ["x,y,t,p\n", "96 72\n", "# t x y p\n"])
+@pytest.mark.parametrize("suffix", ["txt", "csv"])
+def test_headers_alone_are_no_events(suffix: str, text: str, tmp_path: Path) -> None:
+    file = open_event_file(written(tmp_path / f"empty.{suffix}", text), 96, 72)
+    for look in (lambda file: file.time_span(), lambda file: list(file.chunks())):
+        with pytest.raises(DataError, match="the file holds no events"):
+            look(file)
+
+
 PLAIN = [(31, 62, 500_004, 0), (58, 17, 500_010, 1), (56, 21, 500_011, 0)]
 SPELLINGS = {
     "bom.csv": "\ufeffx,y,t,p\n" + "".join(f"{x},{y},{t},{p}\n" for x, y, t, p in PLAIN),
@@ -125,6 +134,7 @@ SPELLINGS = {
     "plus_minus.txt": "".join(f"{t / 1e6:.6f} {x} {y} {2 * p - 1}\n" for x, y, t, p in PLAIN),
     "microseconds.txt": "".join(f"{t} {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "commas.txt": "".join(f"{t / 1e6:.6f},{x},{y},{p}\n" for x, y, t, p in PLAIN),
+    "remark.txt": "".join(f"{t} {x} {y} {p} # first, or later\n" for x, y, t, p in PLAIN),
     "named.txt": "timestamp x y polarity\n" + "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "xytp.txt": "".join(f"{x} {y} {t} {p}\n" for x, y, t, p in PLAIN),
     "aliases.csv": "polarity,x,y,ts\n" + "".join(f"{p},{x},{y},{t}\n" for x, y, t, p in PLAIN),

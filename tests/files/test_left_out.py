@@ -15,6 +15,7 @@ from helpers.event_file_writers import HEADER2, HEADER3, HEIGHT, WIDTH, Rows, ae
 from helpers.own_recordings import random_events, write_calibration, write_poses
 
 from aenerf_ns.cli.convert import Convert
+from aenerf_ns.dataparsers.enerf_esim import EsimEventFolder
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.open import open_event_file
@@ -88,13 +89,42 @@ def test_leave_out_a_few_malformed_events(suffix: str, folder: Path, capsys: pyt
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".dat"])
-def test_refuse_many_malformed_events(suffix: str, folder: Path) -> None:
-    path = folder / f"shuffled{suffix}"
-    WRITERS[suffix](path, [ROWS[i] for i in np.random.default_rng(0).permutation(len(ROWS))])
+@pytest.mark.parametrize("kind", ["shuffled", "outside"])
+def test_refuse_many_malformed_events(kind: str, suffix: str, folder: Path) -> None:
+    path = folder / f"{kind}{suffix}"
+    order = np.random.default_rng(0).permutation(len(ROWS)) if kind == "shuffled" else range(len(ROWS))
+    WRITERS[suffix](path, [(x + WIDTH * (kind == "outside"), y, t, p) for x, y, t, p in (ROWS[i] for i in order)])
+    for look in (read, lambda file: file.time_span()):
+        file = opened(path)
+        file.drop_malformed = True
+        with pytest.raises(DataError, match=r"of its 5,000 events are malformed.*only a thousandth"):
+            look(file)
+
+
+@pytest.mark.parametrize("columns", ["txyp", "xytp", "xypt"])
+@pytest.mark.parametrize("suffix", [".txt", ".csv"])
+def test_a_malformed_event_hides_no_order_of_the_columns(suffix: str, columns: str, folder: Path) -> None:
+    path = folder / f"unnamed{suffix}"
+    # The other kind of polarity does not count either.
+    rows = [(x, y, t, int(p > 0)) for x, y, t, p in ROWS[:300]]
+    rows.insert(100, (WIDTH + 500, 1, ROWS[100][2], -1))
+    separator = "," if suffix == ".csv" else " "
+    path.write_text("".join(separator.join(str(row["xytp".index(name)]) for name in columns) + "\n" for row in rows))
     file = opened(path)
     file.drop_malformed = True
-    with pytest.raises(DataError, match=r"of its 5,000 events are malformed.*only a thousandth"):
-        read(file)
+    np.testing.assert_array_equal(read(file), [(x, y, t * 1000, p) for x, y, t, p in ROWS[:300]])
+
+
+def test_leave_out_events_between_the_files_of_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = np.array(ROWS[:2000]), np.array([(7, 7, 100_010, 1), *ROWS[2000:]])
+    for index, part in enumerate(parts):
+        np.save(tmp_path / f"{index}.npy", part)
+    file = EsimEventFolder(tmp_path, WIDTH, HEIGHT)
+    file.drop_malformed = True
+    for _ in range(2):
+        assert file.time_span() == (ROWS[0][2], ROWS[-1][2])
+        np.testing.assert_array_equal(read(file)[:, 2], [t for _, _, t, _ in ROWS])
+    assert capsys.readouterr().out.count("1 out of order (the first at 100010 ns)") == 1
 
 
 def evt3_of(*values: int) -> bytes:

@@ -35,6 +35,7 @@ POSES = {
     "names": f"timestamp tx ty tz qx qy qz qw\n0.492 {POSE}\n0.496 {POSE}\n",
     "EuRoC": "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n"
     "492000000,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n496000000,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
+    "another order in a remark": f"# t x y z qx qy qz qw (not qw qx qy qz)\n0.492 {POSE}\n0.496 {POSE}\n",
     "w first": "t,tx,ty,tz,qw,qx,qy,qz\n0.492,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n0.496,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
 }
 

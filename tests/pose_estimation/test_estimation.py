@@ -153,7 +153,7 @@ def test_find_poses_and_lens_of_a_bare_recording(
     with CONSOLE.capture() as checked, contextlib.suppress(SystemExit):
         Check(folder).main()
     told = " ".join(checked.get().split())
-    assert f"How they were estimated: {report['summary'].splitlines()[0]}" in told
+    assert f"How they were found: {report['summary'].splitlines()[0]}" in told
     assert "The intrinsics were estimated with the poses: focal length" in told
     lens = json.loads((folder / "transforms.json").read_text())["event_camera"]
     assert lens["intrinsics_origin"] == "estimated"
