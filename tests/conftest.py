@@ -26,9 +26,11 @@ if not torch.cuda.is_available():
     # Before anything imports Triton: it then interprets its kernels on the CPU.
     os.environ["TRITON_INTERPRET"] = "1"
 
-# numba and PyTorch share one OpenMP: a simulation with two threads would leave PyTorch with two as well, and threads of
-# all workers would then wait for each other.
+# numba and PyTorch share one OpenMP. When numba starts its threads, PyTorch gets as many, and threads of all workers wait
+# for each other: a training then takes up to nine times as long.
+_TORCH_THREADS = torch.get_num_threads()
 numba.set_num_threads(1)
+torch.set_num_threads(_TORCH_THREADS)
 
 # The same examples in every run of the suite, so that a failure is that of a change. Longer runs look for new ones.
 settings.register_profile("suite", derandomize="AENERF_FUZZ_EXAMPLES" not in os.environ)

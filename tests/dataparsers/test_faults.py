@@ -205,7 +205,7 @@ def bounds(array: np.ndarray) -> Change:
 
 
 ESIM: dict[str, Fault] = {
-    "no events": (remove("events"), "events", "no such"),
+    "no events": (remove("events"), "events", "no *.npy"),
     "empty folder": (remove("events/*"), "events", "no *.npy"),
     "no camera": (remove("poses_bounds.npy"), "poses_bounds.npy", "no such file"),
     "two lists": (write_text("other_poses_all.txt", ""), "made", "2 files *poses_all*.txt"),

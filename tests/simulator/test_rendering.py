@@ -8,7 +8,6 @@ import sys
 import numba
 import numpy as np
 import pytest
-import torch
 import trimesh
 from helpers.small_meshes import BLACK, OVERHEAD, baked_mesh, light_mesh, mesh_of, plate, ray_directions
 from scipy.stats import norm
@@ -116,13 +115,12 @@ def test_threads_do_not_change_pictures() -> None:
     mesh, _ = repair(mesh_of(trimesh.creation.icosphere(3)), 0.2)
     lamp = AreaLight((0.5, 0, 2.0), (0.3, 0, 0), (0, -0.3, 0), (1.0, 2.0, 3.0))
     pose = paths.look_at((3, 1, 1), (0, 0, 0))
-    pictures, torch_threads = [], torch.get_num_threads()
+    pictures = []
     for threads in (1, numba.config.NUMBA_NUM_THREADS):
         numba.set_num_threads(threads)
         scene = light_mesh(mesh, sky((0.1,) * 3, (1.0,) * 3), [lamp], BLACK)
         pictures.append(b"".join(part.tobytes() for part in scene.render(pose, (50, 50, 20, 15), 40, 30, 4)))
     numba.set_num_threads(1)
-    torch.set_num_threads(torch_threads)
     assert pictures[0] == pictures[1]
 
 
