@@ -26,8 +26,8 @@ if not torch.cuda.is_available():
     # Before anything imports Triton: it then interprets its kernels on the CPU.
     os.environ["TRITON_INTERPRET"] = "1"
 
-# numba and PyTorch share one OpenMP. When numba starts its threads, PyTorch gets as many. Threads of all workers then wait
-# for each other, and a training takes up to nine times as long.
+# numba and PyTorch share one OpenMP. When numba starts its threads, PyTorch gets as many. Threads of all workers
+# then wait for each other, and a training takes up to nine times as long.
 _TORCH_THREADS = torch.get_num_threads()
 numba.set_num_threads(1)
 torch.set_num_threads(_TORCH_THREADS)
