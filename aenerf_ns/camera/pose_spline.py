@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation
+from aenerf_ns.camera.time_window import runs_of
 
 # Four lost frames in a row make a segment five times as long as its neighbors. The errors of the poses at its ends
 # grow with its length, but the spline is still closer to the path than a straight line (benchmarks/LOG.md).
@@ -108,8 +109,7 @@ def _spline_slopes(seconds: Tensor, values: Tensor, in_spline: Tensor) -> Tensor
     x, y = seconds.cpu().numpy(), values.cpu().numpy()
     slopes = np.zeros_like(y)
     # A spline begins and ends where a segment that belongs to one meets a segment, or an end, that does not.
-    edges = np.flatnonzero(np.diff(in_spline.cpu().numpy(), prepend=False, append=False))
-    for first, last in edges.reshape(-1, 2):
+    for first, last in runs_of(in_spline.cpu().numpy()):
         knots = slice(first, last + 1)
         slopes[knots] = CubicSpline(x[knots], y[knots], bc_type="not-a-knot")(x[knots], 1)
     return torch.from_numpy(slopes).to(values)

@@ -40,3 +40,9 @@ class TimeWindow:
             (max(first, self.start), min(last, self.end)) for first, last in zip(edges[::2], edges[1::2], strict=True)
         )
         return [(first, last) for first, last in pieces if first <= last]
+
+
+def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the first index, and the index after the last one, of each run of true values in a mask (N,)."""
+    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]

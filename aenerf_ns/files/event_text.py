@@ -164,7 +164,7 @@ class TextEventFile(EventReader):
         )
 
     def _assumed_unit(self) -> TimeUnit | None:
-        return None if self._time_unit else self._unit(self._ends())
+        return None if self._time_unit else self._unit_of(self._ends())
 
     def _ends(self) -> list[_Lines]:
         """Parse the beginning of the file and its last line; none of them without events."""
@@ -173,12 +173,12 @@ class TextEventFile(EventReader):
             beginning = next(self._lines(file, names), None)
             return [] if beginning is None else [beginning, self._last_line(file, names)]
 
-    def _unit(self, ends: list[_Lines]) -> TimeUnit:
-        """Return the unit of the times: stated, or assumed from those at the ends of the file."""
-        return self._time_unit or ("s" if any(lines.fraction[2].any() for lines in ends) else "us")
+    def _unit_of(self, ends: list[_Lines]) -> TimeUnit:
+        """Return the unit that is assumed of the times at the ends of the file."""
+        return "s" if any(lines.fraction[2].any() for lines in ends) else "us"
 
     def _chunks(self) -> Iterator[EventStream]:
-        tick = NANOSECONDS[self._unit(self._ends())]
+        tick = NANOSECONDS[self._time_unit or self._unit_of(self._ends())]
         with self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
                 yield self._events(lines, tick)
@@ -188,7 +188,7 @@ class TextEventFile(EventReader):
         if not ends:
             return None
         beginning, last = ends
-        tick = NANOSECONDS[self._unit(ends)]
+        tick = NANOSECONDS[self._time_unit or self._unit_of(ends)]
         first = replace(beginning, whole=beginning.whole[:, :1], fraction=beginning.fraction[:, :1])
         start, end = (int(self._events(lines, tick).t[0]) for lines in (first, last))
         return start, end

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.alignment import Similarity, align, pose_errors, rotation_angle
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.time_window import runs_of
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, intrinsics_of, trajectory_of
@@ -68,11 +69,8 @@ class EstimatedPoses:
     def gaps(self) -> list[tuple[int, int, int]]:
         """Return first time, last time (nanoseconds) and number of frames of every run of frames without a pose."""
         lost = ~np.isin(self.frame_times, self.trajectory.times.numpy())
-        edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
-        return [
-            (int(self.frame_times[first]), int(self.frame_times[end - 1]), int(end - first))
-            for first, end in zip(edges[::2], edges[1::2], strict=True)
-        ]
+        times = self.frame_times
+        return [(int(times[first]), int(times[end - 1]), end - first) for first, end in runs_of(lost)]
 
     def report(self) -> dict[str, Any]:
         """Return the figures as plain values for JSON."""

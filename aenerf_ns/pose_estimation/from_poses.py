@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.camera.time_window import TimeWindow, runs_of
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, move_poses, tracks_of
@@ -55,11 +55,7 @@ class RefinedPoses:
 
     def weak_stretches(self) -> list[tuple[int, int]]:
         """Return the first and last times in nanoseconds of runs of images whose given poses nearly stay."""
-        edges = np.flatnonzero(np.diff(self.is_weak, prepend=False, append=False))
-        return [
-            (int(self.times[first]), int(self.times[end - 1]))
-            for first, end in zip(edges[::2], edges[1::2], strict=True)
-        ]
+        return [(int(self.times[first]), int(self.times[end - 1])) for first, end in runs_of(self.is_weak)]
 
     def report(self) -> dict[str, Any]:
         """Return the figures as plain values for JSON."""
