@@ -98,7 +98,8 @@ class OwnRecordingDataParser(EventDataParser):
         folder, config = Path(self.config.data), self.config
         stated = config.colmap or config.poses
         if stated is not None and not stated.exists():
-            raise DataError(stated, "there is no such file of poses", "correct the option, or leave it out")
+            option = "--colmap" if config.colmap else "--poses"
+            raise DataError(stated, "there is no such file of poses", f"correct {option}, or leave it out")
         trajectory, model = folder / "trajectory.txt", folder / "colmap"
         return stated or (model if model.is_dir() and not trajectory.is_file() else trajectory)
 
@@ -148,7 +149,7 @@ class OwnRecordingDataParser(EventDataParser):
 
 
 def _guess_calibration(events: EventFile) -> Calibration:
-    """Return a guess for a camera of which no more is known than the size that the event file states."""
+    """Return a guess for a camera. Only its size is known, which the event file states."""
     camera = CameraIntrinsics.guess(events.width, events.height)
     return Calibration(camera, camera, torch.eye(4, dtype=torch.float64), SensorModel(), "linear", "guessed")
 

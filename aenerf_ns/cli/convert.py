@@ -53,8 +53,8 @@ class Convert(DatasetCommand):
     poses: Literal["given", "refined", "colmap", "events"] = "given"
     """given: take the dataset's poses. refined: correct them by the motion of features in images that are made of the
     events, as far as these know better. colmap: have COLMAP estimate poses from the recording's frames. events: have it
-    estimate poses from images that are made of the events, for a recording without frames or of fast motion. Estimated
-    poses have no metric scale. Given poses are then kept as ground truth, to compare with."""
+    estimate poses from images that are made of the events, for a recording without frames or of fast motion. Poses
+    of colmap and events have no metric scale, and poses that the dataset gives are kept as ground truth."""
     start_time_ns: int | None = None
     """Leave out events and images before this time on the clock of the events, in nanoseconds."""
     end_time_ns: int | None = None

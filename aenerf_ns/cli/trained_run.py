@@ -83,7 +83,7 @@ def _at_its_place(config: TrainerConfig, path: Path, data: Path | None) -> Train
     """Tell a configuration where its file and its dataset are now.
 
     Raises:
-        DataError: there are no checkpoints, of which the framework complains in several lines.
+        DataError: there are no checkpoints. The framework would print several lines.
     """
     config.__dict__["opened_folder"] = path.absolute().parent
     folder = config.get_checkpoint_dir()

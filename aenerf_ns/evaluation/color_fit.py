@@ -57,7 +57,7 @@ class ColorFit:
         self._read_reference_views = read_reference_views
         # Chosen once: otherwise every fit would read the images again.
         self._pixels: _Pixels | None = None
-        # What was last printed.
+        # The sign of the slope that was printed last.
         self._was_reversed: bool | None = None
         if model.color_correction.protocol == "affine-test":
             CONSOLE.print(

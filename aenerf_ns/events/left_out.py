@@ -23,6 +23,11 @@ class LeftOut:
     """
 
     def __init__(self) -> None:
+        self._printed = ""
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all counts, because the file is read from its beginning."""
         self.last_time: int | None = None
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
@@ -50,6 +55,12 @@ class LeftOut:
     def summary(self) -> str:
         """Describe in words what is left out; empty if it is nothing."""
         return ", ".join(f"{n:,} {reason} (the first {self._first[reason]})" for reason, n in self._counts.items())
+
+    def print_once(self, path: Path) -> None:
+        """Print what is left out of a file, unless that is what was printed last."""
+        if self.summary() != self._printed:
+            self._printed = self.summary()
+            print(f"{path.name}: events that are left out: {self._printed}.")
 
     def require_few(self, source: Path, num_kept: int) -> None:
         """Raise a DataError if so many events are left out that the file must have been read wrongly."""

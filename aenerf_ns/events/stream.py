@@ -161,7 +161,6 @@ class EventFile(ABC):
         self.width = width
         self.height = height
         self.left_out = LeftOut()
-        self._told = ""
 
     @abstractmethod
     def read_chunks(self) -> Iterator[EventStream]:
@@ -217,7 +216,7 @@ class EventFile(ABC):
             DataError: the file is missing, empty or out of order, or an event is malformed.
         """
         self.require()
-        self.left_out = LeftOut()
+        self.left_out.restart()
         total, last_time = 0, None
         for chunk in self.read_chunks():
             if len(chunk) == 0:
@@ -229,8 +228,6 @@ class EventFile(ABC):
             yield chunk
         if self.drop_malformed:
             self.left_out.require_few(self.path, total)
-        if self.left_out.summary() != self._told:
-            self._told = self.left_out.summary()
-            print(f"{self.path.name}: events that are left out: {self._told}.")
+        self.left_out.print_once(self.path)
         if total == 0:
             raise self.empty_error()

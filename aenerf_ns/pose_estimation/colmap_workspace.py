@@ -276,8 +276,7 @@ class ColmapWorkspace:
 
         Args:
             model: its poses.
-            max_pixels: as for :meth:`triangulate`.
-            max_degrees: likewise.
+            max_pixels, max_degrees: see :meth:`triangulate`.
             max_iterations: of the bundle adjustment.
             refine_intrinsics: whether to adjust focal length and distortion too.
         """

@@ -17,7 +17,7 @@ _MIN_VARIANCE = 0.5
 _NUM_TIMES = 6
 # Degrees: where the search for the size of the processes begins.
 _FIRST_SIZE = 0.3
-# A process of size zero would keep it.
+# Degrees. A process of size zero could not grow again.
 _SIZE_LIMITS = (0.003, 10.0)
 _VARIANCE_UPDATES = 6
 # Share of an orientation's variance that tracks take away at least, if they say anything of it.
@@ -95,7 +95,7 @@ class PoseRefinement:
             force = lu_solve(factors, pull).reshape(self.twists.shape)
             expected = (draws * lu_solve(factors, weighted_draws)).sum(0).reshape(_NUM_TIMES, -1).mean(1)
             found = np.square(self._roots.transpose(0, 2, 1) @ (force * self._units)).sum((1, 2))
-            # The ones keep a process as it is of which the tracks say nothing.
+            # The ones keep the size of a process if the tracks say nothing of it.
             growth = (self._variances * found + 1) / (self._variances * expected + 1)
             self._variances = np.clip(self._variances * np.clip(growth, 0.1, 10), *np.square(np.deg2rad(_SIZE_LIMITS)))
         force = lu_solve(self._factors(), pull)

@@ -27,8 +27,8 @@ from aenerf_ns.events.stream import EventFile
 _VERSION = 1
 # The end of the file: length of the description as JSON in front of it, and this word.
 _WORD = b"aenerf-pairs"
-# What a reader of events has beside its options.
-_NOT_OPTIONS = ("path", "left_out", "_told")
+# Attributes of a reader of events that are no options.
+_NOT_OPTIONS = ("path", "left_out")
 _NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "int")
 
 

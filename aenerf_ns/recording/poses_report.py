@@ -1,4 +1,4 @@
-"""What a dataset folder says of how its poses were estimated or refined."""
+"""The report in a dataset folder on how its poses were estimated or refined."""
 
 from __future__ import annotations
 

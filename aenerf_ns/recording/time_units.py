@@ -58,7 +58,7 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
 
 
 def require_covered(source: Path, num_events: int, num_covered: int) -> None:
-    """Raise a DataError for events of a whole recording of which hardly any have a pose."""
+    """Raise a DataError if hardly any events of a whole recording have a pose."""
     if num_covered < _MIN_COVERED * num_events:
         raise DataError(
             source,
