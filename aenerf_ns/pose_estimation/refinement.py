@@ -107,13 +107,16 @@ class PoseRefinement:
 
     def _times_prior(self, values: Array) -> Array:
         """Multiply the (6 N, 6 N) covariance of the prior with values (6 N, K)."""
-        covariance = np.tensordot(self._variances, self._correlations, 1)
         scaled = np.square(self._units)[:, None] * values.reshape(*self.twists.shape, -1)
-        return np.tensordot(covariance, scaled, 1).reshape(values.shape)
+        return np.tensordot(self._covariance(), scaled, 1).reshape(values.shape)
+
+    def _covariance(self) -> Array:
+        """Return the (N, N) covariance of each component of the given poses' errors, in square radians."""
+        return np.tensordot(self._variances, self._correlations, 1)
 
     def _noise(self, information: PoseInformation) -> float:
         """Return the variance of a track's error in square pixels, from how groups of tracks pull at the poses."""
-        covariance = np.tensordot(self._variances, self._correlations, 1)
+        covariance = self._covariance()
         pulls = information.group_gradients.reshape(-1, *self.twists.shape) * self._units
         blocks = np.einsum("ncmc,c->nm", information.hessian.reshape(*self.twists.shape * 2), np.square(self._units))
         pulled = np.einsum("gnc,nm,gmc->", pulls, covariance, pulls, optimize=True)
