@@ -46,6 +46,10 @@ aenerf = MethodSpecification(
                 "optimizer": FusedAdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
                 "scheduler": RelativeMultiStepSchedulerConfig(),
             },
+            "proposals": {
+                "optimizer": FusedAdamOptimizerConfig(lr=1e-2, eps=1e-15),
+                "scheduler": RelativeMultiStepSchedulerConfig(),
+            },
             "sensor": {
                 "optimizer": FusedAdamOptimizerConfig(lr=0.05),
                 "scheduler": RelativeMultiStepSchedulerConfig(),

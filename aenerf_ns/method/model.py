@@ -170,11 +170,14 @@ class AENeRFModel(Model):
         self.image_metrics = ImageMetrics(with_lpips=config.lpips)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Return the parameters by optimizer: only networks get weight decay, hash tables and background do not."""
-        groups: dict[str, list[Parameter]] = {"encodings": [], "networks": []}
-        for module in (self.field, self.proposal_networks):
+        """Return the parameters by optimizer: only the field's networks get weight decay.
+
+        The proposal networks' gradients are small before training. Weight decay is larger, and would empty them.
+        """
+        groups: dict[str, list[Parameter]] = {"encodings": [], "networks": [], "proposals": []}
+        for module, networks in ((self.field, "networks"), (self.proposal_networks, "proposals")):
             for name, parameter in module.named_parameters():
-                groups["encodings" if name.endswith("hash_table") else "networks"].append(parameter)
+                groups["encodings" if name.endswith("hash_table") else networks].append(parameter)
         if self.raw_background is not None:
             groups["encodings"].append(self.raw_background)
         if not groups["encodings"]:

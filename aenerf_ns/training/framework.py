@@ -14,7 +14,7 @@ from nerfstudio.utils import writer
 
 USED_NAMES = {
     # Read here.
-    "nerfstudio.engine.trainer:Trainer": ("_start_step",),
+    "nerfstudio.engine.trainer:Trainer": ("_load_checkpoint", "_start_step"),
     "nerfstudio.utils.writer": ("EVENT_WRITERS", "EVENT_STORAGE", "GLOBAL_BUFFER"),
     # Overridden or read in subclasses.
     "nerfstudio.configs.base_config:InstantiateConfig": ("_target",),

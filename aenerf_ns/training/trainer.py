@@ -141,6 +141,15 @@ class AENeRFTrainer(Trainer):
             with _one_line_if_not_written(self.base_dir / "config.yml") as path, atomic_write(path) as partial:
                 partial.write_text(yaml.dump(self._resolved_config()), "utf8")
 
+    def _load_checkpoint(self) -> None:
+        try:
+            super()._load_checkpoint()
+        # torch's, for weights and for the state of an optimizer.
+        except (RuntimeError, ValueError) as error:
+            problem = f"it holds other parameters than this training: {' '.join(str(error).split())}"
+            remedy = "give the method, the options and the version of aenerf-ns that it was made with, or train again"
+            raise DataError(str(self.config.load_checkpoint), problem, remedy) from error
+
     def _resolved_config(self) -> AENeRFTrainerConfig:
         """Return the configuration with what the dataset has resolved: opening the run must give the same cameras."""
         data = self.pipeline.datamanager

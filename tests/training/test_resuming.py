@@ -55,6 +55,13 @@ def test_run_in_two_pieces_equals_one(tmp_path: Path) -> None:
     assert_equal(whole, resumed)
     assert whole["pipeline"]["_model.camera_optimizer.twists.control_twists"].any()
     assert checkpoint(first)["pipeline"]["training_state._extra_state"]["gradients"]["camera_opt"][0].any()
+    # Of a version with other groups of parameters.
+    (path,) = first.checkpoint_dir.iterdir()
+    contents = checkpoint(first)
+    contents["optimizers"]["networks"]["param_groups"][0]["params"].append(99)
+    torch.save(contents, path)
+    with pytest.raises(SystemExit, match=r"^Error: \S+\.ckpt: it holds other parameters than this training: .*again$"):
+        train_small_model(tmp_path, "other", 1, load_dir=first.checkpoint_dir)
 
 
 @pytest.mark.parametrize("counts_earlier_steps", [False, True])
