@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -68,6 +69,34 @@ class RadianceShape:
     hidden_dim: int
 
 
+class IntegratedEncoding(NeRFEncoding):
+    """Sines and cosines of positions in the unit cube, with 1, 2, 4, ... periods across it, and the positions.
+
+    They are the mean values over the part of space that a sample stands for, as in Mip-NeRF: what varies within a
+    sample averages out. Otherwise a field learns the highest frequencies first, as noise, because a change between two
+    events is a derivative along the motion.
+
+    The framework's own integration scales the positions by 2π, and the variances not.
+
+    Args:
+        num_frequencies: of the encoding, in octaves.
+    """
+
+    def __init__(self, num_frequencies: int) -> None:
+        super().__init__(3, num_frequencies, 0.0, num_frequencies - 1.0, include_input=True)
+
+    def pytorch_fwd(self, in_tensor: Tensor, covs: Tensor | None = None) -> Tensor:
+        """Return features (N, 6 frequencies) of positions (N, 3) and, of Gaussians, the variances (N, 3) by axis."""
+        frequencies = 2 * math.pi * 2.0 ** torch.arange(self.num_frequencies, device=in_tensor.device)
+        phases = (in_tensor[..., None] * frequencies).flatten(-2)
+        values = torch.sin(torch.cat([phases, phases + math.pi / 2], -1))
+        if covs is None:
+            return values
+        # Below, products would be denormal numbers, which slow a CPU down.
+        exponents = (-0.5 * covs[..., None] * frequencies.square()).clamp_min(-40).flatten(-2)
+        return values * exponents.exp().repeat(1, 2)
+
+
 class DensityField(Field):
     """Density of space: an encoding of the position (γ_x of the paper, eq. 1) and a network.
 
@@ -112,7 +141,11 @@ class DensityField(Field):
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
         """Return density (..., 1), zero outside the box of a bounded scene, and the feature (..., feature_dim)."""
         positions, inside = _unit_positions(self, ray_samples)
-        raw = self.density_network(self.encoding(positions.flatten(0, -2))).unflatten(0, positions.shape[:-1])
+        inputs = [positions]
+        if isinstance(self.encoding, IntegratedEncoding):
+            inputs.append(_unit_variances(self, ray_samples))
+        encoded = self.encoding(*(values.flatten(0, -2) for values in inputs))
+        raw = self.density_network(encoded).unflatten(0, positions.shape[:-1])
         raw_density, feature = raw.split([1, raw.shape[-1] - 1], dim=-1)
         raw_density = raw_density.to(positions.dtype)
         if self.density_activation == "exp":
@@ -226,6 +259,24 @@ def _unit_positions(field: DensityField | ProposalNetwork, ray_samples: RaySampl
     positions = to_unit_cube(positions, field.spatial_distortion, field.aabb)
     inside = ((positions > 0) & (positions < 1)).all(-1, keepdim=True)
     return positions * inside, inside
+
+
+def _unit_variances(field: DensityField, ray_samples: RaySamples) -> Tensor:
+    """Return variances (..., 3) along the unit cube's axes of the parts of space that samples stand for.
+
+    A part is a segment of the ray, as wide as a pixel. The distortion's effect on both is measured and not derived.
+    """
+    frustums = ray_samples.frustums
+    to_unit = partial(to_unit_cube, spatial_distortion=field.spatial_distortion, aabb=field.aabb)
+    # Neighbors share an end.
+    ends = torch.cat([frustums.starts, frustums.ends[..., -1:, :]], -2)
+    along = to_unit(frustums.origins[..., :1, :] + frustums.directions[..., :1, :] * ends).diff(dim=-2)
+    middles = frustums.get_positions()
+    width = frustums.pixel_area.sqrt() * (frustums.starts + frustums.ends) / 2
+    beside = to_unit(middles[..., None, :] + width[..., None] * torch.eye(3, device=width.device))
+    across = beside - to_unit(middles)[..., None, :]
+    # The variance of an even distribution is a twelfth of its squared length.
+    return (along.square() + across.square().sum(-2)) / 12
 
 
 def to_unit_cube(positions: Tensor, spatial_distortion: SpatialDistortion | None, aabb: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -16,6 +17,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
+from nerfstudio.fields.base_field import Field
 from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
@@ -73,7 +75,7 @@ class AENeRFModelConfig(ModelConfig):
     that states a scene box, "none" for others."""
     backbone: Backbone = "hash"
     """Kind of field and proposal networks. "hash": small networks on hash grids, with exponential density. "mlp": the
-    paper's large networks on sinusoidal encodings, with softplus density."""
+    paper's large networks on integrated sinusoidal encodings, with softplus density."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     """The event radiance field."""
     proposal: ProposalConfig = dataclasses.field(default_factory=ProposalConfig)
@@ -87,6 +89,8 @@ class AENeRFModelConfig(ModelConfig):
     """How renderings are compared with the sensor's record. The datamanager's sampler draws the batches."""
     camera_optimizer: PoseCorrectionConfig = dataclasses.field(default_factory=PoseCorrectionConfig)
     """Correction of the estimated poses."""
+    moving_field: bool = True
+    """Whether field and proposal networks move along with the corrections of the poses. In the paper they do not."""
     color_correction: ColorCorrectionProtocol = "affine"
     """How log-radiance becomes a picture. "affine": by an affine map per channel, fitted on the validation views.
     "affine-test": by one fitted on the test views themselves, only to compare with figures that were made that way.
@@ -134,7 +138,8 @@ class AENeRFModel(Model):
         )
         learned = self.camera_optimizer.is_learned
         aabb = _with_room(self.scene_box.aabb) if learned else self.scene_box.aabb
-        self.warp = PoseFollowingWarp(self.camera_optimizer, distortion, aabb) if learned else None
+        moves = learned and config.moving_field
+        self.warp = PoseFollowingWarp(self.camera_optimizer, distortion, aabb) if moves else None
         self.field, proposal_networks = make_networks(
             config.backbone,
             config.field,
@@ -146,7 +151,7 @@ class AENeRFModel(Model):
             self.warp,
         )
         self.proposal_networks = nn.ModuleList(proposal_networks)
-        self.density_fns = [network.density_fn for network in proposal_networks]
+        self.density_fns = [partial(_density, network) for network in proposal_networks]
         if config.backbone == "mlp":
             self.density_fns *= len(config.proposal.num_samples_per_ray)
         self.proposal_sampler = ProposalSampler(
@@ -365,6 +370,10 @@ class AENeRFModel(Model):
         rendered = [self(rays[begin : begin + chunk]) for begin in range(0, len(rays), chunk)]
         self.train(was_training)
         return [torch.cat([outputs[name] for outputs in rendered]) for name in names]
+
+
+def _density(network: Field, samples: RaySamples) -> Tensor:
+    return network.get_density(samples)[0]
 
 
 def _require_possible(config: AENeRFModelConfig) -> None:

@@ -5,12 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from nerfstudio.field_components.encodings import NeRFEncoding
 from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import Field
-from torch import Tensor
+from torch import Tensor, nn
 
-from aenerf_ns.method.field import DensityField, DensityShape, EventRadianceField, ProposalNetwork, RadianceShape
+from aenerf_ns.method.field import (
+    DensityField,
+    DensityShape,
+    EventRadianceField,
+    IntegratedEncoding,
+    ProposalNetwork,
+    RadianceShape,
+)
 from aenerf_ns.method.hash_grid import HashEncoding, Implementation
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 
@@ -42,6 +48,9 @@ class FieldConfig:
     """Width of the hidden layers."""
     geometry_feature_dim: int = 15
     """Length of the feature that the radiance is computed from, with the view direction."""
+    xavier_initialization: bool = False
+    """mlp: start the layers up to density and feature by Xavier's rule. PyTorch's own start, which is the paper's, lets
+    hardly any gradient through many layers."""
 
 
 @dataclass
@@ -121,15 +130,7 @@ def make_networks(
             )
             for resolution in proposal.max_resolutions
         ]
-    # On a position in [0, 1], which the framework's encoding multiplies by 2π: NeRF's frequencies on [-1, 1].
-    encoding = NeRFEncoding(
-        in_dim=3,
-        num_frequencies=field.num_frequencies,
-        min_freq_exp=0.0,
-        max_freq_exp=field.num_frequencies - 1.0,
-        include_input=True,
-        implementation="torch",
-    )
+    encoding = IntegratedEncoding(field.num_frequencies)
     radiance_field = EventRadianceField(
         aabb,
         spatial_distortion,
@@ -142,5 +143,9 @@ def make_networks(
         field_warp,
     )
     shape = DensityShape(proposal.num_hidden_layers, proposal.hidden_dim, 0, "softplus", average_init_density)
+    if field.xavier_initialization:
+        for layer in radiance_field.density_network.layers:
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
     # One network, which every round of proposals evaluates again.
     return radiance_field, [DensityField(aabb, spatial_distortion, encoding, shape, proposal_warp)]

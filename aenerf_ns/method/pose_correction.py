@@ -347,7 +347,9 @@ def _compared_times(trajectory: Trajectory, ground_truth: Trajectory | None) -> 
 
 
 class TwistNetwork(nn.Module):
-    """The paper's pose correction network (appendix, algorithm 1; softplus as in its text).
+    """The paper's pose correction network (appendix, algorithm 1; softplus as in its text), but it puts out a twist.
+
+    The paper's puts out the corrected pose itself. A twist can be zero before training.
 
     Args:
         trajectory: estimated trajectory, whose span the times lie in.
@@ -358,7 +360,7 @@ class TwistNetwork(nn.Module):
         super().__init__()
         self._duration = trajectory.duration
         width = 256
-        self.pose_embedding = nn.Linear(12, width)
+        self.pose_embedding = nn.Linear(13, width)
         self.time_embedding = nn.Linear(1, width)
         self.encoding = NeRFEncoding(
             in_dim=width,
@@ -390,7 +392,7 @@ class TwistNetwork(nn.Module):
         time = (2 * seconds / self._duration - 1).to(dtype)[:, None]
         # Half precision cannot tell the two ends of an interval apart.
         with torch.autocast(time.device.type, enabled=False):
-            pose = self.pose_embedding(base.flatten(1).to(dtype))
+            pose = self.pose_embedding(torch.cat([base.flatten(1).to(dtype), time], -1))
             embedded = F.softplus(pose) + F.softplus(self.time_embedding(time))
             return (_NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))).double()
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 
+import torch
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import (
     ProposalNetworkSampler,
@@ -12,6 +13,7 @@ from nerfstudio.model_components.ray_samplers import (
     UniformLinDispPiecewiseSampler,
     UniformSampler,
 )
+from torch import Tensor
 
 
 class _OnDevice(SpacedSampler):
@@ -35,18 +37,36 @@ class EvenThenDisparitySampler(_OnDevice, UniformLinDispPiecewiseSampler):
 
 
 class ProposalSampler(ProposalNetworkSampler):
-    """Nerfstudio's proposal sampler, which pictures do not disturb, and which a resumed training can set."""
+    """Nerfstudio's proposal sampler, which pictures do not disturb, and which a resumed training can set.
+
+    The density functions are given samples, where the framework gives them positions alone: an integrated encoding
+    needs the part of space that a sample stands for.
+    """
 
     def generate_ray_samples(
-        self, ray_bundle: RayBundle | None = None, density_fns: list[Callable] | None = None
-    ) -> tuple[RaySamples, list, list]:
+        self,
+        ray_bundle: RayBundle | None = None,
+        density_fns: Sequence[Callable[[RaySamples], Tensor]] | None = None,
+    ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
         """Return samples of the field, and weights and samples of each round of proposals."""
-        steps_since_update: int = self._steps_since_update  # type: ignore[has-type]
-        found = super().generate_ray_samples(ray_bundle, density_fns)
-        if not self.training:
-            # A picture must not move the steps that train the proposal networks.
-            self._steps_since_update = steps_since_update
-        return found
+        assert ray_bundle is not None
+        assert density_fns is not None
+        weights_list: list[Tensor] = []
+        samples_list: list[RaySamples] = []
+        # As in the framework: the proposal networks are trained at every step at first, and then at some.
+        updated = self._steps_since_update > self.update_sched(self._step) or self._step < 10
+        first, *others = self.num_proposal_samples_per_ray
+        samples = self.initial_sampler(ray_bundle, num_samples=first)
+        for density_fn, count in zip(density_fns, (*others, self.num_nerf_samples_per_ray), strict=True):
+            with torch.set_grad_enabled(updated and torch.is_grad_enabled()):
+                weights = samples.get_weights(density_fn(samples))
+            weights_list.append(weights)
+            samples_list.append(samples)
+            samples = self.pdf_sampler(ray_bundle, samples, weights**self._anneal, num_samples=count)
+        # A picture must not move the steps that train the proposal networks.
+        if updated and self.training:
+            self._steps_since_update = 0
+        return samples, weights_list, samples_list
 
     def schedule_state(self) -> dict[str, int]:
         """Return the steps so far, and those since the proposal networks were last trained."""

@@ -19,10 +19,11 @@ def log_radiance_rate(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return G_pred of the paper (before eq. 12): the total derivative d log L̂ / dt while the rays move.
 
-    The derivative is exact: forward-mode automatic differentiation goes through the field and the compositing. One
-    ordinary backward pass then reaches the parameters of the field and of the rays' motion. The samples' distances
-    along the ray are held constant. Everything is in full precision even under autocast, because on a fine grid rates
-    per second exceed the range of half precision.
+    Forward-mode automatic differentiation goes through the field and the compositing. The derivative is exact, but for
+    a field that moves along: the place at which it looks up its motion is held constant. One ordinary backward pass
+    then reaches the parameters of the field and of the rays' motion. The samples' distances along the ray are held
+    constant. Everything is in full precision even under autocast, because on a fine grid rates per second exceed the
+    range of half precision.
 
     Args:
         render: returns log-radiance (N, channels) and weights (N, samples, 1) for ray samples.

@@ -10,10 +10,13 @@ import torch
 import torch.nn.functional as F
 from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.viewer.utils import CameraState, get_camera
+from torch import Tensor
 
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.method.field import to_unit_cube
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.supervision.event_pairs import PairLossCoefficients
 
@@ -120,6 +123,34 @@ def test_the_mlps_are_those_of_the_paper() -> None:
     shapes = [tuple(layer.weight.shape) for layer in proposal_network.density_network.layers]
     assert shapes == [(256, encoded), *[(256, 256)] * 3, (1, 256)]
     assert len(model.density_fns) == 2
+
+
+@pytest.mark.parametrize("contraction", ["l2", "linf", "none"])
+def test_the_mlp_sees_the_mean_of_the_encoding_over_a_sample(contraction: str) -> None:
+    model = make_model(backbone="mlp", scene_contraction=contraction, field={"num_frequencies": 5})
+    origin, direction = torch.tensor([-0.5, 0.2, -0.7]), torch.tensor([0.6, 0.0, 0.8])
+    across = torch.tensor([[0.0, 1.0, 0.0], [0.8, 0.0, -0.6]])
+    edges = torch.tensor([0.5, 0.7, 0.9, 1.3, 1.9])[:, None]
+    frustums = Frustums(
+        origins=origin.expand(1, 4, 3),
+        directions=direction.expand(1, 4, 3),
+        starts=edges[None, :-1],
+        ends=edges[None, 1:],
+        pixel_area=torch.full((1, 4, 1), 0.02),
+    )
+    seen: list[Tensor] = []
+    model.field.density_network.forward = lambda encoded: seen.append(encoded) or torch.zeros(len(encoded), 16)  # type: ignore[method-assign,func-returns-value]
+    model.field.get_density(RaySamples(frustums=frustums))
+    distances = edges[:-1, None] + edges.diff(dim=0)[:, None] * torch.rand(4, 20000, 1)
+    offsets = 0.02**0.5 * distances * (torch.rand(4, 20000, 2) - 0.5)
+    points, middles = origin + distances * direction + offsets @ across, frustums.get_positions()[0]
+    within, plain = (
+        model.field.encoding(to_unit_cube(places, model.field.spatial_distortion, model.field.aabb))
+        for places in (points, middles)
+    )
+    # A Gaussian takes the place of the frustum. It lacks the small oscillations of what ends abruptly.
+    torch.testing.assert_close(seen[0], within.mean(1), rtol=0, atol=0.2)
+    assert (plain - within.mean(1)).abs().max() > 0.7
 
 
 @pytest.mark.parametrize("contraction", ["l2", "linf", "none"])

@@ -21,6 +21,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method_configs import peers
 from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
+from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
 from aenerf_ns.method_configs.peers import robust_enerf, robust_enerf_small
 from aenerf_ns.training.pipeline import AENeRFPipeline
 
@@ -84,6 +85,15 @@ def train(
 def same(first: Any, second: Any) -> bool:
     """Whether two trainings gave the same losses and weights, to the bit."""
     return first[0] == second[0] and all(torch.equal(value, second[1][name]) for name, value in first[1].items())
+
+
+def test_aenerf_mlp_trains_by_the_papers_losses_alone(data: Path) -> None:
+    config, seen = shrunk(deepcopy(aenerf_mlp.config)), []
+    history, _ = train(config, data, 3, lambda pipeline: seen.append(pipeline.model.warp))
+    assert seen == [None, None]
+    assert history[-1].pop("pose_correction_penalty") == 0
+    assert set(history[-1]) == {"reconstruction_loss", "temporal_loss", "interlevel_loss", "distortion_loss"}
+    assert all(history[-1].values())
 
 
 AS_ROBUST = (

@@ -175,8 +175,7 @@ def test_the_pose_correction_keeps_full_precision() -> None:
 
 
 def make_samples(model: AENeRFModel, rays: RayBundle) -> RaySamples:
-    densities = [network.density_fn for network in model.proposal_networks]
-    return model.proposal_sampler(model.collider(rays), density_fns=densities)[0]
+    return model.proposal_sampler(model.collider(rays), density_fns=model.density_fns)[0]
 
 
 def test_the_rate_keeps_full_precision() -> None:

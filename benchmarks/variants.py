@@ -1,0 +1,124 @@
+"""Train variants of methods on datasets, side by side, and follow their losses and their proposal networks.
+
+    python -m benchmarks.variants --data room data/room --variants default=aenerf-small \
+        decayed="aenerf-small --optimizers.proposals.optimizer.weight-decay 1e-6" --steps 400 --output variants.json
+
+All runs are made in one process, because each start takes long. A variant is the name of a method and options of
+ns-train. PSNR is of the test views, as placed; poses without correction must be true ones.
+"""
+
+from __future__ import annotations
+
+import shlex
+import time
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+import tyro
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.utils import writer
+from torch import Tensor
+
+from aenerf_ns.evaluation.view_metrics import average_metrics, measure_reference_views
+from aenerf_ns.training.trainer import AENeRFTrainer
+from benchmarks.runs import run_benchmark, write_result
+
+_EVALUATIONS = ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images", "steps_per_save")
+
+
+@dataclass
+class Variants:
+    """Train variants of methods."""
+
+    output: Path
+    """JSON file to write after each training."""
+    data: dict[str, Path]
+    """Folders of datasets by name."""
+    variants: dict[str, str]
+    """Method and options of ns-train by the name of a variant."""
+    steps: int = 400
+    """Steps of each training."""
+    seeds: tuple[int, ...] = (1, 2, 3)
+    """Seeds of the trainings."""
+    points: int = 6
+    """Steps at which a run is looked at."""
+    curve: bool = False
+    """Measure PSNR at each of them, too."""
+    pictures: Path | None = None
+    """Folder for the pictures of the test views."""
+
+    def main(self) -> None:
+        """Make all runs, and write them."""
+        runs: list[dict[str, Any]] = []
+        for seed in self.seeds:
+            for dataset, folder in self.data.items():
+                for variant, words in self.variants.items():
+                    about = {"dataset": dataset, "variant": variant, "seed": seed}
+                    runs.append(about | self._run(folder, shlex.split(words), seed))
+                    write_result(self.output, {"steps": self.steps, "variants": self.variants, "runs": runs}, False)
+                    print({name: value for name, value in runs[-1].items() if name != "followed"}, flush=True)
+
+    def _run(self, folder: Path, words: list[str], seed: int) -> dict[str, Any]:
+        method, *options = words
+        config = tyro.cli(type(all_methods[method]), default=deepcopy(all_methods[method]), args=options)
+        config.machine.seed, config.machine.device_type, config.vis = seed, "cpu", "tensorboard"
+        config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = folder
+        never = dict.fromkeys(_EVALUATIONS, self.steps + 1)
+        followed: list[dict[str, Any]] = []
+        with TemporaryDirectory() as output:
+            # A new configuration, because the schedules follow the number of steps when it is made.
+            config = replace(config, max_num_iterations=self.steps, output_dir=Path(output), timestamp="now", **never)
+            torch.manual_seed(seed)
+            trainer: AENeRFTrainer = config.setup(local_rank=0, world_size=1)
+            trainer.setup()
+            self._follow(trainer, followed)
+            begin = time.process_time()
+            trainer.train()
+            seconds = time.process_time() - begin
+            writer.EVENT_WRITERS.clear()
+            writer.EVENT_STORAGE.clear()
+        return {**_metrics(trainer, self.pictures), "cpu_seconds": round(seconds), "followed": followed}
+
+    def _follow(self, trainer: AENeRFTrainer, followed: list[dict[str, Any]]) -> None:
+        model, interval = trainer.pipeline.model, max(self.steps // self.points, 1)
+        losses_of, latest = model.get_loss_dict, {}
+
+        def get_loss_dict(outputs: dict[str, Any], *arguments: Any) -> dict[str, Tensor]:
+            losses = losses_of(outputs, *arguments)
+            weights = outputs["weights_list"][-2][..., 0].detach()
+            shares = weights / weights.sum(-1, keepdim=True)
+            # The number of intervals over which a histogram that is even there would spread as widely.
+            latest.update({name: float(loss.detach()) for name, loss in losses.items()})
+            latest["proposal_intervals"] = float((1 / shares.square().sum(-1)).mean())
+            return losses
+
+        def look(step: int) -> None:
+            if (step + 1) % interval and step > 0:
+                return
+            named = model.proposal_networks.named_parameters()
+            weights = torch.cat([p.detach().flatten() for name, p in named if name.endswith("weight")])
+            psnr = _metrics(trainer, None) if self.curve and 0 < step < self.steps - 1 else {}
+            followed.append({"step": step + 1, "proposal_rms": float(weights.square().mean().sqrt()), **latest, **psnr})
+
+        model.get_loss_dict = get_loss_dict  # type: ignore[method-assign]
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        trainer.callbacks.append(TrainingCallback(after, look, update_every_num_iters=1))
+
+
+def _metrics(trainer: AENeRFTrainer, pictures: Path | None) -> dict[str, Any]:
+    """Return PSNR and SSIM of the test views."""
+    pipeline = trainer.pipeline
+    pipeline.color_fit.fit()
+    views = pipeline.datamanager.reference_views("test")
+    run = replace(pipeline.trained_run(), views=views)
+    metrics = average_metrics(measure_reference_views(run, pictures), with_deviations=False)
+    return {name: metrics[name] for name in ("psnr", "ssim")}
+
+
+if __name__ == "__main__":
+    run_benchmark(Variants)
