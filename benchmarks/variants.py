@@ -1,7 +1,7 @@
 """Train variants of methods on datasets, side by side, and follow their losses and their proposal networks.
 
-    python -m benchmarks.variants --data room data/room --variants default=aenerf-small \
-        decayed="aenerf-small --optimizers.proposals.optimizer.weight-decay 1e-6" --steps 400 --output variants.json
+    python -m benchmarks.variants --data room data/room --variants default aenerf-small \
+        decayed "aenerf-small --optimizers.proposals.optimizer.weight-decay 1e-6" --steps 400 --output variants.json
 
 All runs are made in one process, because each start takes long. A variant is the name of a method and options of
 ns-train. PSNR is of the test views, as placed; poses without correction must be true ones.
@@ -105,7 +105,7 @@ class Variants:
             psnr = _metrics(trainer, None) if self.curve and 0 < step < self.steps - 1 else {}
             followed.append({"step": step + 1, "proposal_rms": float(weights.square().mean().sqrt()), **latest, **psnr})
 
-        model.get_loss_dict = get_loss_dict  # type: ignore[method-assign]
+        model.get_loss_dict = get_loss_dict
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         trainer.callbacks.append(TrainingCallback(after, look, update_every_num_iters=1))
 

@@ -43,6 +43,8 @@ class ProposalSampler(ProposalNetworkSampler):
     needs the part of space that a sample stands for.
     """
 
+    _steps_since_update: int
+
     def generate_ray_samples(
         self,
         ray_bundle: RayBundle | None = None,
