@@ -52,6 +52,12 @@ def slider_depth() -> Path:
 
 
 @pytest.fixture(scope="session")
+def firenet_weights() -> Path:
+    """The weights file of FireNet's authors."""
+    return _third_party_data("firenet") / "firenet_1000.pth.tar"
+
+
+@pytest.fixture(scope="session")
 def tum_vie_calibration() -> Path:
     """The folder of the real calibration files of TUM-VIE."""
     return _third_party_data("tum_vie_calibration")

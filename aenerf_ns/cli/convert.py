@@ -16,6 +16,7 @@ from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.progress import tracked
+from aenerf_ns.reconstruction.weights import require_weights
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -55,6 +56,9 @@ class Convert(DatasetCommand):
     events, as far as these know better. colmap: have COLMAP estimate poses from the recording's frames. events: have it
     estimate poses from images that are made of the events, for a recording without frames or of fast motion. Poses
     of colmap and events have no metric scale, and poses that the dataset gives are kept as ground truth."""
+    weights: Path | None = None
+    """Weights file of FireNet or E2VID, as its authors distribute it: the network makes the images that poses are
+    refined by or estimated from. By default, a filter makes them."""
     start_time_ns: int | None = None
     """Leave out events and images before this time on the clock of the events, in nanoseconds."""
     end_time_ns: int | None = None
@@ -79,6 +83,10 @@ class Convert(DatasetCommand):
         """Read the dataset and write it."""
         require_absent(self.output)
         require_seed(self.seed)
+        if self.weights is not None:
+            if self.poses not in ("refined", "events"):
+                raise DataError("--weights", "poses that are given need no images", "choose --poses refined or events")
+            require_weights(self.weights)
         filters = self._make_filters()
         parser = self.open_dataset()
         parser.config.drop_malformed |= self.drop_malformed
@@ -120,7 +128,7 @@ class Convert(DatasetCommand):
             recording = parser.recording
             parser.event_span(recording)
             if self.poses == "refined":
-                recording, report, picture = _with_refined_poses(recording, filters.window, self.data, self.seed)
+                recording, report, picture = self._with_refined_poses(recording, filters.window)
         else:
             recording, report, picture = self._with_estimated_poses(capture, images, filters.window)
         trajectory = _cut(recording, events, filters.window)
@@ -160,7 +168,7 @@ class Convert(DatasetCommand):
 
         has_own_frames = capture.frame_camera == capture.event_camera
         if self.poses == "events":
-            found = estimate_poses_from_events(capture, window, self.data, self.seed)
+            found = estimate_poses_from_events(capture, window, self.data, self.seed, self.weights)
             return _with_poses(found, capture, images if has_own_frames else [])
         if not has_own_frames:
             raise DataError(
@@ -175,37 +183,34 @@ class Convert(DatasetCommand):
         camera = (lens.width, lens.height) if capture.intrinsics_origin == "guessed" else lens
         return _with_poses(estimate_poses(files, times, camera, self.data, self.seed), capture, kept)
 
+    def _with_refined_poses(self, recording: Recording, window: TimeWindow) -> tuple[Recording, dict[str, Any], Image]:
+        """Refine the poses, and return the recording with them, the report on them, and a picture."""
+        from aenerf_ns.camera.alignment import pose_errors
+        from aenerf_ns.pose_estimation.from_poses import refine_poses
+        from aenerf_ns.recording.views import move_views
 
-def _with_refined_poses(
-    recording: Recording, window: TimeWindow, data: Path, seed: int
-) -> tuple[Recording, dict[str, Any], Image]:
-    """Refine the poses, and return the recording with them, the report on them, and a picture."""
-    from aenerf_ns.camera.alignment import pose_errors
-    from aenerf_ns.pose_estimation.from_poses import refine_poses
-    from aenerf_ns.recording.views import move_views
-
-    given, truth = recording.trajectory, recording.ground_truth
-    knots = None if truth is None else given.knots_covered_by(truth)
-    found = refine_poses(recording, window, data, seed)
-    report = found.report()
-    say(found.summary())
-    paths = {"given": given.camera_to_worlds.numpy(), "refined": found.trajectory.camera_to_worlds.numpy()}
-    if truth is None or knots is None:
-        views = {
-            split: move_views(views, given, found.trajectory) for split, views in recording.reference_views.items()
-        }
-        recording = replace(recording, reference_views=views)
-    else:
-        before, after = (
-            pose_errors(poses.interpolate(knots), truth.interpolate(knots)) for poses in (given, found.trajectory)
-        )
-        report |= {"errors_given": before, "errors": after}
-        say(
-            f"Compared with the ground truth: mean errors {before['rotation_error_degrees']:.2f} degrees and "
-            f"{before['translation_error']:.2g} as given, {after['rotation_error_degrees']:.2f} degrees and "
-            f"{after['translation_error']:.2g} refined."
-        )
-    return replace(recording, trajectory=found.trajectory), report, found.draw(paths)
+        given, truth = recording.trajectory, recording.ground_truth
+        knots = None if truth is None else given.knots_covered_by(truth)
+        found = refine_poses(recording, window, self.data, self.seed, self.weights)
+        report = found.report()
+        say(found.summary())
+        paths = {"given": given.camera_to_worlds.numpy(), "refined": found.trajectory.camera_to_worlds.numpy()}
+        if truth is None or knots is None:
+            views = {
+                split: move_views(views, given, found.trajectory) for split, views in recording.reference_views.items()
+            }
+            recording = replace(recording, reference_views=views)
+        else:
+            before, after = (
+                pose_errors(poses.interpolate(knots), truth.interpolate(knots)) for poses in (given, found.trajectory)
+            )
+            report |= {"errors_given": before, "errors": after}
+            say(
+                f"Compared with the ground truth: mean errors {before['rotation_error_degrees']:.2f} degrees and "
+                f"{before['translation_error']:.2g} as given, {after['rotation_error_degrees']:.2f} degrees and "
+                f"{after['translation_error']:.2g} refined."
+            )
+        return replace(recording, trajectory=found.trajectory), report, found.draw(paths)
 
 
 def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) -> Trajectory:

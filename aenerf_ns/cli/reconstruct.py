@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from aenerf_ns.cli.console import say
 from aenerf_ns.cli.dataset import DatasetCommand, copy_images, open_writer, training_command
@@ -40,11 +40,9 @@ class Reconstruct(DatasetCommand):
 
     output: Path
     """Dataset folder to create."""
-    method: Literal["high-pass", "firenet", "e2vid"] = "high-pass"
-    """high-pass: the asynchronous high-pass filter of Scheerlinck et al. (2018), which needs no weights. firenet and
-    e2vid: the networks of Scheerlinck et al. (2020) and Rebecq et al. (2021), whose weights you have."""
     weights: Path | None = None
-    """Weights file of the network, as its authors distribute it."""
+    """Weights file of FireNet (Scheerlinck et al. 2020) or E2VID (Rebecq et al. 2021), as its authors distribute it:
+    the network makes the images. By default, a high-pass filter that runs forwards and backwards makes them."""
     events_per_pixel: float = EVENTS_PER_PIXEL
     """Events between two images, as a share of the sensor's pixels."""
 
@@ -52,10 +50,8 @@ class Reconstruct(DatasetCommand):
         """Read the dataset, reconstruct the images and write them."""
         require_absent(self.output)
         require_range("events-per-pixel", self.events_per_pixel, 1e-6, 1e6)
-        if self.method != "high-pass":
-            require_weights(self.method, self.weights)
-        elif self.weights is not None:
-            raise DataError(self.weights, "the high-pass filter has no weights", "leave out --weights")
+        if self.weights is not None:
+            require_weights(self.weights)
         parser = self.open_dataset()
         with exclusive_output(self.output) as lock:
             self._reconstruct(parser, lock)
@@ -73,7 +69,7 @@ class Reconstruct(DatasetCommand):
             images = self._write_images(recording, source, known, writer)
             num_images = write_video(writer.other_file(_VIDEO), images, _VIDEO_RATE)
         say(
-            f"{self.output}: {num_images} images reconstructed by {self.method}, and {_VIDEO}.\n"
+            f"{self.output}: {num_images} images of the events, and {_VIDEO}.\n"
             f"Train on them with: {training_command(self.output, method='e2vid-nerf')}"
         )
 
@@ -83,18 +79,17 @@ class Reconstruct(DatasetCommand):
         from aenerf_ns.reconstruction.images import FilteredImages, NetworkImages
         from aenerf_ns.reconstruction.weights import load_network
 
-        camera, sensor = recording.event_camera, recording.sensor
-        if self.method == "high-pass":
-            return FilteredImages(camera.width, camera.height, sensor)
+        if self.weights is None:
+            return FilteredImages(recording.sensor)
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        return NetworkImages(load_network(self.method, self.weights), sensor, device)
+        return NetworkImages(load_network(self.weights), recording.sensor, device)
 
     def _write_images(
         self, recording: Recording, source: ImageSource, known: TimeWindow, writer: NativeDatasetWriter
     ) -> Iterator[NDArray[np.uint8]]:
         """Write the events and an image of each batch of them that ends at a time with a pose. Yield the images."""
         from aenerf_ns.camera.trajectory import homogeneous
-        from aenerf_ns.reconstruction.images import images_of
+        from aenerf_ns.reconstruction.batches import batches_of
 
         events = recording.event_file
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
@@ -105,7 +100,7 @@ class Reconstruct(DatasetCommand):
                 yield chunk
 
         num_images = num_posed = 0
-        for time, image in images_of(copied(), num_events, source):
+        for time, image in source(batches_of(copied(), num_events)):
             num_images += 1
             if known.contains(time):
                 num_posed += 1

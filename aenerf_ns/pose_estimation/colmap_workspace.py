@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import statistics
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,8 @@ class HeldOutMatches:
 class ColmapWorkspace:
     """COLMAP's database and images in a folder, and the steps of its work.
 
-    COLMAP runs on one thread, because its results depend on the order in which threads end.
+    Features are found and matched on all cores. All else runs on one thread, because its results would depend on the
+    order in which threads end.
 
     Args:
         folder: an empty folder.
@@ -78,9 +79,13 @@ class ColmapWorkspace:
     """
 
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
+        import pycolmap
+
         self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
         self._pairs = folder / "pairs.txt"
         self._images.mkdir()
+        # COLMAP's log would break the progress bars.
+        pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
         self._seed = seed
         self._progress = progress
@@ -109,11 +114,14 @@ class ColmapWorkspace:
         else:
             reader.camera_model, parameters = camera.to_colmap()
             reader.camera_params = ", ".join(map(repr, parameters))
-        extraction.use_gpu, extraction.num_threads = False, 1
+        extraction.use_gpu = False
         # COLMAP's own limits suit photographs of many megapixels. This one, and those of the mapper below, suit frames
         # of a fraction of a megapixel.
         extraction.sift.peak_threshold = 0.004
         with self._step("Finding features"):
+            # The numbers of the images would depend on the order in which threads end.
+            pycolmap.Database.open(self._database).close()
+            pycolmap.import_images(self._database, self._images, camera_mode=pycolmap.CameraMode.SINGLE, options=reader)
             pycolmap.extract_features(
                 self._database,
                 self._images,
@@ -129,7 +137,7 @@ class ColmapWorkspace:
         pairs = [f"{self._names[i]} {self._names[j]}" for i, j in _choose_pairs(len(self._names))]
         matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
         verification = self._verification()
-        matching.use_gpu, matching.num_threads = False, 1
+        matching.use_gpu = False
         pairing.match_list_path = self._pairs
         self._pairs.write_text("\n".join(pairs), encoding="utf-8")
         with self._step("Matching frames"):
@@ -197,7 +205,7 @@ class ColmapWorkspace:
                 database.delete_matches(*images)
         return HeldOutMatches(matches, camera.mean_focal_length())
 
-    def reconstruct(self, refine_intrinsics: bool) -> list[Any]:
+    def reconstruct(self, refine_intrinsics: bool = False) -> list[Any]:
         """Return the models of the incremental mapper, in the order of the number of frames, the largest first."""
         import pycolmap
 
@@ -208,7 +216,7 @@ class ColmapWorkspace:
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
         options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = 15, 50
         options.extract_colors = False
-        output = self._new_folder("models")
+        output = self._new_folder()
         with self._step("Placing frames", len(self._names)) as task:
             models = pycolmap.incremental_mapping(
                 self._database, self._images, output, options, next_image_callback=lambda: self._progress.advance(task)
@@ -226,7 +234,7 @@ class ColmapWorkspace:
         options.num_threads = mapper.num_threads = 1
         mapper.global_positioning.use_gpu = False
         _keep_intrinsics(mapper.bundle_adjustment)
-        output = self._new_folder("global models")
+        output = self._new_folder()
         with self._step("Placing all frames at once"):
             models = pycolmap.global_mapping(self._database, self._images, output, options)
         return _largest_first(models)
@@ -262,7 +270,7 @@ class ColmapWorkspace:
                 posed,
                 self._database,
                 self._images,
-                self._new_folder("triangulated"),
+                self._new_folder(),
                 clear_points=True,
                 options=options,
             )
@@ -295,15 +303,12 @@ class ColmapWorkspace:
             config.add_image(image)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         with self._step("Adjusting poses to all tracks"):
-            # pycolmap.bundle_adjustment does the same, but it turns COLMAP's log on again.
+            # pycolmap.bundle_adjustment does the same, but it turns COLMAP's log on.
             pycolmap.create_default_bundle_adjuster(adjustment, config, posed).solve()
         return posed
 
-    def _new_folder(self, name: str) -> Path:
-        folder = self._folder / name
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        return folder
+    def _new_folder(self) -> Path:
+        return Path(mkdtemp(dir=self._folder))
 
     def count_features_and_pairs(self) -> tuple[float, int]:
         """Return the median number of features in a frame, and the number of pairs of frames that match."""
@@ -315,16 +320,11 @@ class ColmapWorkspace:
 
     @contextlib.contextmanager
     def _step(self, description: str, total: int | None = None) -> Iterator[TaskID]:
-        """Show the progress of a step, and keep COLMAP's log off the console."""
-        import pycolmap
-
-        level = pycolmap.logging.minloglevel
-        pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+        """Show the progress of a step."""
         task = self._progress.add_task(description, total=total)
         try:
             yield task
         finally:
-            pycolmap.logging.minloglevel = level
             self._progress.update(task, total=len(self._names), completed=len(self._names))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ _ROUNDS = ((12.0, 8.0, 30), (8.0, 5.0, 30), (5.0, 3.0, 30), (4.0, 2.0, 60))
 
 
 def estimate_poses_from_events(
-    capture: Capture, window: TimeWindow, source: str | Path, seed: int = 0
+    capture: Capture, window: TimeWindow, source: str | Path, seed: int = 0, weights: Path | None = None
 ) -> EstimatedPoses:
     """Estimate the poses of an event camera from its events, on the CPU.
 
@@ -36,18 +37,30 @@ def estimate_poses_from_events(
         window: events outside it are left out.
         source: the dataset, for messages.
         seed: of COLMAP's random samples.
+        weights: see :func:`match_event_images`.
 
     Raises:
         DataError: there are too few events for three images, or COLMAP places no images.
     """
     begin = time.perf_counter()
-    with match_event_images(capture, window, source, seed) as (workspace, times, pictures):
+    with match_event_images(capture, window, source, seed, weights) as (workspace, times, pictures):
         is_calibrated = capture.intrinsics_origin != "guessed"
         camera = capture.event_camera if is_calibrated else workspace.estimate_intrinsics(_ROUNDS)
         features, pairs = workspace.count_features_and_pairs()
         held_out = workspace.hold_out_matches(_HELD_OUT)
-        found = {"incremental": workspace.reconstruct(False), "global": workspace.reconstruct_globally()}
-        models: dict[str, Any] = {mapper: models[0] for mapper, models in found.items() if models}
+        mappers = {"incremental": workspace.reconstruct, "global": workspace.reconstruct_globally}
+
+        def place(mapper: str) -> tuple[list[int], Any]:
+            """Return the numbers of images in the models of a mapper, and its largest model, adjusted to all tracks."""
+            found = mappers[mapper]()
+            model = found[0] if found else None
+            for limits in _ROUNDS if found else ():
+                model = workspace.adjust(model, *limits)
+            return [model.num_reg_images() for model in found], model
+
+        with ThreadPoolExecutor(len(mappers)) as pool:
+            placed = dict(zip(mappers, pool.map(place, mappers), strict=True))
+        models: dict[str, Any] = {mapper: model for mapper, (_, model) in placed.items() if model is not None}
         if camera is None or not models:
             raise DataError(
                 source,
@@ -56,8 +69,6 @@ def estimate_poses_from_events(
                 "poses need a camera that moves sideways and sees textured surfaces; "
                 + ("check the calibration too" if is_calibrated else "a calibration helps"),
             )
-        for limits in _ROUNDS:
-            models = {mapper: workspace.adjust(model, *limits) for mapper, model in models.items()}
 
         def rank(mapper: str) -> tuple[bool, float]:
             # The global mapper may throw images far out where it sees nothing, and no adjustment takes them back.
@@ -70,7 +81,7 @@ def estimate_poses_from_events(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),
         camera=camera,
-        model_sizes=[model.num_reg_images() for model in found[mapper]],
+        model_sizes=placed[mapper][0],
         num_points=model.num_points3D(),
         reprojection_error=model.compute_mean_reprojection_error(),
         features=features,

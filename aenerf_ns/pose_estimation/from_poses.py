@@ -88,7 +88,9 @@ class RefinedPoses:
         return float(np.rad2deg(angle)), float(length)
 
 
-def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, seed: int = 0) -> RefinedPoses:
+def refine_poses(
+    recording: Recording, window: TimeWindow, source: str | Path, seed: int = 0, weights: Path | None = None
+) -> RefinedPoses:
     """Refine the poses of a recording by its events, on the CPU.
 
     COLMAP matches images that are made of the events (:func:`match_event_images`), and triangulates tracks from the
@@ -102,6 +104,7 @@ def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, s
         window: events outside it are left out.
         source: the dataset, for messages.
         seed: of COLMAP's random samples.
+        weights: see :func:`match_event_images`.
 
     Raises:
         DataError: there are too few events for three images with a pose, or too few tracks.
@@ -112,7 +115,7 @@ def refine_poses(recording: Recording, window: TimeWindow, source: str | Path, s
     window = TimeWindow(max(given.start, window.start), min(given.end, window.end))
     if window.start >= window.end:
         raise DataError(source, "none of its poses are in the time window", "widen it")
-    with match_event_images(recording, window, source, seed) as (workspace, all_times, pictures):
+    with match_event_images(recording, window, source, seed, weights) as (workspace, all_times, pictures):
         images = np.flatnonzero(given.known_time(recording.max_pose_gap).contains(all_times))
         # Time and memory grow with the number's third and second power.
         images = images[:: math.ceil(len(images) / _MAX_IMAGES) or 1]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,43 +12,45 @@ from numpy.typing import NDArray
 
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.reconstruction.batches import batches_of
-from aenerf_ns.reconstruction.high_pass import HighPassFilter
 from aenerf_ns.reconstruction.networks import E2VID, NUM_BINS, FireNet
+from aenerf_ns.reconstruction.two_sided import log_intensities
 from aenerf_ns.reconstruction.voxels import normalize, voxel_grid
 
-# The authors sharpen images: by this amount, with a blur of this standard deviation and size in pixels.
+# Of the filter. Images of a room and of an object are most like the true ones with 0.03 to 0.05.
+_DECAY = 0.05
+# Radiance of a pixel that has not changed, as a share of display white: the photographers' middle gray.
+_MIDDLE_GRAY = 0.18
+# A state times this power is a display value. Then log-radiance is an exact multiple of the display value's logarithm.
+_DISPLAY_POWER = 1 / 2.2
+# The authors of the networks sharpen images: by this amount, with a blur of this standard deviation and size in pixels.
 _SHARPENING, _BLUR, _BLUR_SIZE = 0.3, 1.0, 5
 
 
-class ImageSource(Protocol):
-    """Makes an image of each batch of events."""
-
-    def image(self, events: EventStream) -> NDArray[np.uint8]:
-        """Take the next batch of the stream, and return the image at its last event.
-
-        Returns:
-            (height, width, 3) RGB display values; gray for a monochrome sensor.
-        """
+ImageSource = Callable[[Iterable[EventStream]], Iterator[tuple[int, NDArray[np.uint8]]]]
+"""Yields for each batch of a stream the time in nanoseconds and the (height, width, 3) RGB display values, gray for a
+monochrome sensor."""
 
 
 class FilteredImages:
-    """Images of the high-pass filter.
+    """Images without a network.
+
+    A display value is (0.18 exp(s))^(1 / 2.2), clipped to [0, 1], times 255, of a change of log-intensity s
+    (:func:`~aenerf_ns.reconstruction.two_sided.log_intensities`).
 
     Args:
-        width: number of pixel columns.
-        height: number of pixel rows.
         sensor: contrast thresholds and Bayer pattern.
     """
 
-    def __init__(self, width: int, height: int, sensor: SensorModel) -> None:
-        self._filter = HighPassFilter(width, height, sensor)
-        self._pattern = sensor.bayer_pattern
+    def __init__(self, sensor: SensorModel) -> None:
+        self._sensor = sensor
 
-    def image(self, events: EventStream) -> NDArray[np.uint8]:
-        """Return the next image; see :class:`ImageSource`."""
-        values = self._filter.image(events)
-        return demosaic(values, self._pattern) if self._pattern else _gray_to_rgb(values)
+    def __call__(self, batches: Iterable[EventStream]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield the images; see :data:`ImageSource`."""
+        pattern = self._sensor.bayer_pattern
+        for time, state in log_intensities(batches, self._sensor, _DECAY):
+            radiance = _MIDDLE_GRAY * np.exp(state)
+            values = np.rint(np.clip(radiance, 0, 1) ** _DISPLAY_POWER * 255).astype(np.uint8)
+            yield time, demosaic(values, pattern) if pattern else _gray_to_rgb(values)
 
 
 class NetworkImages:
@@ -69,8 +71,12 @@ class NetworkImages:
         self._device = device
         self._states: dict[str, Any] = {}
 
-    def image(self, events: EventStream) -> NDArray[np.uint8]:
-        """Return the next image; see :class:`ImageSource`."""
+    def __call__(self, batches: Iterable[EventStream]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield the images, each of the last event of its batch; see :data:`ImageSource`."""
+        for batch in batches:
+            yield int(batch.t[-1]), self._image(batch)
+
+    def _image(self, events: EventStream) -> NDArray[np.uint8]:
         voxels = normalize(voxel_grid(events, NUM_BINS))
         gray = self._run("all", voxels)
         if not self._pattern:
@@ -95,22 +101,6 @@ class NetworkImages:
         blurred = cv2.GaussianBlur(values, (_BLUR_SIZE, _BLUR_SIZE), _BLUR)
         sharpened = (1 + _SHARPENING) * values - _SHARPENING * blurred
         return np.rint(np.clip(sharpened, 0, 1) * 255).astype(np.uint8)
-
-
-def images_of(
-    chunks: Iterable[EventStream], num_events: int, source: ImageSource
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield the time in nanoseconds and the (height, width, 3) image of each batch of a stream.
-
-    The time is that of the batch's last event.
-
-    Args:
-        chunks: the stream in pieces, in the order of time.
-        num_events: events in a batch.
-        source: of the images; it has not seen an event before.
-    """
-    for batch in batches_of(chunks, num_events):
-        yield int(batch.t[-1]), source.image(batch)
 
 
 def demosaic(mosaic: NDArray[np.uint8], pattern: BayerPattern) -> NDArray[np.uint8]:

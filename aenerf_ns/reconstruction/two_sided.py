@@ -1,33 +1,29 @@
-"""Images of events without a network: a high-pass filter that runs forwards and backwards."""
+"""Log-intensity from events without a network: a high-pass filter that runs forwards and backwards."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 
-import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.reconstruction.high_pass import HighPassFilter
 
-_DECAY = 0.12
-"""Share of a pixel's state that is forgotten while the picture gets one event per pixel. It does not depend on time, so
-neither do the images on the camera's speed."""
-# The backward filter starts this number of events per pixel after the image: e^-3 of what lies further is left.
+# The backward filter starts this number of events per pixel after the image. More costs memory and betters little.
 _LOOK_AHEAD = 25.0
 # Events per pixel by which an image shows the past. Light that has changed by less than a threshold has no event yet. A
 # time in place of a number of events would depend on the camera's speed.
 _LAG = 0.1
-# Pixels: standard deviation of a Gaussian, and the percentiles of the picture that are shown black and white.
-_BLUR, _PERCENTILES = 0.8, (1.0, 99.0)
 
 
-def two_sided_images(batches: Iterable[EventStream], sensor: SensorModel) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield the time in nanoseconds and the (height, width) image of each batch of a stream: at its end, less a lag.
+def log_intensities(
+    batches: Iterable[EventStream], sensor: SensorModel, decay: float
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield for each batch of a stream the time in nanoseconds, its end less a lag, and the (height, width) changes of
+    log-intensity that the picture shows.
 
     A pixel's state adds up contrast thresholds, forwards up to the image and backwards, with reversed polarities, down
     to it; both forget with the number of events in the picture. Their mean has no ghosts of what was seen before.
@@ -37,63 +33,72 @@ def two_sided_images(batches: Iterable[EventStream], sensor: SensorModel) -> Ite
     Args:
         batches: the stream in consecutive pieces, in the order of time, all of one sensor.
         sensor: the contrast thresholds.
+        decay: share of a pixel's state that is forgotten while the picture gets one event per pixel. It does not depend
+            on time, so neither do the images on the camera's speed.
     """
     held: list[tuple[EventStream, NDArray[np.float32]]] = []
-    forward: _EventClock | None = None
+    forward: _Filter | None = None
     # The latest batches whose images wait for what follows: as many again are yielded at a time.
     num_ahead = 0
     for batch in batches:
         if forward is None:
-            forward = _EventClock(batch.width, batch.height, sensor)
+            forward = _Filter(batch.width, batch.height, sensor, decay)
         forward.add(batch)
         held.append((batch, forward.state()))
         num_ahead = math.ceil(_LOOK_AHEAD * batch.width * batch.height / len(batch))
         if len(held) == 2 * num_ahead:
-            yield from _finish(held, sensor)[:num_ahead]
+            yield from _finish(held, sensor, decay)[:num_ahead]
             held = held[num_ahead:]
-    yield from _finish(held, sensor)
+    yield from _finish(held, sensor, decay)
 
 
 def _finish(
-    held: list[tuple[EventStream, NDArray[np.float32]]], sensor: SensorModel
-) -> list[tuple[int, NDArray[np.uint8]]]:
-    """Add the states of the backward filter to those of the forward filter, and return times and images."""
-    images: list[tuple[int, NDArray[np.uint8]]] = []
-    backward: _EventClock | None = None
+    held: list[tuple[EventStream, NDArray[np.float32]]], sensor: SensorModel, decay: float
+) -> list[tuple[int, NDArray[np.float32]]]:
+    """Return the times, and the means of the states of the forward and the backward filter."""
+    both: list[tuple[int, NDArray[np.float32]]] = []
+    backward: _Filter | None = None
     for batch, state in reversed(held):
         if backward is None:
-            backward = _EventClock(batch.width, batch.height, sensor)
-            both = state
+            backward = _Filter(batch.width, batch.height, sensor, decay)
         else:
-            both = (state + backward.state()) / 2
+            state = (state + backward.state()) / 2
         lag = round(_LAG * batch.width * batch.height)
-        images.append((int(batch.t[max(len(batch) - 1 - lag, 0)]), _display(both)))
-        backward.add(batch, reverse=True)
-    return images[::-1]
+        both.append((int(batch.t[max(len(batch) - 1 - lag, 0)]), state))
+        backward.add(batch, -1)
+    return both[::-1]
 
 
-def _display(state: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return (height, width) display values of log-intensities."""
-    smooth = cv2.GaussianBlur(state, (0, 0), _BLUR)
-    low, high = np.percentile(smooth, _PERCENTILES)
-    return np.rint(np.clip((smooth - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
+class _Filter:
+    """The asynchronous high-pass filter of Scheerlinck, Barnes and Mahony, "Continuous-time Intensity Estimation Using
+    Event Cameras" (ACCV 2018), in the time that counts the events of the picture.
 
+    A pixel's state adds up the changes of log-intensity that its events stand for. It begins as zero, and decays while
+    the picture gets events.
+    """
 
-class _EventClock:
-    """The high-pass filter, whose time is the number of events in the picture: a nanosecond each."""
-
-    def __init__(self, width: int, height: int, sensor: SensorModel) -> None:
-        self._filter = HighPassFilter(width, height, sensor, 1e9 * _DECAY / (width * height), cutoff_per_event=0.0)
+    def __init__(self, width: int, height: int, sensor: SensorModel, decay: float) -> None:
+        self._changes = sensor.positive_contrast_threshold, -sensor.negative_contrast_threshold
+        self._decay = decay / (width * height)
+        self._state, self._last = np.zeros((height, width)), np.zeros((height, width), np.int64)
         self._count = 0
 
-    def add(self, events: EventStream, reverse: bool = False) -> None:
-        counts = np.arange(self._count, self._count + len(events))
-        if reverse:
-            # A rise of light is a fall backwards.
-            self._filter.add(replace(events, x=events.x[::-1], y=events.y[::-1], t=counts, p=-events.p[::-1]))
-        else:
-            self._filter.add(replace(events, t=counts))
+    def add(self, events: EventStream, step: int = 1) -> None:
+        """Take the next events. With a step of -1 they go back in time, so that a rise of light is a fall."""
+        columns = (events.x[::step], events.y[::step], events.p[::step])
+        changes = self._changes if step == 1 else (-self._changes[0], -self._changes[1])
+        _integrate(self._state, self._last, *columns, self._count, self._decay, *changes)
         self._count += len(events)
 
     def state(self) -> NDArray[np.float32]:
-        return self._filter.log_intensity(self._count).astype(np.float32)
+        """Return the (height, width) states."""
+        return (self._state * np.exp(-self._decay * (self._count - self._last))).astype(np.float32)
+
+
+@numba.njit(cache=True)
+def _integrate(state, last, x, y, p, count, decay, rise, fall):
+    for event in range(len(p)):
+        row, column = y[event], x[event]
+        kept = np.exp(-decay * (count + event - last[row, column])) * state[row, column]
+        state[row, column] = kept + (rise if p[event] > 0 else fall)
+        last[row, column] = count + event

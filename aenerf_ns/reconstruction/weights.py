@@ -4,55 +4,45 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from aenerf_ns.errors import DataError, reading
 
 if TYPE_CHECKING:
     from aenerf_ns.reconstruction.networks import E2VID, FireNet
 
-NetworkName = Literal["e2vid", "firenet"]
-
 # Where the authors' own pages lead to. The weights are not this project's to distribute.
-_WHERE = {
-    "e2vid": "download E2VID_lightweight.pth.tar, which https://github.com/uzh-rpg/rpg_e2vid links to",
-    "firenet": "download firenet_1000.pth.tar, which https://github.com/cedric-scheerlinck/rpg_e2vid links to, on its "
-    "branch cedric/firenet",
-}
+_REMEDY = (
+    "download firenet_1000.pth.tar, which https://github.com/cedric-scheerlinck/rpg_e2vid links to, on its branch "
+    "cedric/firenet, or E2VID_lightweight.pth.tar, which https://github.com/uzh-rpg/rpg_e2vid links to"
+)
 
 
-def require_weights(name: NetworkName, weights: Path | None) -> Path:
-    """Return the weights file of a network, and raise a DataError if none is given or there is no such file."""
-    if weights is None:
-        raise DataError(f"--method {name}", "no weights are given", _remedy(name))
+def require_weights(weights: Path) -> None:
+    """Raise a DataError if there is no such weights file."""
     with reading(weights):
         if not weights.is_file():
-            raise DataError(weights, "there is no such file", _remedy(name))
-    return weights
+            raise DataError(weights, "there is no such file", _REMEDY)
 
 
-def _remedy(name: NetworkName) -> str:
-    return f"{_WHERE[name]}, and give it with --weights"
-
-
-def load_network(name: NetworkName, weights: Path | None) -> E2VID | FireNet:
+def load_network(weights: Path) -> E2VID | FireNet:
     """Load a network with the weights of a file, ready for inference on the CPU.
 
-    Nothing in the file is executed. Every parameter of the network must be in it, and no other.
+    Nothing in the file is executed. Every parameter of the network must be in it, and no other. The names of the
+    parameters tell which network it is.
 
     Args:
-        name: of the network.
         weights: a file of ``torch.save``: a dictionary with ``state_dict``.
 
     Raises:
-        DataError: there is no such file, it cannot be read without executing it, or it is of another network.
+        DataError: there is no such file, it cannot be read without executing it, or it is of neither network.
     """
     # The import takes seconds, and commands look for the file before them.
     import torch
 
     from aenerf_ns.reconstruction.networks import E2VID, FireNet
 
-    weights, remedy = require_weights(name, weights), _remedy(name)
+    require_weights(weights)
     try:
         with warnings.catch_warnings():
             # torch warns of the kind of pickle before it raises the error.
@@ -60,14 +50,16 @@ def load_network(name: NetworkName, weights: Path | None) -> E2VID | FireNet:
             content = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as error:
         # torch.load raises errors of many kinds, with advice to trust the file.
-        raise DataError(weights, f"not a file of plain weights ({type(error).__name__})", remedy) from None
+        raise DataError(weights, f"not a file of plain weights ({type(error).__name__})", _REMEDY) from None
     state = content.get("state_dict") if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
-        raise DataError(weights, "it holds no state_dict", remedy)
-    network = E2VID() if name == "e2vid" else FireNet()
+        raise DataError(weights, "it holds no state_dict", _REMEDY)
+    name = next(iter(state), "").partition(".")[0]
+    network = E2VID() if name == E2VID.name_in_file else FireNet()
     try:
         torch.nn.ModuleDict({network.name_in_file: network}).load_state_dict(state, strict=True)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines()]
-        raise DataError(weights, f"its weights are not {name}'s ({' '.join(lines)})", remedy) from None
+        problem = f"its weights are not those of {type(network).__name__} ({' '.join(lines)})"
+        raise DataError(weights, problem, _REMEDY) from None
     return network.eval()

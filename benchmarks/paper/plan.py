@@ -49,7 +49,7 @@ PEERS: dict[Method, str] = {
 }
 """Other papers' methods in the paper's order, the worst first. PAEv3D stands only in a table of the appendix, between
 Robust e-NeRF and AE-NeRF."""
-HIGH_PASS = "high-pass + NeRF"
+FILTERED = "filter + NeRF"
 """What e2vid-nerf is called on images that no network has reconstructed."""
 ON_TRUE_POSES, CORRECTED = ", true poses", ", pose correction"
 """Ends of the names of a peer's rows. The row on estimated poses without correction has neither."""
@@ -164,7 +164,7 @@ class Plan:
     """Whose rows the table of methods has. A method of another paper has three: on estimated poses, on these with our
     pose correction, and on true poses."""
     e2vid_weights: Path | None = None
-    """Weights file of E2VID, which makes the images of e2vid-nerf. Without it the high-pass filter makes them."""
+    """Weights file of E2VID, which makes the images of e2vid-nerf. Without it a filter makes them."""
     seeds: tuple[int, ...] = (42,)
     """Seeds of the trainings."""
     steps: int | None = None
@@ -226,9 +226,9 @@ class Plan:
         else:
             name = PEERS[method]
             if method == "e2vid-nerf" and self.e2vid_weights is not None:
-                images = ("--method", "e2vid", "--weights", str(self.e2vid_weights.resolve()))
+                images = ("--weights", str(self.e2vid_weights.resolve()))
             elif method == "e2vid-nerf":
-                name, images = HIGH_PASS, ("--method", "high-pass")
+                name, images = FILTERED, ("--events-per-pixel", "0.35")
             options = {name: off, name + CORRECTED: spline, name + ON_TRUE_POSES: off}
         return {row: (self._registered(method), words, images) for row, words in options.items()}
 

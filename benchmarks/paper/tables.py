@@ -21,7 +21,7 @@ _AE_NERF = "AE-NeRF"
 _SETTINGS = ("estimated poses", "estimated poses, pose correction", "true poses")
 # Rows of a method in these settings, the method of the paper last.
 _ROWS_OF = {
-    name: (name, name + plan.CORRECTED, name + plan.ON_TRUE_POSES) for name in (plan.HIGH_PASS, *plan.PEERS.values())
+    name: (name, name + plan.CORRECTED, name + plan.ON_TRUE_POSES) for name in (plan.FILTERED, *plan.PEERS.values())
 }
 _ROWS_OF[_AE_NERF] = (plan.WITHOUT_CORRECTION, plan.OURS, plan.TRUE_POSES)
 # The rows that are put in order: of other papers' methods, and of AE-NeRF.
@@ -100,9 +100,9 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
         "does not say on which poses it ran the others. In the other tables, rows without a method's name are "
         "AE-NeRF's."
     ]
-    if plan.HIGH_PASS in named:
+    if plan.FILTERED in named:
         parts.append(
-            f"{plan.HIGH_PASS} stands in the place of {plan.PEERS['e2vid-nerf']}. It is not the paper's row, because "
+            f"{plan.FILTERED} stands in the place of {plan.PEERS['e2vid-nerf']}. It is not the paper's row, because "
             "its images are a filter's and not a network's."
         )
     for (kind, speed), paper in _PAPER.items():

@@ -31,7 +31,7 @@ from benchmarks.paper.figures import draw, error_map
 from benchmarks.paper.plan import (
     CEILING,
     CORRECTED,
-    HIGH_PASS,
+    FILTERED,
     LOSSES,
     ON_TRUE_POSES,
     OURS,
@@ -84,12 +84,12 @@ def test_plan_has_three_rows_per_peer() -> None:
     rows = {run.row: run for run in runs}
     mode = "--pipeline.model.camera-optimizer.mode"
     for method, name in PEERS.items():
-        shown = HIGH_PASS if method == "e2vid-nerf" else name
+        shown = FILTERED if method == "e2vid-nerf" else name
         for end, correction in (("", "off"), (CORRECTED, "spline"), (ON_TRUE_POSES, "off")):
             run = rows[shown + end]
             assert (run.method, run.true_poses) == (f"{method}-small", end == ON_TRUE_POSES)
             assert run.options == (mode, correction)
-            assert run.images == (("--method", "high-pass") if method == "e2vid-nerf" else ())
+            assert run.images == (("--events-per-pixel", "0.35") if method == "e2vid-nerf" else ())
     # Registered under these names, and corrected by the same spline as ours.
     assert all_methods.keys() >= {run.method for run in runs} | set(PEERS)
     assert aenerf_small.config.pipeline.model.camera_optimizer.mode == "spline"
@@ -233,17 +233,17 @@ def test_report_orders_methods() -> None:
     assert f"| {corrected:.2f} ± 0.71 / {corrected + 2:.2f} ± 0.71 |" in row
     assert "| AE-NeRF | 28.90 |" in text
     assert "| PAEv3D | - |" in text
-    assert "| high-pass + NeRF | - |" in text
+    assert "| filter + NeRF | - |" in text
     paper = "E2VID + NeRF (18.92) < EventNeRF (24.92) < Ev-NeRF (25.44) < Robust e-NeRF (28.37) < AE-NeRF (28.90)"
     assert f"- the paper: {paper}\n" in text
     # AE-NeRF's rows were made first, and others in the order of the paper.
-    names = ["AE-NeRF", HIGH_PASS, *list(PEERS.values())[1:]]
+    names = ["AE-NeRF", FILTERED, *list(PEERS.values())[1:]]
     own = {"which only AE-NeRF corrects": (OURS, ""), "which all correct": (OURS, CORRECTED)}
     for setting, (row, end) in own.items():
         means = [11.5 + rank[row], *(11.5 + rank[name + end] for name in names[1:])]
         order = " < ".join(f"{name} ({mean:.2f})" for name, mean in zip(names, means, strict=True))
         assert f"- here, estimated poses, {setting}: {order}\n" in text
-    assert "- images of the events: `aenerf reconstruct --method high-pass`\n" in text
+    assert "- images of the events: `aenerf reconstruct --events-per-pixel 0.35`\n" in text
     # One method alone has no order.
     uncorrected = [one for one in figures if not one["row"].endswith(CORRECTED)]
     assert "which all correct" in text

@@ -52,7 +52,7 @@ def parse(line: str, monkeypatch: pytest.MonkeyPatch) -> Any:
         ("check {} --format ecd-data", {"format": "ecd-data"}),
         ("check {} --format-options width=3 height=4", {"format_options": ("width=3", "height=4")}),
         ("convert --output O --region 1 2 3 4 {}", {"output": Path("O"), "region": (1, 2, 3, 4)}),
-        ("reconstruct {} --output O --method e2vid --weights W", {"weights": Path("W")}),
+        ("reconstruct {} --output O --weights W", {"weights": Path("W")}),
     ],
 )
 def test_dataset_is_positional_or_named(
@@ -109,8 +109,13 @@ MISTAKES = [
     ("convert F --output O --pixel-share 2", 1, "Error: aenerf convert: the share of pixels must be above 0"),
     ("convert F --output O --seed -1", 1, "Error: --seed: -1 is out of range"),
     ("convert F --output O --shortest-interval-ns 10000000000000000000", 1, "Error: aenerf convert: the shortest"),
-    ("reconstruct F --output O --method e2vid", 1, "Error: --method e2vid: no weights are given; download"),
-    ("reconstruct F --output O --weights W", 1, "Error: W: the high-pass filter has no weights"),
+    ("reconstruct F --output O --weights nothing", 1, "Error: nothing: there is no such file; download firenet_1000"),
+    (
+        "convert F --output O --poses events --weights nothing",
+        1,
+        "Error: nothing: there is no such file; download firenet_1000",
+    ),
+    ("convert F --output O --weights W", 1, "Error: --weights: poses that are given need no images; choose --poses"),
     ("reconstruct F --output O --events-per-pixel nan", 1, "Error: --events-per-pixel: nan is out of range"),
     ("reconstruct F --output O --events-per-pixel 1e300", 1, "Error: --events-per-pixel: 1e+300 is out of range"),
     ("simulate --output F", 1, "Error: F: the folder exists already"),

@@ -179,14 +179,17 @@ def test_from_a_bare_recording_to_a_video(found: tuple[Path, str], tmp_path: Pat
     assert height > 120
 
 
-@pytest.mark.parametrize("degrees", [0.0, 2.0])
-def test_refine_given_poses(dataset: tuple[Path, str], tmp_path: Path, degrees: float) -> None:
+@pytest.mark.parametrize(("degrees", "images"), [(0.0, "filter"), (2.0, "filter"), (2.0, "network")])
+def test_refine_given_poses(
+    dataset: tuple[Path, str], tmp_path: Path, degrees: float, images: str, request: pytest.FixtureRequest
+) -> None:
+    weights = request.getfixturevalue("firenet_weights") if images == "network" else None
     given = tmp_path / "given"
     shutil.copytree(dataset[0], given)
     truth = read_tum_trajectory(given / "trajectory_ground_truth.txt")
     write_tum_trajectory(given / "trajectory_estimated.txt", perturb(truth, degrees, degrees * 0.03, 0.15, seed=2))
     with CONSOLE.capture() as output:
-        Convert(given, output=tmp_path / "scene", poses="refined").main()
+        Convert(given, output=tmp_path / "scene", poses="refined", weights=weights).main()
     report = json.loads((tmp_path / "scene" / "poses_report.json").read_text())
     assert report["summary"].split(";")[0] in " ".join(output.get().split())
     before, after = (report[name]["rotation_error_degrees"] for name in ("errors_given", "errors"))

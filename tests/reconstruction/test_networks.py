@@ -13,10 +13,11 @@ from helpers.streams import make_stream
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.reconstruction.images import FilteredImages, NetworkImages, demosaic, images_of
+from aenerf_ns.reconstruction.batches import batches_of
+from aenerf_ns.reconstruction.images import NetworkImages, demosaic
 from aenerf_ns.reconstruction.layers import ConvGRU, ConvLSTM
 from aenerf_ns.reconstruction.networks import E2VID, FireNet
-from aenerf_ns.reconstruction.weights import NetworkName, load_network
+from aenerf_ns.reconstruction.weights import load_network
 
 
 def convolution(name: str, *shape: int, bias: bool = True) -> dict[str, tuple[int, ...]]:
@@ -95,9 +96,9 @@ def events_of(height: int, width: int, count: int, seed: int = 0) -> EventStream
 
 
 @pytest.mark.parametrize(("name", "number", "weights"), [("e2vid", 74, 10_715_503), ("firenet", 24, 37_777)])
-def test_load_documented_weights(name: NetworkName, number: int, weights: int, tmp_path: Path) -> None:
+def test_load_documented_weights(name: str, number: int, weights: int, tmp_path: Path) -> None:
     assert len(ENTRIES[name]) == number
-    network = load_network(name, save(tmp_path / "weights.pth.tar", name))
+    network = load_network(save(tmp_path / "weights.pth.tar", name))
     assert not network.training
     assert sum(values.numel() for values in network.state_dict().values()) == weights
     for key, values in made(ENTRIES[name]).items():
@@ -109,13 +110,12 @@ class Foreign:
 
 
 @pytest.mark.parametrize("name", ["e2vid", "firenet"])
-def test_refuse_unusable_weights(name: NetworkName, tmp_path: Path) -> None:
+def test_refuse_unusable_weights(name: str, tmp_path: Path) -> None:
     file = "E2VID_lightweight.pth.tar" if name == "e2vid" else "firenet_1000.pth.tar"
-    where = f"{file}, which https://github.com/"
+    where, kind = f"{file}, which https://github.com/", "E2VID" if name == "e2vid" else "FireNet"
     weights = made(ENTRIES[name])
     first = next(iter(weights))
-    faults: list[tuple[Path | None, str]] = [
-        (None, f"--method {name}: no weights are given"),
+    faults: list[tuple[Path, str]] = [
         (tmp_path / "none.pth", "none.pth: there is no such file"),
         (tmp_path / ("n" * 300), "n: it cannot be read"),
         (save(tmp_path / "code.pth", name, config=Foreign()), "code.pth: not a file of plain weights"),
@@ -123,20 +123,20 @@ def test_refuse_unusable_weights(name: NetworkName, tmp_path: Path) -> None:
         (save(tmp_path / "number.pth", name, state_dict={1: torch.zeros(1)}), "number.pth: it holds no state_dict"),
         (
             save(tmp_path / "more.pth", name, state_dict={**weights, "other": torch.zeros(1)}),
-            f"its weights are not {name}'s .*other",
+            f"its weights are not those of {kind} .*other",
         ),
         (
             save(tmp_path / "less.pth", name, state_dict={k: v for k, v in weights.items() if k != first}),
-            f"its weights are not {name}'s .*{first}",
+            f"its weights are not those of {kind} .*{first}",
         ),
         (
             save(tmp_path / "shape.pth", name, state_dict={**weights, first: torch.zeros(3)}),
-            f"its weights are not {name}'s .*{first}",
+            f"its weights are not those of {kind} .*{first}",
         ),
     ]
     for path, complaint in faults:
         with pytest.raises(DataError, match=complaint) as raised:
-            load_network(name, path)
+            load_network(path)
         assert where in str(raised.value) or "cannot be read" in complaint
         assert str(raised.value).isprintable()
 
@@ -178,14 +178,14 @@ def test_network_keeps_size_and_state(kind: type[E2VID] | type[FireNet]) -> None
 
 @pytest.mark.parametrize("pattern", ["", "RGGB"])
 @pytest.mark.parametrize("name", ["e2vid", "firenet"])
-def test_images_of_a_sensor(name: NetworkName, pattern: str, tmp_path: Path) -> None:
-    network = load_network(name, save(tmp_path / "weights.pth.tar", name))
+def test_images_of_a_sensor(name: str, pattern: str, tmp_path: Path) -> None:
+    network = load_network(save(tmp_path / "weights.pth.tar", name))
     sensor = SensorModel(bayer_pattern="RGGB" if pattern else "")
     events = events_of(10, 13, 400)
-    found = list(images_of([events[:150], events[150:]], 130, NetworkImages(network, sensor, "cpu")))
+    found = list(NetworkImages(network, sensor, "cpu")(batches_of([events[:150], events[150:]], 130)))
     assert [time for time, _ in found] == [1290, 2590, 3890]
     assert all(image.shape == (10, 13, 3) and image.dtype == np.uint8 for _, image in found)
-    fresh = NetworkImages(network, sensor, "cpu").image(events[130:260])
+    ((_, fresh),) = NetworkImages(network, sensor, "cpu")([events[130:260]])
     assert (fresh != found[1][1]).any()
     is_gray = (found[0][1] == found[0][1][..., :1]).all()
     assert is_gray == (not pattern)
@@ -201,7 +201,7 @@ def test_padding_is_removed() -> None:
 
     # One positive event, normalized to zero, would be invisible: two of different size.
     events = make_stream([(3, 2, 0, 1), (3, 2, 0, 1), (12, 8, 0, 1)], 13, 9)
-    image = NetworkImages(Echo(), SensorModel(), "cpu").image(events)
+    ((_, image),) = NetworkImages(Echo(), SensorModel(), "cpu")([events])
     assert np.unravel_index(image[..., 0].argmax(), (9, 13)) == (2, 3)
 
 
@@ -212,12 +212,3 @@ def test_demosaic_one_color(pattern: BayerPattern) -> None:
     mosaic = np.array([200, 120, 50], np.uint8)[channels].reshape(6, 8)
     assert ["RGB"[channel] for channel in channels[[0, 1, 8, 9]]] == list(pattern)
     assert (demosaic(mosaic, pattern) == [200, 120, 50]).all()
-
-
-def test_filter_sees_colors() -> None:
-    rows = [(x, y, 0, 1 if y % 2 == 0 and x % 2 == 0 else -1) for y in range(6) for x in range(8)]
-    image = FilteredImages(8, 6, SensorModel(bayer_pattern="RGGB")).image(make_stream(rows, 8, 6))
-    assert (image[..., 0] > image[..., 1]).all()
-    assert (image[..., 1] == image[..., 2]).all()
-    gray = FilteredImages(8, 6, SensorModel()).image(make_stream(rows, 8, 6))
-    assert (gray[..., 0] == gray[..., 2]).all()

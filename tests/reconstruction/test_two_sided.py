@@ -1,4 +1,4 @@
-"""Images of events by the filter that runs forwards and backwards."""
+"""The filter that runs forwards and backwards."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from helpers.streams import make_stream
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.reconstruction.batches import batches_of
-from aenerf_ns.reconstruction.two_sided import two_sided_images
+from aenerf_ns.reconstruction.two_sided import log_intensities
 
 WIDTH, HEIGHT, BATCH = 12, 10, 60
 SENSOR = SensorModel(0.2, 0.2)
@@ -27,16 +27,25 @@ def events() -> EventStream:
     return make_stream(list(zip(x, y, np.arange(count), polarity, strict=True)), WIDTH, HEIGHT)
 
 
-def images_of(events: EventStream) -> Iterator[tuple[int, np.ndarray]]:
-    return two_sided_images(batches_of([events], BATCH), SENSOR)
+def states_of(events: EventStream) -> Iterator[tuple[int, np.ndarray]]:
+    return log_intensities(batches_of([events], BATCH), SENSOR, 0.12)
 
 
 def test_an_image_of_each_batch(events: EventStream) -> None:
-    times, images = zip(*images_of(events), strict=True)
+    times, states = zip(*states_of(events), strict=True)
     # A tenth of an event per pixel ahead of the end of the batch.
     assert list(times) == [BATCH * (k + 1) - 1 - WIDTH * HEIGHT // 10 for k in range(100)]
-    assert {(image.shape, image.dtype.name) for image in images} == {((HEIGHT, WIDTH), "uint8")}
-    assert {(image.min(), image.max()) for image in images} == {(0, 255)}
+    assert {(state.shape, state.dtype.name) for state in states} == {((HEIGHT, WIDTH), "float32")}
+
+
+def test_states_are_sums_of_exponentials() -> None:
+    rows = [(2, 1, 0, 1), (3, 1, 1, 1), (2, 1, 2, -1), (2, 1, 3, 1)]
+    ((_, state),) = log_intensities(batches_of([make_stream(rows, 4, 3)], 4), SensorModel(0.3, 0.2), 0.12)
+    # A twelfth of an event per pixel goes by from one event to the next.
+    kept = np.exp(-0.12 / 12 * np.arange(5))
+    assert state[1, 2] == pytest.approx(0.3 * kept[4] - 0.2 * kept[2] + 0.3 * kept[1], abs=1e-6)
+    assert state[1, 3] == pytest.approx(0.3 * kept[3], abs=1e-6)
+    assert np.count_nonzero(state) == 2
 
 
 def test_both_directions_of_time_count_alike(events: EventStream) -> None:
@@ -44,10 +53,10 @@ def test_both_directions_of_time_count_alike(events: EventStream) -> None:
     reversed_events = EventStream(
         events.x[::-1].copy(), events.y[::-1].copy(), last - events.t[::-1], -events.p[::-1], WIDTH, HEIGHT
     )
-    images, mirrored = ([image for _, image in images_of(stream)] for stream in (events, reversed_events))
+    images, mirrored = ([image for _, image in states_of(stream)] for stream in (events, reversed_events))
     # The last image of each is of one direction only. Images that wait for less than all that follows differ a little.
     for k in range(99):
-        assert np.abs(images[k].astype(int) - mirrored[98 - k].astype(int)).max() <= 8, k
+        assert np.abs(images[k] - mirrored[98 - k]).max() < 0.03 * np.ptp(images[k]), k
 
 
 def test_a_change_shows_before_and_after_it() -> None:
@@ -55,7 +64,8 @@ def test_a_change_shows_before_and_after_it() -> None:
     generator = np.random.default_rng(1)
     rows = [(generator.integers(WIDTH), generator.integers(HEIGHT), time, 1 - 2 * (time % 2)) for time in range(1200)]
     rows[600:620] = [(4, 5, time, 1) for time in range(600, 620)]
-    images = [image for _, image in images_of(make_stream(rows, WIDTH, HEIGHT))]
-    # Images 9 and 10 end before and after the events of the pixel.
-    assert images[9][5, 4] == 0
-    assert images[10][5, 4] == 255
+    stream = make_stream(rows, WIDTH, HEIGHT)
+    states = [state for _, state in log_intensities(batches_of([stream], BATCH), SensorModel(0.3, 0.2), 0.12)]
+    # States 9 and 10 are those before and after the events of the pixel.
+    assert states[9].argmin() == states[10].argmax() == 5 * WIDTH + 4
+    assert states[10][5, 4] - states[9][5, 4] == pytest.approx(20 * 0.3, rel=0.05)
