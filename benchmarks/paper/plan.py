@@ -205,7 +205,8 @@ class Plan:
         return runs
 
     def _dataset(self, scene: str, speed: str) -> Dataset:
-        estimated = _NOISE[self.scale] if self.poses == "noise" else ("--poses", "colmap")
+        # COLMAP has the paper's frames: 250 in a second.
+        estimated = _NOISE[self.scale] if self.poses == "noise" else ("--poses", "colmap", "--frame-rate", "250")
         # Otherwise all paths of one duration would have the same errors, and a mean over scenes would hold one draw.
         seed = str(int(digest((scene_name(scene), speed)), 16))
         options = (*_SIMULATE[self.scale], "--seed", seed, *estimated, *shlex.split(self.simulate))

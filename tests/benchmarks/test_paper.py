@@ -72,7 +72,8 @@ def test_plan_has_every_run_once() -> None:
     # One simulation serves all rows, each with a seed of its own.
     datasets = {run.dataset for run in runs}
     assert len({data.options[data.options.index("--seed") + 1] for data in datasets}) == len(datasets) == 2 * 2
-    assert all(run.dataset.options[-2:] == ("--poses", "colmap") for run in small_plan(poses="colmap"))
+    colmap = ("--poses", "colmap", "--frame-rate", "250")
+    assert all(run.dataset.options[-4:] == colmap for run in small_plan(poses="colmap"))
 
 
 ALL_METHODS = ("aenerf", *PEERS, "nerfacto")
