@@ -105,7 +105,7 @@ def test_weights_choose_e2vid(tmp_path: Path) -> None:
     options: dict[str, Any] = {"methods": ("e2vid-nerf",), "tables": ("methods",)}
     with_weights = small_plan(e2vid_weights=tmp_path / "e2vid.pth.tar", **options)
     assert {run.row for run in with_weights} == {"E2VID + NeRF" + end for end in ("", CORRECTED, ON_TRUE_POSES)}
-    assert with_weights[0].images == ("--method", "e2vid", "--weights", str(tmp_path / "e2vid.pth.tar"))
+    assert with_weights[0].images == ("--weights", str(tmp_path / "e2vid.pth.tar"))
     assert not {run.name for run in with_weights} & {run.name for run in small_plan(**options)}
 
 
