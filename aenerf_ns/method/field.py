@@ -264,7 +264,7 @@ def _unit_positions(field: DensityField | ProposalNetwork, ray_samples: RaySampl
 def _unit_variances(field: DensityField, ray_samples: RaySamples) -> Tensor:
     """Return variances (..., 3) along the unit cube's axes of the parts of space that samples stand for.
 
-    A part is a segment of the ray, as wide as a pixel. The distortion's effect on both is measured and not derived.
+    A part is a segment of the ray, as wide as a pixel. Its length and width there are distances between mapped places.
     """
     frustums = ray_samples.frustums
     to_unit = partial(to_unit_cube, spatial_distortion=field.spatial_distortion, aabb=field.aabb)
