@@ -14,7 +14,19 @@ __version__ = "0.2.0"
 warnings.filterwarnings("ignore", r"(?s).*TBB threading layer")
 warnings.filterwarnings("ignore", r"`torch\.(jit\.script|cuda\.amp)", FutureWarning)
 
-# Path.home() raises for a user without a home.
-if not any(os.access(place, os.W_OK) for place in (os.path.dirname(__file__), os.path.expanduser("~"))):
-    # numba keeps what it compiles beside the package or in the home, and raises where it can write neither.
+
+def _is_writable(folder: str) -> bool:
+    """Return whether a folder that may not exist yet can be made and written to."""
+    while not os.path.exists(folder):
+        folder = os.path.dirname(folder)
+    return os.access(folder, os.W_OK)
+
+
+# numba keeps what it compiles in one of these, and raises where it can write neither. Path.home() raises for a user
+# without a home.
+_NUMBA_CACHES = (
+    os.path.join(os.path.dirname(__file__), "__pycache__"),
+    os.path.abspath(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) + "/numba",
+)
+if not any(map(_is_writable, _NUMBA_CACHES)):
     os.environ.setdefault("NUMBA_CACHE_DIR", f"{tempfile.gettempdir()}/aenerf-ns-numba-{os.getuid()}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -59,7 +60,7 @@ class EdsDataParser(EventDataParser):
     def read_recording(self) -> Recording:
         reference = read_tum_trajectory(self.poses_path())
         capture, images = self.read_capture()
-        views = views_on_trajectory(images, reference, self._calibration()[2])
+        views = views_on_trajectory(images, reference, self._calibration[2])
         return self.config.make_recording(reference, capture, reference_views=views)
 
     def poses_path(self) -> Path:
@@ -67,15 +68,16 @@ class EdsDataParser(EventDataParser):
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         folder = Path(self.config.data)
-        camera, frame_camera, _ = self._calibration()
+        camera, frame_camera, _ = self._calibration
         events = Hdf5TableFile(folder / "events.h5", camera.width, camera.height, COLUMNS_AT_TOP)
         images = read_image_times(folder / "images", folder / "images_timestamps.txt", "us")
         return self.config.make_capture(
             SensorModel(), event_file=events, event_camera=camera, frame_camera=frame_camera
         ), images
 
+    @cached_property
     def _calibration(self) -> tuple[CameraIntrinsics, CameraIntrinsics, Tensor]:
-        """Return event camera, frame camera, and the (4, 4) motion from frame camera to event camera coordinates."""
+        """Event camera, frame camera, and the (4, 4) motion from frame camera to event camera coordinates."""
         path = self.config.calibration
         if path is None:
             return _EVENT_CAMERA, _FRAME_CAMERA, torch.tensor(_EVENT_FROM_FRAME, dtype=torch.float64)

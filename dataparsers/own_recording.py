@@ -54,7 +54,7 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     event_camera: str | None = None
     """Name of the event camera in a camchain of several cameras, such as cam1."""
     frame_camera: str | None = None
-    """Name in the camchain of the camera that took the images, if not the event camera."""
+    """Name in a camchain of several cameras of the one that took the images, which may be the event camera."""
     poses: Path | None = None
     """Poses of the event camera as t tx ty tz qx qy qz qw in seconds, camera-to-world, OpenCV camera axes. By default
     trajectory.txt in the folder."""
@@ -113,9 +113,9 @@ class OwnRecordingDataParser(EventDataParser):
         folder, config = Path(self.config.data), self.config
         if not folder.is_dir():
             raise DataError(folder, "there is no such folder", "give the folder of the recording as --data")
-        calibration = self._read_calibration(folder)
         images = self._image_list(folder)
         timed = read_image_list(images) if config.images is not None or images.is_file() else []
+        calibration = self._read_calibration(folder, bool(timed))
         capture = config.make_capture(
             calibration.sensor,
             event_file=self._event_file(folder, calibration.event_camera.width, calibration.event_camera.height),
@@ -129,14 +129,14 @@ class OwnRecordingDataParser(EventDataParser):
     def _image_list(self, folder: Path) -> Path:
         return folder / IMAGE_LIST if self.config.images is None else self.config.images
 
-    def _read_calibration(self, folder: Path) -> Calibration:
+    def _read_calibration(self, folder: Path, has_images: bool) -> Calibration:
         config, file = self.config, self.config.calibration
         if file is None:
             found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
             if not found:
                 return _guess_calibration(self._event_file(folder))
             file = require_one(found, folder, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
-        return read_calibration(file, config.event_camera, config.frame_camera)
+        return read_calibration(file, config.event_camera, config.frame_camera, has_images)
 
     def _event_file(self, folder: Path, width: int | None = None, height: int | None = None) -> EventFile:
         config = self.config

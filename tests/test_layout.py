@@ -34,7 +34,7 @@ MAY_USE: dict[str, set[str]] = {
     "evaluation": {"errors", "progress", "camera", "recording", "supervision", "method", "checking"},
     # What the viewer shows of a run. It only looks: the pipeline hands it what it needs.
     "viewer": {"errors", "events", "camera", "files", "recording", "method", "evaluation"},
-    "training": {"errors", "atomic_write", "recording", "supervision", "method", "evaluation", "viewer"},
+    "training": {"errors", "atomic_write", "files", "recording", "supervision", "method", "evaluation", "viewer"},
     # What training and checking left behind, measured and shown.
     "report": {
         "errors", "progress", "camera", "files", "recording", "supervision", "evaluation", "training", "checking"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -144,7 +144,9 @@ class Convert(DatasetCommand):
             camera = camera.crop(*self.region)
         with open_writer(lock, parser, recording, camera, recording.frame_camera, has_given_poses) as writer:
             writer.add_trajectories(trajectory, recording.ground_truth)
-            if report is not None:
+            if report is None:
+                writer.copy_poses_report(trajectory)
+            else:
                 writer.add_poses_report(report)
             if picture is not None:
                 picture.quantize().save(writer.other_file(POSES_PICTURE))
@@ -261,7 +263,7 @@ def _with_poses(
     """Return the recording with estimated poses, the report on them, and a picture of them."""
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.pose_estimation.from_frames import compare_with_truth
-    from aenerf_ns.recording.recording import Recording
+    from aenerf_ns.recording.recording import Capture, Recording
     from aenerf_ns.recording.views import views_on_trajectory
 
     trajectory, report = found.trajectory, found.report()
@@ -289,10 +291,18 @@ def _with_poses(
                 f"Compared with the given poses, which are kept as ground truth: mean errors "
                 f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units."
             )
-        # The scene box is in the world of the given poses, and the longest gap is about the given poses.
-        recording = replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None)
-        return recording, report, found.draw and found.draw(paths)
+            # The scene box is in the world of the given poses, and the longest gap is about the given poses.
+            recording = replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None)
+            return recording, report, found.draw and found.draw(paths)
+        say(
+            f"The given poses, from {truth.start} to {truth.end} ns, are of another time than the estimated ones, from "
+            f"{trajectory.start} to {trajectory.end} ns: they are left out."
+        )
     placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
     views = views_on_trajectory(placed, trajectory)
-    recording = Recording(**vars(capture), trajectory=trajectory, reference_views=views)
+    recording = Recording(
+        **{field.name: getattr(capture, field.name) for field in fields(Capture)},
+        trajectory=trajectory,
+        reference_views=views,
+    )
     return recording, report, found.draw and found.draw(paths)

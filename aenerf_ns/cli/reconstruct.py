@@ -65,6 +65,7 @@ class Reconstruct(DatasetCommand):
         known = recording.trajectory.known_time(recording.max_pose_gap)
         with open_writer(lock, parser, recording, camera, camera) as writer:
             writer.add_trajectories(recording.trajectory, recording.ground_truth)
+            writer.copy_poses_report(recording.trajectory)
             _add_reference_views(recording, writer)
             images = self._write_images(recording, source, known, writer)
             num_images = write_video(writer.other_file(_VIDEO), images, _VIDEO_RATE)

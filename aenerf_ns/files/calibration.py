@@ -48,16 +48,19 @@ class Calibration:
     intrinsics_origin: Origin = "given"
 
 
-def read_calibration(path: Path, event_camera: str | None = None, frame_camera: str | None = None) -> Calibration:
+def read_calibration(
+    path: Path, event_camera: str | None = None, frame_camera: str | None = None, has_images: bool = False
+) -> Calibration:
     """Read calibration.json, the camchain that Kalibr writes, or the camera_info that ROS writes for one camera.
 
     Args:
         path: the file, which is JSON if its suffix is .json.
         event_camera: name of the event camera in a camchain. None: the only camera.
         frame_camera: name in the camchain of the camera that took the images. None: the event camera.
+        has_images: whether there are images. Of several cameras, the one that took them must then be named.
 
     Raises:
-        DataError: the file is missing or malformed, or it holds several cameras and none is named.
+        DataError: the file is missing or malformed, or it holds several cameras and one that is needed is not named.
     """
     if path.suffix == ".json":
         meta, lens = read_transforms(path)
@@ -71,8 +74,11 @@ def read_calibration(path: Path, event_camera: str | None = None, frame_camera: 
         lens = _camera_info(path, content)
         return Calibration(lens, lens, torch.eye(4, dtype=torch.float64), SensorModel(), "linear")
     cameras = read_camchain(path)
-    if event_camera is None and len(cameras) > 1:
-        raise DataError(path, f"its cameras are {', '.join(cameras)}", "name that of the events as --event-camera")
+    if len(cameras) > 1:
+        for name, what, option in ((event_camera, "events", "event"), (frame_camera, "images", "frame")):
+            if name is None and (what == "events" or has_images):
+                remedy = f"name that of the {what} as --{option}-camera"
+                raise DataError(path, f"its cameras are {', '.join(cameras)}", remedy)
     event_name = next(iter(cameras)) if event_camera is None else event_camera
     frame_name = event_name if frame_camera is None else frame_camera
     for name in (event_name, frame_name):

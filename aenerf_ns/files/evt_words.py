@@ -159,8 +159,8 @@ def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_ou
     """Blank out upper bits of a time that differ from those before and after them, which fit each other, and the events
     that they would date.
 
-    One such word would move all later events by up to a lap of the time. At the end of a file, upper bits that jump are
-    blanked out as well, because none confirm them.
+    One such word would move all later events by up to a lap of the time. At the end of the words, upper bits that jump
+    are blanked out as well, because none confirm them, and at the beginning those that the next two contradict.
 
     Args:
         blocks: (N,) words in pieces, which may end anywhere.
@@ -173,11 +173,17 @@ def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_ou
     for block in chain(blocks, (None,)):
         words = held if block is None else np.concatenate([held, block])
         where = np.flatnonzero(encoding.kinds(words) == TIME_HIGH)
-        # The last upper bits wait for the next ones.
+        # The last upper bits wait for the next ones, and the first ones for the next two.
         end = len(words) if block is None or len(where) == 0 else int(where[-1])
-        if len(where):
+        if last is None and 0 < len(where) < 3 and block is not None:
+            end = 0
+        elif len(where):
             high = (words[where] & mask).astype(np.int64)
-            before = np.concatenate([high[:1] if last is None else [last], high[:-1]])
+            if last is None:
+                # The steps between the first two, from the first to the third, and between the last two.
+                jumps = len(high) > 2 and ((high[[1, 2, 2]] - high[[0, 0, 1]]) & mask) > encoding.max_steps
+                last = high[int(np.array_equal(jumps, [True, True, False]))]
+            before = np.concatenate([[last], high[:-1]])
             steps = (high - before) & mask
             steps_after = (high[1:] - before[:-1]) & mask
             damaged = np.flatnonzero((steps_after <= encoding.max_steps) & (steps[:-1] > steps_after)).tolist()

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
+from itertools import chain, groupby, islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,6 +59,8 @@ _WORD = np.dtype("<u2")
 _LAP = (1 << 24) * 1000
 # Packets from which the clocks' difference is taken, about 0.4 s.
 _CLOCK_PACKETS = 100
+# Nanoseconds by which the stamp of a packet may be late.
+_MAX_DELAY = 1_000_000_000
 # Seconds before the end of a bag in which its last event is looked for.
 _TAIL_SECONDS = (1, 10, 100)
 
@@ -161,26 +163,21 @@ class RosbagEventFile(EventReader):
 
     def _columns_of_packets(self, start: int | None) -> Iterator[Columns]:
         # Imported lazily: every command of every method imports this module, and numba is slow to import.
-        from aenerf_ns.files.evt_words import EVT3, decode_words, initial_state
+        from aenerf_ns.files.evt_words import EVT3, decode_words, initial_state, without_damaged_times
 
-        state = initial_state()
-
-        def blocks() -> Iterator[NDArray]:
-            expected = None
-            for message in self._messages(start):
-                words = self._words(message)
-                if message.sequence != expected:
-                    # The decoder's state is of no use at the first packet and after lost packets.
-                    expected = None
-                    time = _first_time(words)
-                    if time is None:
-                        continue
-                    laps = round((message.stamp - self._clock_offset - time) / _LAP)
-                    state[:] = initial_state(self._clock_offset + laps * _LAP)
-                expected = (message.sequence or 0) + 1
-                yield words
-
-        return decode_words(blocks(), EVT3, state, self.path)
+        # The decoder's state is of no use at the first packet and after lost packets, where the sequence jumps.
+        numbered = enumerate(self._messages(start))
+        for _, run in groupby(numbered, lambda pair: (pair[1].sequence or 0) - pair[0]):
+            messages = (message for _, message in run)
+            first = next(messages)
+            words_of_packets = map(self._words, chain([first], messages))
+            blocks = without_damaged_times(words_of_packets, EVT3, self.left_out)
+            for words in blocks:
+                time = _first_time(words)
+                if time is not None:
+                    laps = round((first.stamp - self._clock_offset - time) / _LAP)
+                    state = initial_state(self._clock_offset + laps * _LAP)
+                    yield from decode_words(chain([words], blocks), EVT3, state, self.path)
 
     def _words(self, message: _Message) -> NDArray[np.uint16]:
         if message.encoding != "evt3":
@@ -204,9 +201,10 @@ class RosbagEventFile(EventReader):
         ]
         if not offsets:
             return 0
-        # The camera's times may have wrapped in between.
+        # The camera's times may have wrapped in between. A damaged one is far from the others.
         later = [(offset - offsets[0] + _LAP // 2) % _LAP - _LAP // 2 for offset in offsets]
-        return offsets[0] + min(later)
+        middle = sorted(later)[len(later) // 2]
+        return offsets[0] + min(time for time in later if time > middle - _MAX_DELAY)
 
     def _chunks(self) -> Iterator[EventStream]:
         yield from map(self._stream, self._columns())

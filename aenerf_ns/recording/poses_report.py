@@ -29,21 +29,28 @@ class PosesReport:
     picture: Image.Image | None
 
 
+def poses_report_files(trajectory: Trajectory) -> list[Path]:
+    """Return the files of the report beside poses that ``aenerf convert`` found; none for other poses."""
+    path = Path(trajectory.source)
+    if path.name != "trajectory_estimated.txt":
+        return []
+    return [file for name in (POSES_REPORT, POSES_PICTURE) if (file := path.with_name(name)).is_file()]
+
+
 def read_poses_report(trajectory: Trajectory) -> PosesReport | None:
     """Read the report beside poses that ``aenerf convert`` found; None for other poses, and where there is no report.
 
     Raises:
         DataError: the report or its picture cannot be read.
     """
-    path = Path(trajectory.source)
-    report, picture = path.with_name(POSES_REPORT), path.with_name(POSES_PICTURE)
-    if path.name != "trajectory_estimated.txt" or not report.is_file():
+    files = {file.name: file for file in poses_report_files(trajectory)}
+    if POSES_REPORT not in files:
         return None
-    summary = read_json(report, _File).summary
+    summary = read_json(files[POSES_REPORT], _File).summary
     if summary is None:
         return None
     drawn = None
-    if picture.is_file():
-        with open_image(picture) as image:
+    if POSES_PICTURE in files:
+        with open_image(files[POSES_PICTURE]) as image:
             drawn = image.convert("RGB")
     return PosesReport(" ".join(summary.split()), drawn)

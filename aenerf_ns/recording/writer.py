@@ -26,7 +26,7 @@ from aenerf_ns.files.output_paths import output_error
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.output_lock import OutputLock
-from aenerf_ns.recording.poses_report import POSES_REPORT
+from aenerf_ns.recording.poses_report import POSES_REPORT, poses_report_files
 from aenerf_ns.recording.recording import SPLITS, Split
 from aenerf_ns.recording.views import IMAGE_LIST
 
@@ -146,6 +146,11 @@ class NativeDatasetWriter(_FolderWriter):
     def add_poses_report(self, report: dict[str, Any]) -> None:
         """Write how the estimated trajectory was made and what is known of its errors, for people to read."""
         _write_json(self._partial / POSES_REPORT, report)
+
+    def copy_poses_report(self, trajectory: Trajectory) -> None:
+        """Copy the report on poses that are written as they were read, and its picture, where there are such files."""
+        for file in poses_report_files(trajectory):
+            shutil.copyfile(file, self._partial / file.name)
 
     def other_file(self, name: str) -> Path:
         """Return the path at which another file of the folder can be written until the block ends."""

@@ -27,7 +27,7 @@ from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.supervision.base import Batch, ChangeBatch
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.framework import mean_step_seconds, steps_of
-from aenerf_ns.training.preflight import provide_ffmpeg
+from aenerf_ns.training.preflight import provide_ffmpeg, require_camera_path
 from aenerf_ns.training.training_state import TrainingState
 from aenerf_ns.viewer.panel import RecordingPanel
 from aenerf_ns.viewer.recording_view import RecordingView
@@ -64,8 +64,10 @@ class AENeRFPipeline(VanillaPipeline):
         **kwargs: Any,
     ) -> None:
         if test_mode != "val":
-            # Once the pipeline is made, ns-render asks for a program that pip cannot install.
+            # Once the pipeline is made, ns-render asks for a program that pip cannot install, and reads a camera path.
             provide_ffmpeg()
+            with errors_as_one_line():
+                require_camera_path()
         super().__init__(config, device, test_mode=test_mode, **kwargs)
         self._pose_diagnosis: dict[str, Any] | None = None
         self.training_state = TrainingState()

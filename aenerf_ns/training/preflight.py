@@ -1,16 +1,46 @@
-"""What a command needs of the machine: the device it asks for, and a program that ns-render insists on."""
+"""What a command needs: the device that it asks for, and the program and the camera path that ns-render asks for."""
 
 from __future__ import annotations
 
+import argparse
 import atexit
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
+import numpy as np
 import torch
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.files.json_file import read_json
+
+
+class _Camera(msgspec.Struct):
+    camera_to_world: list[Any]
+    fov: float | None = None
+
+    def __post_init__(self) -> None:
+        if np.asarray(self.camera_to_world, np.float64).size != 16:
+            raise ValueError("camera_to_world does not have 16 numbers")
+
+
+class _CameraPath(msgspec.Struct):
+    """What ns-render takes from the file without asking whether it is there."""
+
+    seconds: Annotated[float, msgspec.Meta(gt=0)]
+    render_width: Annotated[float, msgspec.Meta(ge=1)]
+    render_height: Annotated[float, msgspec.Meta(ge=1)]
+    camera_path: Annotated[list[_Camera], msgspec.Meta(min_length=1)]
+    camera_type: str = "perspective"
+
+    def __post_init__(self) -> None:
+        is_panorama = self.camera_type.lower() in ("equirectangular", "omnidirectional", "vr180")
+        if not is_panorama and any(camera.fov is None for camera in self.camera_path):
+            raise ValueError("a camera has no field of view `fov`")
 
 
 def require_device(device: str) -> None:
@@ -44,3 +74,13 @@ def provide_ffmpeg() -> None:
     except (ImportError, RuntimeError, OSError):
         return
     os.environ["PATH"] = f"{os.environ.get('PATH', '')}{os.pathsep}{folder}"
+
+
+def require_camera_path() -> None:
+    """Raise a DataError if this process is ``ns-render camera-path`` and the file of the path lacks what it needs."""
+    if Path(sys.argv[0]).name != "ns-render" or "camera-path" not in sys.argv[1:2]:
+        return
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser.add_argument("--camera-path-filename", "--camera_path_filename", type=Path, default="camera_path.json")
+    path = parser.parse_known_args(sys.argv[2:])[0].camera_path_filename
+    read_json(path, _CameraPath, "export the camera path from the viewer's Render tab")

@@ -122,7 +122,7 @@ class AENeRFTrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Read the data, make the model, load a checkpoint to resume from, and save the configuration."""
-        with errors_as_one_line(), _full_disk_as_one_line(self.base_dir):
+        with errors_as_one_line(), _full_disk_as_one_line(self.base_dir), _missing_key_as_one_line(self.config.vis):
             # The viewer writes there before there is a configuration.
             self.base_dir.mkdir(parents=True, exist_ok=True)
             super().setup(test_mode)
@@ -248,6 +248,18 @@ def _one_line_if_not_written(path: Path) -> Iterator[Path]:
         if "CUDA" in str(error):
             raise
         raise _not_written(path, error) from None
+
+
+@contextmanager
+def _missing_key_as_one_line(vis: str) -> Iterator[None]:
+    """Turn the error of wandb or comet for a user who is not logged in into a DataError."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, DataError) or "API key" not in str(error):
+            raise
+        remedy = "log in there, or choose another --vis, such as viewer or tensorboard"
+        raise DataError(f"--vis {vis}", str(error).strip().rstrip("."), remedy) from None
 
 
 @contextmanager

@@ -27,6 +27,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
 from aenerf_ns.camera.noise import perturb
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
@@ -35,7 +36,9 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
-from aenerf_ns.recording.recording import Recording
+from aenerf_ns.pose_estimation import from_frames
+from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
+from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.writer import NativeDatasetWriter
 
 
@@ -214,6 +217,35 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
     np.testing.assert_array_equal(columns(without)["t"], columns(with_truth)["t"])
     with pytest.raises(DataError, match=r"groundtruth.txt: there are no such poses"):
         convert(data, tmp_path / "given", format="ecd-data")
+
+
+def test_given_poses_of_another_time_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place_frames(3, monkeypatch)
+
+    def estimate(capture: Capture, window: TimeWindow, source: Path, seed: int) -> EstimatedPoses:
+        times = [50_000_000, 150_000_000, 250_000_000]
+        return from_frames.estimate_poses([source] * 3, times, capture.event_camera, source, seed)
+
+    monkeypatch.setattr("aenerf_ns.pose_estimation.from_events.estimate_poses_from_events", estimate)
+    data = write_ecd(tmp_path / "made")
+    given = read_tum_trajectory(data / "groundtruth.txt")
+    write_tum_trajectory(data / "groundtruth.txt", Trajectory(given.times + 10**12, given.camera_to_worlds))
+    with CONSOLE.capture() as output:
+        found = convert(data, tmp_path / "found", poses="events")
+    assert "The given poses, from 1000000000000 to " in output.get()
+    assert "are of another time than the estimated ones, from 50000000 to 250000000 ns: they are left" in output.get()
+    assert found.ground_truth is None
+    assert found.trajectory.times.tolist() == [50_000_000, 150_000_000, 250_000_000]
+
+
+def test_the_report_on_poses_stays_with_them(tmp_path: Path) -> None:
+    data = write_native(tmp_path / "made")
+    (data / "poses_report.json").write_text('{"summary": "Found by hand."}')
+    Image.new("RGB", (3, 2)).save(data / "poses_report.png")
+    convert(data, tmp_path / "once", pixel_share=0.5)
+    convert(tmp_path / "once", tmp_path / "twice")
+    for name in ("poses_report.json", "poses_report.png"):
+        assert (tmp_path / "twice" / name).read_bytes() == (data / name).read_bytes()
 
 
 def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:

@@ -102,6 +102,9 @@ def test_camchain_places_both_cameras(tmp_path: Path) -> None:
     (truth.data / "camchain.yaml").write_text(yaml.dump(CAMCHAIN))
     with pytest.raises(DataError, match="its cameras are cam0, cam1; name that of the events as --event-camera"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data))
+    # They are not taken for images of the event camera.
+    with pytest.raises(DataError, match="its cameras are cam0, cam1; name that of the images as --frame-camera"):
+        recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1"))
     recording = recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1", frame_camera="cam0"))
     assert recording.event_camera == CameraIntrinsics(60, 40, 50.0, 51.0, 30.0, 20.5, distortion=(-0.1, 0, 0, 0.01, 0))
     assert recording.frame_camera == CameraIntrinsics(
@@ -146,7 +149,7 @@ def test_refuse_a_mount_that_the_camchain_lacks(pair: tuple[str, str], tmp_path:
     with pytest.raises(DataError, match="cam1 has no T_cn_cnm1"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera=pair[0], frame_camera=pair[1]))
     # One camera needs no mount.
-    recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera=pair[0]))
+    recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera=pair[0], frame_camera=pair[0]))
 
 
 def test_refuse_a_mount_that_the_calibration_lacks(tmp_path: Path) -> None:

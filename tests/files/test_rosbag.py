@@ -78,6 +78,36 @@ def test_lost_packets_reset_the_decoder(folder: Path) -> None:
     assert read(open_event_file(path))[:, :2].tolist() == [[1, 5], [4, 7]]
 
 
+@pytest.mark.parametrize(("packet", "word"), [(0, 0), (0, 4), (3, 0), (3, 4), (4, 4), (6, 0), (8, 0), (11, 4)])
+def test_a_damaged_time_moves_no_later_packet(
+    packet: int, word: int, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def packet_words(number: int) -> list[int]:
+        # Two events of 1 ms, and between them the upper bits of the time again.
+        time = 0x5000 + 1000 * number
+        high, low = 0x8000 | time >> 12, 0x6000 | time & 0xFFF
+        return [high, low, 0x0005, 0x2000 | number, high, low, 0x2010 | number]
+
+    def events_of(packets: list[list[int]]) -> np.ndarray:
+        messages = [
+            (START + 1_000_000 * i, packet_message(i, START + 1_000_000 * i, np.array(words, "<u2").tobytes()))
+            for i, words in enumerate(packets)
+        ]
+        # The sixth is lost.
+        return read(
+            open_event_file(write_bag(folder / "times.bag", {"/events": (PACKET, messages[:5] + messages[6:])}))
+        )
+
+    packets = [packet_words(number) for number in range(12)]
+    expected = events_of(packets)
+    assert len(expected) == 22
+    packets[packet][word] ^= 0x800
+    found = events_of(packets)
+    assert {*map(tuple, found.tolist())} < {*map(tuple, expected.tolist())}
+    assert len(found) >= 20
+    assert "after a damaged time (the first at word" in capsys.readouterr().out
+
+
 def test_real_packets_agree_with_independent_reader(folder: Path) -> None:
     faery = pytest.importorskip("faery")
     rosbag1 = pytest.importorskip("rosbags.rosbag1")

@@ -17,6 +17,7 @@ from helpers.commands import CPU, newest_config, run, simulate
 from helpers.small_trainings import own_log
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.scripts import train
+from nerfstudio.utils import writer
 
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.errors import DataError
@@ -192,6 +193,23 @@ def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Pa
     errors = [line for line in output.splitlines() if line.startswith("Error: ")]
     assert len(errors) == 1
     assert "nothing: there is no such folder" in errors[0]
+
+
+def test_a_log_that_needs_a_key_ends_training_with_one_line(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_key(**_: Any) -> None:
+        raise ValueError("Comet.ml requires an API key. Set COMET_API_KEY\n")
+
+    # The import of the real one changes the process.
+    monkeypatch.setattr(writer, "CometWriter", without_key)
+    config = deepcopy(aenerf_small.config)
+    config.data, config.output_dir, config.vis = room, tmp_path, "comet"
+    config.machine.device_type = "cpu"
+    with own_log(), pytest.raises(SystemExit) as stopped:
+        train.main(config)
+    assert str(stopped.value).startswith("Error: --vis comet: Comet.ml requires an API key. Set COMET_API_KEY; ")
+    assert "another --vis" in str(stopped.value)
 
 
 def test_training_that_diverges_ends_with_one_line(room: Path, workspace: Path) -> None:
