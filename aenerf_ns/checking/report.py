@@ -47,6 +47,8 @@ class CheckLimits:
     """Contrast above that of the shuffled events by these standard deviations and by this factor is not noise."""
     min_slices: int = 2
     """One slice alone gives no verdict."""
+    min_clock_slices: int = 4
+    """Nor do two or three about the clock: of the many offsets that are tried, one fits a hand's shaking by chance."""
     min_share_in_favor: float = 0.5
     """Share of the slices that, each by itself, must clearly fit another meaning of the poses for it to be named."""
     max_elsewhere_share: float = 0.3
@@ -339,7 +341,11 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) 
         for c in alternatives
         if c.is_clearly_better
         and c.contrast > noise
-        and len(c.slices_in_favor) >= max(_LIMITS.min_slices, _LIMITS.min_share_in_favor * num_slices)
+        and len(c.slices_in_favor)
+        >= max(
+            _LIMITS.min_clock_slices if c.hypothesis.clock_offset else _LIMITS.min_slices,
+            _LIMITS.min_share_in_favor * num_slices,
+        )
     ]
     if better:
         best = better[0]
