@@ -83,6 +83,8 @@ class AENeRFModelConfig(ModelConfig):
     average_init_density: float = 10.0
     """Density of field and proposal networks before training, per scene unit. A scene that starts nearly transparent
     sits in a fog for hundreds of steps, until matter grows out of it."""
+    unbounded_init_density: float | None = None
+    """Density before training in a scene without a box. By default, average_init_density."""
     loss_coefficients: LossCoefficients = dataclasses.field(default_factory=PairLossCoefficients)
     """Weights of the losses (paper, eq. 14)."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=PairSupervisionConfig)
@@ -140,6 +142,9 @@ class AENeRFModel(Model):
         aabb = _with_room(self.scene_box.aabb) if learned else self.scene_box.aabb
         moves = learned and config.moving_field
         self.warp = PoseFollowingWarp(self.camera_optimizer, distortion, aabb) if moves else None
+        density = config.average_init_density
+        if distortion is not None and config.unbounded_init_density is not None:
+            density = config.unbounded_init_density
         self.field, proposal_networks = make_networks(
             config.backbone,
             config.field,
@@ -147,7 +152,7 @@ class AENeRFModel(Model):
             aabb,
             distortion,
             self.sensor.num_channels,
-            config.average_init_density,
+            density,
             self.warp,
         )
         self.proposal_networks = nn.ModuleList(proposal_networks)

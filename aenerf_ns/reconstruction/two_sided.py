@@ -26,7 +26,8 @@ def log_intensities(
     log-intensity that the picture shows.
 
     A pixel's state adds up contrast thresholds, forwards up to the image and backwards, with reversed polarities, down
-    to it; both forget with the number of events in the picture. Their mean has no ghosts of what was seen before.
+    to it; both forget with the number of events in the picture. Their mean, in which the
+    direction that has seen more counts more, has no ghosts of what was seen before.
     FIBAR (arXiv 2510.20071) is a published filter of the forward kind, with a decay in events and a blur where events
     are few.
 
@@ -36,7 +37,7 @@ def log_intensities(
         decay: share of a pixel's state that is forgotten while the picture gets one event per pixel. It does not depend
             on time, so neither do the images on the camera's speed.
     """
-    held: list[tuple[EventStream, NDArray[np.float32]]] = []
+    held: list[tuple[EventStream, NDArray[np.float32], float]] = []
     forward: _Filter | None = None
     # The latest batches whose images wait for what follows: as many again are yielded at a time.
     num_ahead = 0
@@ -44,7 +45,7 @@ def log_intensities(
         if forward is None:
             forward = _Filter(batch.width, batch.height, sensor, decay)
         forward.add(batch)
-        held.append((batch, forward.state()))
+        held.append((batch, forward.state(), forward.weight))
         num_ahead = math.ceil(_LOOK_AHEAD * batch.width * batch.height / len(batch))
         if len(held) == 2 * num_ahead:
             yield from _finish(held, sensor, decay)[:num_ahead]
@@ -53,18 +54,17 @@ def log_intensities(
 
 
 def _finish(
-    held: list[tuple[EventStream, NDArray[np.float32]]], sensor: SensorModel, decay: float
+    held: list[tuple[EventStream, NDArray[np.float32], float]], sensor: SensorModel, decay: float
 ) -> list[tuple[int, NDArray[np.float32]]]:
-    """Return the times, and the means of the states of the forward and the backward filter."""
+    """Return the times, and the weighted means of the states of the forward and the backward filter."""
     both: list[tuple[int, NDArray[np.float32]]] = []
     backward: _Filter | None = None
-    for batch, state in reversed(held):
+    for batch, state, weight in reversed(held):
         if backward is None:
             backward = _Filter(batch.width, batch.height, sensor, decay)
-        else:
-            state = (state + backward.state()) / 2
+        mean = (weight * state + backward.weight * backward.state()) / (weight + backward.weight)
         lag = round(_LAG * batch.width * batch.height)
-        both.append((int(batch.t[max(len(batch) - 1 - lag, 0)]), state))
+        both.append((int(batch.t[max(len(batch) - 1 - lag, 0)]), mean))
         backward.add(batch, -1)
     return both[::-1]
 
@@ -89,6 +89,11 @@ class _Filter:
         changes = self._changes if step == 1 else (-self._changes[0], -self._changes[1])
         _integrate(self._state, self._last, *columns, self._count, self._decay, *changes)
         self._count += len(events)
+
+    @property
+    def weight(self) -> float:
+        """The share of a state that has been forgotten: at first, a state tells less than it will."""
+        return 1 - math.exp(-self._decay * self._count)
 
     def state(self) -> NDArray[np.float32]:
         """Return the (height, width) states."""

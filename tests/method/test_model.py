@@ -37,6 +37,15 @@ def test_outputs_have_their_shapes_and_ranges(backbone: str, contraction: str, b
     assert all(torch.isfinite(value).all() for value in outputs.values())
 
 
+def test_unbounded_scenes_may_start_from_another_density() -> None:
+    of = {
+        contraction: make_model(scene_contraction=contraction, unbounded_init_density=0.3)
+        for contraction in ("l2", "none")
+    }
+    assert {name: model.field.average_init_density for name, model in of.items()} == {"l2": 0.3, "none": 10.0}
+    assert of["l2"].proposal_networks[0].average_init_density == 0.3
+
+
 def test_proposal_loss_is_normalised_by_the_mean_threshold() -> None:
     model = make_model(loss_coefficients=PairLossCoefficients(interlevel_loss=3.0, distortion_loss=1.0))
     model.field.average_init_density = 5.0

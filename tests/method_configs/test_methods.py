@@ -100,6 +100,7 @@ AS_ROBUST = (
     "--pipeline.datamanager.sampler.max-events-per-pair", "1",
     "--pipeline.datamanager.sampler.silent-pair-share", "0",
     "--pipeline.model.camera-optimizer.mode", "off",
+    "--pipeline.model.unbounded-init-density", "0.3",
 )  # fmt: skip
 
 
