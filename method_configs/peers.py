@@ -67,7 +67,7 @@ robust_enerf, robust_enerf_small = peer(
     PairSamplerConfig(max_events_per_pair=1, silent_pair_share=0.0),
     PairSupervisionConfig(),
     PairLossCoefficients(),
-    # Its own is 0.37. AE-NeRF's suits objects; in the room it costs 3 dB with consecutive events (benchmarks/LOG.md).
+    # Its own is 0.37. AE-NeRF's suits objects; in a room it costs 3 dB, and PAEv3D 2 dB (benchmarks/LOG.md).
     unbounded_init_density=0.3,
 )
 """W. F. Low and G. H. Lee, ICCV 2023."""
@@ -99,6 +99,7 @@ paev3d, paev3d_small = peer(
     FlowPatchSamplerConfig(),
     PAEv3DSupervisionConfig(),
     PAEv3DLossCoefficients(),
+    unbounded_init_density=0.3,
 )
 """J. Wang et al., ICRA 2024."""
 
