@@ -4,7 +4,7 @@
         decayed "aenerf-small --optimizers.proposals.optimizer.weight-decay 1e-6" --steps 400 --output variants.json
 
 All runs are made in one process, because each start takes long. A variant is the name of a method and options of
-ns-train. PSNR is of the test views, as placed; poses without correction must be true ones.
+ns-train. PSNR is of the test views, as placed. Train without correction on true poses only.
 """
 
 from __future__ import annotations
@@ -92,8 +92,8 @@ class Variants:
             losses = losses_of(outputs, *arguments)
             weights = outputs["weights_list"][-2][..., 0].detach()
             shares = weights / weights.sum(-1, keepdim=True)
-            # The number of intervals over which a histogram that is even there would spread as widely.
             latest.update({name: float(loss.detach()) for name, loss in losses.items()})
+            # The number of intervals over which a histogram that is even there would spread as widely.
             latest["proposal_intervals"] = float((1 / shares.square().sum(-1)).mean())
             return losses
 

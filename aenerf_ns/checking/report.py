@@ -372,7 +372,7 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) 
             f"shuffled {mean:.3f} +/- {deviation:.3f}): they are noise, or the poses are of another recording: check "
             "the polarities, the order of the columns and the poses"
         )
-    elif len(in_favor_of_others) > max(_LIMITS.max_elsewhere_share * num_slices, _LIMITS.min_slices):
+    elif len(in_favor_of_others) > max(_LIMITS.max_elsewhere_share * num_slices, _LIMITS.min_clock_slices - 1):
         problems.append(
             f"{len(in_favor_of_others)} of {num_slices} slices of the events clearly fit another meaning of the poses, "
             "and not all the same one: the poses are of another recording, or wrong in places"

@@ -22,6 +22,8 @@ _PLAIN = {f"{_YAML}{name}" for name in ("null", "bool", "int", "float", "str", "
 }
 # Packages whose classes a configuration may name.
 _PACKAGES = ("nerfstudio.", "torch.optim.", "aenerf_ns.")
+# What Python 3.11.0 to 3.11.3 writes of a member of an enumeration: the class and the name follow.
+_GETATTR = f"{_YAML}python/object/apply:builtins.getattr"
 # What else the framework's configurations name.
 _CALLED = {f"pathlib.{name}" for name in ("PosixPath", "PurePosixPath", "WindowsPath", "PureWindowsPath", "Path")}
 _FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}
@@ -37,21 +39,24 @@ def require_known_names(config: Path) -> None:
     because the file says so.
     """
     try:
-        events = yaml.parse(read_yaml_text(config, _MAX_BYTES), Loader=yaml.Loader)
-        tags = [(event.tag, event.start_mark.line + 1) for event in events if getattr(event, "tag", None) is not None]
+        events = list(yaml.parse(read_yaml_text(config, _MAX_BYTES), Loader=yaml.Loader))
     except DataError:
         raise
     except YAML_ERRORS as error:
         raise DataError(config, f"it cannot be read ({error})", _REMEDY) from None
-    for tag, line in tags:
-        kind, _, name = tag.removeprefix(_YAML).partition(":")
-        if tag in _PLAIN or _is_known(kind, name):
+    tagged = [(index, event) for index, event in enumerate(events) if getattr(event, "tag", None) is not None]
+    for index, event in tagged:
+        kind, name = _split(event)
+        if event.tag in _PLAIN or _is_known(kind, name):
             continue
+        if event.tag == _GETATTR and _is_member(events[: index + 4]):
+            continue
+        line = event.start_mark.line + 1
         if kind in ("python/object", "python/name") and name.startswith("aenerf_ns.") and _find(name) is None:
             problem = f"line {line} names {name}, which this version does not have"
             raise DataError(config, problem, "open it with the version that trained it (0.1), or train again")
         raise DataError(config, f"line {line} names {kind}:{name}, and opening the file could run it", _REMEDY)
-    if not tags or not tags[0][0].startswith(f"{_YAML}python/object:"):
+    if not tagged or _split(tagged[0][1])[0] != "python/object":
         raise DataError(config, "not the config.yml of a run", _REMEDY)
 
 
@@ -68,6 +73,28 @@ def _is_known(kind: str, name: str) -> bool:
         or (kind == "python/object" and dataclasses.is_dataclass(found))
         or (kind == "python/object/apply" and issubclass(found, enum.Enum))
     )
+
+
+def _is_member(events: list[yaml.Event]) -> bool:
+    """Tell whether the last three events are a known class of enumerations, the name of a member, and an end."""
+    owner, member, end = events[-3:]
+    if isinstance(owner, yaml.AliasEvent):
+        owner = next(event for event in events if getattr(event, "anchor", None) == owner.anchor)
+    kind, name = _split(owner)
+    found = _find(name) if name.startswith(_PACKAGES) else None
+    return (
+        kind == "python/name"
+        and isinstance(found, enum.EnumMeta)
+        and isinstance(member, yaml.ScalarEvent)
+        and member.value in found.__members__
+        and isinstance(end, yaml.SequenceEndEvent)
+    )
+
+
+def _split(event: yaml.Event) -> tuple[str, str]:
+    """Return the kind and the name that an event's tag states."""
+    kind, _, name = (getattr(event, "tag", None) or "").removeprefix(_YAML).partition(":")
+    return kind, name
 
 
 def _find(name: str) -> Any:

@@ -222,7 +222,7 @@ def decode_words(
     Args:
         blocks: (N,) words in pieces, which may end anywhere.
         encoding: the encoding of the words.
-        state: from :func:`initial_state`. The iterator of the blocks may reset it between two of them.
+        state: from :func:`initial_state`.
         source: the file, for messages.
 
     Yields:

@@ -84,15 +84,17 @@ class IntegratedEncoding(NeRFEncoding):
 
     def __init__(self, num_frequencies: int) -> None:
         super().__init__(3, num_frequencies, 0.0, num_frequencies - 1.0, include_input=True)
+        # Checkpoints of fields with a plain encoding fit otherwise, and would show other pictures.
+        self.register_buffer("is_integrated", torch.tensor(True))
 
     def pytorch_fwd(self, in_tensor: Tensor, covs: Tensor | None = None) -> Tensor:
-        """Return features (N, 6 frequencies) of positions (N, 3) and, of Gaussians, the variances (N, 3) by axis."""
+        """Return features (N, 6 num_frequencies) of positions (N, 3), for Gaussians with variances (N, 3) by axis."""
         frequencies = 2 * math.pi * 2.0 ** torch.arange(self.num_frequencies, device=in_tensor.device)
         phases = (in_tensor[..., None] * frequencies).flatten(-2)
         values = torch.sin(torch.cat([phases, phases + math.pi / 2], -1))
         if covs is None:
             return values
-        # Below, products would be denormal numbers, which slow a CPU down.
+        # Smaller exponents give denormal numbers, which slow a CPU down.
         exponents = (-0.5 * covs[..., None] * frequencies.square()).clamp_min(-40).flatten(-2)
         return values * exponents.exp().repeat(1, 2)
 
@@ -101,7 +103,7 @@ class DensityField(Field):
     """Density of space: an encoding of the position (γ_x of the paper, eq. 1) and a network.
 
     It can be differentiated as often as the encoding and the activation can. Weights start as those of PyTorch's own
-    linear layers do.
+    linear layers do, unless the maker starts them by another rule.
 
     Args:
         aabb: (2, 3) scene box, which bounds the scene where there is no spatial distortion.

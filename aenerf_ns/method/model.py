@@ -84,7 +84,7 @@ class AENeRFModelConfig(ModelConfig):
     """Density of field and proposal networks before training, per scene unit. A scene that starts nearly transparent
     sits in a fog for hundreds of steps, until matter grows out of it."""
     unbounded_init_density: float | None = None
-    """Density before training in a scene without a box. By default, average_init_density."""
+    """Density before training in a scene without a box, in place of average_init_density where it is given."""
     loss_coefficients: LossCoefficients = dataclasses.field(default_factory=PairLossCoefficients)
     """Weights of the losses (paper, eq. 14)."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=PairSupervisionConfig)

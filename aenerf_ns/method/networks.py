@@ -142,10 +142,10 @@ def make_networks(
         RadianceShape(num_channels, num_hidden_layers=1, hidden_dim=128),
         field_warp,
     )
-    shape = DensityShape(proposal.num_hidden_layers, proposal.hidden_dim, 0, "softplus", average_init_density)
     if field.xavier_initialization:
         for layer in radiance_field.density_network.layers:
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
+    shape = DensityShape(proposal.num_hidden_layers, proposal.hidden_dim, 0, "softplus", average_init_density)
     # One network, which every round of proposals evaluates again.
     return radiance_field, [DensityField(aabb, spatial_distortion, encoding, shape, proposal_warp)]

@@ -25,8 +25,7 @@ from aenerf_ns.recording.recording import Capture
 
 # Batches of events from one image to the next, each of as many events as networks are made for.
 _BATCHES = 3
-# Of the filter. Features want to be seen where they are now, more than true brightness: 0.05 leaves 0.8 degrees in the
-# room where this leaves 0.6.
+# Of the filter. Features should show where they are now, which matters more than true brightness.
 _DECAY = 0.12
 # Pixels: standard deviation of a Gaussian, and the percentiles of the picture that are shown black and white.
 _BLUR, _PERCENTILES = 0.8, (1.0, 99.0)
@@ -48,7 +47,8 @@ def match_event_images(
         weights: file of a network that makes the images; by default, a filter makes them.
 
     Yields:
-        COLMAP's workspace, and the (N,) times in nanoseconds, increasing, and the images, (height, width) each.
+        COLMAP's workspace, and the (N,) times in nanoseconds, increasing, and the images: (height, width) gray, or
+        (height, width, 3) where a network makes them.
 
     Raises:
         DataError: there are too few events for three images.

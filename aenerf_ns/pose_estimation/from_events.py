@@ -59,7 +59,12 @@ def estimate_poses_from_events(
             return [model.num_reg_images() for model in found], model
 
         with ThreadPoolExecutor(len(mappers)) as pool:
-            placed = dict(zip(mappers, pool.map(place, mappers), strict=True))
+            try:
+                placed = dict(zip(mappers, pool.map(place, mappers), strict=True))
+            except BaseException:
+                # The pool waits for its threads, and Ctrl-C should not wait for minutes.
+                workspace.stop()
+                raise
         models: dict[str, Any] = {mapper: model for mapper, (_, model) in placed.items() if model is not None}
         if camera is None or not models:
             raise DataError(

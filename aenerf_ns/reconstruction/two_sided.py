@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 
-# The backward filter starts this number of events per pixel after the image. More costs memory and betters little.
-_LOOK_AHEAD = 25.0
+# The backward filter starts about this number of events per pixel after the image, but at most this number of images.
+# More costs memory and improves little.
+_LOOK_AHEAD, _MAX_IMAGES_AHEAD = 25.0, 200
 # Events per pixel by which an image shows the past. Light that has changed by less than a threshold has no event yet. A
 # time in place of a number of events would depend on the camera's speed.
 _LAG = 0.1
@@ -26,10 +27,9 @@ def log_intensities(
     log-intensity that the picture shows.
 
     A pixel's state adds up contrast thresholds, forwards up to the image and backwards, with reversed polarities, down
-    to it; both forget with the number of events in the picture. Their mean, in which the
-    direction that has seen more counts more, has no ghosts of what was seen before.
-    FIBAR (arXiv 2510.20071) is a published filter of the forward kind, with a decay in events and a blur where events
-    are few.
+    to it; both forget with the number of events in the picture. Their mean weighs each direction by how much it has
+    seen. It has no ghosts of what was seen before. FIBAR (arXiv 2510.20071) is a published filter of the forward kind,
+    with a decay in events and a blur where events are few.
 
     Args:
         batches: the stream in consecutive pieces, in the order of time, all of one sensor.
@@ -46,8 +46,8 @@ def log_intensities(
             forward = _Filter(batch.width, batch.height, sensor, decay)
         forward.add(batch)
         held.append((batch, forward.state(), forward.weight))
-        num_ahead = math.ceil(_LOOK_AHEAD * batch.width * batch.height / len(batch))
-        if len(held) == 2 * num_ahead:
+        num_ahead = min(math.ceil(_LOOK_AHEAD * batch.width * batch.height / len(batch)), _MAX_IMAGES_AHEAD)
+        if len(held) >= 2 * num_ahead:
             yield from _finish(held, sensor, decay)[:num_ahead]
             held = held[num_ahead:]
     yield from _finish(held, sensor, decay)

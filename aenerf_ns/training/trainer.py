@@ -144,6 +144,8 @@ class AENeRFTrainer(Trainer):
     def _load_checkpoint(self) -> None:
         try:
             super()._load_checkpoint()
+        except torch.cuda.OutOfMemoryError:
+            raise
         # torch's, for weights and for the state of an optimizer.
         except (RuntimeError, ValueError) as error:
             problem = f"it holds other parameters than this training: {' '.join(str(error).split())}"

@@ -205,7 +205,7 @@ class Plan:
         return runs
 
     def _dataset(self, scene: str, speed: str) -> Dataset:
-        # COLMAP has the paper's frames: 250 in a second.
+        # COLMAP gets frames at the paper's rate.
         estimated = _NOISE[self.scale] if self.poses == "noise" else ("--poses", "colmap", "--frame-rate", "250")
         # Otherwise all paths of one duration would have the same errors, and a mean over scenes would hold one draw.
         seed = str(int(digest((scene_name(scene), speed)), 16))
@@ -229,6 +229,7 @@ class Plan:
             if method == "e2vid-nerf" and self.e2vid_weights is not None:
                 images = ("--weights", str(self.e2vid_weights.resolve()))
             elif method == "e2vid-nerf":
+                # The default, stated: without options no images are made.
                 name, images = FILTERED, ("--events-per-pixel", "0.35")
             options = {name: off, name + CORRECTED: spline, name + ON_TRUE_POSES: off}
         return {row: (self._registered(method), words, images) for row, words in options.items()}

@@ -222,7 +222,7 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
 def test_given_poses_of_another_time_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place_frames(3, monkeypatch)
 
-    def estimate(capture: Capture, window: TimeWindow, source: Path, seed: int) -> EstimatedPoses:
+    def estimate(capture: Capture, window: TimeWindow, source: Path, seed: int, weights: None) -> EstimatedPoses:
         times = [50_000_000, 150_000_000, 250_000_000]
         return from_frames.estimate_poses([source] * 3, times, capture.event_camera, source, seed)
 

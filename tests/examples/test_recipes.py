@@ -70,7 +70,7 @@ def test_mvsec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     events = write_mvsec(tmp_path)
     run_example("mvsec_to_recording")
-    recording = recording_of(OwnRecordingDataParserConfig(data=Path("mvsec"), event_camera="cam0"))
+    recording = recording_of(OwnRecordingDataParserConfig(data=Path("mvsec"), event_camera="cam0", frame_camera="cam0"))
     assert_same_events(recording, events)
     assert_same_poses(recording.trajectory.camera_to_worlds, make_poses())
     lens = CameraIntrinsics(346, 260, 226.4, 226.1, 174.1, 134.2, "fisheye", (-0.05, -0.01, 0.02, -0.01))
@@ -88,7 +88,8 @@ def test_poses_of_devo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     estimated[:, :3, 3] *= 0.1
     header = "# timestamp[secs] tx ty tz qx qy qz qw\n"
     write_poses(tmp_path / "stamped_traj_estimate.txt", estimated, [repr(float(time)) for time in TIMES], header)
-    options = {"data": Path("mvsec"), "event_camera": "cam0", "trajectory": Path("stamped_traj_estimate.txt")}
+    options = {"data": Path("mvsec"), "event_camera": "cam0", "frame_camera": "cam0"}
+    options["trajectory"] = Path("stamped_traj_estimate.txt")
     recording = recording_of(OwnRecordingDataParserConfig(**options))
     assert_same_poses(recording.trajectory.camera_to_worlds, estimated)
     assert recording.ground_truth is not None

@@ -41,7 +41,7 @@ def events() -> Iterator[EventStream]:
 def test_images_are_those_of_the_light() -> None:
     stream = list(events())
     images = list(FilteredImages(SENSOR)(batches_of(stream, int(EVENTS_PER_PIXEL * SIZE**2))))
-    assert len(images) == sum(map(len, stream)) // 358
+    assert len(images) == sum(map(len, stream)) // 358 > 200
     for time, image in images[100:-60:10]:
         truth = np.log(radiance(round(time / STEP)))
         assert np.corrcoef(np.log(image[..., 0].ravel()), truth.ravel())[0, 1] > 0.9
@@ -49,7 +49,7 @@ def test_images_are_those_of_the_light() -> None:
 
 
 def test_display_values() -> None:
-    stream = make_stream([(0, 0, 1, 1), (1, 0, 2, -1), *[(2, 0, 3, 1)] * 9], 100, 100)
+    stream = make_stream([(0, 0, 1, 1), (1, 0, 2, -1), *[(2, 0, 3, 1)] * 9, *[(3, 0, 4, 1)] * 300], 100, 100)
     ((_, image),) = FilteredImages(SensorModel(0.5, 0.5))(batches_of([stream], len(stream)))
     ratios = (image[0, :2, 0] / image[2, 3, 0]) ** 2.2
     np.testing.assert_allclose(ratios, np.exp([0.5, -0.5]), rtol=0.02)
