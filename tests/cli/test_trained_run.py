@@ -38,12 +38,21 @@ def test_configurations_of_methods_are_known(method: object, tmp_path: Path) -> 
     require_known_names(tmp_path / "config.yml")
 
 
+def test_members_of_enumerations_are_known_as_python_3_11_2_writes_them(tmp_path: Path) -> None:
+    name = f"&x {EVENT_NAME}"
+    members = [f"{GETATTR} [{name}, ETA]", f"{GETATTR} [*x, ITER_TRAIN_TIME]"]
+    text = f"!!python/object:aenerf_ns.training.trainer.AENeRFTrainerConfig\na: [{', '.join(members)}]"
+    (tmp_path / "config.yml").write_text(text)
+    require_known_names(tmp_path / "config.yml")
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_configurations_of_formats_are_known(name: str, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text(yaml.dump(type(FORMATS[name])(data=tmp_path)))
     require_known_names(tmp_path / "config.yml")
 
 
+GETATTR, EVENT_NAME = "!!python/object/apply:builtins.getattr", "!!python/name:nerfstudio.utils.writer.EventName ''"
 COMMANDS = (Evaluate, ExportTrajectory, ExportCameras, ExportFrames, ExportMesh, ExportVideo, report_of_one)
 TOUCH = "!!python/object/apply:os.system ['touch executed']"
 HOSTILE = {
@@ -53,6 +62,11 @@ HOSTILE = {
     "another handle": "%TAG !h! tag:yaml.org,2002:python/object/apply:\n--- !h!os.system ['touch executed']",
     "a verbatim tag": "!<tag:yaml.org,2002:python/object/apply:os.system> ['touch executed']",
     "new": "!!python/object/new:os.system ['touch executed']",
+    "another attribute": f"{GETATTR} [{EVENT_NAME}, mro]",
+    "an attribute of another class": f"{GETATTR} [!!python/name:nerfstudio.engine.trainer.Trainer '', train]",
+    "an attribute of nothing": f"{GETATTR} [*x, ETA]",
+    "an attribute alone": f"{GETATTR} []",
+    "an attribute and a call": f"{GETATTR} [{EVENT_NAME}, ETA, {TOUCH}]",
     "a second document": f"a: 1\n--- {TOUCH}",
     "a function": "!!python/name:os.system",
     "a module": "!!python/module:antigravity",
