@@ -431,7 +431,7 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "member with a password": edit_bytes(
             # The flags follow the versions, which differ between versions of Python.
             "camera_poses.npz",
-            lambda b: re.sub(rb"(PK\1\2.{4})\0", rb"\1\1", b, flags=re.DOTALL),
+            lambda b: re.sub(b"(PK\1\2.{4})\0", lambda found: found[1] + b"\1", b, flags=re.DOTALL),
         ),
         "objects as events": robust_events(timestamp=np.array([None] * 200)),
         "no dimensions": robust_events(timestamp=np.int64(3)),
