@@ -89,15 +89,6 @@ class ColmapWorkspace:
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
         self._seed = seed
         self._progress = progress
-        self._is_stopped = False
-
-    def stop(self) -> None:
-        """Let what other threads do end with its next step or image."""
-        self._is_stopped = True
-
-    def _require_going_on(self) -> None:
-        if self._is_stopped:
-            raise KeyboardInterrupt
 
     def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
         """Write the frames as image files for COLMAP."""
@@ -227,13 +218,8 @@ class ColmapWorkspace:
         options.extract_colors = False
         output = self._new_folder()
         with self._step("Placing frames", len(self._names)) as task:
-
-            def next_image() -> None:
-                self._require_going_on()
-                self._progress.advance(task)
-
             models = pycolmap.incremental_mapping(
-                self._database, self._images, output, options, next_image_callback=next_image
+                self._database, self._images, output, options, next_image_callback=lambda: self._progress.advance(task)
             )
         return _largest_first(models)
 
@@ -335,7 +321,6 @@ class ColmapWorkspace:
     @contextlib.contextmanager
     def _step(self, description: str, total: int | None = None) -> Iterator[TaskID]:
         """Show the progress of a step."""
-        self._require_going_on()
         task = self._progress.add_task(description, total=total)
         try:
             yield task

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,13 +57,8 @@ def estimate_poses_from_events(
                 model = workspace.adjust(model, *limits)
             return [model.num_reg_images() for model in found], model
 
-        with ThreadPoolExecutor(len(mappers)) as pool:
-            try:
-                placed = dict(zip(mappers, pool.map(place, mappers), strict=True))
-            except BaseException:
-                # The pool waits for its threads, and Ctrl-C should not wait for minutes.
-                workspace.stop()
-                raise
+        # Not side by side: the global mapper then gives other poses each time.
+        placed = {mapper: place(mapper) for mapper in mappers}
         models: dict[str, Any] = {mapper: model for mapper, (_, model) in placed.items() if model is not None}
         if camera is None or not models:
             raise DataError(
