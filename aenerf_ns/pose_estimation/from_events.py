@@ -47,19 +47,9 @@ def estimate_poses_from_events(
         camera = capture.event_camera if is_calibrated else workspace.estimate_intrinsics(_ROUNDS)
         features, pairs = workspace.count_features_and_pairs()
         held_out = workspace.hold_out_matches(_HELD_OUT)
-        mappers = {"incremental": workspace.reconstruct, "global": workspace.reconstruct_globally}
-
-        def place(mapper: str) -> tuple[list[int], Any]:
-            """Return the numbers of images in the models of a mapper, and its largest model, adjusted to all tracks."""
-            found = mappers[mapper]()
-            model = found[0] if found else None
-            for limits in _ROUNDS if found else ():
-                model = workspace.adjust(model, *limits)
-            return [model.num_reg_images() for model in found], model
-
         # Not side by side: the global mapper then gives other poses each time.
-        placed = {mapper: place(mapper) for mapper in mappers}
-        models: dict[str, Any] = {mapper: model for mapper, (_, model) in placed.items() if model is not None}
+        found = {"incremental": workspace.reconstruct(), "global": workspace.reconstruct_globally()}
+        models: dict[str, Any] = {mapper: models[0] for mapper, models in found.items() if models}
         if camera is None or not models:
             raise DataError(
                 source,
@@ -68,6 +58,8 @@ def estimate_poses_from_events(
                 "poses need a camera that moves sideways and sees textured surfaces; "
                 + ("check the calibration too" if is_calibrated else "a calibration helps"),
             )
+        for limits in _ROUNDS:
+            models = {mapper: workspace.adjust(model, *limits) for mapper, model in models.items()}
 
         def rank(mapper: str) -> tuple[bool, float]:
             # The global mapper may throw images far out where it sees nothing, and no adjustment takes them back.
@@ -80,7 +72,7 @@ def estimate_poses_from_events(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),
         camera=camera,
-        model_sizes=placed[mapper][0],
+        model_sizes=[model.num_reg_images() for model in found[mapper]],
         num_points=model.num_points3D(),
         reprojection_error=model.compute_mean_reprojection_error(),
         features=features,

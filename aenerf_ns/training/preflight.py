@@ -1,4 +1,4 @@
-"""What a command needs: the device that it asks for, and the program and the camera path that ns-render asks for."""
+"""Checks before a command begins: its device, and the program and the camera path that ns-render needs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class _Camera(msgspec.Struct):
 
 
 class _CameraPath(msgspec.Struct):
-    """What ns-render takes from the file without asking whether it is there."""
+    """The fields that ns-render reads. It does not check that the file has them."""
 
     seconds: Annotated[float, msgspec.Meta(gt=0)]
     render_width: Annotated[float, msgspec.Meta(ge=1)]
