@@ -41,7 +41,6 @@ from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.open3d_import import load_open3d
-from aenerf_ns.training.preflight import require_camera_path
 
 # Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.
 STEPS = 300
@@ -410,48 +409,6 @@ def test_rendering_a_camera_path_of_the_viewer(trained: Path, workspace: Path) -
     ).main()
     frames = [imageio.imread(file) for file in sorted((workspace / "path").glob("*.jpg"))]
     assert [frame.shape for frame in frames] == [(36, 48, 3)] * 2
-
-
-CAMERA = {"camera_to_world": [0.0] * 16, "fov": 75.0}
-CAMERA_PATH = {"seconds": 1.0, "render_width": 48, "render_height": 36, "camera_path": [CAMERA]}
-
-
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        ({"seconds": None}, "seconds: expected `float`"),
-        ({"seconds": 0}, "seconds: "),
-        ({"render_width": ...}, "missing required field `render_width`"),
-        ({"camera_path": ...}, "missing required field `camera_path`"),
-        ({"camera_path": []}, "camera_path: "),
-        ({"camera_path": [{"fov": 75.0}]}, "missing required field `camera_to_world`"),
-        ({"camera_path": [{**CAMERA, "fov": None}]}, "no field of view `fov`"),
-        (
-            {"camera_path": [{**CAMERA, "camera_to_world": [0.0] * 12}]},
-            "camera_path[0]: camera_to_world does not have 16 numbers",
-        ),
-    ],
-)
-def test_a_camera_path_that_cannot_be_rendered_is_one_line(
-    change: dict[str, Any], problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    content = {key: value for key, value in (CAMERA_PATH | change).items() if value is not ...}
-    path = tmp_path / "path.json"
-    path.write_text(json.dumps(content))
-    monkeypatch.setattr(
-        sys, "argv", ["ns-render", "camera-path", "--load-config", "x", f"--camera_path_filename={path}"]
-    )
-    with pytest.raises(DataError) as error:
-        require_camera_path()
-    assert error.value.source == path
-    assert problem in error.value.problem
-    assert "Render tab" in error.value.remedy
-    # Panoramas need no field of view, and other commands no camera path.
-    panorama = CAMERA_PATH | {"camera_type": "equirectangular", "camera_path": [{**CAMERA, "fov": None}]}
-    path.write_text(json.dumps(panorama))
-    require_camera_path()
-    monkeypatch.setattr(sys, "argv", ["ns-render", "interpolate"])
-    require_camera_path()
 
 
 def test_rendering_the_dataset(trained: Path, workspace: Path) -> None:
