@@ -78,7 +78,7 @@ class _Filter:
     """
 
     def __init__(self, width: int, height: int, sensor: SensorModel, decay: float) -> None:
-        self._changes = sensor.positive_contrast_threshold, -sensor.negative_contrast_threshold
+        self._rise, self._fall = sensor.positive_contrast_threshold, -sensor.negative_contrast_threshold
         self._decay = decay / (width * height)
         self._state, self._last = np.zeros((height, width)), np.zeros((height, width), np.int64)
         self._count = 0
@@ -86,7 +86,7 @@ class _Filter:
     def add(self, events: EventStream, step: int = 1) -> None:
         """Take the next events. With a step of -1 they go back in time, so that a rise of light is a fall."""
         columns = (events.x[::step], events.y[::step], events.p[::step])
-        changes = self._changes if step == 1 else (-self._changes[0], -self._changes[1])
+        changes = (step * self._rise, step * self._fall)
         _integrate(self._state, self._last, *columns, self._count, self._decay, *changes)
         self._count += len(events)
 
