@@ -102,6 +102,8 @@ class Simulate(SimulationCommand):
         num_events = 0
         with NativeDatasetWriter(lock, camera, sensor, "srgb", scene.aabb) as writer:
             writer.add_trajectories(estimated, truth)
+            simulator = simulation.simulator
+            writer.add_contrast_thresholds(simulator.positive_contrast_threshold, simulator.negative_contrast_threshold)
             if report is not None:
                 writer.add_poses_report(report)
             for events in simulation.events():

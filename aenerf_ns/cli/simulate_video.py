@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from aenerf_ns.pose_estimation.video import Video
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.recording.writer import NativeDatasetWriter, PoselessRecordingWriter
-    from aenerf_ns.simulator.video_events import VideoInterval
+    from aenerf_ns.simulator.esim import EventSimulator
 
 _COMMAND = "aenerf simulate-video"
 
@@ -92,17 +92,17 @@ class SimulateVideo(SimulationCommand):
         import numpy as np
 
         from aenerf_ns.pose_estimation.video import open_video
-        from aenerf_ns.simulator.video_events import video_events
+        from aenerf_ns.simulator.video_events import video_simulator
 
         video = open_video(self.video, self.frame_rate)
         require_event_sensor_size(video.width, video.height, self.video, "scale the frames down")
         camera = self._read_camera(video)
         poses = self._find_poses(video, camera)
-        intervals = video_events(video, sensor, self.noise, self.interpolation, self.max_displacement, self.seed)
+        simulator = video_simulator(video, sensor, self.noise, self.seed)
         if poses is None:
-            written = self._write_poseless(lock, video, camera, sensor, intervals)
+            written = self._write_poseless(lock, video, camera, simulator)
         else:
-            written = self._write_dataset(lock, video, sensor, poses, intervals)
+            written = self._write_dataset(lock, video, simulator, poses)
         longest = np.diff(video.times).max() * 1e-6
         say(
             f"{written}\nEvents between two frames, up to {longest:.3g} ms apart, are interpolated. What moves faster "
@@ -153,14 +153,7 @@ class SimulateVideo(SimulationCommand):
             return _VideoPoses(found.camera, found.trajectory, report=found.report())
         return None
 
-    def _write_dataset(
-        self,
-        lock: OutputLock,
-        video: Video,
-        sensor: SensorModel,
-        poses: _VideoPoses,
-        intervals: Iterable[VideoInterval],
-    ) -> str:
+    def _write_dataset(self, lock: OutputLock, video: Video, simulator: EventSimulator, poses: _VideoPoses) -> str:
         """Write a dataset folder, and describe it in one line."""
         from aenerf_ns.camera.trajectory import homogeneous
         from aenerf_ns.recording.recording import Split
@@ -175,7 +168,7 @@ class SimulateVideo(SimulationCommand):
             "val": spread_evenly(taken[::2], self.validation_views),
             "test": spread_evenly(taken[1::2], self.test_views),
         }
-        with NativeDatasetWriter(lock, poses.camera, sensor, "srgb") as writer:
+        with NativeDatasetWriter(lock, poses.camera, simulator.sensor, "srgb") as writer:
             writer.add_trajectories(poses.estimated, poses.truth)
             if poses.report is not None:
                 writer.add_poses_report(poses.report)
@@ -185,7 +178,7 @@ class SimulateVideo(SimulationCommand):
                     if time in times:
                         writer.add_image(split, frame, homogeneous(reference.interpolate(time)), time)
 
-            num_events = _write_events(writer, video, intervals, add_image)
+            num_events = self._write_events(writer, video, simulator, add_image)
         counts = ", ".join(f"{len(times)} {split}" for split, times in chosen.items())
         return (
             f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(poses.estimated)} poses, images: "
@@ -193,30 +186,45 @@ class SimulateVideo(SimulationCommand):
         )
 
     def _write_poseless(
-        self,
-        lock: OutputLock,
-        video: Video,
-        camera: CameraIntrinsics | None,
-        sensor: SensorModel,
-        intervals: Iterable[VideoInterval],
+        self, lock: OutputLock, video: Video, camera: CameraIntrinsics | None, simulator: EventSimulator
     ) -> str:
         """Write the events and images of a video without poses, and describe them in one line."""
         from aenerf_ns.recording.views import spread_evenly
         from aenerf_ns.recording.writer import PoselessRecordingWriter
 
         kept = spread_evenly(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
-        with PoselessRecordingWriter(lock, camera, sensor) as writer:
+        with PoselessRecordingWriter(lock, camera, simulator.sensor) as writer:
 
             def add_image(frame: NDArray[np.uint8], time: int) -> None:
                 if time in kept:
                     writer.add_image(frame, time)
 
-            num_events = _write_events(writer, video, intervals, add_image)
+            num_events = self._write_events(writer, video, simulator, add_image)
         missing = "trajectory.txt" if camera is not None else "calibration.json and trajectory.txt"
         return (
             f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(kept)} images, no poses.\n"
             f"To train on them, add {missing} (docs/your_data.md)."
         )
+
+    def _write_events(
+        self,
+        writer: NativeDatasetWriter | PoselessRecordingWriter,
+        video: Video,
+        simulator: EventSimulator,
+        add_image: Callable[[NDArray[np.uint8], int], None],
+    ) -> int:
+        """Write and count the events of a video, and give its frames with their times to ``add_image``."""
+        from aenerf_ns.simulator.video_events import video_events
+
+        writer.add_contrast_thresholds(simulator.positive_contrast_threshold, simulator.negative_contrast_threshold)
+        num_events = 0
+        for frame, time, events in video_events(video, simulator, self.interpolation, self.max_displacement):
+            writer.events.append(events)
+            num_events += len(events)
+            add_image(frame, time)
+        if num_events == 0:
+            raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")
+        return num_events
 
 
 @dataclass(frozen=True)
@@ -227,20 +235,3 @@ class _VideoPoses:
     estimated: Trajectory
     truth: Trajectory | None = None
     report: dict[str, Any] | None = None
-
-
-def _write_events(
-    writer: NativeDatasetWriter | PoselessRecordingWriter,
-    video: Video,
-    intervals: Iterable[VideoInterval],
-    add_image: Callable[[NDArray[np.uint8], int], None],
-) -> int:
-    """Write and count the events of a video, and give its frames with their times to ``add_image``."""
-    num_events = 0
-    for frame, time, events in intervals:
-        writer.events.append(events)
-        num_events += len(events)
-        add_image(frame, time)
-    if num_events == 0:
-        raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")
-    return num_events

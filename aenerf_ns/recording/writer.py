@@ -82,6 +82,10 @@ class _FolderWriter(ABC):
         finally:
             self._cleanup.close()
 
+    def add_contrast_thresholds(self, positive: NDArray[np.float64], negative: NDArray[np.float64]) -> None:
+        """Write the true contrast thresholds of each pixel, (height, width) in log-radiance, for comparisons."""
+        np.savez_compressed(self._partial / "thresholds_ground_truth.npz", positive=positive, negative=negative)
+
     @abstractmethod
     def _finish(self) -> None:
         """Write what is known when all events and images are written."""

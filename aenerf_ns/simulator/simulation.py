@@ -50,6 +50,9 @@ class Simulation:
 
     Raises:
         ValueError: the duration is too short.
+
+    Attributes:
+        simulator: the sensor.
     """
 
     def __init__(
@@ -66,7 +69,7 @@ class Simulation:
         self._scene, self._camera, self._sensor = scene, camera, sensor
         self._intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
         self._profile = SpeedProfile(speed, easy_duration)
-        self._simulator = EventSimulator(camera.width, camera.height, sensor, noise, seed=seed)
+        self.simulator = EventSimulator(camera.width, camera.height, sensor, noise, seed=seed)
         self._frames = frame_parameters(scene, self._intrinsics, camera.width, camera.height, max_displacement)
         self._times = _nanoseconds(self._profile.time(self._frames))
         if (np.diff(self._times) <= 0).any():
@@ -92,7 +95,7 @@ class Simulation:
         with progress_bar() as progress:
             for parameter, time in progress.track(frames, total=len(self._frames), description="Simulating events"):
                 image = self._render(self._scene.path(float(parameter)), RAYS_PER_PIXEL)[0]
-                yield EventStream(*self._simulator(image, int(time)), camera.width, camera.height, "simulation")
+                yield EventStream(*self.simulator(image, int(time)), camera.width, camera.height, "simulation")
 
     def frame_times(self, frame_rate: float, exposure: float) -> NDArray[np.int64]:
         """Return the middles of the exposures of a camera that takes frames along the path, in nanoseconds.

@@ -42,21 +42,25 @@ def quantization_epsilon(sensor: SensorModel) -> float:
     return float(_GRAY_LEVELS[2]) / math.expm1(threshold)
 
 
+def video_simulator(video: Video, sensor: SensorModel, noise: SensorNoise = NOISELESS, seed: int = 0) -> EventSimulator:
+    """Make the sensor that is to see a video. It adds :func:`quantization_epsilon` before the logarithm."""
+    epsilon = quantization_epsilon(sensor)
+    return EventSimulator(video.width, video.height, sensor, noise, log_epsilon=epsilon, seed=seed)
+
+
 def video_events(
     video: Video,
-    sensor: SensorModel,
-    noise: SensorNoise = NOISELESS,
+    simulator: EventSimulator,
     interpolation: Interpolation = "flow",
     max_displacement: float = 0.5,
-    seed: int = 0,
 ) -> Iterator[VideoInterval]:
     """Simulate an event sensor that sees a video. One frame after the other is read, so memory does not grow.
 
-    sRGB values are decoded to linear radiance, and :func:`quantization_epsilon` is added before the logarithm.
+    sRGB values are decoded to linear radiance.
 
     Args:
         video: the frames.
-        sensor, noise, seed: see :class:`~aenerf_ns.simulator.esim.EventSimulator`.
+        simulator: the sensor, see :func:`video_simulator`.
         interpolation: "linear": log-radiance is linear in time between two frames. "flow": frames along the optical
             flow are put between them (:class:`FlowInterpolation`), and log-radiance is linear between all of these.
         max_displacement: pixels that 99 % of the picture may move between two frames that "flow" puts in.
@@ -65,14 +69,13 @@ def video_events(
         DataError: a frame cannot be read or has another size than the first one.
         ValueError: the frames are too small for optical flow.
     """
-    epsilon = quantization_epsilon(sensor)
-    simulator = EventSimulator(video.width, video.height, sensor, noise, log_epsilon=epsilon, seed=seed)
+    epsilon = simulator.log_epsilon
     flow = FlowInterpolation(video.width, video.height, max_displacement) if interpolation == "flow" else None
     before: tuple[NDArray[np.uint8], NDArray[np.float64], int] | None = None
     with progress_bar() as progress:
         frames = zip(video, video.times.tolist(), strict=True)
         for frame, time in progress.track(frames, total=len(video.times), description="Simulating events"):
-            seen = to_channels(torch.from_numpy(_GRAY_LEVELS[frame]), sensor.num_channels).squeeze(-1).numpy()
+            seen = to_channels(torch.from_numpy(_GRAY_LEVELS[frame]), simulator.sensor.num_channels).squeeze(-1).numpy()
             pieces = []
             if flow is not None and before is not None:
                 first_frame, first_seen, start = before

@@ -27,7 +27,7 @@ from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.pose_estimation.video import open_video
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.simulator.options import SensorNoise
-from aenerf_ns.simulator.video_events import video_events
+from aenerf_ns.simulator.video_events import video_events, video_simulator
 
 WIDTH, HEIGHT, FRAME = 24, 16, 40_000_000
 CAMCHAIN = """
@@ -87,7 +87,8 @@ def test_video_with_poses_becomes_a_dataset(
     output = tmp_path / "dataset"
     arguments = (
         f"aenerf simulate-video {frames} --output {output} --trajectory {poses} --intrinsics 20 21 11.5 7.5 "
-        "--interpolation linear --positive-contrast-threshold 0.3 --leak-rate 2 --seed 4"
+        "--interpolation linear --positive-contrast-threshold 0.3 --contrast-threshold-spread 0.02 "
+        "--leak-rate 2 --seed 4"
     )
     monkeypatch.setattr(sys, "argv", arguments.split())
     with CONSOLE.capture() as printed:
@@ -101,10 +102,15 @@ def test_video_with_poses_becomes_a_dataset(
     assert recording.ground_truth is None
     torch.testing.assert_close(recording.trajectory.camera_to_worlds, make_poses().camera_to_worlds)
     # The events are those of the sensor that the options describe.
-    intervals = video_events(open_video(frames), recording.sensor, SensorNoise(leak_rate=2.0), "linear", seed=4)
+    noise = SensorNoise(contrast_threshold_spread=0.02, leak_rate=2.0)
+    simulator = video_simulator(open_video(frames), recording.sensor, noise, seed=4)
+    intervals = video_events(open_video(frames), simulator, "linear")
     expected = np.concatenate([interval.events.t for interval in intervals])
     assert len(expected) > 500
     np.testing.assert_array_equal(times_of(recording), expected)
+    thresholds = np.load(output / "thresholds_ground_truth.npz")
+    np.testing.assert_array_equal(thresholds["positive"], simulator.positive_contrast_threshold)
+    np.testing.assert_array_equal(thresholds["negative"], simulator.negative_contrast_threshold)
     # Frames within the poses are reference views at the poses of their times.
     views = recording.reference_views
     assert [len(views[split]) for split in ("train", "val", "test")] == [7, 4, 3]
@@ -157,12 +163,13 @@ def test_video_without_poses_becomes_a_recording(frames: Path, camchain: Path, t
     assert recording.sensor == SensorModel(0.25, 0.25)
     assert recording.image_encoding == "srgb"
     assert [view.time for view in recording.reference_views["train"]] == [FRAME * index for index in range(1, 8)]
-    intervals = video_events(open_video(frames), recording.sensor)
+    intervals = video_events(open_video(frames), video_simulator(open_video(frames), recording.sensor))
     np.testing.assert_array_equal(times_of(recording), np.concatenate([interval.events.t for interval in intervals]))
     printed = simulate(tmp_path / "no_lens", video=frames, validation_views=0, test_views=0, train_images=4)
     assert "4 images, no poses" in printed
     assert "add calibration.json and trajectory.txt" in printed
-    assert sorted(path.name for path in (tmp_path / "no_lens").iterdir()) == ["events.h5", "images", "images.txt"]
+    written = ["events.h5", "images", "images.txt", "thresholds_ground_truth.npz"]
+    assert sorted(path.name for path in (tmp_path / "no_lens").iterdir()) == written
 
 
 def test_frame_of_another_size_leaves_nothing(frames: Path, tmp_path: Path) -> None:

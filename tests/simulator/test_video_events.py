@@ -22,7 +22,7 @@ from aenerf_ns.pose_estimation.video import Video, open_video
 from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.simulator.options import Interpolation, SensorNoise
 from aenerf_ns.simulator.textures import spectral_noise
-from aenerf_ns.simulator.video_events import quantization_epsilon, video_events
+from aenerf_ns.simulator.video_events import quantization_epsilon, video_events, video_simulator
 
 FRAME = 33_333_333
 LEVELS = decode(np.arange(256) / 255, "srgb")
@@ -50,7 +50,8 @@ def events_of(
     seed: int = 0,
 ) -> EventStream:
     video = cast(Video, StoredVideo(frames))
-    return joined([interval.events for interval in video_events(video, sensor, noise, interpolation, seed=seed)])
+    simulator = video_simulator(video, sensor, noise, seed)
+    return joined([interval.events for interval in video_events(video, simulator, interpolation)])
 
 
 def joined(pieces: list[EventStream]) -> EventStream:
@@ -75,9 +76,8 @@ def test_events_cross_thresholds(rising: bool, tmp_path: Path) -> None:
         lines.append(f"0.{time:09d} {index}.png\n")
     (tmp_path / "images.txt").write_text("".join(lines))
     sensor = SensorModel(0.21, 0.17)
-    events = joined(
-        [interval.events for interval in video_events(open_video(tmp_path), sensor, interpolation="linear")]
-    )
+    video = open_video(tmp_path)
+    events = joined([interval.events for interval in video_events(video, video_simulator(video, sensor), "linear")])
     # As stated in the docs: the step from gray level 0 to 2 is the smaller threshold.
     epsilon = 2 / 255 / 12.92 / (math.exp(0.17) - 1)
     log_radiance = np.log(LEVELS[levels] + epsilon)
@@ -194,7 +194,8 @@ def test_memory_of_long_video(interpolation: Interpolation) -> None:
 
     video = LongVideo([np.zeros((16, 16, 3), np.uint8)] * 40)
     most = 0
-    for interval in video_events(cast(Video, video), SensorModel(), interpolation=interpolation):
+    simulator = video_simulator(cast(Video, video), SensorModel())
+    for interval in video_events(cast(Video, video), simulator, interpolation):
         del interval
         most = max(most, sum(frame() is not None for frame in alive))
     assert len(alive) == 40
