@@ -13,7 +13,7 @@ from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
 from aenerf_ns.files.limits import MAX_ROWS
-from aenerf_ns.simulator.options import BUILT_IN, require_scene_file
+from aenerf_ns.simulator.options import BUILT_IN, SensorNoise, require_scene_file
 
 if TYPE_CHECKING:
     from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -59,9 +59,9 @@ class Simulate(SimulationCommand):
             raise DataError("aenerf simulate", f"pose noise {self.pose_noise} with --poses colmap", remedy)
         if self.scene not in BUILT_IN:
             require_scene_file(Path(self.scene))
-        sensor = self.make_sensor()
+        sensor, noise = self.make_sensor()
         with exclusive_output(self.output) as lock:
-            self._simulate(sensor, lock)
+            self._simulate(sensor, noise, lock)
 
     def _require_poses(self, duration: float) -> None:
         """Raise a DataError if the trajectories of a duration in seconds have one pose, or more than readers take."""
@@ -72,7 +72,7 @@ class Simulate(SimulationCommand):
         if num_poses > MAX_ROWS:
             raise DataError("--pose-rate", f"it gives {num_poses:.3g} poses", "give a lower rate or --duration")
 
-    def _simulate(self, sensor: SensorModel, lock: OutputLock) -> None:
+    def _simulate(self, sensor: SensorModel, noise: SensorNoise, lock: OutputLock) -> None:
         import numpy as np
         import torch
 
@@ -95,7 +95,7 @@ class Simulate(SimulationCommand):
         with value_errors_as_data_error("aenerf simulate", "see aenerf simulate --help"):
             camera = CameraIntrinsics(self.width, self.height, *scene.intrinsics(self.width, self.height))
             simulation = Simulation(
-                scene, camera, sensor, self.speed, duration, self.max_displacement, self.seed, self.noise
+                scene, camera, sensor, self.speed, duration, self.max_displacement, self.seed, noise
             )
             truth = simulation.trajectory(self.pose_rate)
             estimated, report = self._estimate_poses(simulation, camera, truth)
@@ -118,6 +118,8 @@ class Simulate(SimulationCommand):
                 for pose in poses:
                     seen = simulation.reference_picture(pose)
                     writer.add_image(split, seen.display, pose, linear=seen.linear, depth=seen.depth)
+        if simulator.num_lost_events:
+            say(simulator.readout_note())
         say(
             f"{self.output}: {num_events:,} events in {truth.duration:.2f} s, {len(estimated)} poses, "
             f"{self.train_images} train, {self.validation_views} validation and {self.test_views} test images.\n"

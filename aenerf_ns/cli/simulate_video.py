@@ -15,7 +15,7 @@ from aenerf_ns.cli.simulation import SimulationCommand
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, reading, require_file, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
-from aenerf_ns.simulator.options import Interpolation
+from aenerf_ns.simulator.options import Interpolation, SensorNoise
 
 if TYPE_CHECKING:
     import numpy as np
@@ -62,7 +62,7 @@ class SimulateVideo(SimulationCommand):
         """Read the video and write the dataset."""
         self.require_possible()
         self._require_compatible()
-        sensor = self.make_sensor()
+        sensor, noise = self.make_sensor()
         with reading(self.video):
             if not self.video.exists():
                 raise DataError(self.video, "there is no such video", "give a file, or a folder of images")
@@ -70,7 +70,7 @@ class SimulateVideo(SimulationCommand):
             if file is not None:
                 require_file(file)
         with exclusive_output(self.output) as lock, value_errors_as_data_error(_COMMAND, f"see {_COMMAND} --help"):
-            self._simulate(sensor, lock)
+            self._simulate(sensor, noise, lock)
 
     def _require_compatible(self) -> None:
         """Raise a DataError for options that contradict each other."""
@@ -88,7 +88,7 @@ class SimulateVideo(SimulationCommand):
                     "give --calibration or --intrinsics, or let COLMAP estimate lens and poses with --poses colmap",
                 )
 
-    def _simulate(self, sensor: SensorModel, lock: OutputLock) -> None:
+    def _simulate(self, sensor: SensorModel, noise: SensorNoise, lock: OutputLock) -> None:
         import numpy as np
 
         from aenerf_ns.pose_estimation.video import open_video
@@ -98,11 +98,13 @@ class SimulateVideo(SimulationCommand):
         require_event_sensor_size(video.width, video.height, self.video, "scale the frames down")
         camera = self._read_camera(video)
         poses = self._find_poses(video, camera)
-        simulator = video_simulator(video, sensor, self.noise, self.seed)
+        simulator = video_simulator(video, sensor, noise, self.seed)
         if poses is None:
             written = self._write_poseless(lock, video, camera, simulator)
         else:
             written = self._write_dataset(lock, video, simulator, poses)
+        if simulator.num_lost_events:
+            say(simulator.readout_note())
         longest = np.diff(video.times).max() * 1e-6
         say(
             f"{written}\nEvents between two frames, up to {longest:.3g} ms apart, are interpolated. What moves faster "

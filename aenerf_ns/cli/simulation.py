@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -12,7 +12,7 @@ from aenerf_ns.cli.ranges import require_range, require_seed
 from aenerf_ns.errors import value_errors_as_data_error
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.files.output_paths import require_absent
-from aenerf_ns.simulator.options import DURATIONS, SensorNoise
+from aenerf_ns.simulator.options import DURATIONS, SENSORS, SensorName, SensorNoise
 
 if TYPE_CHECKING:
     from aenerf_ns.camera.trajectory import Trajectory
@@ -25,6 +25,12 @@ _RANGES = {
     "contrast_threshold_spread": (0, 10),
     "leak_rate": (0, 1e6),
     "shot_noise_rate": (0, 1e6),
+    "bandwidth": (1e-3, 1e9),
+    "noise_rate_spread": (0, 2),
+    "hot_pixel_fraction": (0, 1),
+    "hot_pixel_rate": (0, 1e6),
+    "readout_rate": (1e3, 1e12),
+    "time_resolution_ns": (1, 10**9),
     "frame_rate": (1e-3, 1e6),
     "max_displacement": (1e-2, 1e2),
     "train_images": (0, 100_000),
@@ -51,11 +57,13 @@ class SimulationCommand:
     """Error of the estimated positions: root mean square of its length, in scene units (meters)."""
     pose_noise_correlation_time: float = 0.25
     """Correlation time of the pose errors in seconds."""
-    positive_contrast_threshold: float = 0.25
-    """C+: rise of log-radiance that triggers an event."""
-    negative_contrast_threshold: float = 0.25
-    """C-: fall of log-radiance that triggers an event."""
-    refractory_period_ns: int = 0
+    sensor: SensorName = "ideal"
+    """A sensor of this kind (docs/simulator.md lists its values). The options below change single values of it."""
+    positive_contrast_threshold: float | None = None
+    """C+: rise of log-radiance that triggers an event. By default 0.25."""
+    negative_contrast_threshold: float | None = None
+    """C-: fall of log-radiance that triggers an event. By default 0.25."""
+    refractory_period_ns: int | None = None
     """Time for which a pixel is blind after each event, in nanoseconds."""
     noise: tyro.conf.OmitArgPrefixes[SensorNoise] = field(default_factory=SensorNoise)
     bayer_pattern: BayerPattern = ""
@@ -84,15 +92,18 @@ class SimulationCommand:
                 require_range(name.replace("_", "-"), value, *_RANGES[name])
         require_seed(self.seed)
 
-    def make_sensor(self) -> SensorModel:
-        """Make the sensor. A DataError is raised if a value is impossible."""
+    def make_sensor(self) -> tuple[SensorModel, SensorNoise]:
+        """Make the sensor and its noise. A DataError is raised if a value is impossible."""
+        sensor, noise = SENSORS[self.sensor]
+        given: dict[str, Any] = {
+            "positive_contrast_threshold": self.positive_contrast_threshold,
+            "negative_contrast_threshold": self.negative_contrast_threshold,
+            "refractory_period": self.refractory_period_ns,
+        }
         with value_errors_as_data_error("aenerf simulate", "see aenerf simulate --help"):
-            return SensorModel(
-                self.positive_contrast_threshold,
-                self.negative_contrast_threshold,
-                self.refractory_period_ns,
-                self.bayer_pattern,
-            )
+            changed = {name: value for name, value in given.items() if value is not None}
+            sensor = replace(sensor, bayer_pattern=self.bayer_pattern, **changed)
+        return sensor, self.noise.with_defaults(noise)
 
     def add_pose_noise(self, poses: Trajectory) -> Trajectory:
         """Add errors to true poses."""

@@ -1,7 +1,8 @@
 """Simulate an event sensor: ESIM (Rebecq et al., CoRL 2018) with the corrections of Robust e-NeRF (Low and Lee, 2023).
 
 Between two frames the log-intensity of every pixel is linear in time, and every threshold crossing is solved for its
-time. So a pixel may fire any number of events between two frames.
+time. So a pixel may fire any number of events between two frames. What makes a sensor real is in
+:class:`~aenerf_ns.simulator.options.SensorNoise`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.simulator.options import SensorNoise
 
 _MIN_CONTRAST_THRESHOLD = 0.01
+# Both from v2e (Hu et al., CVPRW 2021): the part of the shot noise that vanishes at white, and the radiance that a dark
+# pixel seems to see where its bandwidth is concerned.
 _BRIGHT_REDUCTION = 0.75
+_DARK_RADIANCE = 20 / 255
 
 NOISELESS = SensorNoise()
 
@@ -150,6 +154,47 @@ def _frame_events(frames, times, references, thresholds, refractory_period, nois
     return keys
 
 
+def _low_pass(
+    filtered: NDArray[np.float64],
+    start: NDArray[np.float64],
+    end: NDArray[np.float64],
+    time_constants: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return what a first-order filter that holds ``filtered`` holds after its input went linearly from start to end.
+
+    ``time_constants`` is the duration in units of the filter's time constant.
+    """
+    decay = np.expm1(-time_constants)
+    return end + (filtered - start) * (1 + decay) + (end - start) * decay / time_constants
+
+
+@numba.njit(cache=True)
+def _read_out(times, pixels, busy_until, waits_until, period):
+    """Delay events by a readout that takes them one by one, in their order.
+
+    Args:
+        times: (N,) of the events, in order, after an arbitrary start. The delayed times replace them; -1 if lost.
+        pixels: (N,) their pixels.
+        busy_until: when the readout becomes free, on the same clock.
+        waits_until: (H · W) when the last event of each pixel is read, changed in place. An event before that is lost.
+        period: time that an event takes.
+
+    Returns:
+        when the readout becomes free, and the longest delay.
+    """
+    longest = 0.0
+    for i in range(len(times)):
+        time = times[i]
+        if time < waits_until[pixels[i]]:
+            times[i] = -1.0
+            continue
+        times[i] = max(time, busy_until)
+        busy_until = times[i] + period
+        waits_until[pixels[i]] = times[i]
+        longest = max(longest, times[i] - time)
+    return busy_until, longest
+
+
 class EventSimulator:
     """Turn a sequence of linear-radiance frames into events.
 
@@ -162,9 +207,11 @@ class EventSimulator:
         width, height: pixel columns and rows, at most 65536.
         sensor: contrast thresholds, refractory period and Bayer pattern. Initial reference times are random, uniform in
             [0, refractory period) after the first frame.
-        noise: thresholds of single pixels are drawn once from N(C, contrast_threshold_spread) and clipped at 0.01. The
-            leak makes the log-intensity rise by leak_rate · C+ a second. Shot noise falls with the intensity, to a
-            quarter at 1 and above (v2e, Hu et al. 2021), and moves the reference as any event does.
+        noise: thresholds of single pixels are drawn once from N(C, contrast_threshold_spread) and clipped at 0.01. A
+            low-pass filter of first order follows the logarithm; its cutoff frequency is bandwidth · (I + ε) / (1 + ε),
+            ε = 20 / 255. The leak makes the filtered signal rise by leak_rate · C+ a second. Shot noise falls with the
+            intensity, to a quarter at 1 and above (v2e, Hu et al. 2021), and moves the reference as any event does.
+            Readout and clock change the times of events only, and lose those of pixels that wait.
         log_epsilon: added to the intensity before the logarithm.
         seed: of the thresholds, of the initial reference times, and of the noise.
 
@@ -193,18 +240,29 @@ class EventSimulator:
         self.width, self.height = width, height
         self.sensor = sensor
         self.log_epsilon = log_epsilon
-        self.shot_noise_rate = noise.shot_noise_rate
+        self.num_lost_events, self.longest_delay = 0, 0.0
         self._bits = (width - 1).bit_length(), (height - 1).bit_length()
         self._channel_weights = np.array(LUMINANCE)
         if sensor.bayer_pattern:
             y, x = np.indices((height, width))
             self._channel_weights = np.eye(3)[sensor.color_filter[y & 1, x & 1]]
-        self._leak = noise.leak_rate * sensor.positive_contrast_threshold * 1e-9
         self._rng = np.random.default_rng(seed)
-        spread = noise.contrast_threshold_spread
+        spread = noise.contrast_threshold_spread or 0.0
         self.positive_contrast_threshold = self._draw_thresholds(sensor.positive_contrast_threshold, spread)
         self.negative_contrast_threshold = self._draw_thresholds(sensor.negative_contrast_threshold, spread)
-        self._log_intensity: NDArray[np.float64] | None = None
+        # Noise has a generator of its own, so that thresholds do not depend on it.
+        rng = np.random.default_rng((seed, 1))
+        factors = 10 ** rng.normal(0.0, noise.noise_rate_spread or 0.0, (height, width))
+        self._leak = (noise.leak_rate or 0.0) * factors * sensor.positive_contrast_threshold * 1e-9
+        self._is_hot = rng.random(height * width) < (noise.hot_pixel_fraction or 0.0)
+        shot_noise_rates = (noise.shot_noise_rate or 0.0) * factors.ravel()
+        self._noise_rates = np.where(self._is_hot, noise.hot_pixel_rate or 0.0, shot_noise_rates).cumsum()
+        self._bandwidth = noise.bandwidth
+        self._tick = noise.time_resolution_ns or 1
+        self._readout_period = 1e9 / noise.readout_rate if noise.readout_rate else 0.0
+        self._busy_until, self._waits_until = 0.0, np.zeros(height * width)
+        # Of the last frame: the intensity, its logarithm, that filtered, and the same with the leak.
+        self._last: tuple[NDArray[np.float64], ...] = ()
         self._time_ns = 0
 
     def __call__(self, image: ArrayLike, time_ns: int) -> Events:
@@ -217,18 +275,19 @@ class EventSimulator:
 
         Returns:
             x (N,) uint16, y (N,) uint16, t (N,) int64 in nanoseconds, p (N,) int8 of +1 or -1: the events in
-            (previous frame, this frame], ordered by time, then by pixel. The first frame gives no events.
+            (previous frame, this frame], ordered by time, then by pixel unless they wait or share a tick. The
+            first frame gives no events. A readout may delay events beyond this frame.
 
         Raises:
             ValueError: a wrong shape, a negative or non-finite radiance, or a time that does not increase.
         """
         intensity = self._to_intensity(np.asarray(image))
         time_ns = int(time_ns)
-        if self._log_intensity is None:
-            self._start_ns = self._time_ns = time_ns
-        log_intensity = np.log(intensity + self.log_epsilon) + self._leak * (time_ns - self._start_ns)
+        log_intensity = np.log(intensity + self.log_epsilon)
         x_bits, y_bits = self._bits
-        if self._log_intensity is None:
+        filtered = signal = log_intensity
+        if not self._last:
+            self._start_ns = self._time_ns = time_ns
             self._reference_log = log_intensity.copy()
             self._reference_time = np.full(log_intensity.shape, time_ns, np.int64)
             if self.sensor.refractory_period > 0:
@@ -240,8 +299,14 @@ class EventSimulator:
                 raise ValueError(
                     f"frame times must increase, by at most {longest} ns: got {time_ns} ns after {self._time_ns} ns"
                 )
+            last_intensity, last_log, last_filtered, last_signal = self._last
+            if self._bandwidth is not None:
+                light = ((last_intensity + intensity) / 2 + _DARK_RADIANCE) / (1 + _DARK_RADIANCE)
+                time_constants = 2e-9 * math.pi * self._bandwidth * light * (time_ns - self._time_ns)
+                filtered = _low_pass(last_filtered, last_log, log_intensity, time_constants)
+            signal = filtered + self._leak * (time_ns - self._start_ns)
             keys = _frame_events(
-                (self._log_intensity, log_intensity),
+                (last_signal, signal),
                 (self._time_ns, time_ns),
                 (self._reference_log, self._reference_time),
                 (self.positive_contrast_threshold, self.negative_contrast_threshold),
@@ -250,25 +315,46 @@ class EventSimulator:
                 self._bits,
             )
             keys.sort()
-        events = (
-            (keys >> 1 & (1 << x_bits) - 1).astype(np.uint16),
-            (keys >> (1 + x_bits) & (1 << y_bits) - 1).astype(np.uint16),
-            self._time_ns + (keys >> (1 + x_bits + y_bits)),
-            (2 * (keys & 1) - 1).astype(np.int8),
+        x = (keys >> 1 & (1 << x_bits) - 1).astype(np.uint16)
+        y = (keys >> (1 + x_bits) & (1 << y_bits) - 1).astype(np.uint16)
+        t = self._time_ns + (keys >> (1 + x_bits + y_bits))
+        p = (2 * (keys & 1) - 1).astype(np.int8)
+        if self._readout_period > 0:
+            delayed = (t - self._start_ns).astype(np.float64)
+            pixels = y.astype(np.int64) * self.width + x
+            self._busy_until, longest = _read_out(
+                delayed, pixels, self._busy_until, self._waits_until, self._readout_period
+            )
+            self.longest_delay = max(self.longest_delay, longest)
+            is_read = delayed >= 0
+            self.num_lost_events += len(t) - np.count_nonzero(is_read)
+            x, y, t, p = x[is_read], y[is_read], self._start_ns + delayed[is_read].astype(np.int64), p[is_read]
+        if self._tick > 1:
+            t -= t % self._tick
+        self._last, self._time_ns = (intensity, log_intensity, filtered, signal), time_ns
+        return x, y, t, p
+
+    def readout_note(self) -> str:
+        """Say how many events the readout lost, and how long it delayed others."""
+        return (
+            f"The readout of {1e3 / self._readout_period:.4g} million events a second is saturated at times: it delays "
+            f"events by up to {self.longest_delay * 1e-6:.2g} ms, and {self.num_lost_events:,} events of pixels that "
+            "wait for it are lost."
         )
-        self._log_intensity, self._time_ns = log_intensity, time_ns
-        return events
 
     def _draw_thresholds(self, mean: float, spread: float) -> NDArray[np.float64]:
         thresholds = self._rng.normal(mean, spread, (self.height, self.width))
         return np.maximum(thresholds, _MIN_CONTRAST_THRESHOLD)
 
     def _shot_noise(self, intensity: NDArray[np.float64], time_ns: int) -> tuple[NDArray[np.int64], ...]:
-        """Draw the shot-noise events of a frame interval: pixels, row by row, times and polarities."""
+        """Draw the noise events of a frame interval: pixels, row by row, times and polarities."""
         seconds = (time_ns - self._time_ns) * 1e-9
-        count = self._rng.poisson(self.shot_noise_rate * seconds * intensity.size)
-        pixels = self._rng.integers(0, intensity.size, count)
-        kept = self._rng.random(count) < 1 - _BRIGHT_REDUCTION * np.minimum(intensity.ravel()[pixels], 1)
+        total = self._noise_rates[-1]
+        count = self._rng.poisson(total * seconds)
+        # Without the last sum, rounding never leads beyond the last pixel.
+        pixels = np.searchsorted(self._noise_rates[:-1], total * self._rng.random(count), side="right")
+        reduction = np.where(self._is_hot[pixels], 0.0, _BRIGHT_REDUCTION)
+        kept = self._rng.random(count) < 1 - reduction * np.minimum(intensity.ravel()[pixels], 1)
         times = self._rng.integers(self._time_ns + 1, time_ns + 1, count)
         polarities = self._rng.integers(0, 2, count) * 2 - 1
         order = np.lexsort((times, pixels))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.pose_estimation.video import open_video
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.simulator.options import SensorNoise
+from aenerf_ns.simulator.options import SENSORS
 from aenerf_ns.simulator.video_events import video_events, video_simulator
 
 WIDTH, HEIGHT, FRAME = 24, 16, 40_000_000
@@ -88,7 +89,7 @@ def test_video_with_poses_becomes_a_dataset(
     arguments = (
         f"aenerf simulate-video {frames} --output {output} --trajectory {poses} --intrinsics 20 21 11.5 7.5 "
         "--interpolation linear --positive-contrast-threshold 0.3 --contrast-threshold-spread 0.02 "
-        "--leak-rate 2 --seed 4"
+        "--sensor davis346 --leak-rate 2 --seed 4"
     )
     monkeypatch.setattr(sys, "argv", arguments.split())
     with CONSOLE.capture() as printed:
@@ -98,11 +99,11 @@ def test_video_with_poses_becomes_a_dataset(
     parser = NativeDataParserConfig(data=output).setup()
     recording = parser.recording
     assert recording.event_camera == recording.frame_camera == CameraIntrinsics(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 7.5)
-    assert recording.sensor == SensorModel(0.3, 0.25)
+    assert recording.sensor == SensorModel(0.3, 0.25, SENSORS["davis346"][0].refractory_period)
     assert recording.ground_truth is None
     torch.testing.assert_close(recording.trajectory.camera_to_worlds, make_poses().camera_to_worlds)
-    # The events are those of the sensor that the options describe.
-    noise = SensorNoise(contrast_threshold_spread=0.02, leak_rate=2.0)
+    # The events are those of the sensor that the options describe: one option changes one value of --sensor.
+    noise = replace(SENSORS["davis346"][1], contrast_threshold_spread=0.02, leak_rate=2.0)
     simulator = video_simulator(open_video(frames), recording.sensor, noise, seed=4)
     intervals = video_events(open_video(frames), simulator, "linear")
     expected = np.concatenate([interval.events.t for interval in intervals])

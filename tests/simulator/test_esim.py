@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.simulator.esim import EventSimulator
-from aenerf_ns.simulator.options import SensorNoise
+from aenerf_ns.simulator.options import SENSORS, SensorName, SensorNoise
 
 WIDTH, HEIGHT = 7, 6
 LOG_EPSILON = 1e-3
@@ -23,7 +24,7 @@ def make_simulator(
     refractory_period: int = 0,
     bayer_pattern: BayerPattern = "",
     seed: int = 0,
-    **noise: float,
+    **noise: Any,
 ) -> EventSimulator:
     sensor = SensorModel(positive, negative, refractory_period, bayer_pattern)
     return EventSimulator(width, height, sensor, SensorNoise(**noise), log_epsilon=LOG_EPSILON, seed=seed)
@@ -222,6 +223,118 @@ def test_shot_noise_moves_the_reference(refractory: int) -> None:
     expected = 8.0 * 0.8 * WIDTH * HEIGHT
     assert 0.1 * expected < noise < expected
     assert len(t) - noise > 3 * WIDTH * HEIGHT
+
+
+def test_low_pass_follows_the_step_response() -> None:
+    # The same step of the logarithm by 1, in light and a hundred times darker.
+    simulator = make_simulator(0.2, 0.2, 2, 1, bandwidth=100.0)
+    bright = 0.9
+    after = np.array([[bright, bright / 100]])
+    before = (after + LOG_EPSILON) / math.e - LOG_EPSILON
+    times = np.append([0, 1], np.arange(1, 3001) * 20_000)
+    x, _, t, p = simulate(simulator, np.concatenate([[before], np.repeat([after], 3001, axis=0)]), times)
+    assert (p == 1).all()
+    for column, radiance in enumerate(after[0]):
+        floor = 20 / 255
+        time_constant = (1 + floor) / (2 * math.pi * 100 * (radiance + floor))
+        expected = -time_constant * np.log(1 - 0.2 * np.arange(1, 5))
+        np.testing.assert_allclose(t[x == column] * 1e-9, expected[expected < 0.06], rtol=2e-3)
+    # Seen by v2e's rule, white has 14 times the bandwidth of black.
+    assert (x == 0).sum() == 4
+    assert t[x == 1][0] > 9 * t[x == 0][0]
+
+
+@pytest.mark.parametrize("coarse", [2, 10])
+def test_low_pass_needs_no_finer_frames(coarse: int) -> None:
+    # The time constant is 1.6 ms at white, and the light turns every 5 ms. Frames are 0.1 ms, or 0.2 and 1 ms apart.
+    corners = np.random.default_rng(0).uniform(-3, 0, (31, HEIGHT, WIDTH))
+    times = np.arange(1501) * 100_000
+    logs = np.apply_along_axis(lambda column: np.interp(times / 5e6, np.arange(31), column), 0, corners)
+    streams = []
+    for step in (1, coarse):
+        simulator = make_simulator(0.2, 0.2, bandwidth=100.0)
+        streams.append(simulate(simulator, (np.exp(logs) - LOG_EPSILON)[::step], times[::step]))
+    fine, other = ((y.astype(int) * WIDTH + x, t, p) for x, y, t, p in streams)
+    assert len(fine[0]) > 1500
+    assert abs(len(other[0]) - len(fine[0])) < 0.01 * len(fine[0])
+    errors = []
+    for pixel in range(WIDTH * HEIGHT):
+        a, b = (stream[1][stream[0] == pixel] for stream in (fine, other))
+        if len(a) == len(b):
+            errors.append(np.abs(a - b))
+    assert np.mean(np.concatenate(errors)) < 100_000 * coarse / 8
+
+
+def test_leak_differs_from_pixel_to_pixel() -> None:
+    simulator = make_simulator(0.2, 0.2, 60, 50, leak_rate=40.0, noise_rate_spread=0.1)
+    x, y, t, p = simulate(simulator, np.full((3, 50, 60), 0.3), np.array([0, 1, 10]) * 10**9)
+    rates = np.bincount(y.astype(int) * 60 + x, minlength=3000) / 10
+    assert (p == 1).all()
+    assert abs(np.log10(rates).mean() - math.log10(40)) < 0.01
+    assert abs(np.log10(rates).std() - 0.1) < 0.01
+    # The same pixels leak more in the second half.
+    halves = [np.bincount((y.astype(int) * 60 + x)[half], minlength=3000) for half in (t < 5e9, t >= 5e9)]
+    assert np.corrcoef(halves)[0, 1] > 0.98
+
+
+def test_hot_pixels_have_their_rate_in_any_light() -> None:
+    image = np.zeros((80, 100))
+    image[:, 50:] = 1.0
+    simulator = make_simulator(0.2, 0.2, 100, 80, shot_noise_rate=1.0, hot_pixel_fraction=0.01, hot_pixel_rate=200.0)
+    x, y, _, p = simulate(simulator, np.stack([image] * 11), np.arange(11) * 5 * 10**8)
+    rates = np.bincount(y.astype(int) * 100 + x, minlength=8000) / 5
+    is_hot = rates > 50
+    assert 50 < is_hot.sum() < 110
+    np.testing.assert_allclose(rates[is_hot], 200, atol=4 * math.sqrt(200 / 5))
+    assert abs(rates[~is_hot].mean() - (1 + 0.25) / 2) < 0.05
+    assert abs(p.mean()) < 0.02
+
+
+def test_clock_ticks() -> None:
+    rng = np.random.default_rng(6)
+    images, times = rng.uniform(0, 1, (5, HEIGHT, WIDTH)), 7_777 + np.arange(5) * 10**6
+    exact = simulate(make_simulator(0.05, 0.05), images, times)
+    x, y, t, p = simulate(make_simulator(0.05, 0.05, time_resolution_ns=1000), images, times)
+    np.testing.assert_array_equal(t, exact[2] // 1000 * 1000)
+    for mine, other in zip((x, y, p), (exact[0], exact[1], exact[3]), strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
+@pytest.mark.parametrize("threshold", [0.02, 0.4])
+def test_readout_delays_and_counts_what_it_loses(threshold: float) -> None:
+    # Every pixel fires within 0.1 ms, once in each burst with the higher threshold. The readout takes 1 event in 10 us.
+    rises = np.random.default_rng(7).uniform(0.5, 0.7, (1, HEIGHT, WIDTH))
+    images = np.exp(rises * np.array([0, 1, 1, 2, 2]).reshape(5, 1, 1)) - LOG_EPSILON
+    times = np.array([0, 100_000, 200_000, 5_000_000, 5_100_000])
+    wanted = simulate(make_simulator(threshold, threshold), images, times)
+    simulator = make_simulator(threshold, threshold, readout_rate=1e5)
+    x, y, t, p = simulate(simulator, images, times)
+    assert (np.diff(t) >= 9_999).all()
+    assert len(t) + simulator.num_lost_events == len(wanted[0])
+    # Nobody waits longer than all other pixels take.
+    assert 100_000 < simulator.longest_delay < WIDTH * HEIGHT * 10_000
+    if threshold > 0.1:
+        assert simulator.num_lost_events == 0
+        places = 10_000 * np.arange(len(t))
+        np.testing.assert_allclose(t, np.maximum.accumulate(wanted[2] - places) + places, atol=1)
+        for mine, other in zip((x, y, p), (wanted[0], wanted[1], wanted[3]), strict=True):
+            np.testing.assert_array_equal(mine, other)
+    else:
+        assert simulator.num_lost_events > 50
+        assert f"{simulator.num_lost_events:,} events of pixels that wait" in simulator.readout_note()
+
+
+@pytest.mark.parametrize("name", get_args(SensorName))
+def test_sensors_are_decided_by_name_and_seed(name: SensorName) -> None:
+    rng = np.random.default_rng(5)
+    images, times = rng.uniform(0, 1, (20, HEIGHT, WIDTH)), np.arange(20) * 10**7
+    streams = []
+    for seed in (1, 1, 2):
+        simulator = EventSimulator(WIDTH, HEIGHT, *SENSORS[name], seed=seed)
+        streams.append(b"".join(column.tobytes() for column in simulate(simulator, images, times)))
+    assert streams[0] == streams[1]
+    assert (streams[1] == streams[2]) == (name == "ideal")
+    assert len(streams[0]) > 1000
 
 
 def test_seed_decides_everything() -> None:
