@@ -69,7 +69,7 @@ class EcdDataParser(EventDataParser):
         if not images and None in stated:
             CONSOLE.print(f"The sensor's size {width} x {height} is a guess: if it is another, give width and height.")
         events = TextEventFile(folder / "events.txt", width, height, "s")
-        return self.config.make_capture(SensorModel(0.5, 0.5), event_file=events, event_camera=camera), images
+        return self.config.make_capture(SensorModel(0.5, 0.5), True, event_file=events, event_camera=camera), images
 
 
 def _read_calibration(path: Path, size: tuple[int, int]) -> CameraIntrinsics:

@@ -72,7 +72,7 @@ class EdsDataParser(EventDataParser):
         events = Hdf5TableFile(folder / "events.h5", camera.width, camera.height, COLUMNS_AT_TOP)
         images = read_image_times(folder / "images", folder / "images_timestamps.txt", "us")
         return self.config.make_capture(
-            SensorModel(), event_file=events, event_camera=camera, frame_camera=frame_camera
+            SensorModel(), True, event_file=events, event_camera=camera, frame_camera=frame_camera
         ), images
 
     @cached_property

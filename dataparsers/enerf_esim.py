@@ -84,7 +84,7 @@ class ENeRFEsimDataParser(EventDataParser):
         camera = _read_camera(folder / "poses_bounds.npy")
         events = EsimEventFolder(folder / "events", camera.width, camera.height)
         images = read_image_times(folder / "images", folder / "images" / "image_stamps_ns.txt", "ns")
-        return self.config.make_capture(SensorModel(), event_file=events, event_camera=camera), images
+        return self.config.make_capture(SensorModel(), True, event_file=events, event_camera=camera), images
 
 
 def _read_camera(path: Path) -> CameraIntrinsics:

@@ -114,6 +114,7 @@ class EventNeRFDataParser(EventDataParser):
         file = require_one(events, split / "events", "files *.npz", "leave the events of the scene only")
         capture = self.config.make_capture(
             SensorModel(bayer_pattern="RGGB" if self.config.color else ""),
+            has_assumed_thresholds=True,
             event_file=ArrayEventFile(file, _WIDTH, _HEIGHT, XYTP_MEMBERS, self.config.time_unit),
             event_camera=read_intrinsics(split / "intrinsics", _WIDTH, _HEIGHT),
             image_encoding="srgb",

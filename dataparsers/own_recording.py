@@ -118,6 +118,7 @@ class OwnRecordingDataParser(EventDataParser):
         calibration = self._read_calibration(folder, bool(timed))
         capture = config.make_capture(
             calibration.sensor,
+            calibration.has_assumed_thresholds,
             event_file=self._event_file(folder, calibration.event_camera.width, calibration.event_camera.height),
             event_camera=calibration.event_camera,
             frame_camera=calibration.frame_camera,

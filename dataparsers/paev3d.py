@@ -67,6 +67,7 @@ class PAEv3DDataParser(EventDataParser):
         scene = self._scene()
         capture = self.config.make_capture(
             SensorModel(),
+            has_assumed_thresholds=True,
             event_file=Hdf5TableFile(scene / "event.h5", _WIDTH, _HEIGHT, TXYP_MATRIX, self.config.time_unit),
             event_camera=read_intrinsics(scene.parents[1] / "Intrinsics", _WIDTH, _HEIGHT),
             image_encoding="srgb",

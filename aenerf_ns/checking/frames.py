@@ -1,10 +1,11 @@
-"""Whether the events rise where the frames become brighter."""
+"""Whether the events rise where the frames become brighter, and by how much for each event."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.images import check_image, read_image
@@ -12,8 +13,9 @@ from aenerf_ns.recording.recording import Recording
 
 # Pairs of frames that are compared. More do not change the result.
 _MAX_PAIRS = 8
-# Added to display values, 0 to 255, before the logarithm.
-_EPSILON = 4.0
+# Gray levels whose radiance is added before the logarithm, because the black level of a frame is not known: one that
+# is used, and those that give the range of the thresholds.
+_GRAY, _GRAY_RANGE = 4, (1, 10)
 _MIN_PIXELS = 100
 
 
@@ -32,33 +34,61 @@ class FrameChanges:
         starts = np.unique(np.linspace(0, len(times) - 2, _MAX_PAIRS).astype(int)) if len(times) > 1 else []
         self._spans = [(times[i], times[i + 1]) for i in starts]
         self._files, self._camera = files, recording.event_camera
-        self._sums = np.zeros((len(self._spans), self._camera.height, self._camera.width))
+        self._encoding = recording.image_encoding
+        # Of the positive and of the negative events.
+        self._sums = np.zeros((len(self._spans), 2, self._camera.height, self._camera.width))
 
-    def add(self, events: EventStream) -> None:
-        """Add a piece of the stream of events."""
+    def add(self, events: EventStream, weights: NDArray[np.float64]) -> None:
+        """Add a piece of the stream of events, each of which stands for its weight in thresholds."""
         for sums, (start, end) in zip(self._sums, self._spans, strict=True):
-            part = events.between(start, end)
-            np.add.at(sums, (part.y, part.x), part.p)
+            part = slice(*np.searchsorted(events.t, (start, end), side="right"))
+            np.add.at(sums, ((events.p[part] < 0).astype(int), events.y[part], events.x[part]), weights[part])
 
     def correlation(self) -> float | None:
         """Return the correlation of the sums of polarities with the changes of the frames, from −1 to 1.
 
         None if there are no such frames, or hardly any events between them.
         """
-        pairs = [(sums, self._change(*span)) for sums, span in zip(self._sums, self._spans, strict=True) if sums.any()]
-        if not pairs:
+        events, frames = self._changes(1.0, _GRAY)
+        events, frames = events[events != 0], frames[events != 0]
+        if len(events) < _MIN_PIXELS or frames.std() == 0 or events.std() == 0:
             return None
-        events, frames = (np.concatenate([part.ravel() for part in parts]) for parts in zip(*pairs, strict=True))
-        seen = events != 0
-        if seen.sum() < _MIN_PIXELS or frames[seen].std() == 0 or events[seen].std() == 0:
-            return None
-        return float(np.corrcoef(events[seen], frames[seen])[0, 1])
+        return float(np.corrcoef(events, frames)[0, 1])
 
-    def _change(self, start: int, end: int) -> NDArray[np.float64]:
+    def negative_threshold(self, ratio: float) -> tuple[float, float, float] | None:
+        """Return C−, given C+ / C−, and its range for the black levels that frames may have.
+
+        None if the frames say nothing of it: see :meth:`correlation`.
+        """
+        if (self.correlation() or 0.0) <= 0:
+            return None
+        value, *ends = (_robust_slope(*self._changes(ratio, gray)) for gray in (_GRAY, *_GRAY_RANGE))
+        return value, min(ends), max(ends)
+
+    def _changes(self, ratio: float, gray: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the change of log-radiance by the events, in C−, and by the frames, where there are events."""
+        changes = [np.empty((2, 0))]
+        for (positive, negative), span in zip(self._sums, self._spans, strict=True):
+            seen = positive + negative > 0
+            if seen.any():
+                changes.append(np.stack([ratio * positive - negative, self._change(*span, gray)])[:, seen])
+        events, frames = np.concatenate(changes, 1)
+        return events, frames
+
+    def _change(self, start: int, end: int, gray: int) -> NDArray[np.float64]:
         for time in (start, end):
             check_image(self._files[time], self._camera)
-        before, after = (
-            np.log(np.asarray(read_image(self._files[time]).convert("L"), np.float64) + _EPSILON)
-            for time in (start, end)
-        )
+        levels = decode(np.arange(256) / 255, self._encoding)
+        logs = np.log(levels + levels[gray])
+        before, after = (logs[np.asarray(read_image(self._files[time]).convert("L"))] for time in (start, end))
         return after - before
+
+
+def _robust_slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    """Return the slope of a line through the origin, with Huber's loss."""
+    weights, slope = np.ones(len(x)), 0.0
+    for _ in range(20):
+        slope = float((weights * x * y).sum() / (weights * x * x).sum())
+        residuals = np.abs(y - slope * x)
+        weights = 1 / np.maximum(residuals / (1.5 * 1.48 * np.median(residuals) + 1e-9), 1)
+    return slope

@@ -15,6 +15,7 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents, choose_runs, contrast_of
 from aenerf_ns.checking.frames import FrameChanges
+from aenerf_ns.checking.thresholds import PolarityBalance
 from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
 from aenerf_ns.events.stream import EventStream
@@ -34,6 +35,8 @@ class CheckLimits:
     min_polarity_share: float = 0.02
     min_correlation: float = -0.4
     """Of the polarities with the change from frame to frame."""
+    threshold_deviations: float = 2.0
+    """A ratio of the assumed thresholds that differs from the estimate by so many times its uncertainty is replaced."""
     max_repeated_share: float = 0.05
     max_hot_pixel_share: float = 0.01
     min_covered_share: float = 0.5
@@ -88,6 +91,7 @@ class CheckResult:
         problems: what is wrong with the recording and what to do about it, a line for each problem.
         planes: options of training, by name: a near and a far plane in scene units for a camera that stays equally far
             from everything. Empty for a scene with a box, and where no depth is known.
+        sensor_options: options of the dataset's format, by name: a threshold in place of a guessed one.
         warped: the warped events, or None if too few events have a pose.
     """
 
@@ -95,6 +99,7 @@ class CheckResult:
     figures: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     planes: dict[str, str] = field(default_factory=dict)
+    sensor_options: dict[str, str] = field(default_factory=dict)
     warped: WarpedEvents | None = None
 
     @property
@@ -116,10 +121,12 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
         DataError: the events cannot be read.
     """
     changes = FrameChanges(recording, window)
-    statistics, num_covered = _count_events(recording, window, changes)
+    balance = PolarityBalance(recording.event_file, recording.sensor.refractory_period)
+    statistics, num_covered = _count_events(recording, window, changes, balance)
     result = CheckResult(statistics)
     _check_events(result)
     _check_polarity(result, changes.correlation())
+    _check_thresholds(result, recording, changes, balance)
     _check_poses(result, recording, window, num_covered)
     is_simple = _check_lens(result, recording.event_camera) | _check_steps(result, recording.trajectory, window)
     if num_covered < _LIMITS.min_events:
@@ -138,8 +145,10 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     return result
 
 
-def _count_events(recording: Recording, window: TimeWindow, changes: FrameChanges) -> tuple[EventStatistics, int]:
-    """Return statistics of the events, and the number of events that have a pose; hand all on to ``changes``."""
+def _count_events(
+    recording: Recording, window: TimeWindow, changes: FrameChanges, balance: PolarityBalance
+) -> tuple[EventStatistics, int]:
+    """Return statistics of the events, and the number of events that have a pose; hand all on to the other two."""
     file = recording.event_file
     num_covered = 0
 
@@ -147,7 +156,7 @@ def _count_events(recording: Recording, window: TimeWindow, changes: FrameChange
         nonlocal num_covered
         for chunk in tracked(file.chunks(), "Reading events", file.count()):
             num_covered += int(window.contains(chunk.t).sum())
-            changes.add(chunk)
+            changes.add(chunk, balance.add(chunk))
             yield chunk
 
     statistics = event_statistics(chunks(), file.width, file.height, file.time_span(), _RATE_PARTS)
@@ -211,6 +220,27 @@ def _check_polarity(result: CheckResult, correlation: float | None) -> None:
             f"events fall where the frames become brighter (correlation {correlation:+.2f}): the polarities look "
             "reversed. Write p as -p, unless the frames are negatives or have another clock"
         )
+
+
+def _check_thresholds(
+    result: CheckResult, recording: Recording, changes: FrameChanges, balance: PolarityBalance
+) -> None:
+    """Estimate the contrast thresholds."""
+    estimate, sensor = balance.ratio(), recording.sensor
+    if estimate is None:
+        return
+    ratio, uncertainty = estimate
+    used = sensor.positive_contrast_threshold / sensor.negative_contrast_threshold
+    figure = f"Contrast thresholds: C+/C- is {ratio:.2f} +/- {uncertainty:.2f} by the balance of the polarities"
+    figure += f" ({'assumed' if recording.has_assumed_thresholds else 'given'}: {used:.2f})"
+    by_frames = changes.negative_threshold(ratio)
+    if by_frames is not None:
+        size, low, high = by_frames
+        figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
+    result.figures.append(figure)
+    if recording.has_assumed_thresholds and abs(ratio - used) > _LIMITS.threshold_deviations * uncertainty:
+        value = ratio * sensor.negative_contrast_threshold
+        result.sensor_options = {"positive-contrast-threshold": f"{value:.3g}"}
 
 
 def _check_poses(result: CheckResult, recording: Recording, window: TimeWindow, num_covered: int) -> None:

@@ -54,10 +54,12 @@ class Check(DatasetCommand):
         for figure in result.figures:
             say(figure)
         format_words: list[str] = []
-        if self.format != "auto" or self.format_options:
+        if self.format != "auto" or self.format_options or result.sensor_options:
             format_words = [parser.guessed_format or self.format]
             for option in self.format_options:
                 format_words += f"--{option}".split("=", 1)
+            for name, value in result.sensor_options.items():
+                format_words += [f"--{name}", value]
         command = training_command(self.data, options=result.planes, format_words=format_words)
         remark = " (near and far plane for a camera that stays that close)" if result.planes else ""
         say(f"Train with{remark}: {command}")

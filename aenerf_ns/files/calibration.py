@@ -17,7 +17,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.json_file import convert
 from aenerf_ns.files.kalibr import motion_between, read_camchain
 from aenerf_ns.files.plain_yaml import read_plain_yaml
-from aenerf_ns.files.transforms import frame_from_event, read_transforms, sensor_values
+from aenerf_ns.files.transforms import frame_from_event, read_transforms, sensor_values, states_thresholds
 
 
 class _Values(msgspec.Struct):
@@ -46,6 +46,7 @@ class Calibration:
     sensor: SensorModel
     image_encoding: ImageEncoding
     intrinsics_origin: Origin = "given"
+    has_assumed_thresholds: bool = True
 
 
 def read_calibration(
@@ -68,7 +69,8 @@ def read_calibration(
             sensor = SensorModel(**sensor_values(meta.event_camera))
         camera = meta.event_camera
         motion = frame_from_event(path, camera, lens)
-        return Calibration(camera.intrinsics(), lens, motion, sensor, meta.image_encoding, camera.intrinsics_origin)
+        origin, is_assumed = camera.intrinsics_origin, not states_thresholds(camera)
+        return Calibration(camera.intrinsics(), lens, motion, sensor, meta.image_encoding, origin, is_assumed)
     content = read_plain_yaml(path)
     if isinstance(content, dict) and "camera_matrix" in content:
         lens = _camera_info(path, content)

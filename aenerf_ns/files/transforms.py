@@ -81,6 +81,11 @@ def sensor_values(stated: object) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
+def states_thresholds(stated: object) -> bool:
+    """Return whether an event camera, or the options, state a contrast threshold."""
+    return any(name.endswith("contrast_threshold") for name in sensor_values(stated))
+
+
 class Frame(msgspec.Struct, kw_only=True):
     """An image. ``transform_matrix`` is camera-to-world with OpenGL camera axes."""
 

@@ -14,7 +14,7 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.limits import MAX_TIME
-from aenerf_ns.files.transforms import sensor_values
+from aenerf_ns.files.transforms import sensor_values, states_thresholds
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import MAX_VIEWS
@@ -101,11 +101,12 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
         with value_errors_as_data_error(str(self.data), "correct it among the options"):
             return replace(stated, **sensor_values(self))
 
-    def make_capture(self, sensor: SensorModel, **content: Any) -> Capture:
+    def make_capture(self, sensor: SensorModel, has_assumed_thresholds: bool = False, **content: Any) -> Capture:
         """Make a capture, with what the options state in place of the dataset's own sensor.
 
         Args:
             sensor: the dataset's sensor, or the one assumed.
+            has_assumed_thresholds: whether the dataset states no thresholds.
             content: further attributes of :class:`~aenerf_ns.recording.recording.Capture`. By default the event camera
                 took the images, and they are linear.
 
@@ -113,7 +114,8 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
             DataError: a value among the options is impossible.
         """
         defaults = {"frame_camera": content["event_camera"], "image_encoding": "linear"}
-        return Capture(sensor=self.sensor(sensor), **{**defaults, **content})
+        is_assumed = has_assumed_thresholds and not states_thresholds(self)
+        return Capture(sensor=self.sensor(sensor), has_assumed_thresholds=is_assumed, **{**defaults, **content})
 
     def make_recording(self, reference: Trajectory, capture: Capture, **content: Any) -> Recording:
         """Make a recording. Poses that the options give are the estimated ones, and the dataset's own are then true.

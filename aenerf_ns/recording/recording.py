@@ -46,6 +46,7 @@ class Capture:
         sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
         frame_camera: the lens of the camera that took the images.
         image_encoding: whether the images' values are sRGB or linear in radiance.
+        has_assumed_thresholds: whether neither the dataset nor an option states the contrast thresholds.
         intrinsics_origin: where the event camera's lens comes from. A guessed one has to be estimated together with the
             poses.
     """
@@ -55,6 +56,7 @@ class Capture:
     sensor: SensorModel
     frame_camera: CameraIntrinsics
     image_encoding: ImageEncoding
+    has_assumed_thresholds: bool = field(default=False, kw_only=True)
     intrinsics_origin: Origin = field(default="given", kw_only=True)
 
 
