@@ -15,6 +15,7 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents, choose_runs, contrast_of
 from aenerf_ns.checking.frames import FrameChanges
+from aenerf_ns.checking.noise import NoiseRate
 from aenerf_ns.checking.thresholds import PolarityBalance
 from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
@@ -122,9 +123,10 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     """
     changes = FrameChanges(recording, window)
     balance = PolarityBalance(recording.event_file, recording.sensor.refractory_period)
-    statistics, num_covered = _count_events(recording, window, changes, balance)
+    noise = NoiseRate(recording.event_file.width, recording.event_file.height)
+    statistics, num_covered = _count_events(recording, window, changes, balance, noise)
     result = CheckResult(statistics)
-    _check_events(result)
+    _check_events(result, noise)
     _check_polarity(result, changes.correlation())
     _check_thresholds(result, recording, changes, balance)
     _check_poses(result, recording, window, num_covered)
@@ -146,9 +148,9 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
 
 
 def _count_events(
-    recording: Recording, window: TimeWindow, changes: FrameChanges, balance: PolarityBalance
+    recording: Recording, window: TimeWindow, changes: FrameChanges, balance: PolarityBalance, noise: NoiseRate
 ) -> tuple[EventStatistics, int]:
-    """Return statistics of the events, and the number of events that have a pose; hand all on to the other two."""
+    """Return statistics of the events, and the number of events that have a pose; hand all on to the other three."""
     file = recording.event_file
     num_covered = 0
 
@@ -157,6 +159,7 @@ def _count_events(
         for chunk in tracked(file.chunks(), "Reading events", file.count()):
             num_covered += int(window.contains(chunk.t).sum())
             changes.add(chunk, balance.add(chunk))
+            noise.add(chunk)
             yield chunk
 
     statistics = event_statistics(chunks(), file.width, file.height, file.time_span(), _RATE_PARTS)
@@ -178,7 +181,7 @@ def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> li
     return [EventStream.concatenate(part) for part in parts]
 
 
-def _check_events(result: CheckResult) -> None:
+def _check_events(result: CheckResult, noise: NoiseRate) -> None:
     statistics, figures, problems = result.statistics, result.figures, result.problems
     count, seconds = statistics.num_events, max(statistics.end - statistics.start, 1) * 1e-9
     height, width = statistics.counts.shape
@@ -204,6 +207,10 @@ def _check_events(result: CheckResult) -> None:
         )
     hot = find_hot_pixels(statistics.counts)
     figures.append(hot_pixel_summary(hot, statistics.counts))
+    noise_rate = noise.rate(hot)
+    if noise_rate is not None:
+        noise_share = min(noise_rate * seconds * statistics.counts.size / count, 1)
+        figures.append(f"Noise: at most {noise_rate:.2g} events a second a pixel, {noise_share:.1%} of all")
     share = statistics.counts[hot].sum() / count
     if share > _LIMITS.max_hot_pixel_share:
         problems.append(

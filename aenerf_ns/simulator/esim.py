@@ -215,6 +215,10 @@ class EventSimulator:
         log_epsilon: added to the intensity before the logarithm.
         seed: of the thresholds, of the initial reference times, and of the noise.
 
+    Attributes:
+        positive_contrast_threshold, negative_contrast_threshold: (H, W) of each pixel.
+        num_lost_events, longest_delay: what the readout has lost, and its longest delay in nanoseconds, so far.
+
     Example:
         One pixel whose radiance doubles in a millisecond: log-radiance rises by 0.69, and by 0.25 twice.
 
