@@ -13,8 +13,8 @@ from aenerf_ns.recording.recording import Recording
 
 # Pairs of frames that are compared. More do not change the result.
 _MAX_PAIRS = 8
-# Gray levels whose radiance is added before the logarithm, because the black level of a frame is not known: one that
-# is used, and those that give the range of the thresholds.
+# The gray level whose radiance is added before the logarithm, because the black level of a frame is not known, and two
+# others, which give the range of the thresholds.
 _GRAY, _GRAY_RANGE = 4, (1, 10)
 _MIN_PIXELS = 100
 

@@ -37,7 +37,7 @@ class CheckLimits:
     min_correlation: float = -0.4
     """Of the polarities with the change from frame to frame."""
     threshold_deviations: float = 2.0
-    """A ratio of the assumed thresholds that differs from the estimate by so many times its uncertainty is replaced."""
+    """A ratio of the thresholds that differs from the estimate by so many times its uncertainty is clearly another."""
     max_repeated_share: float = 0.05
     max_hot_pixel_share: float = 0.01
     min_covered_share: float = 0.5
@@ -244,10 +244,13 @@ def _check_thresholds(
     if by_frames is not None:
         size, low, high = by_frames
         figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
+    if abs(ratio - used) > _LIMITS.threshold_deviations * uncertainty:
+        value = f"{ratio * sensor.negative_contrast_threshold:.3g}"
+        if recording.has_assumed_thresholds:
+            result.sensor_options = {"positive-contrast-threshold": value}
+        else:
+            figure += f". If the given ones were a guess, train with --positive-contrast-threshold {value}"
     result.figures.append(figure)
-    if recording.has_assumed_thresholds and abs(ratio - used) > _LIMITS.threshold_deviations * uncertainty:
-        value = ratio * sensor.negative_contrast_threshold
-        result.sensor_options = {"positive-contrast-threshold": f"{value:.3g}"}
 
 
 def _check_poses(result: CheckResult, recording: Recording, window: TimeWindow, num_covered: int) -> None:

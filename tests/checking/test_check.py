@@ -407,7 +407,12 @@ def test_unreadable_data_is_one_line_and_status_2(room: Path, tmp_path: Path, ca
 def test_polarities_are_compared_with_the_frames(sign: int, shorter: Path) -> None:
     events = all_events(open_native(shorter))
     rewrite(shorter, replace(events, p=np.int8(sign) * events.p))
+    meta = json.loads((shorter / "transforms.json").read_text())
+    meta["event_camera"]["positive_contrast_threshold"] = 0.4
+    (shorter / "transforms.json").write_text(json.dumps(meta))
     status, output = run(shorter)
+    assert "(given: 1.60)" in output
+    assert number_after("guess, train with --positive-contrast-threshold ", output) == pytest.approx(0.25, abs=0.02)
     assert f"change from frame to frame: {'+' if sign > 0 else '-'}0.9" in output
     assert ("the polarities look reversed" in output) == (sign < 0)
     assert ("by the frames, C- is 0.2" in output) == (sign > 0)
