@@ -85,7 +85,9 @@ class Convert(DatasetCommand):
         require_seed(self.seed)
         if self.weights is not None:
             if self.poses not in ("refined", "events"):
-                raise DataError("--weights", "poses that are given need no images", "choose --poses refined or events")
+                raise DataError(
+                    "--weights", f"--poses {self.poses} makes no images of events", "choose --poses refined or events"
+                )
             require_weights(self.weights)
         filters = self._make_filters()
         parser = self.open_dataset()

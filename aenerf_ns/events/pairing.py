@@ -451,3 +451,68 @@ def find_rows(rows, replacement_rows, block_ends, near, step, moments, events, s
             found[i, 0, part] = rows[row, part]
             found[i, 1, part] = rows[row - 1, part]
             found[i, 2, part] = rows[row - span, part]
+
+
+@numba.njit(cache=True)
+def _add_line(sums, squares, products, part):
+    """Add the points of a line to those of a part, each line with a constant of its own, and begin a new line."""
+    n, x, y, xx, xy = sums
+    if n > 0:
+        squares[part] += xx - x * x / n
+        products[part] += xy - x * y / n
+    sums[:] = 0
+
+
+@numba.njit(cache=True)
+def surplus_slopes(rows, num_pixels):
+    """Fit lines to the surplus of positive events over the number of events of a pixel.
+
+    Args:
+        rows: see :class:`EventPairs`, without those behind the last event.
+        num_pixels: of the sensor.
+
+    Returns:
+        (3, pixels) float64 slopes, over all events of a pixel and over each half of them, 0 where there are too few,
+        and sums of squares of the numbers of events around their means, which tell how well the slopes are known.
+    """
+    slopes, all_squares = np.zeros((2, 3, num_pixels))
+    num_events = np.zeros(num_pixels, np.int64)
+    for i in range(rows.shape[0]):
+        num_events[rows[i, 1] >> PIXEL_SHIFT] += 1
+    # Of a chain, and of the part of it in one half: number, sums of events and of surplus, and of their products.
+    whole, half = np.zeros(5), np.zeros(5)
+    squares, products = np.zeros(3), np.zeros(3)
+    row = 0
+    for pixel in range(num_pixels):
+        count = num_events[pixel]
+        squares[:] = products[:] = 0
+        number = surplus = 0
+        for i in range(count):
+            packed = rows[row, 1]
+            starts_chain = (packed >> SPAN_SHIFT) & SPAN_MASK == 0
+            if starts_chain:
+                _add_line(whole, squares, products, 0)
+            if starts_chain or i == count // 2:
+                _add_line(half, squares, products, 1 if i <= count // 2 else 2)
+            if not starts_chain:
+                before = rows[row - 1, 1]
+                if (before >> SPAN_SHIFT) & SPAN_MASK == 0:
+                    before = 0
+                positive = (packed - before) & COUNT_MASK
+                negative = ((packed >> NEGATIVE_SHIFT) - (before >> NEGATIVE_SHIFT)) & COUNT_MASK
+                number += positive + negative
+                surplus += positive - negative
+            for sums in (whole, half):
+                sums[0] += 1
+                sums[1] += number
+                sums[2] += surplus
+                sums[3] += number * number
+                sums[4] += number * surplus
+            row += 1
+        _add_line(whole, squares, products, 0)
+        _add_line(half, squares, products, 2)
+        all_squares[:, pixel] = squares
+        for part in range(3):
+            if squares[part] > 0:
+                slopes[part, pixel] = products[part] / squares[part]
+    return slopes, all_squares

@@ -147,7 +147,7 @@ class ChangeSupervision(Supervision):
     def thresholds(self, outputs: Mapping[str, Any]) -> tuple[Tensor | float, Tensor | float]:
         """Return the changes of log-radiance that a positive and a negative event stand for, both positive."""
 
-    def changes(self, outputs: Mapping[str, Any], batch: ChangeBatch) -> tuple[Tensor, Tensor]:
+    def changes(self, outputs: Mapping[str, Any], batch: Any) -> tuple[Tensor, Tensor]:
         """Return the (N,) changes between the two times: as rendered in the pixel's channel, and as the events say."""
         first, second = outputs["log_radiance"].split(len(batch))[:2]
         rendered = (second - first).gather(1, batch.channel[:, None])[:, 0]

@@ -43,6 +43,9 @@ from aenerf_ns.supervision.sensor_parameters import SensorParameters
 # Share of a device's free memory that the table of pairs may take. The rest is for the model and its gradients.
 _SHARE_OF_FREE_MEMORY = 0.5
 
+# Variance of rendered changes, in squared contrast thresholds, around what the events of a right pixel tell of.
+_RENDERED_VARIANCE = 0.25
+
 # t_sam: a truncated normal distribution over the interval of the pair's last event.
 _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
 # Share of the distribution before it is cut.
@@ -62,6 +65,9 @@ class PairBatch(ChangeBatch):
         last_num_negative: (N,) float, negative events at the time of the last event.
         last_interval: (N,) float, seconds from the event before to the last event.
         pixel: (N,) pixels, counted row by row.
+        drift: (N,) float, how much of the change that the events tell of is due to the pixel's thresholds, in units of
+            the mean contrast threshold.
+        weight: (N,) float, the variance of a rendered change over that of its difference from the events' change.
     """
 
     ends_between_events: Tensor
@@ -69,6 +75,8 @@ class PairBatch(ChangeBatch):
     last_num_negative: Tensor
     last_interval: Tensor
     pixel: Tensor
+    drift: Tensor
+    weight: Tensor
 
 
 @dataclass
@@ -158,12 +166,18 @@ class PairSupervision(ChangeSupervision):
         positive, negative = self.thresholds(outputs)
         return (positive + negative) / 2
 
+    def changes(self, outputs: Mapping[str, Any], batch: PairBatch) -> tuple[Tensor, Tensor]:
+        """Return the (N,) changes as rendered, and as the events say, less the drift of their pixels."""
+        rendered, change = super().changes(outputs, batch)
+        return rendered, change - batch.drift * self.loss_unit(outputs)
+
     def losses(self, outputs: Mapping[str, Any], batch: PairBatch) -> dict[str, Tensor]:
         """Return the reconstruction loss (eq. 11), and while training the temporal loss (eq. 12) where it is on."""
         rendered, change = self.changes(outputs, batch)
         silent = silent_change(rendered, change, *self.thresholds(outputs))
         target = torch.where(batch.ends_between_events, silent, change)
-        losses = {"reconstruction_loss": reconstruction_loss(rendered, target, self.loss_unit(outputs))}
+        unit = self.loss_unit(outputs)
+        losses = {"reconstruction_loss": reconstruction_loss(rendered, target, unit, batch.weight)}
         if self.training and "log_radiance_rate" in outputs:
             rate = outputs["log_radiance_rate"].gather(1, batch.channel[:, None])[:, 0]
             interval = batch.last_interval + outputs.get("interval_change", 0.0)
@@ -175,7 +189,7 @@ class PairSupervision(ChangeSupervision):
 
     def has_sign(self, change: Tensor, batch: PairBatch) -> Tensor:
         """Return whether the signs of (N,) changes are known. A change known to a threshold only may have either."""
-        return super().has_sign(change, batch) & ~batch.ends_between_events
+        return (batch.num_positive != batch.num_negative) & ~batch.ends_between_events
 
     def learned_values(self) -> dict[str, float]:
         """Return C+ / C- and the refractory period in nanoseconds, each where it is learned."""
@@ -206,6 +220,9 @@ class PairSampler(Sampler):
     1 is the paper's pair of consecutive events (eq. 4). Consecutive events tell where an edge is, but little of how the
     edge compares with the rest of the scene: a change that is seen at a slightly wrong time is as large an error as the
     change itself. Over many events that error is a small part.
+
+    A pair of n events carries a difference of its pixel's thresholds n-fold. It is taken off as far as the events tell
+    of it (:mod:`aenerf_ns.events.polarity_drift`), and pairs count less, the more is left of it.
 
     A pair's interval is [earlier time + refractory period, time of the later event or of the moment]. A pixel records
     no event of what changes while it is blind, so a longer pair would miss that change: pairs reach back only over
@@ -263,11 +280,25 @@ class PairSampler(Sampler):
         Raises:
             DataError: the events cannot be used.
         """
-        _ = self._table
+        _ = self._table, self._drift
 
     @cached_property
     def _table(self) -> _PairTable:
         return _PairTable(self.dataset.pairs, self.device)
+
+    @cached_property
+    def _drift(self) -> tuple[Tensor, Tensor, float]:
+        """Each pixel's drift, the variance of its error, and of drifts: none where all pairs are of one event."""
+        # Imported lazily: every ns-* command imports this module, and numba is slow to import.
+        from aenerf_ns.events.polarity_drift import polarity_drift
+
+        found = polarity_drift(self.dataset.pairs)
+        used = float(self._max_events_per_pair > 1)
+        drift, variance = (
+            torch.from_numpy(used * array).to(self._pixel_rays.channels.device)
+            for array in (found.drift, found.variance)
+        )
+        return drift, variance, used * found.spread**2
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, PairBatch]:
         """Draw a batch of pairs.
@@ -302,6 +333,10 @@ class PairSampler(Sampler):
         # A pair that ends at a moment has not seen its last event.
         count[:, :num_silent] -= last_count[:, :num_silent]
         pixel = pixel_index(packed[0])
+        drift, variance, variance_of_all = self._drift
+        num_events, surplus = count.sum(0), count[0] - count[1]
+        # Thresholds that are both too large or too small make no drift, and differ between pixels as much.
+        unknown = variance[pixel] * num_events**2 + variance_of_all * surplus**2
         batch = PairBatch(
             num_positive=count[0],
             num_negative=count[1],
@@ -311,6 +346,8 @@ class PairSampler(Sampler):
             last_num_negative=last_count[1],
             last_interval=last_interval.float(),
             pixel=pixel,
+            drift=drift[pixel] * num_events,
+            weight=_RENDERED_VARIANCE / (_RENDERED_VARIANCE + unknown),
         )
         return self._pixel_rays.rays(pixel, seconds), batch
 

@@ -62,18 +62,21 @@ def temporal_loss(rate: Tensor, change: Tensor, interval: Tensor) -> Tensor:
     return (relative.abs() * usable).sum() / usable.sum().clamp_min(1)
 
 
-def reconstruction_loss(predicted: Tensor, target: Tensor, mean_contrast_threshold: Tensor | float) -> Tensor:
+def reconstruction_loss(
+    predicted: Tensor, target: Tensor, mean_contrast_threshold: Tensor | float, weight: Tensor | float = 1.0
+) -> Tensor:
     """Return ℓ_r (paper, eq. 11): the mean squared error of changes, in units of the mean contrast threshold.
 
     Args:
         predicted: (N,) rendered changes of log-radiance.
         target: (N,) changes that the events tell of.
         mean_contrast_threshold: C̄.
+        weight: (N,) how much each counts.
 
     Returns:
-        The loss, a scalar: 1 for a constant field when every pair is one event and C+ = C−.
+        The loss, a scalar: 1 for a constant field when all weights are 1, every pair is one event and C+ = C−.
     """
-    return (predicted - target).square().mean() / mean_contrast_threshold**2
+    return (weight * (predicted - target).square()).mean() / mean_contrast_threshold**2
 
 
 def dead_zone_excess(

@@ -115,7 +115,11 @@ MISTAKES = [
         1,
         "Error: nothing: there is no such file; download firenet_1000",
     ),
-    ("convert F --output O --weights W", 1, "Error: --weights: poses that are given need no images; choose --poses"),
+    (
+        "convert F --output O --weights W",
+        1,
+        "Error: --weights: --poses given makes no images of events; choose",
+    ),
     ("reconstruct F --output O --events-per-pixel nan", 1, "Error: --events-per-pixel: nan is out of range"),
     ("reconstruct F --output O --events-per-pixel 1e300", 1, "Error: --events-per-pixel: 1e+300 is out of range"),
     ("simulate --output F", 1, "Error: F: the folder exists already"),

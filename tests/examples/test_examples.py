@@ -90,6 +90,7 @@ def test_supervision_of_your_own(tmp_path: Path) -> None:
     assert list((tmp_path / "outputs").rglob("step-000000002.ckpt"))
 
 
+@pytest.mark.slow
 def test_notebook(tmp_path: Path) -> None:
     """Runs with few steps: the cells, not the picture, are tested."""
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")

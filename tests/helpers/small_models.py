@@ -164,4 +164,6 @@ def make_batch(num_pairs: int, device: torch.device | str = "cpu") -> PairBatch:
         last_num_negative=1 - positive,
         last_interval=torch.full_like(positive, 1e-3),
         pixel=zeros,
+        drift=torch.zeros_like(positive),
+        weight=torch.ones_like(positive),
     )

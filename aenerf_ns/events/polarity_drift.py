@@ -1,0 +1,72 @@
+"""How far the contrast thresholds of each pixel are from those of the sensor, from the events alone.
+
+The thresholds of a real sensor's pixels differ. Where a pixel's C+ is too small beside its C−, positive events prevail,
+however long the pixel watches: their surplus grows with the number of events. What the scene does to a pixel does not
+grow, because radiance stays within bounds. So the surplus that a pixel gains with each event, its *drift*, tells of its
+thresholds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aenerf_ns.events.pair_store import EventPairs
+from aenerf_ns.events.pairing import surplus_slopes
+
+# Of the numbers 1, 2, ..., 6 around their mean. Pixels with fewer events in a half say nothing of their own.
+_MIN_SQUARES = 17.5
+# A pixel whose events are three quarters of one polarity is broken, and not one of those whose thresholds differ.
+_MAX_DRIFT = 0.5
+
+
+@dataclass(frozen=True)
+class PolarityDrift:
+    """The drift of each pixel.
+
+    Attributes:
+        drift: (pixels,) float32, positive less negative events that a pixel gains with each event, less what pixels
+            gain on average, shrunk to what is known. (C− − C+) / (C+ + C−) of the pixel.
+        variance: (pixels,) float32, of its error.
+        spread: standard deviation of the drift over the pixels; half of that of C+ / C−.
+    """
+
+    drift: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    spread: float
+
+
+def polarity_drift(pairs: EventPairs) -> PolarityDrift:
+    """Estimate the drift of each pixel.
+
+    The drift of a pixel is the slope of a line through its surplus over its number of events. The slopes in the first
+    and in the second half of the events share the pixel's thresholds, and not what it saw: their covariance over the
+    pixels is the variance of the drift. What neighbors share is left out of it, because it is of the scene.
+    """
+    num_pixels = pairs.width * pairs.height
+    num_rows = len(pairs) + pairs.num_first + pairs.num_within_refractory_period
+    slopes, squares = surplus_slopes(pairs.rows[:num_rows], num_pixels)
+    known = (squares[1:] >= _MIN_SQUARES).all(0)
+    typical = known & (np.abs(slopes) < _MAX_DRIFT).all(0)
+    if typical.sum() < 2:
+        return PolarityDrift(np.zeros(num_pixels, np.float32), np.zeros(num_pixels, np.float32), 0.0)
+    # The errors of the slopes, in squared thresholds of what was seen.
+    error, *errors_of_halves = 1 / np.maximum(squares, _MIN_SQUARES)
+    variance, seen = 0.0, 1.0
+    for _ in range(20):
+        weight = typical / (variance + seen * sum(errors_of_halves)) ** 2
+        weight /= weight.sum()
+        whole, first, second = slopes - (slopes * weight).sum(1, keepdims=True)
+        product, near = weight * first * second, weight * np.roll(weight, 1)
+        shared = (near * (first * np.roll(second, 1) + second * np.roll(first, 1))).sum() / (2 * near.sum() or 1.0)
+        # Two standard errors, so that equal thresholds are found equal.
+        variance = max(product.sum() - shared - 2 * np.sqrt((product**2).sum()), 0.0)
+        seen = (weight * (first - second) ** 2).sum() / (weight * sum(errors_of_halves)).sum()
+    share = known * variance / (variance + seen * error)
+    return PolarityDrift(
+        drift=(share * whole).astype(np.float32),
+        variance=((1 - share) * variance).astype(np.float32),
+        spread=float(np.sqrt(variance)),
+    )
