@@ -27,15 +27,26 @@ class PolarityDrift:
     """The drift of each pixel.
 
     Attributes:
-        drift: (pixels,) float32, positive less negative events that a pixel gains with each event, less what pixels
-            gain on average, shrunk to what is known. (C− − C+) / (C+ + C−) of the pixel.
-        variance: (pixels,) float32, of its error.
+        drift: (height, width) float32, positive less negative events that a pixel gains with each event, less what
+            pixels gain on average, shrunk to what is known. (C− − C+) / (C+ + C−) of the pixel.
+        variance: (height, width) float32, of its error.
         spread: standard deviation of the drift over the pixels; half of that of C+ / C−.
     """
 
     drift: NDArray[np.float32]
     variance: NDArray[np.float32]
     spread: float
+
+    def summary(self) -> str:
+        """Return one line that says how thresholds differ."""
+        return (
+            f"C+ / C- of the pixels differs by {2 * self.spread:.1%} (standard deviation), by the drift of their events"
+        )
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Draw the map: gray for a pixel like the others, black and white from three standard deviations of C+ / C−."""
+        shown = np.clip(self.drift / max(3 * self.spread, 1e-6), -1, 1)
+        return np.rint(127.5 - 127.5 * shown).astype(np.uint8)
 
 
 def polarity_drift(pairs: EventPairs) -> PolarityDrift:
@@ -45,13 +56,13 @@ def polarity_drift(pairs: EventPairs) -> PolarityDrift:
     and in the second half of the events share the pixel's thresholds, and not what it saw: their covariance over the
     pixels is the variance of the drift. What neighbors share is left out of it, because it is of the scene.
     """
-    num_pixels = pairs.width * pairs.height
+    shape = (pairs.height, pairs.width)
     num_rows = len(pairs) + pairs.num_first + pairs.num_within_refractory_period
-    slopes, squares = surplus_slopes(pairs.rows[:num_rows], num_pixels)
+    slopes, squares = surplus_slopes(pairs.rows[:num_rows], pairs.height * pairs.width)
     known = (squares[1:] >= _MIN_SQUARES).all(0)
     typical = known & (np.abs(slopes) < _MAX_DRIFT).all(0)
     if typical.sum() < 2:
-        return PolarityDrift(np.zeros(num_pixels, np.float32), np.zeros(num_pixels, np.float32), 0.0)
+        return PolarityDrift(np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0.0)
     # The errors of the slopes, in squared thresholds of what was seen.
     error, *errors_of_halves = 1 / np.maximum(squares, _MIN_SQUARES)
     variance, seen = 0.0, 1.0
@@ -66,7 +77,7 @@ def polarity_drift(pairs: EventPairs) -> PolarityDrift:
         seen = (weight * (first - second) ** 2).sum() / (weight * sum(errors_of_halves)).sum()
     share = known * variance / (variance + seen * error)
     return PolarityDrift(
-        drift=(share * whole).astype(np.float32),
-        variance=((1 - share) * variance).astype(np.float32),
+        drift=(share * whole).astype(np.float32).reshape(shape),
+        variance=((1 - share) * variance).astype(np.float32).reshape(shape),
         spread=float(np.sqrt(variance)),
     )

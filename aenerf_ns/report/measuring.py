@@ -20,6 +20,7 @@ from aenerf_ns.report.view_pictures import ViewPictures, choose_views, picture_v
 
 if TYPE_CHECKING:
     from aenerf_ns.checking.report import CheckResult
+    from aenerf_ns.events.polarity_drift import PolarityDrift
 
 
 @dataclass
@@ -42,6 +43,7 @@ class RunReport:
         pictures: by the file of the view.
         pairs: rendered against measured changes, None where batches are not pairs of events.
         num_pairs: the account of the pairs, in words.
+        drift: how the thresholds of the pixels differ, None where batches are not pairs of events.
         missing: what was not measured, and why.
     """
 
@@ -60,6 +62,7 @@ class RunReport:
     pictures: dict[str, ViewPictures] = field(default_factory=dict)
     pairs: PairResiduals | None = None
     num_pairs: str | None = None
+    drift: PolarityDrift | None = None
     missing: list[str] = field(default_factory=list)
 
     @property
@@ -85,6 +88,8 @@ class RunReport:
             data["estimation"] = self.estimation.summary
         if self.num_pairs is not None:
             data["pairs"] = self.num_pairs
+        if self.drift is not None:
+            data["drift_spread"] = self.drift.spread
         return {
             "name": self.name,
             "folder": str(self.folder),
@@ -181,6 +186,7 @@ def _measure_data(report: RunReport, run: TrainedRun) -> None:
     """Measure what needs the events, where they still are."""
     # Imported lazily, because numba is slow to import.
     from aenerf_ns.checking.report import check
+    from aenerf_ns.events.polarity_drift import polarity_drift
 
     scene = run.scene
     if not scene.event_file.path.is_file():
@@ -196,3 +202,4 @@ def _measure_data(report: RunReport, run: TrainedRun) -> None:
         report.missing.append("Rendered against measured changes: the batches of this method are no pairs of events.")
     else:
         report.num_pairs = run.dataset.pairs.summary()
+        report.drift = polarity_drift(run.dataset.pairs)

@@ -293,9 +293,11 @@ class PairSampler(Sampler):
         from aenerf_ns.events.polarity_drift import polarity_drift
 
         found = polarity_drift(self.dataset.pairs)
+        if found.spread > 0:
+            CONSOLE.print(f"{found.summary()}: pairs allow for it", soft_wrap=True)
         used = float(self._max_events_per_pair > 1)
         drift, variance = (
-            torch.from_numpy(used * array).to(self._pixel_rays.channels.device)
+            torch.from_numpy(used * array.ravel()).to(self._pixel_rays.channels.device)
             for array in (found.drift, found.variance)
         )
         return drift, variance, used * found.spread**2

@@ -12,6 +12,7 @@ from PIL import Image
 
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.report import CheckResult
+from aenerf_ns.events.polarity_drift import PolarityDrift
 from aenerf_ns.events.statistics import EventStatistics
 from aenerf_ns.recording.poses_report import PosesReport
 from aenerf_ns.report.comparison import paired_differences, views_left_out
@@ -75,6 +76,7 @@ def make_report(name: str, **changes: Any) -> RunReport:
         "check": CheckResult(events, ["Events: 1000"], [HOSTILE], warped=cast(WarpedEvents, Drawing())),
         "estimation": PosesReport(HOSTILE, picture()),
         "num_pairs": "1000 pairs",
+        "drift": PolarityDrift(np.zeros((4, 6)), np.zeros((4, 6)), 0.06),
         "poses": RunPoses(2, [0.0, 1.0], {"estimated": path, "true": path}, [1.0, 1.0], [0.0, 0.0],
                           {"estimated": kinds, "corrected": kinds}, {"estimated": over_time},
                           {axis: [0.0, 0.1] for axis in axes}),
@@ -101,12 +103,12 @@ def test_page_shows_everything_escaped() -> None:
     assert body.count("&lt;script&gt;alert(&#34;&amp;&#34;)") > 8
     # Eight plots: curves, rate, trajectory, errors, correction, changes, tiles, lengths.
     assert body.count('class="plotly-graph-div"') == 8
-    assert body.count('<img alt="" src="data:image/jpeg;base64,') == 6
+    assert body.count('<img alt="" src="data:image/jpeg;base64,') == 7
     targets = re.findall(r'<a href="#(\w+)">', body)
     assert len(targets) == 8
     assert all(f'<h2 id="{target}">' in body for target in targets)
     for text in ("1,000 events in 1.000 s, 40.0% positive. 1 gaps of the poses", "finished: all 5 steps", "no GPU",
-                 "1.00 GiB (host)", "PSNR 20.50 ± 0.50 dB", "absolute trajectory error 1.25 before",
+                 "1.00 GiB (host)", "PSNR 20.50 ± 0.50 dB", "differs by 12.0%", "absolute trajectory error 1.25 before",
                  "rendering: PSNR 20.00 dB, SSIM 0.500", 'data-value="21.0">21.00<', "correlation 0.500"):  # fmt: skip
         assert text in body, text
     # The column of turn rates is empty.
@@ -115,7 +117,7 @@ def test_page_shows_everything_escaped() -> None:
 
 
 def test_page_of_a_run_without_measurements() -> None:
-    bare = dict.fromkeys(("record", "scalars", "check", "num_pairs", "pairs"))
+    bare = dict.fromkeys(("record", "scalars", "check", "num_pairs", "drift", "pairs"))
     empty = {"pose_gaps_ns": [], "evaluation": {}, "chosen": {}, "pictures": {}, "missing": []}
     poses = RunPoses(0, [0.0], {"estimated": [[0.0] * 3]}, [0.0], [0.0], None, None, None)
     page = page_of([make_report("a", **bare, **empty, poses=poses)], [])
@@ -135,5 +137,5 @@ def test_page_compares_runs_on_shared_views() -> None:
     assert "Left out: 1 of a, 1 of b." in page
     # The same data once, and four pictures for each run.
     assert page.count("All that aenerf check says") == 1
-    assert page.count("<figure>") == 2 + 2 * 4
+    assert page.count("<figure>") == 3 + 2 * 4
     assert "No test view is in all runs" in page_of([first, second], [])
