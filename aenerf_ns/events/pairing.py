@@ -33,8 +33,8 @@ _MAX_MERGED = 255
 _MAX_PIXELS = 1 << 23
 
 # A pair spans an event only where the intervals on both sides of it are so many refractory periods long. At a steady
-# rate, at most a twentieth of a contrast threshold then goes unseen, which is less than thresholds are known to.
-_INTERVAL_TO_REFRACTORY_PERIOD = 20
+# rate, at most a third of a contrast threshold then goes unseen. Shorter pairs would cost more (benchmarks/LOG.md).
+_INTERVAL_TO_REFRACTORY_PERIOD = 4
 
 EVENTS_IN_MEMORY = 1 << 27
 """The most events that stay in memory, if there is a file for more: 16 bytes each, twice while they are sorted."""
@@ -62,7 +62,7 @@ def pair_events(
     Args:
         chunks: the stream in pieces, in the order of time, all of one sensor.
         refractory_period: τ in nanoseconds. An event at most τ after the previous event of its pixel gives no pair. A
-            pair is joined with others only if its interval is at least 20 τ, and theirs are.
+            pair is joined with others only if its interval is at least 4 τ, and theirs are.
         window: events outside the window are left out, and no pair spans a gap.
         usable: (height, width) whether the events of a pixel are used. None: all are.
         expected_events: the number of events, if known. It saves growing the arrays.

@@ -203,7 +203,7 @@ class PairSamplerConfig(SamplerConfig):
     _target: type = field(default_factory=lambda: PairSampler)
     max_events_per_pair: int = 64
     """The most events of its pixel that a pair spans, up to 255. 1: consecutive events, as in the paper. Pairs are of
-    consecutive events wherever the refractory period is more than a twentieth of the interval between two events."""
+    consecutive events wherever the refractory period is more than a quarter of the interval between two events."""
     silent_pair_share: float = 0.25
     """Share of the pairs of a batch that end at a random moment at a random pixel, between two events. The others end
     at a random event. 0: all of them, as in the paper."""

@@ -68,8 +68,8 @@ def cut(stream: EventStream, sizes: list[int]) -> Iterator[EventStream]:
 def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     rows: list[tuple[int, int, int, int]], sizes: list[int], refractory_period: int, in_memory: int, unused: int
 ) -> None:
-    # Intervals that are shorter and longer than 20 refractory periods.
-    rows = [(x, y, 10 * t, p) for x, y, t, p in rows]
+    # Intervals that are shorter and longer than 4 refractory periods.
+    rows = [(x, y, 3 * t, p) for x, y, t, p in rows]
     usable = (unused >> np.arange(WIDTH * HEIGHT) & 1 == 0).reshape(HEIGHT, WIDTH)
     used = [row for row in rows if usable[row[1], row[0]]]
     options = {"refractory_period": refractory_period, "usable": usable}
@@ -90,7 +90,7 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     # A pair is joined with the pair that ends where it begins, if neither is too short.
     reaches: dict[tuple[int, int, int], int] = {}
     for x, y, begin, end, _, _, reach in found:
-        is_long = end - begin >= 20 * refractory_period
+        is_long = end - begin >= 4 * refractory_period
         assert reach == 1 + (reaches.get((x, y, begin), 0) if is_long else 0)
         if is_long:
             reaches[x, y, end] = reach
