@@ -71,17 +71,17 @@ def test_a_pair_spans_several_events(random_poses: torch.Tensor) -> None:
     assert found[one] / found[two] == pytest.approx(1, abs=0.2)
 
 
-@pytest.mark.parametrize("refractory_period", [12_000_000, 12_500_000])
+@pytest.mark.parametrize("refractory_period", [60_000_000, 62_500_000])
 def test_pairs_span_events_beside_which_the_refractory_period_is_short(
     random_poses: torch.Tensor, refractory_period: int
 ) -> None:
-    # The middle one of a pixel's three events is 245 ms after the first, 750 ms before the last.
+    # The middle one of a pixel's three events is 250 ms after the first, 750 ms before the last.
     sensor = SensorModel(refractory_period=refractory_period)
     sampler = make_sampler(random_poses, sensor, max_events_per_pair=3)
     rays, batch = sampler.sample(400)
     assert rays.times is not None
     longer = batch.num_positive + batch.num_negative > 1
-    assert longer.any() == (refractory_period == 12_000_000)
+    assert longer.any() == (refractory_period == 60_000_000)
     starts, ends = torch.round(rays.times[:, 0] * 1e9).long().chunk(2)
     assert (starts[longer] == 5_000 + refractory_period).all()
     assert (ends[longer] == 10**9).all()
