@@ -21,7 +21,11 @@ from aenerf_ns.events.stream import EventStream
 PIXEL_SHIFT, SPAN_SHIFT, NEGATIVE_SHIFT = 40, 32, 16
 COUNT_MASK, SPAN_MASK, INDEX_MASK = 0xFFFF, 0xFF, 0xFFFFFFFF
 MAX_SPAN = 255
-"""The most consecutive pairs that are joined. With at most 255 events merged into one, counts then fit in 16 bits."""
+"""The most consecutive pairs that are joined."""
+COUNT_UNIT = 8
+"""Counts are kept in eighths of an event, for changes that no event tells of."""
+MAX_JOINED = 31
+"""The most events merged into one that others are joined with. Counts of :data:`MAX_SPAN` pairs then fit in 16 bits."""
 BLOCK = 16
 """Rows for which :class:`EventPairs` keeps one end, to find moments."""
 
@@ -36,11 +40,12 @@ class EventPairs:
 
     Attributes:
         rows: (R, 2) int64, in memory or mapped from a file: the event's time in nanoseconds, and a packed number. The
-            packed number holds, from the highest bits, the pixel (row * width + column, 24 bits), the maximum span
-            (8 bits) and two counts (16 bits each). The maximum span is how many consecutive pairs may be joined that
-            end with this pair, at most 255; 0 for a chain start. The counts are negative and positive events from the
-            last chain start up to this row, modulo 65536. A chain start has its index among all chain starts in place
-            of the counts. Rows behind the last event's fill the last block, and are not drawn.
+            packed number holds, from the highest bits, the pixel (row * width + column, 24 bits), the maximum span (8
+            bits) and two counts (16 bits each). The maximum span is how many consecutive pairs may be joined that end
+            with this pair, at most 255; 0 for a chain start. The counts are negative and positive events from the last
+            chain start up to this row, and the change that the pixel is blind to after each of them, in eighths of an
+            event, modulo 65536. A chain start has its index among all chain starts in place of the counts. Rows behind
+            the last event's fill the last block, and are not drawn.
         replacement_rows: (S,) int64, for each chain start among the first ``len(pairs)`` rows, a pair among the rows
             behind them. So a uniform row of the first ``len(pairs)``, or its replacement if it is a chain start, is a
             uniform pair.
@@ -141,18 +146,22 @@ def chain_index(packed: Any) -> Any:
 def event_counts(later: Any, earlier: Any) -> tuple[Any, Any]:
     """Count the events of a pixel after an earlier row, up to and including a later one.
 
+    A pixel is blind for the refractory period τ after an event. Where a single event of the same polarity follows after
+    an interval dt, log-radiance is taken to change steadily: by τ / (dt − τ) thresholds, at most 7/8, while the pixel
+    is blind. This counts for the event that made it blind, so the whole part of one event's counts is that event.
+
     Args:
-        later: packed numbers of pairs.
-        earlier: packed numbers of rows of the same pixels, at most the later rows' maximum span before these.
+        later: packed numbers of rows.
+        earlier: packed numbers of rows of the same pixels, at most the maximum span of a pair before these.
 
     Returns:
-        Numbers of positive and of negative events.
+        Numbers of positive and of negative events, with those missed after each.
     """
     # A chain start has an index in place of its counts, which are 0.
-    earlier = earlier * is_pair(earlier)
+    later, earlier = later * is_pair(later), earlier * is_pair(earlier)
     positive = (later - earlier) & COUNT_MASK
     negative = ((later >> NEGATIVE_SHIFT) - (earlier >> NEGATIVE_SHIFT)) & COUNT_MASK
-    return positive, negative
+    return positive / COUNT_UNIT, negative / COUNT_UNIT
 
 
 def map_rows(file: BinaryIO, num_rows: int) -> NDArray[np.int64]:

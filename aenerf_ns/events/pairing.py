@@ -16,7 +16,9 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import (
     BLOCK,
     COUNT_MASK,
+    COUNT_UNIT,
     INDEX_MASK,
+    MAX_JOINED,
     MAX_SPAN,
     NEGATIVE_SHIFT,
     PIXEL_SHIFT,
@@ -207,7 +209,7 @@ class _Table:
         if num_rows == 0:
             raise DataError(self._source, "no event lies on a pixel with a direction", "check the lens's distortion")
         num_pairs = num_rows - first - refractory
-        ends = _Ends(num_rows, _INTERVAL_TO_REFRACTORY_PERIOD * self._refractory_period)
+        ends = _Ends(num_rows, self._refractory_period)
         if self.file is None:
             rows, _ = self._by_pixel(self.size, ends.num_padded)
             self._entries = rows[:0]
@@ -280,7 +282,7 @@ class _Ends:
 
     Args:
         num_rows: of all pixels.
-        shortest_interval: nanoseconds. Pairs whose events are closer are not joined with others.
+        refractory_period: τ in nanoseconds.
 
     Attributes:
         num_rows: of all pixels.
@@ -288,12 +290,12 @@ class _Ends:
         block_ends: see :class:`EventPairs`.
     """
 
-    def __init__(self, num_rows: int, shortest_interval: int) -> None:
+    def __init__(self, num_rows: int, refractory_period: int) -> None:
         num_blocks = -(-num_rows // BLOCK)
         self.num_rows = num_rows
         self.num_padded = num_blocks * BLOCK
         self.block_ends = np.zeros(num_blocks + 1, np.int64)
-        self._shortest_interval = shortest_interval
+        self._refractory_period = refractory_period
         self._chain_starts: list[NDArray[np.int64]] = []
         self._num_chains = 0
         self._row = 0
@@ -304,7 +306,7 @@ class _Ends:
 
     def finish(self, rows: NDArray[np.int64]) -> None:
         """Put maximum span and sums into the next rows, all rows of some pixels."""
-        starts = _finish(rows, self._row, self._num_chains, self._shortest_interval, self.block_ends)
+        starts = _finish(rows, self._row, self._num_chains, self._refractory_period, self.block_ends)
         self._chain_starts.append(self._row + starts)
         self._num_chains += len(starts)
         self._row += len(rows)
@@ -368,11 +370,15 @@ def _sort_into(entries, first_pixel, next_rows, rows):
 
 
 @numba.njit(cache=True)
-def _finish(rows, row, num_chains, shortest_interval, block_ends):
-    """Put maximum span and sums into rows that hold each event's own counts. Returns the chain starts among them."""
+def _finish(rows, row, num_chains, refractory_period, block_ends):
+    """Put maximum span and sums into rows that hold each event's own counts. Returns the chain starts among them.
+
+    For the change that a blind pixel misses see :func:`aenerf_ns.events.pair_store.event_counts`.
+    """
     chain_starts = np.empty(rows.shape[0], np.int64)
     begin = num_chains
-    span = positive = negative = 0
+    span = positive = negative = last_own = 0
+    rest = 0.0
     was_long = False
     for i in range(rows.shape[0]):
         block = (row + i) // BLOCK
@@ -384,16 +390,28 @@ def _finish(rows, row, num_chains, shortest_interval, block_ends):
             chain_starts[num_chains - begin] = i
             rows[i, 1] = pixel << PIXEL_SHIFT | num_chains
             num_chains += 1
-            positive = negative = 0
+            positive = negative = last_own = 0
+            rest = 0.0
             was_long = False
             continue
+        own &= (1 << SPAN_SHIFT) - 1
         interval = rows[i, 0] - rows[i - 1, 0]
         block_ends[block + 1] += interval
-        is_long = interval >= shortest_interval
+        if refractory_period > 0 and own == last_own and (own == 1 or own == 1 << NEGATIVE_SHIFT):
+            # What the rounding leaves goes to the next event.
+            rest += min(COUNT_UNIT * refractory_period / (interval - refractory_period), COUNT_UNIT - 1)
+            missed = min(int(rest), COUNT_UNIT - 1)
+            rest -= missed
+            positive = (positive + missed * (own == 1)) & COUNT_MASK
+            negative = (negative + missed * (own != 1)) & COUNT_MASK
+            rows[i - 1, 1] = rows[i - 1, 1] >> SPAN_SHIFT << SPAN_SHIFT | negative << NEGATIVE_SHIFT | positive
+        last_own = own
+        is_long = interval >= _INTERVAL_TO_REFRACTORY_PERIOD * refractory_period
+        is_long &= max(own & COUNT_MASK, own >> NEGATIVE_SHIFT) <= MAX_JOINED
         span = min(span + 1, MAX_SPAN) if is_long and was_long else 1
         was_long = is_long
-        positive = (positive + own) & COUNT_MASK
-        negative = (negative + (own >> NEGATIVE_SHIFT)) & COUNT_MASK
+        positive = (positive + COUNT_UNIT * (own & COUNT_MASK)) & COUNT_MASK
+        negative = (negative + COUNT_UNIT * (own >> NEGATIVE_SHIFT)) & COUNT_MASK
         rows[i, 1] = pixel << PIXEL_SHIFT | span << SPAN_SHIFT | negative << NEGATIVE_SHIFT | positive
     return chain_starts[: num_chains - begin].copy()
 
@@ -486,7 +504,7 @@ def surplus_slopes(rows, num_pixels):
     for pixel in range(num_pixels):
         count = num_events[pixel]
         squares[:] = products[:] = 0
-        number = surplus = 0
+        number = surplus = 0.0
         for i in range(count):
             packed = rows[row, 1]
             starts_chain = (packed >> SPAN_SHIFT) & SPAN_MASK == 0
@@ -500,8 +518,8 @@ def surplus_slopes(rows, num_pixels):
                     before = 0
                 positive = (packed - before) & COUNT_MASK
                 negative = ((packed >> NEGATIVE_SHIFT) - (before >> NEGATIVE_SHIFT)) & COUNT_MASK
-                number += positive + negative
-                surplus += positive - negative
+                number += (positive + negative) / COUNT_UNIT
+                surplus += (positive - negative) / COUNT_UNIT
             for sums in (whole, half):
                 sums[0] += 1
                 sums[1] += number

@@ -224,10 +224,11 @@ class PairSampler(Sampler):
     A pair of n events carries a difference of its pixel's thresholds n-fold. It is taken off as far as the events tell
     of it (:mod:`aenerf_ns.events.polarity_drift`), and pairs count less, the more is left of it.
 
-    A pair's interval is [earlier time + refractory period, time of the later event or of the moment]. A pixel records
-    no event of what changes while it is blind, so a longer pair would miss that change: pairs reach back only over
-    events beside which the refractory period is short. A learned refractory period needs pairs of consecutive events
-    and none that end at moments, because the pixel may be blind at a moment.
+    A pair's interval is [earlier time + refractory period, time of the later event or of the moment]. What a pixel
+    misses while it is blind, between the two, is counted as if log-radiance changed steadily. Where events follow each
+    other within a few refractory periods that says too little, and pairs do not reach back over them. A learned
+    refractory period needs pairs of consecutive events and none that end at moments, because the pixel may be blind at
+    a moment.
 
     Draws from torch's global generator of the device that holds the pairs, which Nerfstudio seeds. That is the device
     of the batches if the pairs take at most half of the device's free memory. Otherwise the pairs stay in host memory,
@@ -330,10 +331,11 @@ class PairSampler(Sampler):
             within = torch.rand(num_pairs, dtype=torch.float64, device=device).mul_(2).sub_(1).mul_(_WITHIN_MASS)
             within.erfinv_().mul_(_WITHIN_DEVIATION * math.sqrt(2)).add_(_WITHIN_MEAN)
             seconds.append(last_start + within * last_interval)
-        # From the pair's last event but one, and from its first event.
-        last_count, count = torch.stack(event_counts(packed[:1], packed[1:])).float().unbind(1)
+        # What the pixel misses after the last event is not of the pair.
+        last_count = torch.stack(event_counts(packed[0], packed[1])).floor()
+        count = torch.stack(event_counts(packed[1], packed[2]))
         # A pair that ends at a moment has not seen its last event.
-        count[:, :num_silent] -= last_count[:, :num_silent]
+        count[:, num_silent:] += last_count[:, num_silent:]
         pixel = pixel_index(packed[0])
         drift, variance, variance_of_all = self._drift
         num_events, surplus = count.sum(0), count[0] - count[1]

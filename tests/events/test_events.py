@@ -18,12 +18,13 @@ from hypothesis import strategies as st
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pair_store import EventPairs
+from aenerf_ns.events.pair_store import EventPairs, event_counts
 from aenerf_ns.events.pairing import find_rows as find_rows_on_cpu
 from aenerf_ns.events.pairing import near_blocks, pair_events
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.supervision.event_pairs import find_rows
 
 WIDTH, HEIGHT = 4, 3
@@ -142,11 +143,36 @@ def test_pairs_are_found_by_place_and_by_number(
     assert sorted(drawn[len(places) :]) == list(range(len(known)))
 
 
-def test_a_pair_joins_255_events_at_most() -> None:
-    pairs = pair_events([make_stream([(1, 2, t, 1) for t in range(300) for _ in range(255)])])
+@pytest.mark.parametrize(("merged", "most"), [(31, 255), (255, 1)])
+def test_a_pair_joins_255_events_at_most(merged: int, most: int) -> None:
+    pairs = pair_events([make_stream([(1, 2, t, 1) for t in range(300) for _ in range(merged)])])
     found = unpacked(pairs)
-    assert [pair[6] for pair in found] == [min(i + 1, 255) for i in range(299)]
-    assert {pair[4:6] for pair in found} == {(255, 0)}
+    assert [pair[6] for pair in found] == [min(i + 1, most) for i in range(299)]
+    assert {pair[4:6] for pair in found} == {(merged, 0)}
+    later, earlier = pairs.rows[299, 1], pairs.rows[299 - most, 1]
+    assert event_counts(later, earlier) == (merged * most, 0)
+
+
+def test_what_a_blind_pixel_misses_is_counted() -> None:
+    """Log-radiance that rises, then falls, steadily: between any two events it changed by as much as is counted."""
+    sensor = SensorModel(refractory_period=2_000_000)
+    simulator = EventSimulator(1, 1, sensor, log_epsilon=0.0)
+    log_radiance = np.concatenate([np.linspace(-3, 3, 301), np.linspace(3, -3, 301)])
+    columns = [simulator(np.exp([[value]]), 1_000_000 * i) for i, value in enumerate(log_radiance)]
+    rows = pair_events(
+        [EventStream(*map(np.concatenate, zip(*columns, strict=True)), 1, 1)], refractory_period=2_000_000
+    ).rows
+    num_events = sum(len(events[0]) for events in columns)
+    assert num_events == 40
+    for first in range(1, num_events - 3):
+        for last in range(first + 1, num_events):
+            own = np.floor(event_counts(rows[last, 1], rows[last - 1, 1]))
+            positive, negative = own + event_counts(rows[last - 1, 1], rows[first, 1])
+            interval = rows[first, 0] + 2_000_000, rows[last, 0]
+            begin, end = np.interp(interval, 1_000_000 * np.arange(602), log_radiance)
+            # Rounding, and where the rise ends: what it rises after its last event has no event.
+            turns = interval[0] < 300_000_000 < interval[1]
+            assert 0.25 * (positive - negative) == pytest.approx(end - begin, abs=0.25 / 8 + 0.25 * turns)
 
 
 def test_a_table_that_cannot_be_made_is_refused() -> None:

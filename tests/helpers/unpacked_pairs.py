@@ -12,7 +12,8 @@ def unpacked(pairs: EventPairs) -> list[tuple[int, ...]]:
     for row, (time, number) in enumerate(pairs.rows.tolist()):
         pixel, reach, low = number >> 40, number >> 32 & 255, number & 0xFFFFFFFF
         if reach:
-            counts = (low - positive) & 0xFFFF, ((low >> 16) - negative) & 0xFFFF
+            # Whole events: the rest is what the pixel is blind to after them.
+            counts = ((low - positive) & 0xFFFF) // 8, (((low >> 16) - negative) & 0xFFFF) // 8
             positive, negative = low & 0xFFFF, low >> 16
             place = (pixel % pairs.width, pixel // pairs.width)
             found.append((*place, int(pairs.rows[row - 1, 0]), time, *counts, reach))
