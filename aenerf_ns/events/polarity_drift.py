@@ -18,6 +18,8 @@ from aenerf_ns.events.pairing import surplus_slopes
 
 # Of the numbers 1, 2, ..., 6 around their mean. Pixels with fewer events in a half say nothing of their own.
 _MIN_SQUARES = 17.5
+# Of the drift over the pixels, where a tenth is the standard deviation of thresholds, as v2e assumes.
+_TYPICAL_VARIANCE = 0.005
 # A pixel whose events are three quarters of one polarity is broken, and not one of those whose thresholds differ.
 _MAX_DRIFT = 0.5
 
@@ -65,9 +67,10 @@ def polarity_drift(pairs: EventPairs) -> PolarityDrift:
         return PolarityDrift(np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0.0)
     # The errors of the slopes, in squared thresholds of what was seen.
     error, *errors_of_halves = 1 / np.maximum(squares, _MIN_SQUARES)
-    variance, seen = 0.0, 1.0
+    variance, seen = _TYPICAL_VARIANCE, 1.0
     for _ in range(20):
-        weight = typical / (variance + seen * sum(errors_of_halves)) ** 2
+        # No pixel counts for many others, however many events it has.
+        weight = typical / (max(variance, _TYPICAL_VARIANCE) + seen * sum(errors_of_halves)) ** 2
         weight /= weight.sum()
         whole, first, second = slopes - (slopes * weight).sum(1, keepdims=True)
         product, near = weight * first * second, weight * np.roll(weight, 1)

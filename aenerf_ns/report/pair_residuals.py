@@ -68,7 +68,7 @@ def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
         pieces.append(torch.stack([change / unit for change in supervision.changes(outputs, batch[chosen])]))
     rendered, measured = torch.cat(pieces, -1).double().cpu().numpy()
     at_events = ~batch.ends_between_events.cpu().numpy()
-    length = (batch.num_positive + batch.num_negative).cpu().numpy()[at_events]
+    length = (batch.num_positive + batch.num_negative).floor().cpu().numpy()[at_events]
     pixel = batch.pixel.cpu().numpy()[at_events]
     rendered, measured = rendered[at_events], measured[at_events]
     residual = np.abs(rendered - measured)

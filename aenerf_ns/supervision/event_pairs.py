@@ -54,7 +54,7 @@ _WITHIN_MASS = math.erf(_WITHIN_MEAN / (_WITHIN_DEVIATION * math.sqrt(2)))
 
 @dataclass
 class PairBatch(ChangeBatch):
-    """Pairs of events of a pixel, each of which may span several events.
+    """Pairs of events of a pixel, each of which may span several events. Their counts include what the pixel missed.
 
     Rays at the starts of the intervals come first, then rays at their ends, then, if rates are needed, rays at t_sam: a
     random time between the last two events of the pair, because over more events the mean rate says little of a moment.
