@@ -60,8 +60,8 @@ def test_nothing_is_found_where_thresholds_are_equal() -> None:
 
 
 def test_hot_pixels_neither_count_nor_keep_their_surplus() -> None:
-    noise = SensorNoise(contrast_threshold_spread=0.03)
-    pairs, simulator = record(noise)
+    # Some fire either polarity at random, and one positive events only.
+    pairs, simulator = record(SensorNoise(contrast_threshold_spread=0.03, hot_pixel_fraction=0.003, hot_pixel_rate=1e3))
     events = pairs.events()
     times = np.arange(1, 3001, dtype=np.int64) * 1_300_000
     hot = EventStream(
