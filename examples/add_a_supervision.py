@@ -34,7 +34,7 @@ class AbsoluteError(PairSupervision):
     def losses(self, outputs: Mapping[str, Any], batch: PairBatch) -> dict[str, Tensor]:
         """Return the loss of a batch."""
         predicted, change = self.changes(outputs, batch)
-        return {"reconstruction_loss": ((predicted - change) / self.loss_unit(outputs)).abs().mean()}
+        return {"reconstruction_loss": (batch.weight * ((predicted - change) / self.loss_unit(outputs)).abs()).mean()}
 
 
 def main(data: Path, output: Path, steps: int = 2000) -> None:

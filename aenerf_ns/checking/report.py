@@ -244,7 +244,9 @@ def _check_thresholds(
     if by_frames is not None:
         size, low, high = by_frames
         figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
-    if abs(ratio - used) > _LIMITS.threshold_deviations * uncertainty:
+    # Reversed polarities reverse the ratio.
+    is_reversed = (changes.correlation() or 0.0) < _LIMITS.min_correlation
+    if abs(ratio - used) > _LIMITS.threshold_deviations * uncertainty and not is_reversed:
         value = f"{ratio * sensor.negative_contrast_threshold:.3g}"
         if recording.has_assumed_thresholds:
             result.sensor_options = {"positive-contrast-threshold": value}

@@ -148,7 +148,8 @@ def event_counts(later: Any, earlier: Any) -> tuple[Any, Any]:
 
     A pixel is blind for the refractory period τ after an event. Where a single event of the same polarity follows after
     an interval dt, log-radiance is taken to change steadily: by τ / (dt − τ) thresholds, at most 7/8, while the pixel
-    is blind. This counts for the event that made it blind, so the whole part of one event's counts is that event.
+    is blind. This counts for the event that made it blind. Being less than one, it leaves the number of events that
+    share a time the whole part of what is counted from the row before.
 
     Args:
         later: packed numbers of rows.

@@ -400,7 +400,7 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
         if refractory_period > 0 and own == last_own and (own == 1 or own == 1 << NEGATIVE_SHIFT):
             # What the rounding leaves goes to the next event.
             rest += min(COUNT_UNIT * refractory_period / (interval - refractory_period), COUNT_UNIT - 1)
-            missed = min(int(rest), COUNT_UNIT - 1)
+            missed = int(rest)
             rest -= missed
             positive = (positive + missed * (own == 1)) & COUNT_MASK
             negative = (negative + missed * (own != 1)) & COUNT_MASK
@@ -494,15 +494,15 @@ def surplus_slopes(rows, num_pixels):
         and sums of squares of the numbers of events around their means, which tell how well the slopes are known.
     """
     slopes, all_squares = np.zeros((2, 3, num_pixels))
-    num_events = np.zeros(num_pixels, np.int64)
-    for i in range(rows.shape[0]):
-        num_events[rows[i, 1] >> PIXEL_SHIFT] += 1
     # Of a chain, and of the part of it in one half: number, sums of events and of surplus, and of their products.
     whole, half = np.zeros(5), np.zeros(5)
     squares, products = np.zeros(3), np.zeros(3)
     row = 0
-    for pixel in range(num_pixels):
-        count = num_events[pixel]
+    while row < rows.shape[0]:
+        pixel = rows[row, 1] >> PIXEL_SHIFT
+        count = 1
+        while row + count < rows.shape[0] and rows[row + count, 1] >> PIXEL_SHIFT == pixel:
+            count += 1
         squares[:] = products[:] = 0
         number = surplus = 0.0
         for i in range(count):

@@ -18,10 +18,12 @@ from aenerf_ns.events.pairing import surplus_slopes
 
 # Of the numbers 1, 2, ..., 6 around their mean. Pixels with fewer events in a half say nothing of their own.
 _MIN_SQUARES = 17.5
-# Of the drift over the pixels, where a tenth is the standard deviation of thresholds, as v2e assumes.
+# Of the drift over the pixels, where a tenth is the standard deviation of thresholds.
 _TYPICAL_VARIANCE = 0.005
-# A pixel whose events are three quarters of one polarity is broken, and not one of those whose thresholds differ.
+# A pixel whose events are three quarters of one polarity is broken: how much thresholds differ is not asked of it.
 _MAX_DRIFT = 0.5
+# Fewer say too little of how much thresholds differ.
+_MIN_PIXELS = 100
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class PolarityDrift:
         drift: (height, width) float32, positive less negative events that a pixel gains with each event, less what
             pixels gain on average, shrunk to what is known. (C− − C+) / (C+ + C−) of the pixel.
         variance: (height, width) float32, of its error.
-        spread: standard deviation of the drift over the pixels; half of that of C+ / C−.
+        spread: standard deviation of the drift over the pixels; half of the relative one of C+ / C−.
     """
 
     drift: NDArray[np.float32]
@@ -63,7 +65,7 @@ def polarity_drift(pairs: EventPairs) -> PolarityDrift:
     slopes, squares = surplus_slopes(pairs.rows[:num_rows], pairs.height * pairs.width)
     known = (squares[1:] >= _MIN_SQUARES).all(0)
     typical = known & (np.abs(slopes) < _MAX_DRIFT).all(0)
-    if typical.sum() < 2:
+    if typical.sum() < _MIN_PIXELS:
         return PolarityDrift(np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0.0)
     # The errors of the slopes, in squared thresholds of what was seen.
     error, *errors_of_halves = 1 / np.maximum(squares, _MIN_SQUARES)
@@ -77,7 +79,7 @@ def polarity_drift(pairs: EventPairs) -> PolarityDrift:
         shared = (near * (first * np.roll(second, 1) + second * np.roll(first, 1))).sum() / (2 * near.sum() or 1.0)
         # Two standard errors, so that equal thresholds are found equal.
         variance = max(product.sum() - shared - 2 * np.sqrt((product**2).sum()), 0.0)
-        seen = (weight * (first - second) ** 2).sum() / (weight * sum(errors_of_halves)).sum()
+        seen = max((weight * (first - second) ** 2).sum() / (weight * sum(errors_of_halves)).sum(), 1e-6)
     share = known * variance / (variance + seen * error)
     return PolarityDrift(
         drift=(share * whole).astype(np.float32).reshape(shape),

@@ -254,7 +254,7 @@ class EventSimulator:
         spread = noise.contrast_threshold_spread or 0.0
         self.positive_contrast_threshold = self._draw_thresholds(sensor.positive_contrast_threshold, spread)
         self.negative_contrast_threshold = self._draw_thresholds(sensor.negative_contrast_threshold, spread)
-        # Noise has a generator of its own, so that thresholds do not depend on it.
+        # The rates of noise have a generator of their own, so that the first reference times do not depend on them.
         rng = np.random.default_rng((seed, 1))
         factors = 10 ** rng.normal(0.0, noise.noise_rate_spread or 0.0, (height, width))
         self._leak = (noise.leak_rate or 0.0) * factors * sensor.positive_contrast_threshold * 1e-9
@@ -326,10 +326,10 @@ class EventSimulator:
         if self._readout_period > 0:
             delayed = (t - self._start_ns).astype(np.float64)
             pixels = y.astype(np.int64) * self.width + x
-            self._busy_until, longest = _read_out(
+            self._busy_until, delay = _read_out(
                 delayed, pixels, self._busy_until, self._waits_until, self._readout_period
             )
-            self.longest_delay = max(self.longest_delay, longest)
+            self.longest_delay = max(self.longest_delay, delay)
             is_read = delayed >= 0
             self.num_lost_events += len(t) - np.count_nonzero(is_read)
             x, y, t, p = x[is_read], y[is_read], self._start_ns + delayed[is_read].astype(np.int64), p[is_read]

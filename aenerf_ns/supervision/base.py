@@ -40,7 +40,7 @@ class ChangeBatch(Batch):
     """The events of N pixels, each between two times. The rays at the first times come first, then those at the second.
 
     Attributes:
-        num_positive: (N,) float, positive events after the first time up to the second.
+        num_positive: (N,) float, positive events after the first time up to the second; may be fractional.
         num_negative: (N,) float, negative events in the same time.
         channel: (N,) index of the radiance channel that the pixel sees.
     """

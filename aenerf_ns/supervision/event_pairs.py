@@ -43,7 +43,7 @@ from aenerf_ns.supervision.sensor_parameters import SensorParameters
 # Share of a device's free memory that the table of pairs may take. The rest is for the model and its gradients.
 _SHARE_OF_FREE_MEMORY = 0.5
 
-# Variance of rendered changes, in squared contrast thresholds, around what the events of a right pixel tell of.
+# Variance of rendered changes, in squared contrast thresholds, around what a pixel whose thresholds are right tells.
 _RENDERED_VARIANCE = 0.25
 
 # t_sam: a truncated normal distribution over the interval of the pair's last event.
@@ -54,7 +54,9 @@ _WITHIN_MASS = math.erf(_WITHIN_MEAN / (_WITHIN_DEVIATION * math.sqrt(2)))
 
 @dataclass
 class PairBatch(ChangeBatch):
-    """Pairs of events of a pixel, each of which may span several events. Their counts include what the pixel missed.
+    """Pairs of events of a pixel, each of which may span several events.
+
+    Counts of pairs may be fractional: they include what the pixel missed while it was blind.
 
     Rays at the starts of the intervals come first, then rays at their ends, then, if rates are needed, rays at t_sam: a
     random time between the last two events of the pair, because over more events the mean rate says little of a moment.
@@ -189,7 +191,7 @@ class PairSupervision(ChangeSupervision):
 
     def has_sign(self, change: Tensor, batch: PairBatch) -> Tensor:
         """Return whether the signs of (N,) changes are known. A change known to a threshold only may have either."""
-        return (batch.num_positive != batch.num_negative) & ~batch.ends_between_events
+        return ((batch.num_positive - batch.num_negative).abs() >= 1) & ~batch.ends_between_events
 
     def learned_values(self) -> dict[str, float]:
         """Return C+ / C- and the refractory period in nanoseconds, each where it is learned."""
@@ -290,18 +292,18 @@ class PairSampler(Sampler):
     @cached_property
     def _drift(self) -> tuple[Tensor, Tensor, float]:
         """Each pixel's drift, the variance of its error, and of drifts: none where all pairs are of one event."""
+        device = self._pixel_rays.channels.device
+        if self._max_events_per_pair == 1:
+            nothing = torch.zeros(len(self._pixel_rays.channels), device=device)
+            return nothing, nothing, 0.0
         # Imported lazily: every ns-* command imports this module, and numba is slow to import.
         from aenerf_ns.events.polarity_drift import polarity_drift
 
         found = polarity_drift(self.dataset.pairs)
         if found.spread > 0:
             CONSOLE.print(f"{found.summary()}: pairs allow for it", soft_wrap=True)
-        used = float(self._max_events_per_pair > 1)
-        drift, variance = (
-            torch.from_numpy(used * array.ravel()).to(self._pixel_rays.channels.device)
-            for array in (found.drift, found.variance)
-        )
-        return drift, variance, used * found.spread**2
+        drift, variance = (torch.from_numpy(array.ravel()).to(device) for array in (found.drift, found.variance))
+        return drift, variance, found.spread**2
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, PairBatch]:
         """Draw a batch of pairs.

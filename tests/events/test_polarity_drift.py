@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.streams import make_stream
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.events.pair_store import EventPairs
@@ -79,6 +80,15 @@ def test_few_events_say_nothing() -> None:
     found = polarity_drift(pairs)
     assert found.spread == 0
     assert not found.drift.any()
+
+
+def test_pixels_that_see_the_same_say_nothing() -> None:
+    polarity = np.tile(np.repeat([1, -1], 5), 4)
+    rows = [(x, y, 1000 * t, int(p)) for t, p in enumerate(polarity) for y in range(HEIGHT) for x in range(WIDTH)]
+    found = polarity_drift(pair_events([make_stream(rows, WIDTH, HEIGHT)]))
+    assert found.spread == 0
+    assert not found.drift.any()
+    assert not found.variance.any()
 
 
 def test_gaps_are_no_surplus() -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 
+import numpy as np
 import pytest
 import torch
 from helpers.small_models import CAMERA, EPOCH, make_sampler
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
+from aenerf_ns.events.polarity_drift import PolarityDrift
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
+from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervisionConfig
 
 
 def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> None:
@@ -133,6 +136,31 @@ def test_a_share_of_the_pairs_ends_at_uniform_moments(random_poses: torch.Tensor
         assert longer.any() == (index == 2)
         assert torch.allclose(starts[longer], torch.tensor(0.000_006, dtype=torch.float64))
         assert torch.allclose(starts[inside & ~longer], torch.tensor(start, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("max_events_per_pair", [1, 3])
+def test_the_drift_of_its_pixel_is_taken_off_a_pair(
+    random_poses: torch.Tensor, max_events_per_pair: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drift, variance = np.zeros((2, CAMERA.height, CAMERA.width), np.float32)
+    drift[1, 3], variance[1, 3] = 0.1, 0.01
+    found = PolarityDrift(drift, variance, spread=0.2)
+    monkeypatch.setattr("aenerf_ns.events.polarity_drift.polarity_drift", lambda pairs: found)
+    sampler = make_sampler(random_poses, SensorModel(), max_events_per_pair=max_events_per_pair)
+    _, batch = sampler.sample(400)
+    number, surplus = batch.num_positive + batch.num_negative, batch.num_positive - batch.num_negative
+    here = batch.pixel == CAMERA.width + 3
+    assert here.any()
+    assert not here.all()
+    used = max_events_per_pair > 1
+    torch.testing.assert_close(batch.drift, 0.1 * used * here * number)
+    unknown = used * (0.01 * here * number**2 + 0.04 * surplus**2)
+    torch.testing.assert_close(batch.weight, 0.25 / (0.25 + unknown))
+    # A pixel that has gained too many positive events has become less bright than they say.
+    supervision = PairSupervisionConfig().setup(sensor=SensorModel(), loss_coefficients=PairLossCoefficients())
+    log_radiance = torch.zeros(2 * len(batch), 1)
+    _, change = supervision.changes({"log_radiance": log_radiance}, batch)
+    torch.testing.assert_close(change, 0.25 * (surplus - batch.drift))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])

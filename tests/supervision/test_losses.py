@@ -24,6 +24,8 @@ def test_reconstruction_loss_by_hand() -> None:
     predicted, target = torch.tensor([0.1, -0.2, 0.4]), torch.tensor([0.2, -0.5, 0.2])
     expected = (0.01 + 0.09 + 0.04) / 3 / 0.35**2
     assert reconstruction_loss(predicted, target, 0.35).item() == pytest.approx(expected)
+    weight = torch.tensor([1.0, 0.5, 0.0])
+    assert reconstruction_loss(predicted, target, 0.35, weight).item() == pytest.approx(0.055 / 3 / 0.35**2)
     # A field that does not change misses each event by one threshold.
     assert reconstruction_loss(torch.zeros(2), torch.tensor([0.3, -0.3]), 0.3).item() == pytest.approx(1.0)
 
