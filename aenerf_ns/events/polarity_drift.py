@@ -18,8 +18,9 @@ from aenerf_ns.events.pairing import surplus_slopes
 
 # Of the numbers 1, 2, ..., 6 around their mean. Pixels with fewer events in a half say nothing of their own.
 _MIN_SQUARES = 17.5
-# Of the drift over the pixels, where a tenth is the standard deviation of thresholds.
-_TYPICAL_VARIANCE = 0.005
+# Of the drift over the pixels: where a tenth is the standard deviation of thresholds, and where it is 3 %, which is
+# less than sensors have.
+_TYPICAL_VARIANCE, _MIN_VARIANCE = 0.005, 0.0004
 # A pixel whose events are three quarters of one polarity is broken: how much thresholds differ is not asked of it.
 _MAX_DRIFT = 0.5
 # Fewer say too little of how much thresholds differ.
@@ -80,6 +81,8 @@ def polarity_drift(pairs: EventPairs) -> PolarityDrift:
         # Two standard errors, so that equal thresholds are found equal.
         variance = max(product.sum() - shared - 2 * np.sqrt((product**2).sum()), 0.0)
         seen = max((weight * (first - second) ** 2).sum() / (weight * sum(errors_of_halves)).sum(), 1e-6)
+    # Parts of the scene that are seen in both halves make a little of it.
+    variance *= variance > _MIN_VARIANCE
     share = known * variance / (variance + seen * error)
     return PolarityDrift(
         drift=(share * whole).astype(np.float32).reshape(shape),
