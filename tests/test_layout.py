@@ -37,7 +37,8 @@ MAY_USE: dict[str, set[str]] = {
     "training": {"errors", "atomic_write", "files", "recording", "supervision", "method", "evaluation", "viewer"},
     # What training and checking left behind, measured and shown.
     "report": {
-        "errors", "progress", "events", "camera", "files", "recording", "supervision", "evaluation", "training", "checking"
+        "errors", "progress", "events", "camera", "files", "recording", "supervision", "evaluation", "training",
+        "checking",
     },
     # Stands beside the method: only commands and benchmarks use it.
     "simulator": {"errors", "progress", "open3d_import", "events", "camera", "files", "pose_estimation"},
