@@ -321,11 +321,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
 
     def folder(name: str) -> Path:
         if name not in written:
-            written[name] = root / name
             if name == "tum-vie-data":
                 write_tum_vie(root / name, request.getfixturevalue("tum_vie_calibration"))
             else:
                 FORMAT_WRITERS[name](root / name)
+            written[name] = root / name
         return written[name]
 
     return folder
