@@ -165,6 +165,7 @@ def test_real_recording_prefers_its_poses(slider_depth: Path) -> None:
         assert late.is_clearly_worse
 
 
+@pytest.mark.slow
 def test_name_mistakes_in_the_real_recording(slider_depth: Path) -> None:
     recording = open_ecd(slider_depth)
     events = all_events(recording)
@@ -276,6 +277,7 @@ def small_object(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [None, *SHUFFLES], ids=["as recorded", *SHUFFLES])
 def test_tell_the_real_recording_from_noise(order: str | None, slider_depth: Path, tmp_path: Path) -> None:
     events = all_events(open_ecd(slider_depth))
