@@ -35,11 +35,13 @@ class FrameChanges:
         self._spans = [(times[i], times[i + 1]) for i in starts]
         self._files, self._camera = files, recording.event_camera
         self._encoding = recording.image_encoding
+        # Of the frames that were read, by their times.
+        self._levels: dict[int, NDArray[np.uint8]] = {}
         # Of the positive and of the negative events.
         self._sums = np.zeros((len(self._spans), 2, self._camera.height, self._camera.width))
 
     def add(self, events: EventStream, weights: NDArray[np.float64]) -> None:
-        """Add a piece of the stream of events, each of which stands for its weight in thresholds."""
+        """Add a piece of the stream of events. The (N,) weights say for how many thresholds each event stands."""
         for sums, (start, end) in zip(self._sums, self._spans, strict=True):
             part = slice(*np.searchsorted(events.t, (start, end), side="right"))
             np.add.at(sums, ((events.p[part] < 0).astype(int), events.y[part], events.x[part]), weights[part])
@@ -55,33 +57,32 @@ class FrameChanges:
             return None
         return float(np.corrcoef(events, frames)[0, 1])
 
-    def negative_threshold(self, ratio: float) -> tuple[float, float, float] | None:
+    def negative_threshold(self, ratio: float) -> tuple[float, float, float]:
         """Return C−, given C+ / C−, and its range for the black levels that frames may have.
 
-        None if the frames say nothing of it: see :meth:`correlation`.
+        The :meth:`correlation` must be positive.
         """
-        if (self.correlation() or 0.0) <= 0:
-            return None
         value, *ends = (_robust_slope(*self._changes(ratio, gray)) for gray in (_GRAY, *_GRAY_RANGE))
         return value, min(ends), max(ends)
 
     def _changes(self, ratio: float, gray: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the change of log-radiance by the events, in C−, and by the frames, where there are events."""
+        levels = decode(np.arange(256) / 255, self._encoding)
+        logs = np.log(levels + levels[gray])
         changes = [np.empty((2, 0))]
         for (positive, negative), span in zip(self._sums, self._spans, strict=True):
             seen = positive + negative > 0
             if seen.any():
-                changes.append(np.stack([ratio * positive - negative, self._change(*span, gray)])[:, seen])
+                before, after = (self._gray_levels(time) for time in span)
+                changes.append(np.stack([ratio * positive - negative, logs[after] - logs[before]])[:, seen])
         events, frames = np.concatenate(changes, 1)
         return events, frames
 
-    def _change(self, start: int, end: int, gray: int) -> NDArray[np.float64]:
-        for time in (start, end):
+    def _gray_levels(self, time: int) -> NDArray[np.uint8]:
+        if time not in self._levels:
             check_image(self._files[time], self._camera)
-        levels = decode(np.arange(256) / 255, self._encoding)
-        logs = np.log(levels + levels[gray])
-        before, after = (logs[np.asarray(read_image(self._files[time]).convert("L"))] for time in (start, end))
-        return after - before
+            self._levels[time] = np.asarray(read_image(self._files[time]).convert("L"))
+        return self._levels[time]
 
 
 def _robust_slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:

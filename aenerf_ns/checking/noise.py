@@ -32,7 +32,7 @@ class NoiseRate:
             return
         if self._end is None:
             self._end = int(events.t[0])
-            # What was before is not known.
+            # Nobody knows when the pixels fired before the first event, so they count as not quiet.
             self._last_time += self._end
         self._quiet_time += _count_isolated(events.x, events.y, events.t, self._end, self._last_time, self._counts)
         self._end = int(events.t[-1])

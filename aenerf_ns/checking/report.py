@@ -127,8 +127,9 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     statistics, num_covered = _count_events(recording, window, changes, balance, noise)
     result = CheckResult(statistics)
     _check_events(result, noise)
-    _check_polarity(result, changes.correlation())
-    _check_thresholds(result, recording, changes, balance)
+    correlation = changes.correlation()
+    _check_polarity(result, correlation)
+    _check_thresholds(result, recording, changes, balance, correlation or 0.0)
     _check_poses(result, recording, window, num_covered)
     is_simple = _check_lens(result, recording.event_camera) | _check_steps(result, recording.trajectory, window)
     if num_covered < _LIMITS.min_events:
@@ -230,7 +231,7 @@ def _check_polarity(result: CheckResult, correlation: float | None) -> None:
 
 
 def _check_thresholds(
-    result: CheckResult, recording: Recording, changes: FrameChanges, balance: PolarityBalance
+    result: CheckResult, recording: Recording, changes: FrameChanges, balance: PolarityBalance, correlation: float
 ) -> None:
     """Estimate the contrast thresholds."""
     estimate, sensor = balance.ratio(), recording.sensor
@@ -240,12 +241,11 @@ def _check_thresholds(
     used = sensor.positive_contrast_threshold / sensor.negative_contrast_threshold
     figure = f"Contrast thresholds: C+/C- is {ratio:.2f} +/- {uncertainty:.2f} by the balance of the polarities"
     figure += f" ({'assumed' if recording.has_assumed_thresholds else 'given'}: {used:.2f})"
-    by_frames = changes.negative_threshold(ratio)
-    if by_frames is not None:
-        size, low, high = by_frames
+    if correlation > 0:
+        size, low, high = changes.negative_threshold(ratio)
         figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
     # Reversed polarities reverse the ratio.
-    is_reversed = (changes.correlation() or 0.0) < _LIMITS.min_correlation
+    is_reversed = correlation < _LIMITS.min_correlation
     if abs(ratio - used) > _LIMITS.threshold_deviations * uncertainty and not is_reversed:
         value = f"{ratio * sensor.negative_contrast_threshold:.3g}"
         if recording.has_assumed_thresholds:

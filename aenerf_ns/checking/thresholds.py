@@ -18,8 +18,8 @@ _BIAS = 0.03
 class PolarityBalance:
     """Weigh the polarities against each other.
 
-    What a pixel sees becomes neither brighter nor darker for long, so over a recording C+ times the number of positive
-    events is C− times the number of negative ones. A pixel is blind for the refractory period after each event. While
+    The light at a pixel does not keep rising or falling. So over a recording, C+ times the number of positive events is
+    C− times the number of negative events. A pixel is blind for the refractory period after each event. While
     its brightness goes on to change, an event after an interval dt stands for dt / (dt − refractory period) thresholds.
     """
 

@@ -398,7 +398,7 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
         interval = rows[i, 0] - rows[i - 1, 0]
         block_ends[block + 1] += interval
         if refractory_period > 0 and own == last_own and (own == 1 or own == 1 << NEGATIVE_SHIFT):
-            # What the rounding leaves goes to the next event.
+            # Rounding down leaves a rest, which is added at the next event.
             rest += min(COUNT_UNIT * refractory_period / (interval - refractory_period), COUNT_UNIT - 1)
             missed = int(rest)
             rest -= missed

@@ -333,7 +333,7 @@ class PairSampler(Sampler):
             within = torch.rand(num_pairs, dtype=torch.float64, device=device).mul_(2).sub_(1).mul_(_WITHIN_MASS)
             within.erfinv_().mul_(_WITHIN_DEVIATION * math.sqrt(2)).add_(_WITHIN_MEAN)
             seconds.append(last_start + within * last_interval)
-        # What the pixel misses after the last event is not of the pair.
+        # The pair ends with its last event, so the change that the pixel misses after that event does not count.
         last_count = torch.stack(event_counts(packed[0], packed[1])).floor()
         count = torch.stack(event_counts(packed[1], packed[2]))
         # A pair that ends at a moment has not seen its last event.
