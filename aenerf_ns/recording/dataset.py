@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterable
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -22,6 +23,9 @@ from aenerf_ns.progress import tracked
 from aenerf_ns.recording.pair_cache import PairFile
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.recording.time_units import require_covered
+
+if TYPE_CHECKING:
+    from aenerf_ns.events.polarity_drift import PolarityDrift
 
 # Events in a picture, as a share of the sensor's pixels: enough to show edges, too few to smear them.
 _PICTURE_DENSITY = 0.25
@@ -52,6 +56,14 @@ class EventDataset(InputDataset):
             DataError: the event file is missing or malformed, or no event lies in the time window.
         """
         return self._pairs_and_pictures[0]
+
+    @cached_property
+    def polarity_drift(self) -> PolarityDrift:
+        """How the contrast thresholds of the pixels differ. The first access goes through all :attr:`pairs`."""
+        # Imported lazily: every ns-* command imports this module, and numba is slow to import.
+        from aenerf_ns.events.polarity_drift import polarity_drift
+
+        return polarity_drift(self.pairs)
 
     @property
     def windows(self) -> SortedEvents:

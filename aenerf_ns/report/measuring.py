@@ -186,7 +186,6 @@ def _measure_data(report: RunReport, run: TrainedRun) -> None:
     """Measure what needs the events, where they still are."""
     # Imported lazily, because numba is slow to import.
     from aenerf_ns.checking.report import check
-    from aenerf_ns.events.polarity_drift import polarity_drift
 
     scene = run.scene
     if not scene.event_file.path.is_file():
@@ -202,4 +201,4 @@ def _measure_data(report: RunReport, run: TrainedRun) -> None:
         report.missing.append("Rendered against measured changes: the batches of this method are no pairs of events.")
     else:
         report.num_pairs = run.dataset.pairs.summary()
-        report.drift = polarity_drift(run.dataset.pairs)
+        report.drift = run.dataset.polarity_drift

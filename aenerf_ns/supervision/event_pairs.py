@@ -296,10 +296,7 @@ class PairSampler(Sampler):
         if self._max_events_per_pair == 1:
             nothing = torch.zeros(len(self._pixel_rays.channels), device=device)
             return nothing, nothing, 0.0
-        # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-        from aenerf_ns.events.polarity_drift import polarity_drift
-
-        found = polarity_drift(self.dataset.pairs)
+        found = self.dataset.polarity_drift
         if found.spread > 0:
             CONSOLE.print(f"{found.summary()}: pairs allow for it", soft_wrap=True)
         drift, variance = (torch.from_numpy(array.ravel()).to(device) for array in (found.drift, found.variance))

@@ -20,6 +20,7 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.pairing import pair_events
+from aenerf_ns.events.polarity_drift import PolarityDrift, polarity_drift
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
@@ -83,6 +84,10 @@ class FivePairs:
 
     scene: SceneRecording
     pairs: EventPairs
+
+    @property
+    def polarity_drift(self) -> PolarityDrift:
+        return polarity_drift(self.pairs)
 
 
 def make_sampler(

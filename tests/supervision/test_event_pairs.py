@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
-from helpers.small_models import CAMERA, EPOCH, make_sampler
+from helpers.small_models import CAMERA, EPOCH, FivePairs, make_sampler
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
@@ -145,7 +145,7 @@ def test_the_drift_of_its_pixel_is_taken_off_a_pair(
     drift, variance = np.zeros((2, CAMERA.height, CAMERA.width), np.float32)
     drift[1, 3], variance[1, 3] = 0.1, 0.01
     found = PolarityDrift(drift, variance, spread=0.2)
-    monkeypatch.setattr("aenerf_ns.events.polarity_drift.polarity_drift", lambda pairs: found)
+    monkeypatch.setattr(FivePairs, "polarity_drift", found)
     sampler = make_sampler(random_poses, SensorModel(), max_events_per_pair=max_events_per_pair)
     _, batch = sampler.sample(400)
     number, surplus = batch.num_positive + batch.num_negative, batch.num_positive - batch.num_negative
