@@ -82,8 +82,7 @@ class ExportCameras(RunCommand):
         require_range("num-points", self.num_points, 1, _MAX_POINTS)
         _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
         from aenerf_ns.export.camera_model_files import IMAGE_FOLDER, write_cameras
-        from aenerf_ns.export.placing import place_views
-        from aenerf_ns.export.rendering import observe_points
+        from aenerf_ns.export.rendering import observe_points, place_views
 
         placed = place_views(run)
         images = [image for image, _ in placed]

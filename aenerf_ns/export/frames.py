@@ -12,13 +12,8 @@ from torch import Tensor
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import to_image
-from aenerf_ns.export.camera_model_files import (
-    IMAGE_FOLDER,
-    PlacedImage,
-    write_cameras,
-)
-from aenerf_ns.export.placing import corrected_poses
-from aenerf_ns.export.rendering import observe_points, render
+from aenerf_ns.export.camera_model_files import IMAGE_FOLDER, PlacedImage, write_cameras
+from aenerf_ns.export.rendering import corrected_poses, observe_points, render
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.progress import track
 from aenerf_ns.recording.views import IMAGE_LIST

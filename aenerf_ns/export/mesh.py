@@ -11,8 +11,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
-from aenerf_ns.export.placing import corrected_poses
-from aenerf_ns.export.rendering import render
+from aenerf_ns.export.rendering import corrected_poses, render
 from aenerf_ns.export.times import spread_times
 from aenerf_ns.open3d_import import load_open3d
 from aenerf_ns.progress import track

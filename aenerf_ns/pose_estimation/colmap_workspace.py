@@ -11,6 +11,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
+import pycolmap
 import torch
 from numpy.typing import NDArray
 from PIL import Image
@@ -79,8 +80,6 @@ class ColmapWorkspace:
     """
 
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
-        import pycolmap
-
         self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
         self._pairs = folder / "pairs.txt"
         self._images.mkdir()
@@ -106,8 +105,6 @@ class ColmapWorkspace:
                 image.convert("L" if image.mode == "L" else "RGB").save(self._images / name)
 
     def find_features(self, camera: CameraIntrinsics | None) -> None:
-        import pycolmap
-
         reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
         if camera is None:
             reader.camera_model = "SIMPLE_RADIAL"
@@ -132,8 +129,6 @@ class ColmapWorkspace:
             )
 
     def match(self) -> None:
-        import pycolmap
-
         pairs = [f"{self._names[i]} {self._names[j]}" for i, j in _choose_pairs(len(self._names))]
         matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
         verification = self._verification()
@@ -152,8 +147,6 @@ class ColmapWorkspace:
         Returns:
             The intrinsics; None where the mapper places no frames.
         """
-        import pycolmap
-
         models = self.reconstruct(refine_intrinsics=True)
         if not models:
             return None
@@ -169,24 +162,18 @@ class ColmapWorkspace:
         return intrinsics_of(model)
 
     def _store_intrinsics(self, model: Any) -> None:
-        import pycolmap
-
         (camera,) = model.cameras.values()
         camera.has_prior_focal_length = True
         with contextlib.closing(pycolmap.Database.open(self._database)) as database:
             database.update_camera(camera)
 
     def _verification(self) -> Any:
-        import pycolmap
-
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = self._seed
         return options
 
     def hold_out_matches(self, share: float) -> HeldOutMatches:
         """Take the matches of a share of the pairs of frames out of the database, to judge models by."""
-        import pycolmap
-
         with contextlib.closing(pycolmap.Database.open(self._database)) as database:
             camera = database.read_all_cameras()[0]
             pair_ids, geometries = database.read_two_view_geometries()
@@ -207,8 +194,6 @@ class ColmapWorkspace:
 
     def reconstruct(self, refine_intrinsics: bool = False) -> list[Any]:
         """Return the models of the incremental mapper, in the order of the number of frames, the largest first."""
-        import pycolmap
-
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self._seed
         options.num_threads = options.mapper.num_threads = 1
@@ -225,8 +210,6 @@ class ColmapWorkspace:
 
     def reconstruct_globally(self) -> list[Any]:
         """Return the models of the global mapper (GLOMAP), the largest first. The intrinsics stay as given."""
-        import pycolmap
-
         options = pycolmap.GlobalPipelineOptions()
         mapper = options.mapper
         options.random_seed = mapper.random_seed = mapper.retriangulation.random_seed = self._seed
@@ -247,8 +230,6 @@ class ColmapWorkspace:
             max_pixels: reprojection error beyond which an observation belongs to no point.
             max_degrees: the same as an angle between rays.
         """
-        import pycolmap
-
         with contextlib.closing(pycolmap.Database.open(self._database)) as database:
             numbers = {image.name: image.image_id for image in database.read_all_images()}
             (camera,) = database.read_all_cameras()
@@ -288,8 +269,6 @@ class ColmapWorkspace:
             max_iterations: of the bundle adjustment.
             refine_intrinsics: whether to adjust focal length and distortion too.
         """
-        import pycolmap
-
         posed = self.triangulate(poses_of(model), max_pixels, max_degrees)
         adjustment = pycolmap.BundleAdjustmentOptions()
         _keep_intrinsics(adjustment)
@@ -312,8 +291,6 @@ class ColmapWorkspace:
 
     def count_features_and_pairs(self) -> tuple[float, int]:
         """Return the median number of features in a frame, and the number of pairs of frames that match."""
-        import pycolmap
-
         with contextlib.closing(pycolmap.Database.open(self._database)) as database:
             counts = [database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()]
             return statistics.median(counts) if counts else 0.0, database.num_verified_image_pairs()

@@ -10,7 +10,7 @@ import pytest
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.export.event_pictures import RenderedEvents, sum_recorded_events
+from aenerf_ns.export.video import RenderedEvents, sum_recorded_events
 
 
 class Pieces(EventFile):

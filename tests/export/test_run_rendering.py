@@ -18,8 +18,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.export import mesh
 from aenerf_ns.export.camera_model_files import PlacedImage
-from aenerf_ns.export.placing import corrected_poses, place_views
-from aenerf_ns.export.rendering import observe_points
+from aenerf_ns.export.rendering import corrected_poses, observe_points, place_views
 from aenerf_ns.export.times import spread_times, times_at_rate, times_from_seconds
 
 SECOND = 10**9
