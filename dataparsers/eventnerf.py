@@ -184,15 +184,8 @@ def read_intrinsics(folder: Path, width: int, height: int) -> CameraIntrinsics:
     k1, k2 = matrix[4][:2] if len(matrix) == 5 else (0.0, 0.0)
     with value_errors_as_data_error(file, "it must hold the matrix of the intrinsics"):
         # NeRF++ counts pixels from the edge of the image, as CameraIntrinsics does.
-        return CameraIntrinsics(
-            width,
-            height,
-            fx=matrix[0][0],
-            fy=matrix[1][1],
-            cx=matrix[0][2],
-            cy=matrix[1][2],
-            distortion=(k1, k2, 0.0, 0.0, 0.0),
-        )
+        pinhole = matrix[0][0], matrix[1][1], matrix[0][2], matrix[1][2]
+        return CameraIntrinsics(width, height, *pinhole, distortion=(k1, k2, 0.0, 0.0, 0.0))
 
 
 eventnerf_dataparser = DataParserSpecification(

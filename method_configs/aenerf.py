@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import replace
+from typing import Any
 
 import torch
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.writer import EventName
 
@@ -24,6 +26,15 @@ from aenerf_ns.training.schedules import (
 )
 from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
+
+def optimized_by(scheduler: SchedulerConfig | None = None, **adam: float) -> dict[str, Any]:
+    """Return how a group of parameters is optimized: Adam's options, and by default a rate that falls at milestones."""
+    return {
+        "optimizer": FusedAdamOptimizerConfig(**adam),  # type: ignore[arg-type]
+        "scheduler": scheduler or RelativeMultiStepSchedulerConfig(),
+    }
+
+
 aenerf = MethodSpecification(
     config=AENeRFTrainerConfig(
         method_name="aenerf",
@@ -37,27 +48,12 @@ aenerf = MethodSpecification(
             model=AENeRFModelConfig(camera_optimizer=PoseCorrectionConfig(mode="spline")),
         ),
         optimizers={
-            "encodings": {
-                # A field that learns slowly holds on to wrong poses (docs/defaults.md).
-                "optimizer": FusedAdamOptimizerConfig(lr=8e-2, eps=1e-15),
-                "scheduler": RelativeMultiStepSchedulerConfig(),
-            },
-            "networks": {
-                "optimizer": FusedAdamOptimizerConfig(lr=1e-2, eps=1e-15, weight_decay=1e-6),
-                "scheduler": RelativeMultiStepSchedulerConfig(),
-            },
-            "proposals": {
-                "optimizer": FusedAdamOptimizerConfig(lr=1e-2, eps=1e-15),
-                "scheduler": RelativeMultiStepSchedulerConfig(),
-            },
-            "sensor": {
-                "optimizer": FusedAdamOptimizerConfig(lr=0.05),
-                "scheduler": RelativeMultiStepSchedulerConfig(),
-            },
-            "camera_opt": {
-                "optimizer": FusedAdamOptimizerConfig(lr=8e-3, eps=1e-15),
-                "scheduler": RelativeCosineSchedulerConfig(),
-            },
+            # A field that learns slowly holds on to wrong poses (docs/defaults.md).
+            "encodings": optimized_by(lr=8e-2, eps=1e-15),
+            "networks": optimized_by(lr=1e-2, eps=1e-15, weight_decay=1e-6),
+            "proposals": optimized_by(lr=1e-2, eps=1e-15),
+            "sensor": optimized_by(lr=0.05),
+            "camera_opt": optimized_by(RelativeCosineSchedulerConfig(), lr=8e-3, eps=1e-15),
         },
         # A batch has few rays for each knot of the spline. If poses follow every single batch, the field stays blurred,
         # at lower rates and in longer runs too (docs/defaults.md).

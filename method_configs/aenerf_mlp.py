@@ -9,9 +9,9 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
-from aenerf_ns.method_configs.aenerf import aenerf
+from aenerf_ns.method_configs.aenerf import aenerf, optimized_by
 from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSamplerConfig
-from aenerf_ns.training.schedules import FusedAdamOptimizerConfig, RelativeMultiStepSchedulerConfig
+from aenerf_ns.training.schedules import RelativeMultiStepSchedulerConfig
 from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
 
@@ -37,17 +37,14 @@ def _make_config() -> AENeRFTrainerConfig:
     model.moving_field = False
     model.loss_coefficients = PairLossCoefficients(temporal_loss=1e-3)
     # docs/method.md has the reason for each number that is not the paper's 0.01.
-    for group, optimizer in {
-        "encodings": FusedAdamOptimizerConfig(lr=1e-2),
-        "networks": FusedAdamOptimizerConfig(lr=1e-3, weight_decay=1e-6),
-        "proposals": FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15),
-        "sensor": FusedAdamOptimizerConfig(lr=0.05),
-        "camera_opt": FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15),
+    for group, adam in {
+        "encodings": {"lr": 1e-2},
+        "networks": {"lr": 1e-3, "weight_decay": 1e-6},
+        "proposals": {"lr": 1e-3, "eps": 1e-15},
+        "sensor": {"lr": 0.05},
+        "camera_opt": {"lr": 1e-3, "eps": 1e-15},
     }.items():
-        config.optimizers[group] = {
-            "optimizer": optimizer,
-            "scheduler": RelativeMultiStepSchedulerConfig(warm_up=0),
-        }
+        config.optimizers[group] = optimized_by(RelativeMultiStepSchedulerConfig(warm_up=0), **adam)
     # Every ray of a batch has gradients for all weights of the poses' network.
     config.gradient_accumulation_steps = {"camera_opt": 1}
     # Not set in place: a new configuration gives the schedules its number of steps.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.limits import MAX_LINE, MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
+from aenerf_ns.files.limits import MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
@@ -50,12 +50,6 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
                 raise DataError(path, f"it has more than {MAX_ROWS:,} rows", "cut the recording, or leave rows out")
             rows.append(fields)
     return rows
-
-
-def read_first_line(path: Path) -> str:
-    """Read the first line of a table, where its columns may be named."""
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        return file.readline(MAX_LINE)
 
 
 def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:

@@ -13,15 +13,8 @@ from torch import Tensor
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError, require_file
-from aenerf_ns.files.text import (
-    POSE_COLUMNS,
-    TimeUnit,
-    format_seconds,
-    parse_numbers,
-    parse_times,
-    read_first_line,
-    read_rows,
-)
+from aenerf_ns.files.limits import MAX_LINE
+from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
 
 # Trajectories are commonly printed with six or more digits, so quaternions have rounding errors.
 _MAX_NORM_ERROR = 1e-3
@@ -41,7 +34,8 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     rows = read_rows(path, POSE_COLUMNS)
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
-    header = read_first_line(path)
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = file.readline(MAX_LINE)
     stated = re.match(r"\W*\w+ *\[(ns|us|ms|s)\]", header)
     times = parse_times(path, [row[0] for row in rows], stated[1] if stated else unit)  # type: ignore[arg-type]
     values = parse_numbers(path, [row[1:] for row in rows])

@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aenerf_ns.errors import DataError, reading
+from aenerf_ns.errors import DataError, require_file
 
 if TYPE_CHECKING:
     from aenerf_ns.reconstruction.networks import E2VID, FireNet
@@ -20,9 +20,7 @@ _REMEDY = (
 
 def require_weights(weights: Path) -> None:
     """Raise a DataError if there is no such weights file."""
-    with reading(weights):
-        if not weights.is_file():
-            raise DataError(weights, "there is no such file", _REMEDY)
+    require_file(weights, _REMEDY)
 
 
 def load_network(weights: Path) -> E2VID | FireNet:

@@ -92,15 +92,6 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
     """Estimated poses of the event camera, as t tx ty tz qx qy qz qw in seconds, camera-to-world, to be used in place
     of the dataset's. The dataset's poses then only serve to evaluate them."""
 
-    def sensor(self, stated: SensorModel) -> SensorModel:
-        """Return the sensor that the dataset states, with the values that the options give.
-
-        Raises:
-            DataError: a value is impossible.
-        """
-        with value_errors_as_data_error(str(self.data), "correct it among the options"):
-            return replace(stated, **sensor_values(self))
-
     def make_capture(self, sensor: SensorModel, has_assumed_thresholds: bool = False, **content: Any) -> Capture:
         """Make a capture, with what the options state in place of the dataset's own sensor.
 
@@ -115,7 +106,9 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
         """
         defaults = {"frame_camera": content["event_camera"], "image_encoding": "linear"}
         is_assumed = has_assumed_thresholds and not states_thresholds(self)
-        return Capture(sensor=self.sensor(sensor), has_assumed_thresholds=is_assumed, **{**defaults, **content})
+        with value_errors_as_data_error(str(self.data), "correct it among the options"):
+            sensor = replace(sensor, **sensor_values(self))
+        return Capture(sensor=sensor, has_assumed_thresholds=is_assumed, **{**defaults, **content})
 
     def make_recording(self, reference: Trajectory, capture: Capture, **content: Any) -> Recording:
         """Make a recording. Poses that the options give are the estimated ones, and the dataset's own are then true.
