@@ -26,12 +26,10 @@ from helpers.published_datasets import (
     write_tum_vie,
 )
 from helpers.small_datasets import AS_RECORDED, parse
-from nerfstudio.configs.base_config import MachineConfig
 
 from aenerf_ns.dataparsers.formats import FORMATS, AutomaticDataParserConfig, recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
-from aenerf_ns.method_configs.aenerf import aenerf
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.scene import SCENE_KEY
@@ -198,12 +196,6 @@ def test_poses_may_be_missing(written: tuple[str, Truth]) -> None:
     assert len(frames) == FRAMES.get(name, 0)
     assert (capture.event_camera, capture.sensor) == (known.event_camera, known.sensor)
     assert capture.event_file.path == known.event_file.path
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_missing_gpu_is_one_line() -> None:
-    with pytest.raises(SystemExit, match=r"^Error: .*no GPU can be used; .*aenerf-small --machine.device-type cpu"):
-        replace(aenerf.config, machine=MachineConfig(device_type="cuda")).save_config()
 
 
 def test_estimated_poses_may_be_given(written: tuple[str, Truth], tmp_path: Path) -> None:

@@ -69,10 +69,6 @@ def view(*keys: object, value: object) -> Change:
     return set_in("views/transforms_val.json", *keys, value=value)
 
 
-def bounds(value: float) -> Change:
-    return lambda folder: np.save(folder / "poses_bounds.npy", np.full((3, 17), value))
-
-
 def deflated_zeros(gigabytes: int, beginning: bytes = b"") -> bytes:
     """Zeros behind a beginning, compressed by a factor of 1000."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
@@ -113,10 +109,6 @@ def typed_polarities(dtype: np.dtype) -> Change:
 
 def references(file: h5py.File) -> None:
     without(file, "events/t")["events/t"] = np.array([file.ref], h5py.ref_dtype)
-
-
-def deflated(name: str, array: str, content: bytes) -> Change:
-    return member(name, array, content, zipfile.ZIP_DEFLATED)
 
 
 _COLUMNS = {"x": "u2", "y": "u2", "t": "i8", "p": "i1"}
@@ -246,63 +238,48 @@ def outside_image(change: Change, size: tuple[int, int] = (6, 4), mode: str = "R
 _SOFT_LOOP = all_of(
     put("events.h5", "events/t", h5py.SoftLink("/events/t2")), put("events.h5", "events/t2", h5py.SoftLink("/events/t"))
 )
-_NAMED_TYPE = put("events.h5", "events/t", np.dtype("i8"))
 _MILLISECONDS = set_attribute("time_unit", "ms")
 _TOO_MANY_ROWS = npy_header("(10000000000000,)")
 BIG, HUGE = int("9" * 400), "RAW:1e999999999"
 
-# Values in transforms.json, by the keys that lead to them.
+# Values in transforms.json, by the keys that lead to them: one or two for each way in which values are refused.
 _JSON_VALUES: dict[tuple, list] = {
     ("event_camera", "refractory_period_ns"): [BIG, 10**10, 2**63 - 1, HUGE, "RAW:1e30"],
-    ("frames", 0, "timestamp"): [HUGE, "RAW:1e-999999999", BIG, [1]],
-    ("frames", 0, "transform_matrix", 0, 3): [BIG, HUGE, "RAW:1e300"],
-    ("max_pose_gap_ns",): [BIG],
-    ("event_camera", "x"): ["RAW:" + "9" * 5000],
-    ("event_camera", "fl_x"): [BIG, "RAW:NaN", "RAW:1e-320", "RAW:1e-30"],
-    ("event_camera", "k1"): [BIG, "RAW:Infinity", "RAW:1e10", "RAW:-1e10"],
-    ("frames", 0, "transform_matrix"): ["RAW:" + "[" * 900 + "]" * 900, [[1], [1, 2]], {"a": 1}, [["1"] * 4] * 4],
-    ("test_filenames",): [[["x.png"]]],
-    ("val_filenames",): [[{}]],
-    ("event_camera", "file"): [["events.h5"], "a" * 5000, "a\0b", "", "images"],
-    ("frames", 0, "file_path"): [["a.png"], 3, "a" * 5000, "a\0b", ""],
-    ("frames", 0): [["a.png"]],
-    ("scene_box",): [
-        "wide",
-        [{}, {}],
-        [[-1e300] * 3, [1e300] * 3],
-        [[0, 0, 0], [1e-320] * 3],
-        [[0, 0, 0], [1, 1, 1e-320]],
-        [[1e200] * 3, [2e200] * 3],
-    ],
-    ("frames",): [{"a": 1}],
-    ("event_camera", "width"): [BIG, True, HUGE, "RAW:1e30"],
-    ("event_camera", "bayer_pattern"): [1],
-    ("event_camera", "k2"): ["RAW:1e300", HUGE, "RAW:1e30"],
-    ("event_camera", "fl_y"): ["RAW:1e300", HUGE, "RAW:1e30"],
-    ("event_camera", "cx"): [BIG, "RAW:1e300"],
+    ("event_camera", "width"): [True, "RAW:" + "9" * 5000],
+    ("event_camera", "fl_x"): ["RAW:NaN", "RAW:1e-320"],
+    ("event_camera", "cx"): ["RAW:1e300"],
+    ("event_camera", "k1"): ["RAW:Infinity", "RAW:-1e10"],
+    ("event_camera", "k2"): ["RAW:1e300"],
     ("k1",): ["RAW:-1e10"],
-    ("event_camera", "positive_contrast_threshold"): [BIG, "RAW:1e-320"],
-    ("event_camera", "negative_contrast_threshold"): ["RAW:1e300", HUGE, "RAW:1e30"],
-    ("event_camera", "cy"): [HUGE, "RAW:1e30"],
+    ("event_camera", "positive_contrast_threshold"): ["RAW:1e-320"],
+    ("event_camera", "negative_contrast_threshold"): ["RAW:1e300"],
+    ("event_camera", "bayer_pattern"): [1],
+    ("event_camera", "file"): [["events.h5"], "a" * 5000, "a\0b", "", "images"],
+    ("frames",): [{"a": 1}],
+    ("frames", 0): [["a.png"]],
+    ("frames", 0, "file_path"): ["a" * 5000, "a\0b"],
+    ("frames", 0, "timestamp"): ["RAW:1e-999999999", [1]],
+    ("frames", 0, "transform_matrix"): ["RAW:" + "[" * 900 + "]" * 900, [[1], [1, 2]], [["1"] * 4] * 4],
+    ("frames", 0, "transform_matrix", 0, 3): ["RAW:1e300"],
+    ("test_filenames",): [[["x.png"]]],
+    ("scene_box",): ["wide", [{}, {}], [[-1e300] * 3, [1e300] * 3], [[0, 0, 0], [1, 1, 1e-320]]],
 }
 _ATTRIBUTES: dict[str, list] = {
-    "time_offset": [np.uint64(2**63), [1, 2], "1", h5py.Empty("i8")],
+    "time_offset": [np.uint64(2**63), [1, 2], h5py.Empty("i8")],
     "time_unit": [["ns", "us"], h5py.Empty("S1"), 3, np.bytes_(b"\xff\xfe")],
 }
 # What is in place of a column or of a number in an HDF5 file.
 _HDF5_VALUES: dict[tuple[str, str, str], list] = {
-    (_OWN, "events.h5", "t_offset"): [np.uint64(2**64 - 1), "1", h5py.Empty("i8"), [1, 2], h5py.SoftLink("/t_offset")],
+    (_OWN, "events.h5", "t_offset"): [np.uint64(2**64 - 1), "1", h5py.Empty("i8"), h5py.SoftLink("/t_offset")],
     (_NATIVE, "events.h5", "events/t"): [h5py.SoftLink("/none"), h5py.Empty("i8"), np.int64(3), ["a", "b"]],
-    (_NATIVE, "events.h5", "events"): [np.arange(9)],
     (_OWN, "events.h5", "events/t"): [h5py.Empty("i8")],
     (_PAEV3D, _PAEV3D_EVENTS, "events"): [[["a"] * 4] * 3, 3.0],
 }
 _UNREADABLE: dict[str, str] = {
-    _NATIVE: "transforms.json trajectory_estimated.txt trajectory_ground_truth.txt events.h5 "
-    "images/val/00000.png images/val .",
-    _ECD: "events.txt calib.txt images.txt",
-    _ROBUST: "raw_events.npz camera_poses.npz views/transforms_val.json",
-    _ESIM: "events/2.npy events poses_bounds.npy",
+    _NATIVE: "transforms.json trajectory_estimated.txt events.h5 images/val/00000.png images/val .",
+    _ECD: "events.txt calib.txt",
+    _ROBUST: "raw_events.npz views/transforms_val.json",
+    _ESIM: "events/2.npy events",
     _EVENTNERF: "train/pose/r_00003.txt train/pose",
     _PAEV3D: _OBJECTS,
     _OWN: "trajectory.txt",
@@ -313,35 +290,26 @@ _CAMCHAINS = {
     + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12))
     + CAM0.replace("[60, 40]", "*a11"),
     "yaml of 3 MB": CAM0 + "  rostopic: [" + "1, " * 1_000_000 + "1]\n",
-    "kalibr of 1e999": CAM0.replace("51.0", "1.0e+999"),
     "kalibr of 400 digits": CAM0.replace("51.0", str(BIG)),
     "kalibr of 5000 digits": CAM0.replace("51.0", "9" * 5000),
     "yaml of depth 5000": CAM0 + "  x: " + "[" * 5000 + "]" * 5000 + "\n",
     "kalibr resolution of 64.7": CAM0.replace("[60, 40]", "[64.7, 40]"),
-    "a camera of another name": CAM0.replace("cam0", "0"),
     "two cameras, none asked for": CAM0 + CAM0.replace("cam0", "cam1"),
-    "an alias of itself": CAM0.replace("[60, 40]", "&a [*a, 40]"),
     "a camera that is itself": "cam0: &a\n  intrinsics: *a\n",
     "a number for a name": "0: {}\n1: {}\n",
     "an unknown tag": "cam0: !!python/object/apply:os.getcwd []\n",
     "a timestamp that is none": CAM0 + "  x: !!timestamp never\n",
-    "a whole number that is none": CAM0 + "  x: !!int many\n",
     "a character beyond Unicode": CAM0 + '  x: "\\UFFFFFFFF"\n',
     "a distortion of 1e200": CAM0.replace("[0.0, 0.0, 0.0, 0.0]", "[1.0e+200, 0, 0, 0]"),
     "a date": CAM0.replace("[60, 40]", "2020-01-01"),
-    "a set": CAM0.replace("[60, 40]", "!!set {60, 40}"),
-    "letters": CAM0.replace("[60, 40]", "[a, b]"),
     "a key that is a list": "? [a, b]\n: {}\n",
-    "merge keys": "a: &a {b: 1}\ncam0:\n  <<: [*a, *a]\n",
 }
 _NPY = {
     "bounds of 10^13 rows": npy_header("(10000000000000, 17)", "'<f8'"),
     "npy header of depth 3000": npy_header("(" * 3000 + ")" * 3000),
     "unbalanced header": npy_header("(3, 17", "'<f8'", ""),
-    "open quotes": npy_header("(3, 17)", "'<f8"),
     "unknown type": npy_header("(3, 17)", "'<q99'"),
     "type of many fields": npy_header("(3, 17)", "[('a', '<f8', (1000000, 1000000))]"),
-    "negative shape": npy_header("(-3, 17)", "'<f8'") + bytes(999),
     "shape of decimals": npy_header("(3.5, 17)", "'<f8'") + bytes(999),
     "shape of true": npy_header("(True, 17)", "'<f8'") + bytes(999),
     "version 9": b"\x93NUMPY\x09\x00" + bytes(99),
@@ -351,7 +319,6 @@ _NPY = {
 _CHANGES: dict[str, dict[str, Change]] = {
     _NATIVE: {
         "a sensor of 10^6 x 10^6": camera(width=10**6, height=10**6),
-        "a sensor of 30000 x 30000": camera(width=30000, height=30000),
         "a sensor of 16000 x 16000": camera(width=16000, height=16000),
         "frames of 10^9 x 10^9": edit_json("transforms.json", lambda meta: meta.update(w=10**9, h=10**9)),
         "HDF5 of 10^12 rows": unallocated("events.h5", _COLUMNS, "events/"),
@@ -359,15 +326,12 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "png of 30000 x 30000 among views": black(_VAL_IMAGE, 30000),
         "png comment of 64 MB": with_chunks(_VAL_IMAGE, text_bomb),
         "json of 8 GB": sparse("transforms.json"),
-        "json of 50 MB": write_text("transforms.json", '{"frames": [' + "{}, " * 13_000_000 + "{}]}"),
         "poses of 8 GB": sparse("trajectory_estimated.txt"),
         "timestamp of 1e30 without pose": edit_json(
             "transforms.json", lambda meta: meta["frames"][0].update(timestamp="RAW:1e30", transform_matrix=None)
         ),
         "pose time of 1e30": poses("0 0 0 0 0 0 0 1\n1e30 0 0 0 0 0 0 1\n"),
-        "pose time of 1e999999999": poses("0 0 0 0 0 0 0 1\n1e999999999 0 0 0 0 0 0 1\n"),
         "pose at 1e300": poses("1600000000 1e300 0 0 0 0 0 1\n1600000009 0 0 0 0 0 0 1\n"),
-        "time offset that overflows": all_of(set_attribute("time_offset", np.int64(2**62)), _MILLISECONDS),
         "times that overflow with their unit": all_of(put(_H5, "events/t", np.arange(200) + (1 << 62)), _MILLISECONDS),
         "json of depth 100000": write_text("transforms.json", '{"a":' + "[" * 100_000 + "]" * 100_000 + "}"),
         "text that is not UTF-8": write_bytes("transforms.json", b'{"a": "\xff\xfe"}'),
@@ -375,25 +339,16 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "a link to itself": link("trajectory_estimated.txt", "trajectory_estimated.txt"),
         "an image that is a link to itself": link(_VAL_IMAGE, "00000.png"),
         "soft links in a circle": _SOFT_LOOP,
-        "named type": _NAMED_TYPE,
         "column that is a group": edit_hdf5("events.h5", lambda f: without(f, "events/t").create_group("events/t")),
-        "no group": put("events.h5", "events", None),
         "half a file": truncated("events.h5"),
         "a fisheye no pixel survives": camera(camera_model="OPENCV_FISHEYE", k1="RAW:-1e6", p1=0, k3=0),
         "truncated": cut_image(_VAL_IMAGE, 0.7),
-        "truncated among the train views": cut_image(_TRAIN_IMAGE, 0.7),
-        "EPS": saved_as("EPS", _VAL_IMAGE),
-        "GIF": saved_as("GIF", _VAL_IMAGE),
-        "BMP": saved_as("BMP", _VAL_IMAGE),
         "TIFF among the train views": saved_as("TIFF", _TRAIN_IMAGE),
-        "empty": write_text(_VAL_IMAGE, ""),
-        "text": write_text(_VAL_IMAGE, "no image"),
         "16 bits": saved_as("PNG", _VAL_IMAGE, mode="I;16"),
         "another size among the train views": saved_as("PNG", _TRAIN_IMAGE, (3, 2)),
         "an animation of 2^32 pictures": with_chunks(_VAL_IMAGE, animation),
         "half of a JPEG": cut_image(_VAL_IMAGE, 0.9, "JPEG"),
         "events": lambda folder: (outside_events(folder), camera(file="../outside.h5")(folder)),
-        "events with a whole path": lambda folder: camera(file=str(outside_events(folder)))(folder),
         "image": outside_image(set_in("transforms.json", "frames", 0, "file_path", value="../outside.png")),
         "external link to a group": external_link("events"),
         "external link to a column": external_link("events/t"),
@@ -401,23 +356,15 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "virtual column": virtual,
     },
     _ROBUST: {
-        "robust sensor": calibration(img_width=30000, img_height=30000),
         "npz of 10^13 rows, stored": member("raw_events.npz", "timestamp", _TOO_MANY_ROWS),
-        "npz of 10^13 rows, compressed": deflated("raw_events.npz", "timestamp", _TOO_MANY_ROWS + bytes(64)),
-        "npz of 2^70 rows": member("raw_events.npz", "timestamp", npy_header(f"({2**70},)")),
-        "poses of 10^13 rows": deflated("camera_poses.npz", "T_wc_timestamp", _TOO_MANY_ROWS + bytes(64)),
         "npz bomb": npz_bomb("raw_events.npz", "timestamp"),
-        "npz bomb of one number": npz_bomb("camera_calibration.npz", "img_width"),
         "npz text of 10^9 letters": member(
             "camera_calibration.npz", "bayer_pattern", npy_header("()", "'<U1000000000'")
         ),
         "npz of 8 GB": sparse("camera_poses.npz"),
-        "robust width of 1e300": calibration(img_width=np.float64(1e300)),
         "robust refractory period of 1e300": calibration(refractory_period=np.float64(1e300)),
         "robust pose times of uint64": robust_poses(T_wc_timestamp=np.arange(21, dtype="u8") + np.uint64(2**64 - 30)),
-        "robust file_path of a list": view("frames", 0, "file_path", value=[]),
         "robust angle of 0": view("camera_angle_x", value=0),
-        "robust angle of a list": view("camera_angle_x", value=[]),
         "robust name of bytes": calibration(bayer_pattern=np.array(b"RGGB")),
         "robust objects": calibration(bayer_pattern=np.array({}, dtype=object)),
         "robust complex positions": robust_poses(T_wc_position=np.zeros((21, 3), np.complex128)),
@@ -426,16 +373,12 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "robust file_path of 5000 letters": view("frames", 0, "file_path", value="a" * 5000),
         "robust file_path with a null": view("frames", 0, "file_path", value="a\0b"),
         "unbalanced header in npz": member("raw_events.npz", "timestamp", npy_header("(3", end="")),
-        "unbalanced header in compressed npz": deflated("camera_poses.npz", "T_wc_timestamp", npy_header("(3", end="")),
-        "half an archive": truncated("raw_events.npz"),
         "member with a password": edit_bytes(
             # The flags follow the versions, which differ between versions of Python.
             "camera_poses.npz",
             lambda b: re.sub(b"(PK\1\2.{4})\0", lambda found: found[1] + b"\1", b, flags=re.DOTALL),
         ),
-        "objects as events": robust_events(timestamp=np.array([None] * 200)),
         "no dimensions": robust_events(timestamp=np.int64(3)),
-        "three dimensions": robust_events(timestamp=np.zeros((2, 2, 2), np.int64)),
         "a threshold of 1e-320 of robust": calibration(pos_contrast_threshold=np.float64(1e-320)),
         "robust width of 60.5": calibration(img_width=60.5),
         "robust image": outside_image(view("frames", 0, "file_path", value="../../outside"), (50, 30), "RGBA"),
@@ -446,18 +389,13 @@ _CHANGES: dict[str, dict[str, Change]] = {
         ),
         "calibration of depth 100000": write_text("calibration.json", "[" * 100_000),
         "unreadable camchain": all_of(camchain(CAM0), unreadable("camchain.yaml")),
-        "own soft links in a circle": _SOFT_LOOP,
-        "own named type": _NAMED_TYPE,
         "own t_offset that is a group": edit_hdf5(_H5, lambda f: without(f, "t_offset").create_group("t_offset")),
         "own references": edit_hdf5(_H5, references),
         "own listed image": outside_image(write_text("images.txt", "1600000000.05 ../outside.png\n"), (60, 40), "L"),
     },
     _ESIM: {
-        "esim sensor": bounds(30000.0),
         "npy of 10^13 rows": write_bytes("events/2.npy", npy_header("(10000000000000, 4)", "'<f8'")),
-        "esim focal length of 1e300": bounds(1e300),
-        "unbalanced header of events": write_bytes("events/2.npy", npy_header("(3, 4", "'<f8'", "")),
-        "esim width of 64.5": bounds(64.5),
+        "esim width of 64.5": lambda folder: np.save(folder / "poses_bounds.npy", np.full((3, 17), 64.5)),
     },
     _EDS: {
         "HDF5 columns of 10^12 rows": unallocated("events.h5", {**_COLUMNS, "p": "u1"}),
@@ -466,9 +404,6 @@ _CHANGES: dict[str, dict[str, Change]] = {
     },
     _PAEV3D: {
         "HDF5 matrix of 10^12 rows": unallocated(_PAEV3D_EVENTS, {"events": "f8"}, shape=(10**12, 4)),
-        "HDF5 matrix of 10^12 columns": edit_hdf5(
-            _PAEV3D_EVENTS, lambda f: without(f, "events").create_dataset("events", (9, 10**9), "f8")
-        ),
         "pickle of an array of 10^12": poses_pickle(
             _RECONSTRUCT, b"\x8a\x06" + (10**12).to_bytes(6, "little"), b"\x85C\x01b\x87R"
         ),
@@ -487,13 +422,11 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "event lines of 8 GB": sparse("events.txt"),
         "pose at 1e200": write_text("groundtruth.txt", "0 1e200 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n"),
         "calibration of 1e300": write_text("calib.txt", "1e300 1e300 2.5 1.5 0 0 0 0 0\n"),
-        "calibration of 1e999": write_text("calib.txt", "5 5 1e999 1.5 0 0 0 0 0\n"),
         "event time of 1e30": write_text("events.txt", "0.01 1 2 1\n1e30 1 2 0\n"),
         "a listed image of 5000 letters": write_text("images.txt", f"0.05 {'a' * 5000}\n"),
         "a listed image with a null": write_text("images.txt", "0.05 a\0b\n"),
         "events that are a folder": folder_for("events.txt"),
         "EPS of ECD": saved_as("EPS", "images/0.png"),
-        "PPM": saved_as("PPM", "images/1.png"),
         "listed image": outside_image(write_text("images.txt", "0.05 ../outside.png\n"), mode="L"),
     },
     _EVENTNERF: {
