@@ -107,17 +107,6 @@ def test_real_files_agree_with_independent_reader(
     np.testing.assert_array_equal(events, np.stack(columns, -1, dtype=np.int64, casting="unsafe"))
 
 
-def test_real_files_in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    files = [open_event_file(vendor_file(name)) for name in ("evt3.raw", "gen4.dat", "davis346.aedat4")]
-    whole = [read(file) for file in files]
-    for module in (evt_words, prophesee, event_reader):
-        monkeypatch.setattr(module, "CHUNK", 10_007)
-    monkeypatch.setattr(prophesee, "BLOCK", 9_973)
-    for file, events in zip(files, whole, strict=True):
-        assert max(map(len, file.chunks())) < 11_000
-        np.testing.assert_array_equal(read(file), events)
-
-
 def test_refuse_times_that_go_back(folder: Path) -> None:
     for name, step in (("evt2", 1000), ("evt3", 60_000), ("dat", 1), ("aedat4", 1)):
         path = folder / f"back.{name}"

@@ -18,7 +18,6 @@ from helpers.bag_writers import (
     array_message,
     packet_message,
     packet_messages,
-    typestore,
     write_bag,
     write_bag2,
 )
@@ -157,16 +156,6 @@ def test_packets_of_ros2_equal_those_of_ros1(folder: Path) -> None:
     two = open_event_file(write_bag2(folder / "packets", messages, PACKET))
     np.testing.assert_array_equal(read(one), read(two))
     assert one.time_span() == two.time_span()
-
-
-def test_real_packets_converted_to_ros2(folder: Path) -> None:
-    path = vendor_file("evt3_packets.bag")
-    converter = pytest.importorskip("rosbags.convert")
-    converted = folder / "converted"
-    converter.convert([path], converted, "sqlite3", 8, None, "file", None, typestore(), [], [], [], [])
-    file = open_event_file(converted)
-    np.testing.assert_array_equal(read(file), read(open_event_file(path)))
-    assert file.time_span() == open_event_file(path).time_span()
 
 
 def test_bag_of_ros2_without_metadata_opens(folder: Path) -> None:

@@ -386,12 +386,3 @@ def test_report_lost_frames_and_fragments(truth: torch.Tensor) -> None:
     whole = dataclasses.replace(found, frame_times=times[[1, 2, 5, 6, 8]], model_sizes=[5])
     assert whole.gaps() == []
     assert "\n" not in whole.summary()
-
-
-def test_pose_noise_and_colmap_exclude_each_other(room: SimulationScene, tmp_path: Path) -> None:
-    options = Simulate(tmp_path / "scene", poses="colmap", pose_noise_degrees=1.0, width=16, height=12, duration=0.5)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("aenerf_ns.simulator.open_scene.open_scene", lambda *_: room)
-        with pytest.raises(DataError, match="COLMAP makes errors of its own"):
-            options.main()
-    assert not (tmp_path / "scene").exists()
