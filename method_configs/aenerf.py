@@ -30,7 +30,7 @@ from aenerf_ns.training.trainer import AENeRFTrainerConfig
 def optimized_by(scheduler: SchedulerConfig | None = None, **adam: float) -> dict[str, Any]:
     """Return how a group of parameters is optimized: Adam's options, and by default a rate that falls at milestones."""
     return {
-        "optimizer": FusedAdamOptimizerConfig(**adam),  # type: ignore[arg-type]
+        "optimizer": FusedAdamOptimizerConfig(**adam),
         "scheduler": scheduler or RelativeMultiStepSchedulerConfig(),
     }
 
