@@ -14,9 +14,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import torch
 import tyro
@@ -24,6 +26,9 @@ from filelock import FileLock
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.training.provenance import provenance
+
+if TYPE_CHECKING:
+    from aenerf_ns.training.trainer import AENeRFTrainer
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -119,6 +124,35 @@ def train(folder: Path, name: str, method: str, steps: int, options: Sequence[st
         folder, "ns-train", method, "--machine.device-type", device, "--vis", "tensorboard",
         "--experiment-name", name, "--max-num-iterations", str(steps), *options, *data,
     )  # fmt: skip
+
+
+def new_trainer(words: Sequence[str], data: Path, output: Path, steps: int, seed: int) -> AENeRFTrainer:
+    """Set up a training in this process, on a GPU where there is one, that evaluates and saves nothing on its way.
+
+    Args:
+        words: method and options of ns-train.
+        data: folder of the dataset.
+        output: folder for the run.
+        steps: of the training.
+        seed: of the training.
+    """
+    # Imported lazily, because most benchmarks train by the commands.
+    from nerfstudio.configs.method_configs import all_methods
+
+    method, *options = words
+    config: Any = tyro.cli(type(all_methods[method]), default=deepcopy(all_methods[method]), args=options)
+    config.machine.seed, config.vis = seed, "tensorboard"
+    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = data
+    never = dict.fromkeys(
+        ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images", "steps_per_save"), steps + 1
+    )
+    # A new configuration, because the schedules follow the number of steps when it is made.
+    config = replace(config, max_num_iterations=steps, output_dir=output, timestamp="now", **never)
+    torch.manual_seed(seed)
+    trainer: AENeRFTrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
 
 
 def config_of(folder: Path, name: str) -> str:

@@ -11,24 +11,19 @@ from __future__ import annotations
 
 import shlex
 import time
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-import tyro
-from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils import writer
 from torch import Tensor
 
 from aenerf_ns.evaluation.view_metrics import average_metrics, measure_reference_views
 from aenerf_ns.training.trainer import AENeRFTrainer
-from benchmarks.runs import run_benchmark, write_result
-
-_EVALUATIONS = ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images", "steps_per_save")
+from benchmarks.runs import new_trainer, run_benchmark, write_result
 
 
 @dataclass
@@ -64,18 +59,9 @@ class Variants:
                     print({name: value for name, value in runs[-1].items() if name != "followed"}, flush=True)
 
     def _run(self, folder: Path, words: list[str], seed: int) -> dict[str, Any]:
-        method, *options = words
-        config = tyro.cli(type(all_methods[method]), default=deepcopy(all_methods[method]), args=options)
-        config.machine.seed, config.machine.device_type, config.vis = seed, "cpu", "tensorboard"
-        config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = folder
-        never = dict.fromkeys(_EVALUATIONS, self.steps + 1)
         followed: list[dict[str, Any]] = []
         with TemporaryDirectory() as output:
-            # A new configuration, because the schedules follow the number of steps when it is made.
-            config = replace(config, max_num_iterations=self.steps, output_dir=Path(output), timestamp="now", **never)
-            torch.manual_seed(seed)
-            trainer: AENeRFTrainer = config.setup(local_rank=0, world_size=1)
-            trainer.setup()
+            trainer = new_trainer(words, folder, Path(output), self.steps, seed)
             self._follow(trainer, followed)
             begin = time.process_time()
             trainer.train()

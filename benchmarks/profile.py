@@ -1,0 +1,99 @@
+"""Profile steps of a training: their time, their kernels, how long these kept the GPU busy, and memory.
+
+    python -m benchmarks.profile --data data/room --output benchmarks/results/profile_h100.json
+
+The time is measured first, without the profiler, which slows the steps.
+"""
+
+from __future__ import annotations
+
+import shlex
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch.autograd import DeviceType
+from torch.profiler import ProfilerActivity, profile
+
+from benchmarks.runs import new_trainer, run_benchmark, write_result
+
+_STEPS_BEFORE = 20
+
+
+@dataclass
+class Profile:
+    """Profile steps of trainings."""
+
+    data: Path
+    """Folder of a dataset."""
+    output: Path
+    """JSON file to write after each training."""
+    variants: tuple[str, ...] = (
+        "aenerf",
+        "aenerf --pipeline.model.loss-coefficients.temporal-loss 1e-3",
+        "aenerf-small",
+        "aenerf-mlp",
+    )
+    """Methods with options of ns-train."""
+    steps: int = 200
+    """Steps of each training."""
+    kernels: int = 12
+    """How many kernels are listed, those that take longest."""
+
+    def main(self) -> None:
+        """Profile all trainings, and write what was found."""
+        rows = []
+        for words in self.variants:
+            with TemporaryDirectory() as folder:
+                rows.append({"variant": words, **self._profile(shlex.split(words), Path(folder))})
+            write_result(self.output, {"steps": self.steps, "rows": rows})
+
+    def _profile(self, words: list[str], folder: Path) -> dict[str, Any]:
+        trainer = new_trainer(words, self.data, folder, steps=30000, seed=1)
+        on_gpu = trainer.pipeline.device.type == "cuda"
+
+        def train(first: int, count: int) -> float:
+            begin = time.perf_counter()
+            for step in range(first, first + count):
+                trainer.pipeline.train()
+                trainer.pipeline.model.proposal_sampler.step_cb(step)
+                trainer.train_iteration(step)
+            if on_gpu:
+                torch.cuda.synchronize()
+            return 1e3 * (time.perf_counter() - begin) / count
+
+        # Compiles, and lets the proposal networks train in every second step only.
+        train(0, _STEPS_BEFORE)
+        if on_gpu:
+            torch.cuda.reset_peak_memory_stats()
+        milliseconds = train(_STEPS_BEFORE, self.steps)
+        memory = torch.cuda.max_memory_allocated() / 2**30 if on_gpu else None
+        # The profiler keeps every call, so it watches few steps: a period of the pose correction, over and over.
+        watched = 16
+        with profile(activities=[ProfilerActivity.CPU, *[ProfilerActivity.CUDA] * on_gpu]) as profiler:
+            train(_STEPS_BEFORE + self.steps, watched)
+        device = DeviceType.CUDA if on_gpu else DeviceType.CPU
+        kernels = [event for event in profiler.key_averages() if event.device_type == device]
+        own_time = "self_device_time_total" if on_gpu else "self_cpu_time_total"
+        kernels.sort(key=lambda event: -getattr(event, own_time))
+        return {
+            "milliseconds": milliseconds,
+            "kernels": sum(event.count for event in kernels) / watched,
+            "busy_milliseconds": sum(getattr(event, own_time) for event in kernels) / 1e3 / watched,
+            "peak_gib": memory,
+            "longest": [
+                {
+                    "kernel": event.key[:100],
+                    "calls": event.count / watched,
+                    "milliseconds": getattr(event, own_time) / 1e3 / watched,
+                }
+                for event in kernels[: self.kernels]
+            ],
+        }
+
+
+if __name__ == "__main__":
+    run_benchmark(Profile)
