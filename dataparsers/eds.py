@@ -84,7 +84,7 @@ class EdsDataParser(EventDataParser):
         cameras = read_camchain(path)
         if not {"cam0", "cam1"} <= set(cameras):
             raise DataError(path, f"its cameras are {', '.join(cameras)}", "it must hold cam0 and cam1")
-        return cameras["cam1"].lens, cameras["cam0"].lens, motion_between(path, cameras, "cam0", "cam1")
+        return cameras["cam1"].lens(), cameras["cam0"].lens(), motion_between(path, cameras, "cam0", "cam1")
 
 
 eds_dataparser = DataParserSpecification(

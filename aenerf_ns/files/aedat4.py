@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, NoReturn
 from xml.etree import ElementTree
@@ -28,7 +29,8 @@ _MAGIC = b"#!AER-DAT4.0\r\n"
 # Microseconds.
 _EVENT = np.dtype([("time", "<i8"), ("x", "<u2"), ("y", "<u2"), ("on", "u1"), ("padding", "V3")])
 _MAX_MICROSECONDS = np.iinfo(np.int64).max // 1000
-_COMPRESSIONS = ("none", "lz4", "lz4", "zstd", "zstd")
+# The module that unpacks what is compressed in a way, by its number; 0 is not compressed.
+_COMPRESSIONS = ("", "lz4.frame", "lz4.frame", "backports.zstd", "backports.zstd")
 # Indices of the fields in their tables.
 _HEADER_COMPRESSION, _HEADER_TABLE_POSITION, _HEADER_INFO = range(3)
 _ROW_STREAM, _ROW_COUNT = 1, 2
@@ -87,15 +89,7 @@ class Aedat4File(EventReader):
         raise DataError(self.path, problem, "copy it again, or export it again with DV")
 
     def _unpack(self, data: bytes) -> bytes:
-        if self._compression == "lz4":
-            from lz4.frame import decompress
-
-            return decompress(data)
-        if self._compression == "zstd":
-            from backports.zstd import decompress
-
-            return decompress(data)
-        return data
+        return import_module(self._compression).decompress(data) if self._compression else data
 
     def _packets(self, file: BinaryIO) -> Iterator[tuple[int, int]]:
         """Yield the position and the size in bytes of each packet of the stream."""

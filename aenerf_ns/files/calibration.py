@@ -87,7 +87,7 @@ def read_calibration(
         if name not in cameras:
             raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
     motion = motion_between(path, cameras, event_name, frame_name)
-    return Calibration(cameras[event_name].lens, cameras[frame_name].lens, motion, SensorModel(), "linear")
+    return Calibration(cameras[event_name].lens(), cameras[frame_name].lens(), motion, SensorModel(), "linear")
 
 
 def _camera_info(path: Path, content: dict[str, Any]) -> CameraIntrinsics:

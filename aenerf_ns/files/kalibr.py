@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +18,7 @@ from aenerf_ns.files.transforms import Matrix, Row, rigid_motion
 _REMEDY = "give the camchain that Kalibr wrote"
 
 
-class _Camera(msgspec.Struct, kw_only=True):
+class ChainCamera(msgspec.Struct, kw_only=True):
     """A camera of the chain. ``T_cn_cnm1`` takes points from the coordinates of the camera before it to its own."""
 
     intrinsics: Row
@@ -35,16 +34,9 @@ class _Camera(msgspec.Struct, kw_only=True):
         self.lens()
 
     def lens(self) -> CameraIntrinsics:
+        """Return the camera's lens."""
         distortion = [] if self.distortion_model == "none" else self.distortion_coeffs
         return CameraIntrinsics.from_opencv(self.resolution, self.intrinsics, distortion, self.distortion_model)
-
-
-@dataclass(frozen=True)
-class ChainCamera:
-    """A camera of a camchain: its lens, and the (4, 4) float64 motion from the camera before it, None if not stated."""
-
-    lens: CameraIntrinsics
-    from_previous: Tensor | None
 
 
 def read_camchain(path: Path) -> dict[str, ChainCamera]:
@@ -61,11 +53,14 @@ def read_camchain(path: Path) -> dict[str, ChainCamera]:
     cameras: dict[str, ChainCamera] = {}
     # cam10 follows cam9.
     for name in sorted(chain, key=lambda name: (len(name), name)):
-        camera = convert(path, chain[name], _Camera, _REMEDY, name)
-        stated = camera.T_cn_cnm1 is not None
-        motion = rigid_motion(path, f"{name}.T_cn_cnm1", camera.T_cn_cnm1) if stated else None
-        cameras[name] = ChainCamera(camera.lens(), motion)
+        cameras[name] = convert(path, chain[name], ChainCamera, _REMEDY, name)
+        if cameras[name].T_cn_cnm1 is not None:
+            _motion_from_previous(path, cameras, name)
     return cameras
+
+
+def _motion_from_previous(path: Path, cameras: dict[str, ChainCamera], name: str) -> Tensor:
+    return rigid_motion(path, f"{name}.T_cn_cnm1", cameras[name].T_cn_cnm1)
 
 
 def motion_between(path: Path, cameras: dict[str, ChainCamera], source: str, target: str) -> Tensor:
@@ -78,8 +73,7 @@ def motion_between(path: Path, cameras: dict[str, ChainCamera], source: str, tar
     first, last = sorted((names.index(source), names.index(target)))
     motion = torch.eye(4, dtype=torch.float64)
     for name in names[first + 1 : last + 1]:
-        step = cameras[name].from_previous
-        if step is None:
+        if cameras[name].T_cn_cnm1 is None:
             raise DataError(path, f"{name} has no T_cn_cnm1", "calibrate both cameras in one run of Kalibr, or add it")
-        motion = step @ motion
+        motion = _motion_from_previous(path, cameras, name) @ motion
     return motion if names.index(source) == first else torch.linalg.inv(motion)

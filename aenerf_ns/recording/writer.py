@@ -183,18 +183,17 @@ class NativeDatasetWriter(_FolderWriter):
         """
         frame = self._add_frame(split, ".png", camera_to_world, time)
         Image.fromarray(image).save(self._partial / frame["file_path"])
-        name = Path(frame["file_path"]).relative_to("images").as_posix()
-        for key, values in (("linear", linear), ("depth", depth)):
-            if values is not None:
-                frame[f"{key}_file_path"] = f"{key}/{name}"
-                (self._partial / frame[f"{key}_file_path"]).parent.mkdir(parents=True, exist_ok=True)
-        if linear is not None:
-            _write_16_bits(self._partial / frame["linear_file_path"], linear[..., ::-1])
+        pictures = {} if linear is None else {"linear": linear[..., ::-1]}
         if depth is not None:
             # Nerfstudio's convention: 16 bits of thousandths, 0 for unknown.
             thousandths = np.rint(np.where(np.isfinite(depth), depth, 0) * 1000.0)
             thousandths[thousandths > np.iinfo(np.uint16).max] = 0
-            _write_16_bits(self._partial / frame["depth_file_path"], thousandths.astype(np.uint16))
+            pictures["depth"] = thousandths.astype(np.uint16)
+        for kind, values in pictures.items():
+            name = frame[f"{kind}_file_path"] = frame["file_path"].replace("images/", f"{kind}/", 1)
+            (self._partial / name).parent.mkdir(parents=True, exist_ok=True)
+            # OpenCV's own writing reports no full disk.
+            (self._partial / name).write_bytes(cv2.imencode(".png", values)[1].tobytes())
 
     def add_image_file(
         self,
@@ -270,11 +269,6 @@ def _write_json(path: Path, values: dict[str, Any]) -> None:
     # strings, and their quotes are removed here.
     text = re.sub(r'"timestamp": "([-0-9.]+)"', r'"timestamp": \1', json.dumps(values, indent=2))
     path.write_text(text + "\n", encoding="utf-8")
-
-
-def _write_16_bits(path: Path, values: NDArray[np.uint16]) -> None:
-    # OpenCV's own writing reports no full disk.
-    path.write_bytes(cv2.imencode(".png", values)[1].tobytes())
 
 
 def _event_camera(camera: CameraIntrinsics, sensor: SensorModel) -> dict[str, Any]:

@@ -139,7 +139,11 @@ class AENeRFTrainer(Trainer):
             self.callbacks.append(TrainingCallback([places.AFTER_TRAIN], self._record_end))
             self.callbacks.append(TrainingCallback([places.AFTER_TRAIN_ITERATION], self._stop_if_asked))
             with _one_line_if_not_written(self.base_dir / "config.yml") as path, atomic_write(path) as partial:
-                partial.write_text(yaml.dump(self._resolved_config()), "utf8")
+                # With what the dataset has resolved: opening the run must give the same cameras.
+                assert isinstance(self.pipeline.datamanager, EventDataManager)
+                data = self.pipeline.datamanager.resolved_config()
+                resolved = replace(self.config, pipeline=replace(self.config.pipeline, datamanager=data))  # type: ignore[call-arg]
+                partial.write_text(yaml.dump(resolved), "utf8")
 
     def _load_checkpoint(self) -> None:
         try:
@@ -151,13 +155,6 @@ class AENeRFTrainer(Trainer):
             problem = f"it holds other parameters than this training: {' '.join(str(error).split())}"
             remedy = "give the method, the options and the version of aenerf-ns that it was made with, or train again"
             raise DataError(str(self.config.load_checkpoint), problem, remedy) from error
-
-    def _resolved_config(self) -> AENeRFTrainerConfig:
-        """Return the configuration with what the dataset has resolved: opening the run must give the same cameras."""
-        data = self.pipeline.datamanager
-        assert isinstance(data, EventDataManager)
-        pipeline = replace(self.config.pipeline, datamanager=data.resolved_config())
-        return replace(self.config, pipeline=pipeline)  # type: ignore[call-arg]
 
     def train(self) -> None:
         """Train the model, and record how far that came."""

@@ -209,13 +209,10 @@ class RecordingPanel(nn.Module):
         self._play()
 
     def _draw_between_steps(self) -> None:
-        with self._no_step():
-            self.draw()
-
-    def _no_step(self) -> contextlib.AbstractContextManager[Any]:
-        """Wait until no training step runs, and hold the next one back."""
+        """Draw when no training step runs, and hold the next one back meanwhile."""
         assert self._viewer is not None
-        return self._viewer.train_lock or contextlib.nullcontext()
+        with self._viewer.train_lock or contextlib.nullcontext():
+            self.draw()
 
     def _show_trajectories(self) -> None:
         if self._viewer is None:
