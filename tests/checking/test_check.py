@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.dataset_faults import edit_json, set_in
 from helpers.small_datasets import START, write_native
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
@@ -260,9 +260,7 @@ def test_reject_poses_of_another_path(seed: int, small_object: Path, tmp_path: P
     (folder / "trajectory_ground_truth.txt").unlink()
     (folder / "trajectory_estimated.txt").write_text("\n".join(another_orbit(true.times.numpy(), radius, seed)) + "\n")
     # The box would also tell.
-    meta = json.loads((folder / "transforms.json").read_text())
-    meta.pop("scene_box", None)
-    (folder / "transforms.json").write_text(json.dumps(meta))
+    set_in("transforms.json", "scene_box", value=None)(folder)
     status, output = run(folder)
     assert status == 1, output
     assert "the events look as if" in output or "clearly fit another meaning of the poses" in output
@@ -325,6 +323,11 @@ def rewrite(folder: Path, events: EventStream) -> None:
         writer.append(events)
 
 
+def change_poses(folder: Path, function: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    path = folder / "trajectory_estimated.txt"
+    write_tum_trajectory(path, read_tum_trajectory(path).transform(function))
+
+
 def test_command_finds_nothing_and_draws_a_picture(shorter: Path, tmp_path: Path) -> None:
     status, output = run(shorter, picture=tmp_path / "warped.png")
     assert status == 0, output
@@ -340,8 +343,7 @@ def test_command_finds_nothing_and_draws_a_picture(shorter: Path, tmp_path: Path
 
 
 def test_command_names_mistakes_and_remedies(shorter: Path) -> None:
-    path = shorter / "trajectory_estimated.txt"
-    write_tum_trajectory(path, read_tum_trajectory(path).transform(torch.linalg.inv))
+    change_poses(shorter, torch.linalg.inv)
     events = all_events(open_native(shorter))
     rng = np.random.default_rng(0)
     t = np.concatenate([events.t, np.sort(rng.integers(0, PART, 6000))])
@@ -376,11 +378,8 @@ def test_command_reports_gaps_and_missing_poses(shorter: Path) -> None:
 
 
 def test_scene_box_must_hold_what_is_seen(shorter: Path) -> None:
-    path = shorter / "transforms.json"
-    meta = json.loads(path.read_text())
     for side, status in ((8.0, 0), (0.5, 1)):
-        meta["scene_box"] = [[-side, -side, -side], [side, side, side]]
-        path.write_text(json.dumps(meta))
+        set_in("transforms.json", "scene_box", value=[[-side] * 3, [side] * 3])(shorter)
         found, output = run(shorter)
         assert found == status, output
         assert "Within the scene box: " in output
@@ -409,9 +408,7 @@ def test_unreadable_data_is_one_line_and_status_2(room: Path, tmp_path: Path, ca
 def test_polarities_are_compared_with_the_frames(sign: int, shorter: Path) -> None:
     events = all_events(open_native(shorter))
     rewrite(shorter, replace(events, p=np.int8(sign) * events.p))
-    meta = json.loads((shorter / "transforms.json").read_text())
-    meta["event_camera"]["positive_contrast_threshold"] = 0.4
-    (shorter / "transforms.json").write_text(json.dumps(meta))
+    set_in("transforms.json", "event_camera", "positive_contrast_threshold", value=0.4)(shorter)
     status, output = run(shorter)
     assert "(given: 1.60)" in output
     option = "guess, train with --positive-contrast-threshold "
@@ -460,8 +457,7 @@ def with_lost_tracking(poses: torch.Tensor) -> torch.Tensor:
     ],
 )
 def test_wrong_poses_in_places_are_no_wrong_axes(change: Callable, problem: str, shorter: Path) -> None:
-    path = shorter / "trajectory_estimated.txt"
-    write_tum_trajectory(path, read_tum_trajectory(path).transform(change))
+    change_poses(shorter, change)
     status, output = run(shorter)
     assert status == 1
     assert problem in output
@@ -480,10 +476,7 @@ def test_wrong_poses_in_places_are_no_wrong_axes(change: Callable, problem: str,
     ],
 )
 def test_a_lens_of_another_size_is_no_wrong_axes(changes: dict, problem: str, shorter: Path) -> None:
-    path = shorter / "transforms.json"
-    meta = json.loads(path.read_text())
-    meta["event_camera"] |= changes
-    path.write_text(json.dumps(meta))
+    edit_json("transforms.json", lambda meta: meta["event_camera"].update(changes))(shorter)
     status, output = run(shorter)
     assert status == 1
     assert problem in output
@@ -493,8 +486,7 @@ def test_a_lens_of_another_size_is_no_wrong_axes(changes: dict, problem: str, sh
 def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(room, tmp_path / "room")
     rewrite(folder, all_events(open_native(folder))[:3500])
-    path = folder / "trajectory_estimated.txt"
-    write_tum_trajectory(path, read_tum_trajectory(path).transform(lambda poses: poses @ axes(1, -1, -1)))
+    change_poses(folder, lambda poses: poses @ axes(1, -1, -1))
     _, output = run(folder)
     assert "as if" not in output.split("problem")[-1]
     assert "Because of too few events, the contrast does not tell" in output

@@ -15,7 +15,7 @@ import pytest
 import torch
 from helpers.colmap_stand_in import place_frames
 from helpers.commands import run
-from helpers.dataset_faults import put, remove
+from helpers.dataset_faults import put, remove, set_in
 from helpers.small_datasets import (
     END,
     START,
@@ -250,9 +250,7 @@ def test_the_report_on_poses_stays_with_them(tmp_path: Path) -> None:
 
 def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
-    meta = json.loads((data / "transforms.json").read_text())
-    meta["fl_x"] = 4.0
-    (data / "transforms.json").write_text(json.dumps(meta))
+    set_in("transforms.json", "fl_x", value=4.0)(data)
     with pytest.raises(DataError, match="frames are of another camera than its events"):
         convert(data, tmp_path / "converted", poses="colmap")
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from helpers.dataset_faults import set_in
 from helpers.small_datasets import START, parse, write_native
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
@@ -97,8 +97,7 @@ def test_network_reconstructs_with_given_weights(
 @pytest.mark.parametrize("is_scaled", [False, True])
 def test_poses_keep_their_scale(is_scaled: bool, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     data = write_native(tmp_path / "made")
-    meta = json.loads((data / "transforms.json").read_text())
-    (data / "transforms.json").write_text(json.dumps({**meta, "auto_scale_poses": is_scaled}))
+    set_in("transforms.json", "auto_scale_poses", value=is_scaled)(data)
     Reconstruct(data, tmp_path / "my images").main()
     after = NativeDataParserConfig(data=tmp_path / "my images").setup()
     assert after.scales_poses(after.recording) is is_scaled
@@ -116,9 +115,7 @@ def test_images_without_a_pose_are_left_out(data: Path, tmp_path: Path, capsys: 
 
 
 def test_images_of_another_camera_are_left_out(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    meta = json.loads((data / "transforms.json").read_text())
-    meta["fl_x"] += 1
-    (data / "transforms.json").write_text(json.dumps(meta))
+    set_in("transforms.json", "fl_x", value=4.0)(data)
     Reconstruct(data, tmp_path / "out").main()
     views = opened(tmp_path / "out").reference_views
     assert [len(views[split]) for split in ("train", "val", "test")] == [25, 0, 0]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import tyro
 from helpers.bag_writers import ARRAY, array_message, write_bag
 from helpers.event_file_checks import read
 from helpers.event_file_writers import HEADER2, HEADER3, HEIGHT, WIDTH, Rows, aedat4_file, dat, evt2, evt3, words
+from helpers.event_table_writers import Columns, write_csv, write_eds, write_text
 from helpers.own_recordings import random_events, write_calibration, write_poses
 
 from aenerf_ns.cli.convert import Convert
@@ -23,27 +23,13 @@ from aenerf_ns.files.open import open_event_file
 ROWS: Rows = [(i % WIDTH, i % HEIGHT, 100_000 + 10 * i, 1 - 2 * (i % 2)) for i in range(5000)]
 
 
-def as_hdf5(path: Path, rows: Rows) -> None:
-    with h5py.File(path, "w") as file:
-        for name, column, dtype in zip("xytp", zip(*rows, strict=True), "HHqb", strict=True):
-            file[f"events/{name}"] = np.array(column, dtype)
-
-
-def as_npz(path: Path, rows: Rows) -> None:
-    np.savez(path, **dict(zip("xytp", np.array(rows).T, strict=True)))
-
-
-def as_text(path: Path, rows: Rows) -> None:
-    path.write_text("".join(f"{t} {x} {y} {p > 0:d}\n" for x, y, t, p in rows))
-
-
-def as_csv(path: Path, rows: Rows) -> None:
-    path.write_text("x,y,t,p\n" + "".join(f"{x},{y},{t},{p}\n" for x, y, t, p in rows))
-
-
 def as_bag(path: Path, rows: Rows) -> None:
     messages = [(i, array_message(rows[i : i + 100])) for i in range(0, len(rows), 100)]
     write_bag(path, {"/events": (ARRAY, messages)})
+
+
+def in_columns(write: Callable[[Path, Columns], object]) -> Callable[[Path, Rows], object]:
+    return lambda path, rows: write(path, dict(zip("xytp", np.array(rows).T, strict=True)))
 
 
 def in_bytes(encode: Callable[[Rows], bytes]) -> Callable[[Path, Rows], None]:
@@ -51,10 +37,10 @@ def in_bytes(encode: Callable[[Rows], bytes]) -> Callable[[Path, Rows], None]:
 
 
 WRITERS = {
-    ".h5": as_hdf5,
-    ".npz": as_npz,
-    ".txt": as_text,
-    ".csv": as_csv,
+    ".h5": in_columns(write_eds),
+    ".npz": in_columns(lambda path, columns: np.savez(path, **columns)),
+    ".txt": in_columns(lambda path, columns: write_text(path, columns, "{t} {x} {y} {p}\n")),
+    ".csv": in_columns(write_csv),
     ".bag": as_bag,
     ".dat": in_bytes(dat),
     ".aedat4": in_bytes(aedat4_file),

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from helpers.dataset_faults import set_in
 from helpers.published_datasets import DURATION, EPOCH, config_of, seconds, write_images, write_own
 from helpers.small_datasets import END, START, make_trajectory, parse, write_ecd, write_native
 from helpers.unpacked_pairs import unpacked
@@ -84,10 +84,8 @@ def test_refuse_reference_views_far_away(tmp_path: Path) -> None:
     truth = make_trajectory()
     far = Trajectory(truth.times, truth.camera_to_worlds + torch.tensor([[0, 0, 0, 4e5]], dtype=torch.float64))
     write_tum_trajectory(folder / "trajectory_ground_truth.txt", far)
-    transforms = json.loads((folder / "transforms.json").read_text())
-    for frame in transforms["frames"]:
-        frame["transform_matrix"][0][3] += 4e5
-    (folder / "transforms.json").write_text(json.dumps(transforms))
+    for index in range(6):
+        set_in("transforms.json", "frames", index, "transform_matrix", 0, 3, value=4e5)(folder)
     config = NativeDataParserConfig(data=folder)
     assert len(parse(config, "train").image_filenames)
     with pytest.raises(
