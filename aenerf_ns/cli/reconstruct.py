@@ -14,7 +14,7 @@ from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.progress import tracked
-from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL
+from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL, batches_of
 from aenerf_ns.reconstruction.weights import require_weights
 
 if TYPE_CHECKING:
@@ -90,7 +90,6 @@ class Reconstruct(DatasetCommand):
     ) -> Iterator[NDArray[np.uint8]]:
         """Write the events and an image of each batch of them that ends at a time with a pose. Yield the images."""
         from aenerf_ns.camera.trajectory import homogeneous
-        from aenerf_ns.reconstruction.batches import batches_of
 
         events = recording.event_file
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)

@@ -13,14 +13,13 @@ from aenerf_ns.events.stream import EventStream
 _MAX_DISPLACEMENT, _STEP = 15.0, 1.5
 
 
-def optical_flow(events: EventStream, seed: int = 0) -> tuple[NDArray[np.float64], int]:
+def optical_flow(events: EventStream) -> tuple[NDArray[np.float64], int]:
     """Return the velocity that gives the events of a tile the sharpest edges, without knowing poses or depth.
 
     Where a tile sees edges of one direction only, the velocity along the edges is undetermined.
 
     Args:
         events: of a time so short that the motion is nearly even, and so long that edges move by some pixels.
-        seed: of the position of each event within its pixel.
 
     Returns:
         (R, C, 2) velocities along x and y in pixels of the sensor per second, 0 in tiles without events. And the side
@@ -31,7 +30,8 @@ def optical_flow(events: EventStream, seed: int = 0) -> tuple[NDArray[np.float64
         return np.zeros((height // TILE, width // TILE, 2)), TILE * binning
     duration = max(int(events.t[-1] - events.t[0]), 1)
     part = (events.t - events.t[0]) / duration - 0.5
-    jitter = np.random.default_rng(seed).uniform(0, 1, (2, len(events)))
+    # An event is anywhere within its pixel.
+    jitter = np.random.default_rng(0).uniform(0, 1, (2, len(events)))
     x, y = (np.stack([events.x, events.y]) + jitter) / binning
     polarity = events.p.astype(np.float32)
 

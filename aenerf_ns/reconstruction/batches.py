@@ -1,8 +1,11 @@
-"""Batches of events: each batch gives one image."""
+"""Batches of events, each of which gives one image, and their voxel grids: what E2VID and FireNet see."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
 
 from aenerf_ns.events.stream import EventStream
 
@@ -26,3 +29,43 @@ def batches_of(chunks: Iterable[EventStream], num_events: int) -> Iterator[Event
             for begin in range(0, num_batches * num_events, num_events):
                 yield events[begin : begin + num_events]
             waiting = [events[num_batches * num_events :]]
+
+
+def voxel_grid(events: EventStream, num_bins: int) -> NDArray[np.float32]:
+    """Add up the polarities of events over pixels and over bins of time.
+
+    The first event is at the first bin and the last event at the last bin. In between, each polarity is shared between
+    the two nearest bins, linearly in time (Rebecq et al., "High Speed and High Dynamic Range Video with an Event
+    Camera", TPAMI 2021, eq. 1).
+
+    Args:
+        events: of one batch, at least one.
+        num_bins: at least 2.
+
+    Returns:
+        (num_bins, height, width) sums.
+    """
+    grid = np.zeros((num_bins, events.height, events.width))
+    elapsed = (events.t - events.t[0]).astype(np.float64)
+    # Events that are all of one time are in the first bin.
+    position = (num_bins - 1) * elapsed / max(elapsed[-1], 1.0)
+    lower = np.minimum(position.astype(np.int64), num_bins - 2)
+    share = position - lower
+    np.add.at(grid, (lower, events.y, events.x), events.p * (1 - share))
+    np.add.at(grid, (lower + 1, events.y, events.x), events.p * share)
+    return grid.astype(np.float32)
+
+
+def normalize(grid: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Bring the values of a voxel grid other than zero to mean 0 and standard deviation 1; zeros stay zero.
+
+    Values that are all equal have no deviation: only the mean is subtracted from them.
+    """
+    active = grid != 0
+    if not active.any():
+        return grid
+    values = grid[active].astype(np.float64)
+    deviation = values.std()
+    result = np.zeros_like(grid)
+    result[active] = (values - values.mean()) / (deviation if deviation > 0 else 1.0)
+    return result

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.reconstruction.batches import normalize, voxel_grid
 from aenerf_ns.reconstruction.networks import E2VID, NUM_BINS, FireNet
 from aenerf_ns.reconstruction.two_sided import log_intensities
-from aenerf_ns.reconstruction.voxels import normalize, voxel_grid
 
 # Of the filter. In a room 0.03 to 0.06 come closest to the true images; at an object less is a little better still.
 _DECAY = 0.05

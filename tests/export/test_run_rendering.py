@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers.dataset_faults import set_in
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -28,10 +28,8 @@ SECOND = 10**9
 def run(tmp_path: Path) -> TrainedRun:
     """A run whose correction is far from none. Its first test view was taken on the trajectory."""
     make_pipeline_config(tmp_path / "made")
-    file = tmp_path / "made" / "transforms.json"
-    meta = json.loads(file.read_text())
-    next(frame for frame in meta["frames"] if "test" in frame["file_path"])["timestamp"] = 0.25
-    file.write_text(json.dumps(meta))
+    # After the two validation views.
+    set_in("transforms.json", "frames", 2, "timestamp", value=0.25)(tmp_path / "made")
     made = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
     torch.nn.init.normal_(made.model.camera_optimizer.twists.control_twists, std=0.05)
     return made.eval().trained_run()

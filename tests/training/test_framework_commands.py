@@ -27,6 +27,7 @@ import websockets.sync.client
 import yaml
 from helpers.browser import chromium
 from helpers.commands import CPU, newest_config, run
+from helpers.dataset_faults import set_in
 from helpers.small_trainings import own_log
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.scripts import train
@@ -317,16 +318,15 @@ def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
 @pytest.fixture(scope="module")
 def with_other_views(untrained: Path, workspace: Path) -> Path:
     """config.yml of a copy of the untrained run on a copy of its data with another split of the views."""
-    shutil.copytree(workspace / "room", workspace / "other")
-    file = workspace / "other" / "transforms.json"
-    meta = json.loads(file.read_text())
+    data = workspace / "other"
+    shutil.copytree(workspace / "room", data)
     # The first test view is another one, so that all others have another index.
-    meta["test_filenames"] = [meta["val_filenames"][0], *meta["test_filenames"][:2]]
-    file.write_text(json.dumps(meta))
+    views = [f"images/{view}.png" for view in ("val/00000", "test/00000", "test/00001")]
+    set_in("transforms.json", "test_filenames", value=views)(data)
     shutil.copytree(untrained.parent, workspace / "outputs" / "other" / "aenerf-small" / "now")
     config = yaml.load(untrained.read_text(), Loader=yaml.Loader)
     config.experiment_name, config.timestamp = "other", "now"
-    config.data = config.pipeline.datamanager.dataparser.data = config.pipeline.datamanager.data = file.parent
+    config.data = config.pipeline.datamanager.dataparser.data = config.pipeline.datamanager.data = data
     path = config.get_base_dir() / "config.yml"
     path.write_text(yaml.dump(config))
     return path

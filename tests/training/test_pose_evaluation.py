@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.dataset_faults import set_in
 from helpers.small_models import make_model
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from nerfstudio.cameras.cameras import Cameras
@@ -312,11 +313,7 @@ def test_views_on_the_trajectory_have_their_times_and_the_camera_s_speed(
     monkeypatch.setattr(ImageMetrics, "__call__", lambda *_: {"psnr": 20.0})
     make_pipeline_config(tmp_path / "made", num_views=0)
     # The camera moves along x, by 0.1 units in half a second.
-    file = tmp_path / "made" / "transforms.json"
-    meta = json.loads(file.read_text())
-    (frame,) = meta["frames"]
-    frame["timestamp"] = 0.25
-    file.write_text(json.dumps(meta))
+    set_in("transforms.json", "frames", 0, "timestamp", value=0.25)(tmp_path / "made")
     pipeline = make_pipeline(tmp_path / "made", "test")
     (view,) = pipeline.get_average_eval_image_metrics()["views"]
     assert view["time_ns"] == 250_000_000

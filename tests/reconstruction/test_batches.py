@@ -7,13 +7,12 @@ import pytest
 from helpers.streams import make_stream
 
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.reconstruction.batches import batches_of
-from aenerf_ns.reconstruction.voxels import normalize, voxel_grid
+from aenerf_ns.reconstruction.batches import batches_of, normalize, voxel_grid
 
 EPOCH = 1_600_000_000_000_000_000
 
 
-def test_worked_case() -> None:
+def test_voxel_grid_of_four_events() -> None:
     times = (0, 300_000_000, 500_000_000, 1_000_000_000)
     events = make_stream([(2, 1, EPOCH + t, p) for t, p in zip(times, (1, -1, 1, -1), strict=True)])
     grid = voxel_grid(events, 5)
