@@ -1,4 +1,4 @@
-"""``aenerf simulate``: a dataset of a built-in scene or of a mesh."""
+"""``aenerf simulate``: a dataset of a built-in scene, a mesh or a scene of Blender."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ class Simulate(SimulationCommand):
 
     scene: str = "room"
     """room: a furnished room seen from inside. object: a toy locomotive seen from around it. shiny_object: the
-    same, varnished and polished. A .glb, .obj or .ply file: a mesh seen from around it. A .json file: a mesh, its light
-    and the camera's path (docs/simulator.md)."""
+    same, varnished and polished. A .glb, .obj or .ply file: a mesh seen from around it. A .blend file: a scene of
+    Blender, seen by its own camera if that moves. A .json file: one of these files, its light and the camera's path
+    (docs/simulator.md)."""
     speed: Literal["easy", "hard"] = "easy"
     """easy: constant speed. hard: the same path at 8^sin(2 pi t) times that speed."""
     width: int = 346
@@ -37,7 +38,7 @@ class Simulate(SimulationCommand):
     height: int = 260
     """Pixel rows of the sensor."""
     duration: float | None = None
-    """Seconds that the path takes at constant speed. Default: the duration in scene.json, or 4."""
+    """Seconds that the path takes at constant speed. Default: that of the scene's file, or 4."""
     pose_rate: float = 250.0
     """Poses a second in the trajectories; with --poses colmap, in the true trajectory."""
     poses: Literal["noise", "colmap"] = "noise"

@@ -1,4 +1,4 @@
-"""Open a scene by its name: a built-in scene, a mesh or a scene.json."""
+"""Open a scene by its name: a built-in scene, a mesh, a .blend or a scene.json."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from aenerf_ns.simulator.scene_file import load_scene
 
 
 def open_scene(name: str, seed: int = 0) -> SimulationScene:
-    """Open a built-in scene by its name, or a mesh or scene.json by its file name. Its light takes seconds.
+    """Open a built-in scene by its name, or a mesh, .blend or scene.json by its file name. Its light takes seconds.
 
     Raises:
         DataError: there is no such scene, or the file cannot be used.

@@ -14,6 +14,7 @@ BUILT_IN = ("room", "object", "shiny_object")
 """Names of the built-in scenes."""
 MESH_SUFFIXES = (".glb", ".obj", ".ply")
 """Endings of names of mesh files."""
+BLENDER_SUFFIX = ".blend"
 DURATIONS = (1e-3, 1e5)
 """Shortest and longest duration in seconds."""
 Interpolation = Literal["linear", "flow"]
@@ -21,9 +22,10 @@ Interpolation = Literal["linear", "flow"]
 
 
 def require_scene_file(path: Path) -> None:
-    """Raise a DataError unless a path leads to a file that may be a mesh or a scene.json."""
-    if path.suffix.lower() not in (*MESH_SUFFIXES, ".json"):
-        raise DataError(path, "an unknown scene", "give a built-in scene, a .glb, .obj or .ply file, or a scene.json")
+    """Raise a DataError unless a path leads to a file that may be a mesh, a .blend or a scene.json."""
+    if path.suffix.lower() not in (*MESH_SUFFIXES, BLENDER_SUFFIX, ".json"):
+        remedy = "give a built-in scene, a .glb, .obj, .ply or .blend file, or a scene.json"
+        raise DataError(path, "an unknown scene", remedy)
     require_file(path)
 
 

@@ -9,16 +9,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 from scipy.special import i0, iv
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.arrays import Array
-from aenerf_ns.simulator.rendering.embree import RayCaster
 
 HARD_SPEED_RATIO = 8.0
 HARD_MEAN_SPEED = float(i0(np.log(HARD_SPEED_RATIO)))
@@ -46,15 +46,25 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), 
     return pose
 
 
+class Obstacles(Protocol):
+    """The surfaces that cameras must keep away from."""
+
+    def distance(self, points: ArrayLike, /) -> NDArray[np.floating]:
+        """Return the distance (N,) of points (N, 3) from the nearest surface."""
+
+    def blocked(self, rays: NDArray[np.float32], /) -> NDArray[np.bool_]:
+        """Tell for each ray (N, 6) whether a surface lies between its origin and origin + direction."""
+
+
 class FreeSpace:
     """The space at a clearance from every face: 0.15 m, or less along a path of less than about a meter.
 
     Args:
-        caster: casts rays against the mesh, or None where all space is free.
+        caster: the mesh, or None where all space is free.
         path_size: about the distance of the path from its middle, in meters.
     """
 
-    def __init__(self, caster: RayCaster | None, path_size: float) -> None:
+    def __init__(self, caster: Obstacles | None, path_size: float) -> None:
         self._caster = caster
         self._clearance = min(_MAX_CLEARANCE, 0.13 * path_size)
 
@@ -146,14 +156,14 @@ class ObjectPath(CameraPath):
     Args:
         turns: of the spiral.
         radius, center: of the hemisphere, in meters.
-        caster: casts rays against the mesh that cameras must not come near to; None if there is no such mesh.
+        caster: the mesh that cameras must not come near to; None if there is no such mesh.
 
     Raises:
         ValueError: the path comes too near to the mesh.
     """
 
     def __init__(
-        self, turns: float = 4.0, radius: float = 4.0, center: ArrayLike = ORIGIN, caster: RayCaster | None = None
+        self, turns: float = 4.0, radius: float = 4.0, center: ArrayLike = ORIGIN, caster: Obstacles | None = None
     ) -> None:
         self._turns, self._radius, self._center = turns, radius, np.asarray(center, np.float64)
         self._space = FreeSpace(caster, radius)
@@ -193,12 +203,51 @@ class ObjectPath(CameraPath):
         return look_at(eye + self._center, np.add(target, self._center), up)
 
 
-class WalkPath(CameraPath):
+class InnerPath(CameraPath):
+    """A path through a place. Held-out views lie beside it.
+
+    A held-out view moves towards the path until its camera is clear of the mesh and on the same side of all walls.
+    """
+
+    _max_turn = 0.5
+    """Radians that the gaze of a test view is turned by at most."""
+
+    def _surround(self, eyes: Array, caster: Obstacles | None) -> None:
+        """Learn how far views may lie from the path, from positions (N, 3) on it."""
+        # Root mean square distance of the positions from their mean.
+        size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        # The proportion is the built-in room's.
+        self._spread = min(0.13 * size, 0.5)
+        self._space = FreeSpace(caster, size)
+
+    @abstractmethod
+    def _pose(self, s: float, shift: Array, gaze: float) -> Array:
+        """Return the pose displaced by ``shift`` meters (right, up, forward), turned by ``gaze`` radians."""
+
+    def __call__(self, s: float) -> Array:
+        return self._pose(s, np.zeros(3), 0.0)
+
+    def _validation_view(self, k: int, count: int) -> Array:
+        shift = np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) * (0.8 * self._spread)
+        return self._free_pose((k + 0.5) / count, shift, 0.0)
+
+    def _test_view(self, rng: np.random.Generator) -> Array:
+        s, shift = rng.uniform(), rng.uniform(-self._spread, self._spread, 3)
+        return self._free_pose(s, shift, rng.uniform(-self._max_turn, self._max_turn))
+
+    def _free_pose(self, s: float, shift: Array, gaze: float) -> Array:
+        for part in np.linspace(1, 0, 11):
+            pose = self._pose(s, part * shift, gaze)
+            if self._space.is_reached(pose[:3, 3], self(s)[:3, 3]):
+                break
+        return pose  # at last on the path itself, which is free
+
+
+class WalkPath(InnerPath):
     """A closed smooth walk through given positions, looking at given targets.
 
     Positions and targets are periodic cubic splines. Their parameter is the distance between neighboring positions, so
-    that the speed hardly varies. A held-out view moves towards the path until its camera is clear of the mesh and on
-    the same side of all walls.
+    that the speed hardly varies.
 
     Args:
         positions: (N, 3) that the camera passes, N at least 4. The camera returns to the first.
@@ -210,7 +259,7 @@ class WalkPath(CameraPath):
             or the path comes too near to the mesh.
     """
 
-    def __init__(self, positions: ArrayLike, targets: ArrayLike, caster: RayCaster | None = None) -> None:
+    def __init__(self, positions: ArrayLike, targets: ArrayLike, caster: Obstacles | None = None) -> None:
         eyes, looked_at = np.asarray(positions, np.float64), np.asarray(targets, np.float64)
         if eyes.ndim != 2 or eyes.shape[1] != 3 or len(eyes) < 4 or eyes.shape != looked_at.shape:
             raise ValueError(f"positions {eyes.shape} and targets {looked_at.shape} must both be (N, 3), N at least 4")
@@ -225,29 +274,8 @@ class WalkPath(CameraPath):
         gaze = self._target(fine) - self._eye(fine)
         if (np.linalg.norm(gaze[:, :2], axis=1) < 0.02 * np.linalg.norm(gaze, axis=1) + 1e-9).any():
             raise ValueError("the camera looks straight up or down, or at its own position; move the targets")
-        # Root mean square distance of the positions from their mean.
-        size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
-        # The proportion is the built-in room's.
-        self._spread = min(0.13 * size, 0.5)
-        self._space = FreeSpace(caster, size)
+        self._surround(eyes, caster)
         self._space.require_clear(self)
-
-    def __call__(self, s: float) -> Array:
-        return self._pose(s, np.zeros(3), 0.0)
-
-    def _validation_view(self, k: int, count: int) -> Array:
-        shift = np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) * (0.8 * self._spread)
-        return self._free_pose((k + 0.5) / count, shift, 0.0)
-
-    def _test_view(self, rng: np.random.Generator) -> Array:
-        return self._free_pose(rng.uniform(), rng.uniform(-self._spread, self._spread, 3), rng.uniform(-0.5, 0.5))
-
-    def _free_pose(self, s: float, shift: Array, gaze: float) -> Array:
-        for part in np.linspace(1, 0, 11):
-            pose = self._pose(s, part * shift, gaze)
-            if self._space.is_reached(pose[:3, 3], self._eye(s % 1.0)):
-                break
-        return pose  # at last on the path itself, which is free
 
     def _pose(self, s: float, shift: Array, gaze: float) -> Array:
         """Return the pose displaced by ``shift`` meters (right, up, level forward), turned by ``gaze`` radians."""
@@ -260,6 +288,30 @@ class WalkPath(CameraPath):
         cos, sin = np.cos(gaze), np.sin(gaze)
         x, y, z = target - eye
         return look_at(eye, eye + np.array([cos * x - sin * y, sin * x + cos * y, z]))
+
+
+class TrackPath(InnerPath):
+    """The path of a camera whose poses are known at equal intervals. Splines run through the poses.
+
+    Args:
+        poses: (N, 4, 4) camera-to-world, OpenCV axes, N at least 2.
+        max_turn: radians that the gaze of a test view is turned by at most.
+        caster: see `ObjectPath`.
+    """
+
+    def __init__(self, poses: ArrayLike, max_turn: float, caster: Obstacles | None = None) -> None:
+        given = np.asarray(poses, np.float64)
+        knots = np.linspace(0, 1, len(given))
+        self._eye = CubicSpline(knots, given[:, :3, 3])
+        self._rotation = RotationSpline(knots, Rotation.from_matrix(given[:, :3, :3]))
+        self._max_turn = max_turn
+        self._surround(given[:, :3, 3], caster)
+
+    def _pose(self, s: float, shift: Array, gaze: float) -> Array:
+        pose, axes = np.eye(4), self._rotation(s).as_matrix()
+        pose[:3, :3] = Rotation.from_rotvec([0, 0, gaze]).as_matrix() @ axes
+        pose[:3, 3] = self._eye(s) + axes @ (shift * [1.0, -1.0, 1.0])
+        return pose
 
 
 @dataclass(frozen=True)

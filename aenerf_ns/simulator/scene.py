@@ -1,12 +1,25 @@
-"""A scene of the simulator: the lit mesh and the camera's path."""
+"""A scene of the simulator: what is seen, and the camera's path."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.paths import CameraPath
-from aenerf_ns.simulator.rendering.renderer import Renderer
+
+
+class SceneRenderer(Protocol):
+    """What takes pictures of a scene."""
+
+    def render(
+        self, camera_to_world: ArrayLike, intrinsics: Sequence[float], width: int, height: int, samples: int
+    ) -> tuple[NDArray[np.float32], ...]:
+        """Return radiance (H, W, 3) and depth (H, W), and maybe more: see `rendering.renderer.Renderer`."""
 
 
 @dataclass(frozen=True)
@@ -15,7 +28,7 @@ class SimulationScene:
 
     Attributes:
         name: of a built-in scene or of a file.
-        renderer, path: the lit mesh, and the camera's path with the held-out views around it.
+        renderer, path: what is seen, and the camera's path with the held-out views around it.
         focal_ratio: focal length divided by image width. Pixels are square, and the principal point is the middle.
         aabb: (2, 3) corners of the box around the scene, or None if the scene surrounds the camera.
         background: (3,) linear RGB behind the scene, or None if every ray hits something or sees an environment.
@@ -24,7 +37,7 @@ class SimulationScene:
     """
 
     name: str
-    renderer: Renderer
+    renderer: SceneRenderer
     path: CameraPath
     focal_ratio: float
     aabb: Array | None

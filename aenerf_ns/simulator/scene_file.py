@@ -1,4 +1,4 @@
-"""Read scenes from files: a scene.json with a mesh, its light and the camera's path, or a mesh alone."""
+"""Read scenes from files: a scene.json with a mesh, its light and the camera's path, or a mesh or .blend alone."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.files.json_file import read_json
 from aenerf_ns.files.limits import file_inside
 from aenerf_ns.simulator.arrays import Array
-from aenerf_ns.simulator.options import DURATIONS, MESH_SUFFIXES, require_scene_file
-from aenerf_ns.simulator.paths import CameraPath, ObjectPath, WalkPath
+from aenerf_ns.simulator.blender import BlenderRenderer
+from aenerf_ns.simulator.options import BLENDER_SUFFIX, DURATIONS, require_scene_file
+from aenerf_ns.simulator.paths import CameraPath, ObjectPath, Obstacles, TrackPath, WalkPath
 from aenerf_ns.simulator.rendering.embree import RayCaster
 from aenerf_ns.simulator.rendering.environment import load_environment, sky
 from aenerf_ns.simulator.rendering.lighting import AreaLight, baked_mesh, light_mesh
 from aenerf_ns.simulator.rendering.mesh import Gloss, scaled
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
 from aenerf_ns.simulator.rendering.mesh_repair import repair
+from aenerf_ns.simulator.rendering.renderer import Renderer
 from aenerf_ns.simulator.scene import SimulationScene
 
 _RADIUS = 4.0
@@ -94,8 +96,8 @@ class _SceneFile(Struct, forbid_unknown_fields=True, frozen=True):
     scale: _Scale = 1.0
     materials: dict[str, _Coat] = {}
     light: Literal["baked"] | _Light = _Light(sky=((0.25, 0.25, 0.25), (1.0, 1.0, 1.0)))
-    background: Literal["environment"] | tuple[_Fraction, _Fraction, _Fraction] = (0.5, 0.5, 0.5)
-    path: _Around | _Walk = _Around()
+    background: Literal["environment"] | tuple[_Fraction, _Fraction, _Fraction] | None = None
+    path: _Around | _Walk | None = None
     focal_ratio: Annotated[float, Meta(ge=0.01, le=100)] | None = None
     box: tuple[_Point, _Point] | None = None
     credits: Any = None
@@ -118,9 +120,11 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
         DataError: a file is missing or malformed, or the camera's path runs into the mesh.
     """
     require_scene_file(path)
-    is_bare = path.suffix.lower() in MESH_SUFFIXES
+    is_bare = path.suffix.lower() != ".json"
     values = _SceneFile(path.name) if is_bare else read_json(path, _SceneFile, "see docs/simulator.md")
     file = file_inside(path.parent, values.mesh, path)
+    if file.suffix.lower() == BLENDER_SUFFIX:
+        return _load_blend(path, file, values, seed)
     up = values.up or ("y" if file.suffix.lower() == ".glb" else "z")
     coats = {name: Gloss(*astuple(coat)) for name, coat in values.materials.items()}
     environment = None
@@ -130,7 +134,8 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
         elif values.light.environment is not None:
             panorama = file_inside(path.parent, values.light.environment, path)
             environment = load_environment(panorama, values.light.turn_degrees, values.light.gain)
-    background = None if values.background == "environment" else np.array(values.background)
+    route = values.path or _Around()
+    background = None if values.background == "environment" else np.array(values.background or (0.5, 0.5, 0.5))
 
     mesh, scale = load_mesh(file, up == "y", coats), values.scale
     if is_bare:
@@ -142,9 +147,6 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
         raise DataError(file, str(error), "give a mesh of triangles") from error
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
-    box = None if values.box is None else np.array(values.box)
-    if box is None and isinstance(values.path, _Around) and background is not None:
-        box = bounds + 0.025 * np.diff(bounds, axis=0) * [[-1], [1]]
     notes = []
     if is_bare:
         notes.append(
@@ -157,10 +159,7 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
         )
 
     caster = RayCaster(mesh.vertices, mesh.faces)
-    try:
-        camera_path = _make_path(values.path, bounds, caster)
-    except ValueError as error:
-        raise DataError(path, f"path: {error}", "change the path or the scale, see docs/simulator.md") from error
+    camera_path = _make_path(path, route, bounds, caster)
     behind = np.zeros(3) if background is None else background
     if environment is None or values.light == "baked":
         renderer = baked_mesh(mesh, caster, behind)
@@ -171,33 +170,81 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
         path.stem,
         renderer,
         camera_path,
-        focal_ratio=values.focal_ratio or (1.2 if isinstance(values.path, _Around) else 0.62),
-        aabb=box,
+        focal_ratio=values.focal_ratio or _focal_ratio(route),
+        aabb=_scene_box(values, route, bounds, background),
         background=background,
-        duration=values.path.duration,
+        duration=route.duration,
         notes=tuple(notes),
     )
-    return scene if environment is None else _with_exposure(scene)
+    return scene if environment is None else _with_exposure(scene, renderer)
 
 
-def _make_path(values: _Around | _Walk, bounds: Array, caster: RayCaster) -> CameraPath:
-    if isinstance(values, _Walk):
-        return WalkPath(values.positions, values.targets, caster)
-    center = bounds.mean(axis=0) if values.center is None else values.center
-    radius = values.radius or 0.5 * _RADII * float(np.linalg.norm(bounds[1] - bounds[0]))
-    return ObjectPath(values.turns, radius, center, caster)
+def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> SimulationScene:
+    """Open a .blend that is a scene by itself, or the mesh of a scene.json."""
+    for name in ("up", "materials", "light"):
+        if getattr(values, name) != getattr(_SceneFile(values.mesh), name):
+            raise DataError(path, f"{name} is given, but a .blend has its own", f"leave {name} out")
+    route = values.path
+    renderer = BlenderRenderer(file, values.scale, values.background, route is None, seed)
+    track = renderer.track
+    focal_ratio = values.focal_ratio or (track.focal_ratio if track is not None else _focal_ratio(route))
+    camera_path: CameraPath
+    if track is not None:
+        # A gaze that turns by more would leave what the camera looks at.
+        camera_path, duration = TrackPath(track.poses, 0.31 / focal_ratio, renderer.obstacles), track.duration
+    else:
+        route = route or _Around()
+        camera_path, duration = _make_path(path, route, renderer.bounds, renderer.obstacles), route.duration
+    scene = SimulationScene(
+        path.stem,
+        renderer,
+        camera_path,
+        focal_ratio,
+        aabb=_scene_box(values, route, renderer.bounds, renderer.background),
+        background=renderer.background,
+        duration=duration,
+        notes=renderer.notes,
+    )
+    width, height = 48, 36
+    renderer.expose([scene.path((k + 0.5) / 12) for k in range(12)], scene.intrinsics(width, height), width, height)
+    return scene
 
 
-def _with_exposure(scene: SimulationScene) -> SimulationScene:
+def _focal_ratio(route: _Around | _Walk | None) -> float:
+    return 0.62 if isinstance(route, _Walk) else 1.2
+
+
+def _scene_box(
+    values: _SceneFile, route: _Around | _Walk | None, bounds: Array, background: Array | None
+) -> Array | None:
+    if values.box is not None:
+        return np.array(values.box)
+    if not isinstance(route, _Around) or background is None:
+        return None
+    return bounds + 0.025 * np.diff(bounds, axis=0) * [[-1], [1]]
+
+
+def _make_path(source: Path, route: _Around | _Walk, bounds: Array, obstacles: Obstacles) -> CameraPath:
+    try:
+        if isinstance(route, _Walk):
+            return WalkPath(route.positions, route.targets, obstacles)
+        center = bounds.mean(axis=0) if route.center is None else route.center
+        radius = route.radius or 0.5 * _RADII * float(np.linalg.norm(bounds[1] - bounds[0]))
+        return ObjectPath(route.turns, radius, center, obstacles)
+    except ValueError as error:
+        raise DataError(source, f"path: {error}", "change the path or the scale, see docs/simulator.md") from error
+
+
+def _with_exposure(scene: SimulationScene, renderer: Renderer) -> SimulationScene:
     """Scale the light so that no diffuse surface clips in the pictures. Clip surroundings and highlights to 1."""
     width, height = 192, 144
     poses = [scene.path((k + 0.5) / 48) for k in range(48)]
     poses += [*scene.path.validation_views(16), *scene.path.test_views(16, 0)]
     brightest = 0.0
-    without_highlights = replace(scene.renderer, reflections=None)
+    without_highlights = replace(renderer, reflections=None)
     for pose in poses:
         radiance, _, alpha = without_highlights.render(pose, scene.intrinsics(width, height), width, height, 1)
         brightest = max(brightest, float(radiance[alpha > 0].max(initial=0.0)))
     if brightest == 0:
         raise DataError(scene.name, "no light reaches what the camera sees", "give it light, or another path")
-    return replace(scene, renderer=replace(scene.renderer.with_gain(_MAX_RADIANCE / brightest), limit=1.0))
+    return replace(scene, renderer=replace(renderer.with_gain(_MAX_RADIANCE / brightest), limit=1.0))
