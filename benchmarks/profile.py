@@ -71,12 +71,17 @@ class Profile:
             torch.cuda.reset_peak_memory_stats()
         milliseconds = train(_STEPS_BEFORE, self.steps)
         memory = torch.cuda.max_memory_allocated() / 2**30 if on_gpu else None
-        # The profiler keeps every call, so it watches few steps: a period of the pose correction, over and over.
+        # The profiler keeps every call, so it watches few steps: two periods of the pose correction.
         watched = 16
         with profile(activities=[ProfilerActivity.CPU, *[ProfilerActivity.CUDA] * on_gpu]) as profiler:
             train(_STEPS_BEFORE + self.steps, watched)
         device = DeviceType.CUDA if on_gpu else DeviceType.CPU
-        kernels = [event for event in profiler.key_averages() if event.device_type == device]
+        # A step of an optimizer is listed as a whole, too, beside its kernels.
+        kernels = [
+            event
+            for event in profiler.key_averages()
+            if event.device_type == device and not event.key.startswith("Optimizer.step#")
+        ]
         own_time = "self_device_time_total" if on_gpu else "self_cpu_time_total"
         kernels.sort(key=lambda event: -getattr(event, own_time))
         return {

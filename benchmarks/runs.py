@@ -75,16 +75,6 @@ def run_command(command: Sequence[str], log: Path, folder: Path = Path(), **vari
     return time.perf_counter() - begin
 
 
-def run_script(folder: Path, name: str, *arguments: str) -> float:
-    """Run a console script of this Python environment in a folder that may be temporary; see :func:`run_command`."""
-    log = folder / f"{name}.log"
-    try:
-        return run_command((script(name), *arguments), log, folder)
-    except DataError:
-        print(log.read_text("utf8", errors="replace")[-3000:], file=sys.stderr)
-        raise
-
-
 @contextmanager
 def exclusive(path: Path, timeout: float = -1) -> Iterator[None]:
     """Hold the lock of a file or folder that is being made, which may lie beside others that make it.
@@ -114,18 +104,6 @@ def make_dataset(
     return folder
 
 
-def train(folder: Path, name: str, method: str, steps: int, options: Sequence[str], data: Sequence[str]) -> float:
-    """Train with ns-train, on a GPU where there is one, and return the seconds of wall-clock time.
-
-    The run lands in ``outputs/NAME`` in the folder. ``data`` are the last arguments of ns-train.
-    """
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    return run_script(
-        folder, "ns-train", method, "--machine.device-type", device, "--vis", "tensorboard",
-        "--experiment-name", name, "--max-num-iterations", str(steps), *options, *data,
-    )  # fmt: skip
-
-
 def new_trainer(words: Sequence[str], data: Path, output: Path, steps: int, seed: int) -> AENeRFTrainer:
     """Set up a training in this process, on a GPU where there is one, that evaluates and saves nothing on its way.
 
@@ -153,17 +131,6 @@ def new_trainer(words: Sequence[str], data: Path, output: Path, steps: int, seed
     trainer: AENeRFTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     return trainer
-
-
-def config_of(folder: Path, name: str) -> str:
-    """Return the path of a run's config.yml, relative to the folder that :func:`train` worked in."""
-    return str(next((folder / "outputs" / name).rglob("config.yml")).relative_to(folder))
-
-
-def evaluate(folder: Path, name: str, *options: str) -> dict[str, Any]:
-    """Evaluate a run of :func:`train` with ns-eval and return its results."""
-    run_script(folder, "ns-eval", "--load-config", config_of(folder, name), "--output-path", f"{name}.json", *options)
-    return json.loads((folder / f"{name}.json").read_text("utf8"))["results"]
 
 
 def in_own_process(

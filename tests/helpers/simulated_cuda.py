@@ -16,12 +16,21 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
+import pytest
 import torch
+import torch.utils.backend_registration
 from torch import Tensor, nn
 from torch._guards import active_fake_mode
 from torch._subclasses.fake_tensor import FakeTensor
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_flatten, tree_map
+
+# Torch's engine then takes the simulated device for the machine's, and a backward pass on a real GPU fails.
+NEEDS_SIMULATION = pytest.mark.skipif(
+    torch.cuda.is_available()
+    or not hasattr(torch.utils.backend_registration, "_setup_privateuseone_for_python_backend"),
+    reason="there is a CUDA device, or this version of torch has no devices that are written in Python",
+)
 
 aten = torch.ops.aten
 

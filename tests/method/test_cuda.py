@@ -12,9 +12,8 @@ from typing import Any
 
 import pytest
 import torch
-import torch.utils.backend_registration
 from helpers.commands import run, simulate
-from helpers.simulated_cuda import Counts, SimulatedCuda, device, to_device
+from helpers.simulated_cuda import NEEDS_SIMULATION, Counts, SimulatedCuda, device, to_device
 from helpers.small_models import ALL_LOSSES, make_batch, make_model, make_rays
 from helpers.small_pipelines import make_pipeline_config
 from nerfstudio.engine.optimizers import Optimizers
@@ -32,10 +31,6 @@ from aenerf_ns.supervision.peers.paev3d import PAEv3DSupervisionConfig, PatchBat
 from aenerf_ns.supervision.peers.windows import EventNeRFSupervisionConfig, EvNeRFSupervisionConfig
 
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-NEEDS_SIMULATION = pytest.mark.skipif(
-    not hasattr(torch.utils.backend_registration, "_setup_privateuseone_for_python_backend"),
-    reason="this version of torch has no devices that are written in Python",
-)
 
 
 @NEEDS_SIMULATION

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.simulated_cuda import Counts, SimulatedCuda, device
+from helpers.simulated_cuda import NEEDS_SIMULATION, Counts, SimulatedCuda, device
 from helpers.small_models import CAMERA, EPOCH, make_rays, make_scene, make_supervision
 from helpers.streams import make_stream
 
@@ -154,10 +154,7 @@ def test_a_batch_has_as_many_windows_as_fill_it(random_poses: torch.Tensor) -> N
     assert len(sampler.sample(1, training=False)[0]) == 2
 
 
-@pytest.mark.skipif(
-    not hasattr(torch.utils.backend_registration, "_setup_privateuseone_for_python_backend"),
-    reason="this version of torch has no devices that are written in Python",
-)
+@NEEDS_SIMULATION
 def test_a_batch_goes_to_the_device_in_one_copy(random_poses: torch.Tensor) -> None:
     sampler = make_sampler(random_poses, pixels_per_window=5)
     with SimulatedCuda() as gpu:
