@@ -28,12 +28,18 @@ _ON_DISK = {"FILE", "MOVIE", "SEQUENCE", "TILED"}
 _SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT"}
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """Blender's camera has OpenGL's axes: x right, y up, z backwards."""
-_SENSOR_WIDTH, _MIN_SIZE, _NOWHERE = 100.0, 4, 1e9
-"""So wide that no lens is too short for Blender; the least pixels of its pictures; a depth beyond all surfaces."""
-_AROUND = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
-_MAX_RADIANCE, _PERCENTILE = 0.9, 99.0
+_SENSOR_WIDTH = 100.0
+"""In millimeters: so wide that no lens is too short for Blender, which takes 1 mm at least."""
+_MIN_SIZE = 4
+"""Pixels that Blender's pictures have at least, in width and in height."""
+_NOWHERE = 1e9
+"""A depth beyond all surfaces. Cycles has 1e10 where there is none."""
 _PATHS_PER_RAY = 4
 """Light that bounces at random needs more samples than edges do."""
+_MARGIN = 8
+"""Pixels around a picture that are rendered and cut off: denoising makes ripples at the rim."""
+_DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+_MAX_RADIANCE, _PERCENTILE = 0.9, 99.0
 
 
 class CameraTrack(NamedTuple):
@@ -77,15 +83,16 @@ class BlenderRenderer:
         follow: bool = True,
         seed: int = 0,
     ) -> None:
-        self._path, self._bpy = path, _open(path)
-        bpy = self._bpy
+        self._path = path
+        self._bpy = bpy = _open(path)
         self._scene = scene = bpy.context.scene
         self._scale, self._gain = scale * scene.unit_settings.scale_length, 1.0
         self.notes: tuple[str, ...] = ()
         # Materials of Blender before 2.80 could have textures of another kind, which no material has today.
         unseen = sorted(each.name for each in bpy.data.textures if each.type == "IMAGE" and not each.users)
         if unseen:
-            self.notes += (f"{path}: Blender no longer renders the textures {', '.join(unseen)}: open it in 2.79",)
+            names = ", ".join(unseen)
+            self.notes += (f"{path}: surfaces are plain that had textures of Blender 2.79 or older: {names}",)
         self.track = self._read_track() if follow else None
         scene.frame_set(scene.frame_start)
         scene.timeline_markers.clear()  # Some switch to another camera.
@@ -216,14 +223,15 @@ class BlenderRenderer:
         """
         bpy, scene, lens = self._bpy, self._scene, self._camera.data
         focal, _, cx, cy = map(float, intrinsics)
-        columns, rows = max(width, _MIN_SIZE), max(height, _MIN_SIZE)
+        margin = _MARGIN if samples > 1 else 0
+        columns, rows = max(width + 2 * margin, _MIN_SIZE), max(height + 2 * margin, _MIN_SIZE)
         scene.render.resolution_x, scene.render.resolution_y = columns, rows
         scene.cycles.use_denoising = samples > 1
         scene.cycles.samples = _PATHS_PER_RAY * samples if samples > 1 else 1
         # Cycles' width of a Gaussian is four standard deviations.
         scene.cycles.filter_width = 4 * POINT_SPREAD if samples > 1 else 0.01
         lens.lens = _SENSOR_WIDTH * focal / columns
-        lens.shift_x, lens.shift_y = 0.5 - cx / columns, (cy - rows / 2) / columns
+        lens.shift_x, lens.shift_y = 0.5 - (cx + margin) / columns, (cy + margin - rows / 2) / columns
         pose = np.eye(4)
         pose[:3] = np.asarray(camera_to_world, np.float64)[:3] @ _FLIP
         pose[:3, 3] /= self._scale
@@ -239,7 +247,7 @@ class BlenderRenderer:
         pixels = np.empty((rows, columns, 4), np.float32)
         image.pixels.foreach_get(pixels.ravel())
         bpy.data.images.remove(image)
-        pixels = pixels[::-1][:height, :width]
+        pixels = pixels[::-1][margin : margin + height, margin : margin + width]
         depth = np.where(pixels[..., 3] < _NOWHERE, pixels[..., 3] * np.float32(self._scale), np.float32(np.inf))
         return np.clip(pixels[..., :3] * np.float32(self._gain), 0, limit), depth
 
@@ -259,7 +267,7 @@ class Obstacles:
     def distance(self, points: ArrayLike) -> Array:
         """Return the distance (N,) of points (N, 3) from the nearest surface that one of 26 rays hits."""
         points = np.asarray(points, np.float64).reshape(-1, 3)
-        return np.array([min(self._hit(point, ray, 1e6) for ray in _AROUND) for point in points])
+        return np.array([min(self._hit(point, ray, 1e6) for ray in _DIRECTIONS) for point in points])
 
     def blocked(self, rays: ArrayLike) -> NDArray[np.bool_]:
         """Tell for each ray (N, 6) whether a surface lies between its origin and origin + direction."""
