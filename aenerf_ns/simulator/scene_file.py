@@ -186,7 +186,9 @@ def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> Simula
             raise DataError(path, f"{name} is given, but a .blend has its own", f"leave {name} out")
     route = values.path
     renderer = BlenderRenderer(file, values.scale, values.background, route is None, seed)
-    track = renderer.track
+    track, notes = renderer.track, renderer.notes
+    if route is None and track is None:
+        notes += (f"{path}: seen from around it, because its camera does not move (a scene.json can say otherwise)",)
     focal_ratio = values.focal_ratio or (track.focal_ratio if track is not None else _focal_ratio(route))
     camera_path: CameraPath
     if track is not None:
@@ -203,7 +205,7 @@ def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> Simula
         aabb=_scene_box(values, route, renderer.bounds, renderer.background),
         background=renderer.background,
         duration=duration,
-        notes=renderer.notes,
+        notes=notes,
     )
     width, height = 48, 36
     renderer.expose([scene.path((k + 0.5) / 12) for k in range(12)], scene.intrinsics(width, height), width, height)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import h5py
@@ -73,6 +74,13 @@ def test_refuse_scene_file(box_file: Path, values: dict, problem: str) -> None:
     with pytest.raises(DataError) as raised:
         open_scene(scene_file(box_file, **values))
     assert problem in str(raised.value)
+
+
+def test_blender_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "scene.blend").touch()
+    monkeypatch.setitem(sys.modules, "bpy", None)
+    with pytest.raises(DataError, match=r"scene\.blend: .*pip install 'aenerf-ns\[blender\]', in Python 3\.11"):
+        open_scene(str(tmp_path / "scene.blend"))
 
 
 @pytest.mark.filterwarnings("error")
