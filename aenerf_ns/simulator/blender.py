@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -238,7 +239,8 @@ class BlenderRenderer:
         self._camera.matrix_world = pose.T.tolist()
         if self.background is not None:
             self._behind.default_value = (*(self.background / self._gain), 1.0)
-        bpy.ops.render.render()
+        with _signals_held():
+            bpy.ops.render.render()
         # The pixels of a rendering can be read from a file alone.
         file = str(Path(self._folder.name) / "rendering.exr")
         bpy.data.images["Render Result"].save_render(file, scene=scene)
@@ -290,6 +292,26 @@ def _open(path: Path) -> Any:
         raise DataError(path, f"Blender cannot open it ({str(error).strip()})", "save it again in Blender") from error
     _require_files(bpy, path)
     return bpy
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """Act on Ctrl-C and SIGTERM after the context, in the main thread.
+
+    Parts of Blender are written in Python. An exception that a signal raises there would not reach the caller.
+    """
+    held: list[int] = []
+    handlers = {
+        number: signal.signal(number, lambda number, _: held.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for caught in held[:1]:
+        signal.raise_signal(caught)
 
 
 @contextmanager

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ from helpers.small_meshes import OVERHEAD, WALK
 from PIL import Image
 
 from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.cli.termination import sigterm_as_system_exit
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.simulator import simulation
@@ -107,6 +111,17 @@ def test_still_camera_fires_no_events(blend: Path) -> None:
         renderer.render(OVERHEAD, LENS, 8, 6, 1)
     other = BlenderRenderer(blend, seed=2).render(OVERHEAD, LENS, 32, 24, 16)[0]
     assert 0 < np.abs(other - picture).max() < 0.1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt(blend: Path, number: int) -> None:
+    """Blender's own Python code, in the middle of a rendering, must not be what takes the exception."""
+    renderer = BlenderRenderer(blend)
+    renderer.render(OVERHEAD, LENS, 96, 72, 16)
+    pictures = (renderer.render(OVERHEAD, LENS, 96, 72, 16) for _ in range(20))
+    threading.Timer(0.3, os.kill, (os.getpid(), number)).start()
+    with sigterm_as_system_exit(), pytest.raises((KeyboardInterrupt, SystemExit)):
+        list(pictures)
 
 
 def test_follow_camera(blend: Path) -> None:
