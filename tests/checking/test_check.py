@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_qu
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.hypotheses import clock_hypothesis
+from aenerf_ns.checking.report import _check_contrast
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
@@ -490,3 +492,20 @@ def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
     _, output = run(folder)
     assert "as if" not in output.split("problem")[-1]
     assert "Because of too few events, the contrast does not tell" in output
+
+
+@pytest.mark.parametrize("num_slices", [3, 4])
+def test_a_clock_is_named_where_four_slices_fit_it(num_slices: int) -> None:
+    clock = SimpleNamespace(
+        hypothesis=clock_hypothesis(20_000_000), contrast=0.9, given=0.5, slices_in_favor=frozenset(range(num_slices)),
+        is_clearly_better=True, is_clearly_worse=False, is_inconclusive=False, is_like=lambda other: False,
+    )  # fmt: skip
+    warped = SimpleNamespace(
+        spans=[(0, 10**8)] * 5,
+        compare_without_motion=lambda: SimpleNamespace(given=0.5, contrast=0.2, is_clearly_worse=True),
+        compare_alternatives=lambda: [clock],
+        shuffled_contrasts=lambda: np.array([0.1, 0.1]),
+    )
+    result = SimpleNamespace(figures=[], problems=[])
+    assert _check_contrast(result, warped, is_simple=False) == (num_slices < 4)  # type: ignore[arg-type]
+    assert [clock.hypothesis.name in problem for problem in result.problems] == [True] * (num_slices - 3)
