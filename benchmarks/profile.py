@@ -39,7 +39,7 @@ class Profile:
     )
     """Methods with options of ns-train."""
     steps: int = 200
-    """Steps of each training."""
+    """Steps that are timed."""
     kernels: int = 12
     """How many kernels are listed, those that take longest."""
 

@@ -116,7 +116,11 @@ def new_trainer(words: Sequence[str], data: Path, output: Path, steps: int, seed
     """
     # Imported lazily, because most benchmarks train by the commands.
     from nerfstudio.configs.method_configs import all_methods
+    from nerfstudio.utils import writer
 
+    # Otherwise this training would write into the logs of the one before.
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
     method, *options = words
     config: Any = tyro.cli(type(all_methods[method]), default=deepcopy(all_methods[method]), args=options)
     config.machine.seed, config.vis = seed, "tensorboard"

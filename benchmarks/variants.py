@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.utils import writer
 from torch import Tensor
 
 from aenerf_ns.evaluation.view_metrics import average_metrics, measure_reference_views
@@ -66,8 +65,6 @@ class Variants:
             begin = time.process_time()
             trainer.train()
             seconds = time.process_time() - begin
-            writer.EVENT_WRITERS.clear()
-            writer.EVENT_STORAGE.clear()
         return {**_metrics(trainer, self.pictures), "cpu_seconds": round(seconds), "followed": followed}
 
     def _follow(self, trainer: AENeRFTrainer, followed: list[dict[str, Any]]) -> None:
@@ -80,7 +77,7 @@ class Variants:
             shares = weights / weights.sum(-1, keepdim=True)
             latest.update({name: float(loss.detach()) for name, loss in losses.items()})
             # The number of intervals over which a histogram that is even there would spread as widely.
-            latest["proposal_intervals"] = float((1 / shares.square().sum(-1)).mean())
+            latest["proposal_intervals"] = float((1 / shares.square().sum(-1)).nanmean())
             return losses
 
         def look(step: int) -> None:

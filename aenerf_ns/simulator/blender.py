@@ -1,7 +1,7 @@
 """Scenes of Blender: Cycles renders a .blend file, on the CPU.
 
 Blender is one for the whole process. It holds one file at a time: opening another ends the renderer of the first. Only
-one thread may use it.
+the main thread may use it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ON_DISK = {"FILE", "MOVIE", "SEQUENCE", "TILED"}
 _SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT"}
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """Blender's camera has OpenGL's axes: x right, y up, z backwards."""
-_SENSOR_WIDTH = 100.0
+_SENSOR_WIDTH = 1000.0
 """In millimeters: so wide that no lens is too short for Blender, which takes 1 mm at least."""
 _MIN_SIZE = 4
 """Pixels that Blender's pictures have at least, in width and in height."""
@@ -106,6 +106,10 @@ class BlenderRenderer:
         # What is asked about distances sees what the viewport shows.
         for item in (*bpy.data.objects, *bpy.data.collections):
             item.hide_viewport = item.hide_render
+        collections = [bpy.context.view_layer.layer_collection]
+        for collection in collections:
+            collection.hide_viewport = False
+            collections += collection.children
         for item in bpy.context.view_layer.objects:
             item.hide_set(False)
         depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -118,7 +122,7 @@ class BlenderRenderer:
             raise DataError(path, "it has no surfaces to render", "give a scene with objects that are rendered")
         corners = np.concatenate(boxes) * self._scale
         self.bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
-        self.obstacles = Obstacles(scene, depsgraph, self._scale)
+        self.obstacles = _SceneObstacles(scene, depsgraph, self._scale)
         self._folder = TemporaryDirectory()
         with _silence():
             self._set_up(seed)
@@ -139,8 +143,12 @@ class BlenderRenderer:
         if not poses or np.ptp(poses, axis=0).max() < 1e-6:
             return None
         _, kind, focal_ratio = lenses.pop()
-        if lenses or kind != "PERSP":
-            problem = "the camera or its lens changes" if lenses else f"its camera is of type {kind}"
+        shift = camera.data.shift_x, camera.data.shift_y
+        if lenses or kind != "PERSP" or any(shift):
+            problem = (
+                f"its camera is of type {kind}" if kind != "PERSP" else f"the lens of its camera is shifted by {shift}"
+            )
+            problem = "the camera or its lens changes" if lenses else problem
             raise DataError(path, problem, "give a file with one perspective camera, or a path in a scene.json")
         fps = scene.render.fps / scene.render.fps_base
         self.notes += (
@@ -157,6 +165,7 @@ class BlenderRenderer:
         render.threads_mode, render.threads = "FIXED", numba.get_num_threads()
         render.use_persistent_data = render.use_compositing = True
         render.use_border = render.use_motion_blur = render.use_multiview = render.use_sequencer = False
+        render.use_stamp = render.use_freestyle = False
         render.resolution_percentage, render.pixel_aspect_x, render.pixel_aspect_y = 100, 1.0, 1.0
         render.film_transparent = self.background is not None
         cycles.seed, cycles.use_animated_seed, cycles.use_adaptive_sampling = seed % (1 << 31), False, False
@@ -198,7 +207,7 @@ class BlenderRenderer:
         level = float(np.percentile(brightness, _PERCENTILE)) if len(brightness) else 0.0
         if level == 0:
             raise DataError(self._path, "no light reaches what the camera sees", "give it light, or another path")
-        self._gain = _MAX_RADIANCE / level
+        self._gain *= _MAX_RADIANCE / level
 
     def render(
         self,
@@ -254,7 +263,7 @@ class BlenderRenderer:
         return np.clip(pixels[..., :3] * np.float32(self._gain), 0, limit), depth
 
 
-class Obstacles:
+class _SceneObstacles:
     """The surfaces of an open file, which cameras must keep away from. Lengths are in meters."""
 
     def __init__(self, scene: Any, depsgraph: Any, scale: float) -> None:
@@ -340,6 +349,9 @@ def _require_files(bpy: Any, path: Path) -> None:
     if _missing_files(bpy):
         with _silence(), suppress(RuntimeError):
             bpy.ops.file.find_missing_files(directory=str(path.resolve().parent))
+            # A linked object appears once its file is read.
+            for library in bpy.data.libraries:
+                library.reload()
     missing = _missing_files(bpy)
     if missing:
         remedy = "put them into the folder of the scene, or pack them into it in Blender"

@@ -60,30 +60,30 @@ class FreeSpace:
     """The space at a clearance from every face: 0.15 m, or less along a path of less than about a meter.
 
     Args:
-        caster: the mesh, or None where all space is free.
+        obstacles: the mesh, or None where all space is free.
         path_size: about the distance of the path from its middle, in meters.
     """
 
-    def __init__(self, caster: Obstacles | None, path_size: float) -> None:
-        self._caster = caster
+    def __init__(self, obstacles: Obstacles | None, path_size: float) -> None:
+        self._obstacles = obstacles
         self._clearance = min(_MAX_CLEARANCE, 0.13 * path_size)
 
     def is_free(self, eye: ArrayLike) -> bool:
         """Tell whether a position (3,) keeps the clearance."""
-        return self._caster is None or bool(self._caster.distance(eye)[0] >= self._clearance)
+        return self._obstacles is None or bool(self._obstacles.distance(eye)[0] >= self._clearance)
 
     def is_reached(self, eye: ArrayLike, home: ArrayLike) -> bool:
         """Tell whether a position (3,) keeps the clearance and sees ``home``: both are on one side of all walls."""
         segment = np.concatenate([np.asarray(home), np.subtract(eye, home)]).astype(np.float32)
-        return self.is_free(eye) and (self._caster is None or not self._caster.blocked(segment[None])[0])
+        return self.is_free(eye) and (self._obstacles is None or not self._obstacles.blocked(segment[None])[0])
 
     def require_clear(self, path: CameraPath) -> None:
         """Raise a ValueError if a path passes through a face or comes too close to one."""
-        if self._caster is None:
+        if self._obstacles is None:
             return
         eyes = np.stack([path(s)[:3, 3] for s in np.linspace(0, 1, _NUM_STEPS + 1)]).astype(np.float32)
-        distance = self._caster.distance(eyes)
-        through = self._caster.blocked(np.concatenate([eyes[:-1], np.diff(eyes, axis=0)], axis=1))
+        distance = self._obstacles.distance(eyes)
+        through = self._obstacles.blocked(np.concatenate([eyes[:-1], np.diff(eyes, axis=0)], axis=1))
         if through.any():
             raise ValueError(f"the camera's path runs into the mesh at {eyes[through.argmax()].round(2)}")
         if distance.min() < self._clearance:
@@ -156,17 +156,17 @@ class ObjectPath(CameraPath):
     Args:
         turns: of the spiral.
         radius, center: of the hemisphere, in meters.
-        caster: the mesh that cameras must not come near to; None if there is no such mesh.
+        obstacles: the mesh that cameras must not come near to; None if there is no such mesh.
 
     Raises:
         ValueError: the path comes too near to the mesh.
     """
 
     def __init__(
-        self, turns: float = 4.0, radius: float = 4.0, center: ArrayLike = ORIGIN, caster: Obstacles | None = None
+        self, turns: float = 4.0, radius: float = 4.0, center: ArrayLike = ORIGIN, obstacles: Obstacles | None = None
     ) -> None:
         self._turns, self._radius, self._center = turns, radius, np.asarray(center, np.float64)
-        self._space = FreeSpace(caster, radius)
+        self._space = FreeSpace(obstacles, radius)
         self._space.require_clear(self)
 
     def __call__(self, s: float) -> Array:
@@ -206,19 +206,20 @@ class ObjectPath(CameraPath):
 class InnerPath(CameraPath):
     """A path through a place. Held-out views lie beside it.
 
-    A held-out view moves towards the path until its camera is clear of the mesh and on the same side of all walls.
+    A held-out view moves towards the path until its camera is clear of the mesh and on the same side of all walls,
+    or to the path itself.
     """
 
     _max_turn = 0.5
     """Radians that the gaze of a test view is turned by at most."""
 
-    def _surround(self, eyes: Array, caster: Obstacles | None) -> None:
+    def _surround(self, eyes: Array, obstacles: Obstacles | None) -> None:
         """Learn how far views may lie from the path, from positions (N, 3) on it."""
         # Root mean square distance of the positions from their mean.
         size = float(np.sqrt(((eyes - eyes.mean(axis=0)) ** 2).sum(axis=1).mean()))
         # The proportion is the built-in room's.
         self._spread = min(0.13 * size, 0.5)
-        self._space = FreeSpace(caster, size)
+        self._space = FreeSpace(obstacles, size)
 
     @abstractmethod
     def _pose(self, s: float, shift: Array, gaze: float) -> Array:
@@ -236,11 +237,12 @@ class InnerPath(CameraPath):
         return self._free_pose(s, shift, rng.uniform(-self._max_turn, self._max_turn))
 
     def _free_pose(self, s: float, shift: Array, gaze: float) -> Array:
+        home = self(s)[:3, 3]
         for part in np.linspace(1, 0, 11):
             pose = self._pose(s, part * shift, gaze)
-            if self._space.is_reached(pose[:3, 3], self(s)[:3, 3]):
+            if self._space.is_reached(pose[:3, 3], home):
                 break
-        return pose  # at last on the path itself, which is free
+        return pose  # at last on the path itself
 
 
 class WalkPath(InnerPath):
@@ -252,14 +254,14 @@ class WalkPath(InnerPath):
     Args:
         positions: (N, 3) that the camera passes, N at least 4. The camera returns to the first.
         targets: (N, 3) that the camera looks at from the positions.
-        caster: see `ObjectPath`.
+        obstacles: see `ObjectPath`.
 
     Raises:
         ValueError: there are too few points, neighbors in one position, or a gaze that is vertical or has no direction,
             or the path comes too near to the mesh.
     """
 
-    def __init__(self, positions: ArrayLike, targets: ArrayLike, caster: Obstacles | None = None) -> None:
+    def __init__(self, positions: ArrayLike, targets: ArrayLike, obstacles: Obstacles | None = None) -> None:
         eyes, looked_at = np.asarray(positions, np.float64), np.asarray(targets, np.float64)
         if eyes.ndim != 2 or eyes.shape[1] != 3 or len(eyes) < 4 or eyes.shape != looked_at.shape:
             raise ValueError(f"positions {eyes.shape} and targets {looked_at.shape} must both be (N, 3), N at least 4")
@@ -274,7 +276,7 @@ class WalkPath(InnerPath):
         gaze = self._target(fine) - self._eye(fine)
         if (np.linalg.norm(gaze[:, :2], axis=1) < 0.02 * np.linalg.norm(gaze, axis=1) + 1e-9).any():
             raise ValueError("the camera looks straight up or down, or at its own position; move the targets")
-        self._surround(eyes, caster)
+        self._surround(eyes, obstacles)
         self._space.require_clear(self)
 
     def _pose(self, s: float, shift: Array, gaze: float) -> Array:
@@ -296,16 +298,16 @@ class TrackPath(InnerPath):
     Args:
         poses: (N, 4, 4) camera-to-world, OpenCV axes, N at least 2.
         max_turn: radians that the gaze of a test view is turned by at most.
-        caster: see `ObjectPath`.
+        obstacles: see `ObjectPath`.
     """
 
-    def __init__(self, poses: ArrayLike, max_turn: float, caster: Obstacles | None = None) -> None:
+    def __init__(self, poses: ArrayLike, max_turn: float, obstacles: Obstacles | None = None) -> None:
         given = np.asarray(poses, np.float64)
         knots = np.linspace(0, 1, len(given))
         self._eye = CubicSpline(knots, given[:, :3, 3])
         self._rotation = RotationSpline(knots, Rotation.from_matrix(given[:, :3, :3]))
         self._max_turn = max_turn
-        self._surround(given[:, :3, 3], caster)
+        self._surround(given[:, :3, 3], obstacles)
 
     def _pose(self, s: float, shift: Array, gaze: float) -> Array:
         pose, axes = np.eye(4), self._rotation(s).as_matrix()

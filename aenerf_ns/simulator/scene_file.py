@@ -114,7 +114,7 @@ class _SceneFile(Struct, forbid_unknown_fields=True, frozen=True):
 
 
 def load_scene(path: Path, seed: int = 0) -> SimulationScene:
-    """Read and light a mesh, with a scene.json or by itself. The seed is that of the sampling of light.
+    """Read and light a mesh or a .blend, with a scene.json or by itself. The seed is that of the sampling of light.
 
     Raises:
         DataError: a file is missing or malformed, or the camera's path runs into the mesh.
@@ -181,8 +181,9 @@ def load_scene(path: Path, seed: int = 0) -> SimulationScene:
 
 def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> SimulationScene:
     """Open a .blend that is a scene by itself, or the mesh of a scene.json."""
+    default = _SceneFile(values.mesh)
     for name in ("up", "materials", "light"):
-        if getattr(values, name) != getattr(_SceneFile(values.mesh), name):
+        if getattr(values, name) != getattr(default, name):
             raise DataError(path, f"{name} is given, but a .blend has its own", f"leave {name} out")
     route = values.path
     renderer = BlenderRenderer(file, values.scale, values.background, route is None, seed)

@@ -40,6 +40,7 @@ def blend(tmp_path: Path) -> Path:
     scene.world = bpy.data.worlds.new("sky")
     # What makes pictures for people, and must not change radiance.
     scene.view_settings.view_transform, scene.view_settings.exposure = "AgX", 3.0
+    scene.render.use_stamp = scene.render.use_freestyle = True
     scene.render.resolution_x, scene.render.resolution_y = 200, 100
     return saved(tmp_path)
 
@@ -143,10 +144,11 @@ def test_follow_camera(blend: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lens", "problem"), [({"type": "ORTHO"}, "type ORTHO"), ({"lens": "zoom"}, "its lens changes")]
+    ("lens", "problem"),
+    [({"type": "ORTHO"}, "type ORTHO"), ({"shift_x": 0.3}, "is shifted by"), ({"lens": "zoom"}, "its lens changes")],
 )
 def test_refuse_camera(blend: Path, lens: dict, problem: str) -> None:
-    animate(**(lens if "type" in lens else {}))
+    animate(**({} if "lens" in lens else lens))
     if lens.get("lens") == "zoom":
         data = bpy.context.scene.camera.data
         for frame, focal in ((11, 45), (26, 60)):
@@ -180,6 +182,33 @@ def test_textures(blend: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"files that it uses are missing: .*brick\.png;") as raised:
         BlenderRenderer(blend)
     assert "unused" not in str(raised.value)
+
+
+def test_a_linked_object_is_found_and_a_hidden_collection_is_an_obstacle(blend: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    collection = bpy.data.collections.new("hidden by the eye")
+    bpy.context.scene.collection.children.link(collection)
+    add_plate("wall", [(0, 5, 0), (9, 5, 0), (9, 5, 9), (0, 5, 9)], "ShaderNodeEmission", (1, 1, 1, 1))
+    wall = bpy.data.objects["wall"]
+    collection.objects.link(wall)
+    bpy.context.scene.collection.objects.unlink(wall)
+    bpy.context.view_layer.layer_collection.children[0].hide_viewport = True
+    bpy.data.libraries.write(str(folder / "tower.blend"), {bpy.data.objects["glowing"]})
+    bpy.data.objects.remove(bpy.data.objects["glowing"])
+    with bpy.data.libraries.load(str(folder / "tower.blend"), link=True) as (_, linked):
+        linked.objects = ["glowing"]
+    bpy.context.scene.collection.objects.link(bpy.data.objects["glowing"])
+    saved(tmp_path)
+    for name in ("elsewhere", "moved"):
+        renderer = BlenderRenderer(blend)
+        assert renderer.bounds[1, 2] == pytest.approx(9)
+        assert renderer.obstacles.blocked(np.array([[0.5, 0.5, 2, 0, 0, -1.5], [4, 0, 4, 0, 8, 0]])).tolist() == [1, 1]
+        if name == "elsewhere":
+            folder.rename(tmp_path / "moved")
+    (tmp_path / "moved/tower.blend").unlink()
+    with pytest.raises(DataError, match=r"files that it uses are missing: .*tower\.blend;"):
+        BlenderRenderer(blend)
 
 
 def test_refuse_file(tmp_path: Path) -> None:

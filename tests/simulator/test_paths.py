@@ -83,6 +83,18 @@ def test_walk_is_closed_and_smooth() -> None:
     assert speed.max() < 1.5 * speed.min()
 
 
+def test_a_track_passes_its_poses_and_has_views_beside_it() -> None:
+    walk = paths.WalkPath(WALK["positions"], WALK["targets"])
+    poses = np.stack([walk(s) for s in np.linspace(0, 0.6, 7)])
+    track = paths.TrackPath(poses, 0.4)
+    for s, pose in zip(np.linspace(0, 1, 7), poses, strict=True):
+        np.testing.assert_allclose(track(s), pose, atol=1e-9)
+    on_it = np.stack([track(s)[:3, 3] for s in np.linspace(0, 1, 200)])
+    views = np.concatenate([track.validation_views(4), track.test_views(4, 0)])
+    far = np.linalg.norm(views[:, None, :3, 3] - on_it, axis=-1).min(1)
+    assert 0.01 < np.median(far) < far.max() < 1
+
+
 def test_free_space() -> None:
     space = paths.FreeSpace(RayCaster(plate(1.0).vertices, plate(1.0).faces), 0.1 / 0.13)
     assert space.is_free((0, 0, 0.11))
