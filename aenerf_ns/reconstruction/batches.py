@@ -1,4 +1,4 @@
-"""Batches of events, each of which gives one image, and their voxel grids: what E2VID and FireNet see."""
+"""Batches of events, and the voxel grids that E2VID and FireNet take. Each batch gives one image."""
 
 from __future__ import annotations
 

@@ -60,7 +60,10 @@ class EventDataParser(DataParser):
         return None
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        """Read a dataset without poses: its cameras, and the times in nanoseconds and the files of its frames."""
+        """Read a dataset without poses: its cameras, and the times in nanoseconds and the files of its frames.
+
+        Called only where the file of :meth:`poses_path` is missing: a format that overrides one overrides both.
+        """
         raise NotImplementedError
 
     def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:

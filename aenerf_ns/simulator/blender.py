@@ -103,10 +103,11 @@ class BlenderRenderer:
         self._camera = bpy.data.objects.new("event camera", bpy.data.cameras.new("event camera"))
         scene.collection.objects.link(self._camera)
         scene.camera = self._camera
-        # What is asked about distances sees what the viewport shows.
+        # Blender measures distances only to what the viewport shows.
         for item in (*bpy.data.objects, *bpy.data.collections):
             item.hide_viewport = item.hide_render
         collections = [bpy.context.view_layer.layer_collection]
+        # The list grows while it is walked, by the children of each collection.
         for collection in collections:
             collection.hide_viewport = False
             collections += collection.children
@@ -143,12 +144,14 @@ class BlenderRenderer:
         if not poses or np.ptp(poses, axis=0).max() < 1e-6:
             return None
         _, kind, focal_ratio = lenses.pop()
-        shift = camera.data.shift_x, camera.data.shift_y
-        if lenses or kind != "PERSP" or any(shift):
-            problem = (
-                f"its camera is of type {kind}" if kind != "PERSP" else f"the lens of its camera is shifted by {shift}"
-            )
-            problem = "the camera or its lens changes" if lenses else problem
+        problem = None
+        if lenses:
+            problem = "the camera or its lens changes"
+        elif kind != "PERSP":
+            problem = f"its camera is of type {kind}"
+        elif camera.data.shift_x or camera.data.shift_y:
+            problem = f"the lens of its camera is shifted by {camera.data.shift_x:g} and {camera.data.shift_y:g}"
+        if problem:
             raise DataError(path, problem, "give a file with one perspective camera, or a path in a scene.json")
         fps = scene.render.fps / scene.render.fps_base
         self.notes += (
@@ -344,7 +347,7 @@ def _silence() -> Iterator[None]:
 def _require_files(bpy: Any, path: Path) -> None:
     """Raise a DataError if a file is missing that a surface, a light, the world or a linked object comes from.
 
-    What is not where the scene expects it is looked for in the folder of the scene and in the folders within.
+    If a file is not where the scene expects it, it is looked for in the folder of the scene and in the folders within.
     """
     if _missing_files(bpy):
         with _silence(), suppress(RuntimeError):

@@ -14,7 +14,7 @@ from aenerf_ns.simulator.paths import CameraPath
 
 
 class SceneRenderer(Protocol):
-    """What takes pictures of a scene."""
+    """Render pictures of a scene."""
 
     def render(
         self, camera_to_world: ArrayLike, intrinsics: Sequence[float], width: int, height: int, samples: int

@@ -38,7 +38,7 @@ def blend(tmp_path: Path) -> Path:
     add_plate("glowing", [(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], "ShaderNodeEmission", (0.1, 0.2, 0.8, 1))
     add_plate("floor", [(-9, -9, 0), (9, -9, 0), (9, 9, 0), (-9, 9, 0)], "ShaderNodeBsdfDiffuse", (0.5, 0.5, 0.5, 1))
     scene.world = bpy.data.worlds.new("sky")
-    # What makes pictures for people, and must not change radiance.
+    # These settings are for pictures that people look at. They must not change radiance.
     scene.view_settings.view_transform, scene.view_settings.exposure = "AgX", 3.0
     scene.render.use_stamp = scene.render.use_freestyle = True
     scene.render.resolution_x, scene.render.resolution_y = 200, 100
