@@ -239,7 +239,7 @@ class WarpedEvents:
         return np.array(contrasts)
 
     def _geometry(self, events: EventStream, hypothesis: Hypothesis) -> _SliceGeometry:
-        camera, num_poses = self._camera, _SETTINGS.num_poses
+        camera, num_poses, focal_factor = self._camera, _SETTINGS.num_poses, hypothesis.focal_factor
         times = np.linspace(events.t[0], events.t[-1], num_poses).astype(np.int64)
         if hypothesis.still:
             poses = torch.eye(4, dtype=torch.float64).expand(num_poses, 4, 4)
@@ -249,11 +249,12 @@ class WarpedEvents:
         reference = poses[num_poses // 2]
         duration = max(int(events.t[-1] - events.t[0]), 1)
         return _SliceGeometry(
-            points=hypothesis.plane(self._plane)[events.y, events.x] + self._jitter[: len(events)],
+            points=(hypothesis.plane(self._plane)[events.y, events.x] + self._jitter[: len(events)]) / focal_factor,
             pose_indices=np.rint((events.t - events.t[0]) / duration * (num_poses - 1)).astype(np.int64),
             poses=np.ascontiguousarray((torch.linalg.inv(reference) @ poses)[:, :3].numpy()),
             reference=reference.numpy(),
-            intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]) / self._binning,
+            intrinsics=np.array([camera.fx * focal_factor, camera.fy * focal_factor, camera.cx, camera.cy])
+            / self._binning,
         )
 
     def _warp(self, events: EventStream, hypothesis: Hypothesis) -> WarpedSlice:

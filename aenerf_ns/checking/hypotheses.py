@@ -29,6 +29,9 @@ CLOCK_OFFSETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 REFINEMENTS = (0.6, 0.7, 0.8, 0.9, 1.2, 1.4, 1.7)
 """Factors of the best clock offset, tried because :data:`CLOCK_OFFSETS` are far apart."""
 
+# Lenses that are closer to the given one sharpen the events nearly as much.
+_FOCAL_FACTORS = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
+
 # Nanoseconds. Training gives events that an offset moves beyond the ends of the trajectory the pose of the end, so long
 # offsets need other times of the poses.
 _MAX_LEARNED_OFFSET = 100_000_000
@@ -49,6 +52,7 @@ class Hypothesis:
         remedy: how to correct the mistake.
         poses: maps the given (N, 4, 4) poses to the meant ones.
         plane: maps the (height, width, 2) grid of the pixels' directions to the grid of the meant pixels.
+        focal_factor: the meant focal lengths by the given ones.
         clock_offset: nanoseconds to add to the time of an event before its pose is looked up.
         still: whether the camera does not move.
     """
@@ -57,8 +61,14 @@ class Hypothesis:
     remedy: str = ""
     poses: Callable[[Tensor], Tensor] = _identity
     plane: Callable[[NDArray[np.float64]], NDArray[np.float64]] = _identity
+    focal_factor: float = 1.0
     clock_offset: int = 0
     still: bool = False
+
+    @property
+    def is_one_of_many(self) -> bool:
+        """Whether other values of the clock's offset or of the focal lengths are tried, too."""
+        return self.clock_offset != 0 or self.focal_factor != 1
 
 
 def _flip_axes(*signs: float) -> Callable[[Tensor], Tensor]:
@@ -112,6 +122,14 @@ ALTERNATIVES = (
     Hypothesis("the pixels are mirrored in x", "write x as width - 1 - x", plane=lambda plane: plane[:, ::-1]),
     Hypothesis("the pixels are mirrored in y", "write y as height - 1 - y", plane=lambda plane: plane[::-1]),
     Hypothesis("x and y of the events are swapped", "swap the two columns", plane=_swap_rows_and_columns),
+    *(
+        Hypothesis(
+            f"the focal lengths are about {factor:g} times the given ones",
+            f"multiply them by about {factor:g}, or calibrate the lens",
+            focal_factor=factor,
+        )
+        for factor in _FOCAL_FACTORS
+    ),
 )
 """The usual mistakes in poses and pixels."""
 

@@ -143,6 +143,17 @@ def test_name_and_measure_a_shifted_clock(side: str, seconds: float, simulated: 
     assert float(found) == pytest.approx(0.2, abs=0.05)
 
 
+@pytest.mark.parametrize(("given", "factor"), [(1.5, "0.67"), (0.5, "2")])
+def test_name_focal_lengths_that_do_not_fit(
+    given: float, factor: str, simulated: tuple[Recording, EventStream]
+) -> None:
+    recording, events = simulated
+    camera = recording.event_camera
+    lens = replace(recording, event_camera=replace(camera, fx=given * camera.fx, fy=given * camera.fy))
+    found = named(events, recording.trajectory, lens)
+    assert found[0] == f"the focal lengths are about {factor} times the given ones"
+
+
 def test_clock_remedy_names_the_learning_option() -> None:
     for offset, option in ((20_000_000, "clock-offset 0.02"), (-50_000_000, "clock-offset -0.05"), (2 * 10**9, None)):
         remedy = clock_hypothesis(offset).remedy
