@@ -183,7 +183,8 @@ def _read_colmap(
     if len(order) < len(timed):
         CONSOLE.print(f"COLMAP placed {len(order)} of the {len(timed)} images: poses are interpolated between these.")
     frames = torch.stack([known[time] for time in order])
-    return Trajectory(order, frames @ frame_from_event, model)
+    # The times, of which errors will tell, are in the list.
+    return Trajectory(order, frames @ frame_from_event, images)
 
 
 own_recording_dataparser = DataParserSpecification(

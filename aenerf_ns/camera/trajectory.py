@@ -71,11 +71,14 @@ class Trajectory(nn.Module):
         backward = seconds.diff() <= 0
         if backward.any():
             index = int(backward.nonzero()[0]) + 1
+            is_equal = times[index] == times[index - 1]
             raise DataError(
                 source,
                 f"pose {index} is at {int(times[index])} ns, not after the pose ahead of it at "
                 f"{int(times[index - 1])} ns",
-                "sort the poses by time and drop repeated ones",
+                "drop repeated poses, or write the times with all digits and in the right unit"
+                if is_equal
+                else "sort the poses by time",
             )
         bad = ~poses.isfinite().flatten(1).all(1)
         if bad.any():

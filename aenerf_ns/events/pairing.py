@@ -220,7 +220,8 @@ class _Table:
             self._merge(self.file, ends)
             rows = map_rows(self.file, ends.num_padded)
         if ends.block_ends[-1] < 0:
-            raise DataError(self._source, "its intervals add up to more than 292 years", "choose a shorter time window")
+            remedy = "check the unit of the times, or choose a shorter time window"
+            raise DataError(self._source, "its intervals add up to more than 292 years", remedy)
         tail = np.ones(num_rows - num_pairs, bool)
         chain_starts = ends.chain_starts()
         tail[chain_starts[chain_starts >= num_pairs] - num_pairs] = False

@@ -198,7 +198,8 @@ class EventFile(ABC):
         return None
 
     def assumed_unit(self) -> str | None:
-        """Return the unit of the times ("ns", "us", "ms" or "s") that is assumed, or None where it is stated."""
+        """Return the unit of the times ("ns", "us", "ms" or "s") that is assumed or that the user states, or None
+        where the file or its format states it."""
         return None
 
     def require(self) -> None:

@@ -63,7 +63,8 @@ class EventReader(EventFile):
         return ends[0][0], ends[-1][1]
 
     def _assumed_unit(self) -> TimeUnit | None:
-        """Return the unit of the times that is assumed, or None where the format, the file or the user states it."""
+        """Return the unit of the times that is assumed or that the user states, or None where the file or its format
+        states it."""
         return None
 
     def _count(self) -> int | None:

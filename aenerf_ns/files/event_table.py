@@ -119,7 +119,7 @@ class EventTableFile(EventReader):
 
     def _assumed_unit(self) -> TimeUnit | None:
         with self.open_arrays() as arrays:
-            return None if self._stated_unit(arrays) else self._guessed_unit(arrays)
+            return self._given_unit or (None if self._stated_unit(arrays) else self._guessed_unit(arrays))
 
     def _stated_unit(self, arrays: Mapping[str, Any]) -> TimeUnit | None:
         return self._given_unit or self._layout.time_unit

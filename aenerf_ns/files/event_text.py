@@ -164,7 +164,7 @@ class TextEventFile(EventReader):
         )
 
     def _assumed_unit(self) -> TimeUnit | None:
-        return None if self._time_unit else self._unit_of(self._ends())
+        return self._time_unit or self._unit_of(self._ends())
 
     def _ends(self) -> list[_Lines]:
         """Parse the beginning of the file and its last line; none of them without events."""

@@ -122,6 +122,7 @@ class EventDataset(InputDataset):
         )
         CONSOLE.print(f"{events.path.name}: {pairs.summary()}.")
         if len(pairs) == 0:
+            self._require_covered(pairs.num_events, pairs.num_outside)
             raise DataError(events.path, "no pixel has two events", "record longer, or widen the time window")
         sums = pictures.sums(*usable.shape)
         file.keep(pairs, sums)

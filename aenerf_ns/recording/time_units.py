@@ -17,6 +17,8 @@ _NAMES = list(UNIT_NAMES.values())
 _MIN_POSES, _MIN_COVERED = 10, 0.1
 # Two spans fit by chance less often, the more of the time that either covers is covered by both.
 _MIN_OVERLAP, _SURE_OVERLAP = 0.05, 0.9
+# No recording is shorter or longer, in seconds.
+_SHORTEST, _LONGEST = 1e-3, 86_400
 
 
 def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
@@ -31,30 +33,36 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
         DataError: the events are missing or out of order, or fit the poses only if the times of either have another
             unit.
     """
-    span = events.ordered_time_span()
-    covered = _common(span, (poses.start, poses.end))
+    span, known = events.ordered_time_span(), (poses.start, poses.end)
+    seconds, covered = (span[1] - span[0]) * 1e-9, _common(span, known)
     is_given = len(poses.knots_between(*span)) >= _MIN_POSES and covered >= _MIN_COVERED * (span[1] - span[0])
-    power = unit_steps(span, (poses.start, poses.end), _SURE_OVERLAP if is_given else _MIN_OVERLAP)
-    if power is None:
+    power = unit_steps(span, known, _SURE_OVERLAP if is_given else _MIN_OVERLAP)
+    if power is None and covered <= 0 and poses.duration < _MIN_COVERED * seconds:
+        power = _steps_into(span, poses)
+    # The time of one damaged event, at an end, says nothing of the unit.
+    if power is None or (power < 0 and _share_within(events, known) >= _MIN_COVERED):
         return span
+    problem = f"the poses last {poses.duration:g} s and the events {seconds:g} s, as if the times of "
+    source = poses.source if power > 0 else events.path
+    if not option:
+        event_error, pose_error = ("small", "large") if power > 0 else ("large", "small")
+        problem += f"the events were {1000 ** abs(power):,} times too {event_error}, "
+        problem += f"or those of the poses too {pose_error}"
+        raise DataError(source, problem, "correct the unit of either")
     blamed, remedies = [], []
-    assumed = events.assumed_unit() if option else None
-    if assumed is not None and 0 <= _UNITS.index(assumed) + power < len(_UNITS):
+    assumed = events.assumed_unit()
+    is_short, is_long = seconds < _SHORTEST, poses.duration > _LONGEST
+    if assumed is not None and 0 <= _UNITS.index(assumed) + power < len(_UNITS) and not (power > 0 and is_long):
         index = _UNITS.index(assumed) + power
         unit = _UNITS[index]
         blamed.append(f"the events were in {_NAMES[index]}")
         remedies.append(f"give --{option.replace('_', '-')} {unit} (in aenerf --format-options {option}={unit})")
-    if power > 0:
+    if power > 0 and not (blamed and is_short):
         blamed.append(f"the poses were in {_NAMES[-1 - power]}")
         remedies.append("write the times of the poses in seconds")
     if not blamed:
         return span
-    raise DataError(
-        poses.source if power > 0 else events.path,
-        f"the poses last {poses.duration:g} s and the events {(span[1] - span[0]) * 1e-9:g} s, as if the times of "
-        + ", or those of ".join(blamed),
-        ", or ".join(remedies),
-    )
+    raise DataError(source, problem + ", or those of ".join(blamed), ", or ".join(remedies))
 
 
 def require_covered(source: Path, num_events: int, num_covered: int) -> None:
@@ -83,6 +91,24 @@ def unit_steps(span: Span, reference: Span, min_overlap: float = _MIN_OVERLAP) -
         if _common((first, last), reference) > min_overlap * total:
             return power
     return None
+
+
+def _steps_into(span: Span, poses: Trajectory) -> int | None:
+    """Return by which power of 1000 a span must be divided to lie among poses, as a negative number, or None."""
+    for power in (1, 2, 3):
+        first, last = (time // 1000**power for time in span)
+        if poses.start <= first and last <= poses.end and len(poses.knots_between(first, last)) >= _MIN_POSES:
+            return -power
+    return None
+
+
+def _share_within(events: EventFile, span: Span) -> float:
+    """Return the share of the events in a span of time."""
+    inside = total = 0
+    for chunk in events.chunks():
+        inside += int(((chunk.t >= span[0]) & (chunk.t <= span[1])).sum())
+        total += len(chunk)
+    return inside / total
 
 
 def _common(one: Span, other: Span) -> int:

@@ -132,13 +132,16 @@ def views_on_trajectory(
 def _require_seconds(times: list[int], source: Path, trajectory: Trajectory) -> None:
     """Raise a DataError if images were taken on a trajectory only if their times have another unit than seconds."""
     power = unit_steps((min(times), max(times)), (trajectory.start, trajectory.end)) if len(times) > 1 else None
-    if power is not None and power < 0:
+    if power is not None:
         seconds = (max(times) - min(times)) * 1e-9
+        unit, remedy = f"{1000 ** max(power, 0):,} times too small", "correct their unit"
+        if power < 0:
+            unit, remedy = f"in {list(UNIT_NAMES.values())[power - 1]}", "write the times of the images in seconds"
         raise DataError(
             source,
             f"the poses last {trajectory.duration:g} s and the images {seconds:g} s, as if the times of the images "
-            f"were in {list(UNIT_NAMES.values())[power - 1]}",
-            "write the times of the images in seconds",
+            f"were {unit}",
+            remedy,
         )
 
 

@@ -196,6 +196,11 @@ EDS: dict[str, Fault] = {
     "no column": (put("events.h5", "p", None), "events.h5", "no dataset /p"),
     "five images": (write_text(TIMES, "1\n2\n3\n4\n5\n"), TIMES, "5 times for 3 images"),
     "image time is a word": (write_text(TIMES, "1\ntwo\n3\n"), TIMES, "two is not a time in microseconds"),
+    "image times in seconds": (
+        write_text(TIMES, "1600000000.1\n1600000000.8\n1600000001.7\n"),
+        "images",
+        "as if the times of the images were 1,000,000 times too small",
+    ),
     "huge time": (write_text(TIMES, "1\n2\n1e99999999\n"), TIMES, "1e99999999 is not a time"),
 }
 

@@ -13,6 +13,7 @@ from helpers.own_recordings import random_events, write_calibration, write_poses
 from numpy.typing import NDArray
 
 from aenerf_ns.cli.convert import Convert
+from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
@@ -80,6 +81,56 @@ def test_message_names_the_unit_of_the_events(write: Callable, ticks: float, uni
     assert window_of(recording, event_time_unit=unit) == pytest.approx((0, 2), abs=1e-2)
 
 
+def test_message_names_the_option_where_the_unit_was_stated(recording: Path) -> None:
+    write_npz(recording, scaled(random_events(), 1e9))
+    with pytest.raises(DataError, match="give --event-time-unit ns"):
+        window_of(recording, event_time_unit="us")
+
+
+def test_message_names_the_unit_of_events_in_the_middle_of_the_poses(recording: Path) -> None:
+    write_npz(recording, scaled(random_events(0.2, 1.2), 1e9))
+    with pytest.raises(DataError, match="give --event-time-unit ns"):
+        window_of(recording)
+
+
+@pytest.mark.parametrize(("ticks", "unit", "poses"), [(1e6, 1e-6, True), (1, 1, False)])
+def test_blame_nothing_that_no_recording_lasts(ticks: float, unit: float, poses: bool, recording: Path) -> None:
+    """Poses in microseconds are not made right by events in seconds, nor are events in seconds by other poses."""
+    write_npz(recording, scaled(random_events(), ticks))
+    write_poses(recording / "trajectory.txt", unit=unit)
+    with pytest.raises(DataError) as error:
+        window_of(recording)
+    assert ("those of the poses" in str(error.value) or "the poses were in microseconds" in str(error.value)) == poses
+    assert ("give --event-time-unit s" in str(error.value)) != poses
+
+
+@pytest.mark.parametrize("write", [write_npz, write_text])
+def test_one_late_event_is_no_other_unit(write: Callable, recording: Path) -> None:
+    events = scaled(random_events(), 1e6)
+    events["t"][-1] = 900_000_000
+    write(recording, events)
+    assert window_of(recording) == pytest.approx((0, 2))
+
+
+@pytest.mark.parametrize(
+    ("ticks", "decimals", "unit", "words"),
+    [
+        (1e6, 0, 1, "the events were 1,000,000 times too large, or those of the poses too small"),
+        (1, 9, 1e-3, "the events were 1,000 times too small, or those of the poses too large"),
+    ],
+)
+def test_formats_without_an_option_name_the_factor(
+    ticks: float, decimals: int, unit: float, words: str, tmp_path: Path
+) -> None:
+    columns = random_events()
+    rows = np.stack([columns["t"] * ticks, *(columns[name] for name in "xyp")], 1)
+    np.savetxt(tmp_path / "events.txt", rows, fmt=[f"%.{decimals}f", "%d", "%d", "%d"])
+    write_poses(tmp_path / "groundtruth.txt", unit=unit)
+    (tmp_path / "calib.txt").write_text("90 90 47.5 35.5 0 0 0 0 0\n")
+    with pytest.raises(DataError, match=f"{words}; correct the unit of either"):
+        _ = EcdDataParserConfig(data=tmp_path, width=96, height=72).setup().time_window
+
+
 @pytest.mark.parametrize("hertz", [50, 1000])
 def test_message_names_the_unit_of_dense_poses(hertz: int, recording: Path) -> None:
     write_npz(recording, scaled(random_events(20), 1e6))
@@ -104,6 +155,12 @@ def test_refuse_events_of_which_hardly_any_has_a_pose(recording: Path, tmp_path:
         _ = EventDataset(outputs).pairs
     with pytest.raises(DataError, match="only 134 of its 2,000 events have a pose"):
         _ = EventDataset(outputs).windows
+    # Also where so few are left that none are pairs.
+    write_poses(recording / "trajectory.txt", 1.0)
+    outputs = OwnRecordingDataParserConfig(data=recording).setup().get_dataparser_outputs()
+    with pytest.raises(DataError, match="only 67 of its 2,000 events have a pose"):
+        _ = EventDataset(outputs).pairs
+    write_poses(recording / "trajectory.txt")
     words = [str(recording), "--output", str(tmp_path / "made")]
     with pytest.raises(DataError, match="only 134 of its 2,000 events have a pose"):
         tyro.cli(Convert, args=words).main()
