@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
 from benchmarks.paper.plan import OURS, Run, scene_name
@@ -62,7 +62,7 @@ def _views(folder: Path, runs: Sequence[Run], file: Path) -> Path:
         truth, rendered = _view(folder, run)
         columns.setdefault(_TRUTH, [truth, np.zeros_like(truth)])
         columns[run.row] = [rendered, error_map(rendered, truth)]
-    _grid(columns).save(file, optimize=True)
+    picture_grid(columns).save(file, optimize=True)
     return file
 
 
@@ -80,7 +80,7 @@ def _scenes(folder: Path, runs: Sequence[Run], file: Path) -> list[Path]:
                 columns[name].append(rendered)
     if not columns[_TRUTH]:
         return []
-    _grid(columns).save(file, quality=88)
+    picture_grid(columns).save(file, quality=88)
     return [file]
 
 
@@ -92,7 +92,7 @@ def _view(folder: Path, run: Run) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]
     return truth, rendered
 
 
-def _grid(columns: Mapping[str, Sequence[NDArray[np.uint8]]]) -> Image.Image:
+def picture_grid(columns: Mapping[str, Sequence[NDArray[np.uint8]]]) -> Image.Image:
     """Lay out columns of equally large pictures below their names, in bands of at most :data:`_MAX_COLUMNS`."""
     height, width = next(iter(columns.values()))[0].shape[:2]
     factor = -(-_MIN_WIDTH // width)
@@ -122,31 +122,49 @@ def error_map(rendered: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[
 
 
 def _paths(data: Path, corrected: Path, file: Path) -> Path:
-    """Draw the true, the estimated and the corrected path from above, and the rotation errors over time."""
-    import torch
-    from matplotlib.figure import Figure
-
-    from aenerf_ns.camera.alignment import align, rotation_angle
+    """Draw the true, the estimated and the corrected path of a run, and the errors of the poses."""
+    from aenerf_ns.camera.alignment import align
     from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+    from aenerf_ns.report.poses import errors_over_time
 
     truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    above, over_time = figure.subplots(1, 2)
-    above.plot(*truth.camera_to_worlds[:, :2, 3].T, color="black")
-    drawn = {"estimated": (data / "trajectory_estimated.txt", "tab:red"), "corrected": (corrected, "tab:blue")}
-    for poses, (path, color) in drawn.items():
+    positions: dict[str, ArrayLike] = {"true": truth.camera_to_worlds[..., 3]}
+    errors = {}
+    for poses, path in {"estimated": data / "trajectory_estimated.txt", "corrected": corrected}.items():
         trajectory = read_tum_trajectory(path)
         times = trajectory.knots_covered_by(truth)
-        reference = truth.interpolate(times)
-        aligned = align(trajectory.interpolate(times), reference)(trajectory.interpolate(times))
-        above.plot(*aligned[:, :2, 3].T, color=color, linewidth=0.8)
-        angles = torch.rad2deg(rotation_angle(aligned, reference))
-        over_time.plot((times - truth.start).double() * 1e-9, angles, color=color, linewidth=0.8, label=poses)
-    above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="path from above, after Sim(3) alignment")
-    over_time.set(xlabel="seconds", ylabel="degrees", title="rotation error")
-    over_time.plot([], color="black", label="true")
-    over_time.legend(frameon=False)
-    figure.savefig(file, dpi=100)
+        found, reference = trajectory.interpolate(times), truth.interpolate(times)
+        positions[poses] = align(found, reference)(found)[..., 3]
+        errors[poses] = ((times - truth.start).double() * 1e-9, errors_over_time(found, reference))
+    return draw_paths(positions, errors, file)
+
+
+def draw_paths(
+    positions: Mapping[str, ArrayLike], errors: Mapping[str, tuple[ArrayLike, Mapping[str, ArrayLike]]], file: Path
+) -> Path:
+    """Draw ``estimated``, ``corrected`` and ``true`` positions (N, 3) from above and from the side.
+
+    Where errors of poses are known, ``rotation_degrees`` and ``translation``, they are drawn over their seconds.
+    """
+    from matplotlib.figure import Figure
+
+    lines = {"true": ("darkgray", 3.0), "estimated": ("tab:red", 0.8), "corrected": ("tab:blue", 0.8)}
+    figure = Figure(figsize=(10 if errors else 5, 5), layout="constrained")
+    panels = figure.subplots(2, 2 if errors else 1, squeeze=False)
+    for axes, up, side in zip(panels[:, 0], (1, 2), ("above", "the side"), strict=True):
+        for name, (color, width) in lines.items():
+            if name in positions:
+                path = np.asarray(positions[name])
+                axes.plot(path[:, 0], path[:, up], color=color, linewidth=width, label=name)
+        axes.set(xlabel="x", ylabel="xyz"[up], title=f"path from {side}")
+        axes.set_aspect("equal", adjustable="datalim")
+    kinds = {"rotation_degrees": "rotation error [degrees]", "translation": "position error"} if errors else {}
+    for axes, (kind, title) in zip(panels[:, -1], kinds.items(), strict=False):
+        for name, (seconds, of) in errors.items():
+            axes.plot(seconds, of[kind], color=lines[name][0], linewidth=0.8)
+        axes.set(xlabel="seconds", title=title, ylim=(0, None))
+    panels[0, 0].legend(frameon=False, fontsize=8)
+    figure.savefig(file, dpi=80)
     return file
 
 
