@@ -26,6 +26,10 @@ TIME_HIGH = 0x8
 # Events that one word can hold.
 _MAX_PER_WORD = 12
 
+# Upper bits of a time that jump are damaged if one of so many that follow goes on from those before them, and is
+# confirmed by so many more.
+_RETURNING, _CONFIRMING = 8, 3
+
 # The state of a decoder from one word to the next.
 _HIGH, _LOW, _ROW, _BASE, _POLARITY, _OFFSET = range(6)
 _UNKNOWN = np.iinfo(np.int64).min
@@ -156,48 +160,82 @@ EVT3 = Encoding("EVT 3.0", np.dtype("<u2"), _decode_evt3, _EVT3_HIGH_BITS, 1 << 
 
 
 def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_out: LeftOut) -> Iterator[NDArray]:
-    """Blank out upper bits of a time that differ from those before and after them, which fit each other, and the events
-    that they would date.
+    """Blank out upper bits of a time that jump and come back within a few words, and the events that they would date.
 
-    One such word would move all later events by up to a lap of the time. At the end of the words, upper bits that jump
-    are blanked out as well, because none confirm them, and at the beginning those that the next two contradict.
+    Such words would move all later events by up to a lap of the time. At the end of the words, upper bits that jump are
+    blanked out as well, because none confirm them, and at the beginning those that the next ones contradict.
 
     Args:
         blocks: (N,) words in pieces, which may end anywhere.
         encoding: of the words.
         left_out: takes the events that are blanked out.
     """
-    mask = (1 << encoding.high_bits) - 1
     held, last = np.zeros(0, encoding.dtype), None
     num_before = 0
     for block in chain(blocks, (None,)):
         words = held if block is None else np.concatenate([held, block])
         where = np.flatnonzero(encoding.kinds(words) == TIME_HIGH)
-        # The last upper bits wait for the next ones, and the first ones for the next two.
-        end = len(words) if block is None or len(where) == 0 else int(where[-1])
-        if last is None and 0 < len(where) < 3 and block is not None:
-            end = 0
-        elif len(where):
-            high = (words[where] & mask).astype(np.int64)
-            if last is None:
-                # The steps between the first two, from the first to the third, and between the last two.
-                jumps = len(high) > 2 and ((high[[1, 2, 2]] - high[[0, 0, 1]]) & mask) > encoding.max_steps
-                last = high[int(np.array_equal(jumps, [True, True, False]))]
-            before = np.concatenate([[last], high[:-1]])
-            steps = (high - before) & mask
-            steps_after = (high[1:] - before[:-1]) & mask
-            damaged = np.flatnonzero((steps_after <= encoding.max_steps) & (steps[:-1] > steps_after)).tolist()
-            if block is None and steps[-1] > encoding.max_steps:
-                damaged.append(len(where) - 1)
+        # Upper bits wait for those that confirm them.
+        num_judged = len(where) if block is None else max(len(where) - _RETURNING - _CONFIRMING, 0)
+        end = int(where[num_judged]) if num_judged < len(where) else len(words)
+        if num_judged:
+            high = (words[where] & (1 << encoding.high_bits) - 1).astype(np.int64)
+            last = _first_time_high(high, encoding) if last is None else last
+            damaged = [index for index in _damaged_times(high, last, encoding, block is None) if index < num_judged]
             for index in damaged:
                 part = words[where[index] : where[index + 1] if index + 1 < len(where) else None]
                 number = _blank_out(part, encoding)
                 if number:
                     left_out.add_number("after a damaged time", number, f"at word {num_before + where[index]}")
-            last = next((int(high[i]) for i in range(len(high) - 2, -1, -1) if i not in damaged), last)
+            last = next((int(high[i]) for i in range(num_judged - 1, -1, -1) if i not in damaged), last)
         yield words[:end]
         held = words[end:]
         num_before += end
+
+
+def _goes_on(before: NDArray | int, after: NDArray, encoding: Encoding) -> NDArray[np.bool_]:
+    """Return whether upper bits of a time come at most 65 ms after others."""
+    return (after - before) & (1 << encoding.high_bits) - 1 <= encoding.max_steps
+
+
+def _first_time_high(high: NDArray[np.int64], encoding: Encoding) -> int:
+    """Return the first of (N,) upper bits that are confirmed, or the first of all if none are."""
+    if len(high) > _CONFIRMING:
+        rows = np.lib.stride_tricks.sliding_window_view(high, 1 + _CONFIRMING)
+        confirmed = np.flatnonzero(_goes_on(rows[:, :1], rows[:, 1:], encoding).all(1))
+        if len(confirmed):
+            return int(high[confirmed[0]])
+    # Of a few words, the first is damaged if the second and the third contradict it and fit each other.
+    contradicted = len(high) > 2 and not _goes_on(high[0], high[1:3], encoding).any()
+    return int(high[int(contradicted and bool(_goes_on(high[1], high[2], encoding)))])
+
+
+def _damaged_times(high: NDArray[np.int64], last: int, encoding: Encoding, is_end: bool) -> list[int]:
+    """Return which of (N,) upper bits are damaged, from the last good ones before them."""
+    mask = (1 << encoding.high_bits) - 1
+    before = np.concatenate([[last], high[:-1]])
+    steps, steps_after = (high - before) & mask, (high[1:] - before[:-1]) & mask
+    # One alone may differ from its neighbors by little.
+    suspicious = np.append((steps_after <= encoding.max_steps) & (steps[:-1] > steps_after), False)
+    # A few steps back leave the events out of order, and move none by a lap.
+    jumps = np.minimum(steps, mask + 1 - steps) > encoding.max_steps
+    damaged: list[int] = []
+    for index in np.flatnonzero(suspicious | jumps).tolist():
+        # What follows the damaged ones is what goes on from those before them.
+        if damaged and damaged[-1] >= index - 1:
+            continue
+        if suspicious[index]:
+            damaged.append(index)
+            continue
+        back = np.flatnonzero(_goes_on(int(before[index]), high[index + 1 : index + 1 + _RETURNING], encoding))
+        for end in (index + 1 + back).tolist():
+            if _goes_on(int(high[end]), high[end + 1 : end + 1 + _CONFIRMING], encoding).all():
+                damaged += range(index, end)
+                break
+        else:
+            if is_end and index == len(high) - 1:
+                damaged.append(index)
+    return damaged
 
 
 def _blank_out(words: NDArray, encoding: Encoding) -> int:

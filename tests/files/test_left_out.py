@@ -125,6 +125,10 @@ def after_an_event(*values: int) -> bytes:
     return evt3_of(0x8010, 0x6001, 1, 0x2001, *values)
 
 
+def after_good_times(*values: int) -> bytes:
+    return evt3_of(*4 * (0x8010,), 0x6001, 1, 0x2001, *values)
+
+
 FIRST, NEXT = 0x10001, 0x10003
 DAMAGED = {
     # Words, the times in microseconds of the events that are left, and how many are left out.
@@ -133,6 +137,23 @@ DAMAGED = {
     "evt3: one step back": (after_an_event(0x800F, 0x2001, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 1),
     "evt3: at a step": (after_an_event(0x8A00, 0x2001, 0x2002, 0x8011, 0x6003, 0x2001), [FIRST, 0x11003], 2),
     "evt3: at the end": (after_an_event(0x8810, 0x2001, 0x2002), [FIRST], 2),
+    "evt3: twice": (after_good_times(0x8810, 0x2001, 0x8810, 0x2002, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 2),
+    "evt3: far back": (after_good_times(*2 * (0x8F10,), 0x2001, *2 * (0x8010,), 0x6003, 0x2001), [FIRST, NEXT], 1),
+    "evt3: again and again": (
+        after_an_event(*3 * (0x8810, 0x2001, 0x8010, 0x6002, 0x2001), 0x8010, 0x6003, 0x2001),
+        [FIRST, *3 * (0x10002,), NEXT],
+        3,
+    ),
+    "evt3: other words in a row": (
+        after_an_event(0x8810, 0x2001, 0x8310, 0x2002, 0x8B10, 0x2002, 0x8010, 0x6003, 0x2001),
+        [FIRST, NEXT],
+        3,
+    ),
+    "evt3: twice at the beginning": (
+        evt3_of(0x8A10, 0x8A10, 0x6001, 1, 0x2001, *6 * (0x8010,), 0x6001, 0x2001, 0x6003, 0x2001),
+        [FIRST, NEXT],
+        1,
+    ),
     "evt3: vectors": (after_an_event(0x3001, 0x8810, 0x4005, 0x5003, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 4),
     "evt3: at the beginning": (
         evt3_of(0x8A10, 0x6001, 1, 0x2001, 0x8010, 0x6001, 0x2001, 0x8010, 0x6003, 0x2001),
@@ -142,6 +163,11 @@ DAMAGED = {
     "evt3: a pause": (after_an_event(0x8010, 0x8810, 0x8810, 0x6003, 0x2001), [FIRST, 0x810003], 0),
     "evt2: ahead": (evt2_of(0x80000010, 0x10000801, 0x88000010, 0x10000801, 0x80000010, 0x10400801), [1024, 1025], 1),
     "evt2: back": (evt2_of(0x80000010, 0x10000801, 0x80000002, 0x10000801, 0x80000010, 0x10400801), [1024, 1025], 1),
+    "evt2: twice": (
+        evt2_of(*4 * (0x80000010,), 0x10000801, *2 * (0x88000010, 0x10000801), 0x80000010, 0x10400801),
+        [1024, 1025],
+        2,
+    ),
     "evt2: a pause": (
         evt2_of(0x80000010, 0x10000801, 0x80000010, 0x80008010, 0x80008010, 0x10400801),
         [1024, 0x200401],
