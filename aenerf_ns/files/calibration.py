@@ -72,6 +72,8 @@ def read_calibration(
         origin, is_assumed = camera.intrinsics_origin, not states_thresholds(camera)
         return Calibration(camera.intrinsics(), lens, motion, sensor, meta.image_encoding, origin, is_assumed)
     content = read_plain_yaml(path)
+    if isinstance(content, dict) and not content.keys().isdisjoint("Kk"):
+        content = _as_file(content)
     if isinstance(content, dict) and "camera_matrix" in content:
         lens = _camera_info(path, content)
         return Calibration(lens, lens, torch.eye(4, dtype=torch.float64), SensorModel(), "linear")
@@ -88,6 +90,16 @@ def read_calibration(
             raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
     motion = motion_between(path, cameras, event_name, frame_name)
     return Calibration(cameras[event_name].lens(), cameras[frame_name].lens(), motion, SensorModel(), "linear")
+
+
+def _as_file(message: dict[str, Any]) -> dict[str, Any]:
+    """Return a message camera_info of ROS 1 or 2 with the names of the file."""
+    names = {"width": "image_width", "height": "image_height", "distortion_model": "distortion_model"}
+    matrices = {"k": "camera_matrix", "d": "distortion_coefficients"}
+    values = {name.lower(): value for name, value in message.items() if isinstance(name, str)}
+    return {names[name]: values[name] for name in names if name in values} | {
+        matrices[name]: {"data": values[name]} for name in matrices if name in values
+    }
 
 
 def _camera_info(path: Path, content: dict[str, Any]) -> CameraIntrinsics:

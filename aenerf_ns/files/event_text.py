@@ -23,7 +23,7 @@ from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventReader
 from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.files.limits import MAX_LINE
-from aenerf_ns.files.text import NANOSECONDS, TimeUnit
+from aenerf_ns.files.text import NANOSECONDS, TimeUnit, require_utf8
 
 _COLUMNS = "xytp"
 _ALIASES = {"timestamp": "t", "ts": "t", "time": "t", "polarity": "p", "pol": "p"}
@@ -39,6 +39,8 @@ _SAMPLE_BYTES = 1 << 16
 _LEFT_OUT_FITS = 0.99
 # Longer than any line of a file of events.
 _TAIL_BYTES = 4096
+# The size of the sensor, as E2VID and Metavision write it.
+_SIZE = re.compile(rb"\s*(\d{1,9})[\s,]+(\d{1,9})\s*(?:#.*)?$|%\s*geometry\W+(\d{1,9})\D+(\d{1,9})", re.IGNORECASE)
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 _MAX = np.iinfo(np.int64).max
@@ -104,29 +106,32 @@ class TextEventFile(EventReader):
 
     def _names(self, file: BinaryIO) -> list[str]:
         """Return the names of the columns, x, y, t and p among them. Read the header, if there is one."""
-        if file.read(len(_BYTE_ORDER_MARK)) != _BYTE_ORDER_MARK:
-            file.seek(0)
-        begin = file.tell()
+        beginning = file.read(_SAMPLE_BYTES)
+        require_utf8(self.path, beginning)
+        begin = len(_BYTE_ORDER_MARK) if beginning.startswith(_BYTE_ORDER_MARK) else 0
+        file.seek(begin)
         while line := self._line(file):
-            if _is_row(line):
+            size = _SIZE.match(line)
+            if size:
+                self._require_size(size[1] or size[3], size[2] or size[4])
+            elif _is_row(line):
                 break
             begin = file.tell()
-        fields = line.split(b"#")[0].replace(b",", b" ").split()
-        if re.match(rb"\s*[A-Za-z_\"]", line):
+        if re.match(rb"[\s,]*[A-Za-z_\"]", line):
             return self._named(line.decode("utf-8", "replace"))
-        if len(fields) == 2 and b" ".join(fields) == b"%d %d" % (self.width, self.height):
-            begin = file.tell()
-        elif len(fields) == 2 and all(field.isdigit() for field in fields):
-            found = " x ".join(field.decode() for field in fields)
-            raise DataError(
-                self.path,
-                f"its first line says {found} pixels, the calibration {self.width} x {self.height}",
-                "give the calibration of this sensor",
-            )
         file.seek(begin)
         order = self._order(file)
         file.seek(begin)
         return order
+
+    def _require_size(self, width: bytes, height: bytes) -> None:
+        if (int(width), int(height)) != (self.width, self.height):
+            stated = f"{int(width)} x {int(height)} pixels"
+            raise DataError(
+                self.path,
+                f"its first line says {stated}, the calibration {self.width} x {self.height}",
+                "give the calibration of this sensor",
+            )
 
     def _named(self, header: str) -> list[str]:
         names = [name.strip().strip('"').lower() for name in (header.split(",") if "," in header else header.split())]
@@ -232,8 +237,9 @@ class TextEventFile(EventReader):
     def _malformed(self, line_name: str, line: bytes, names: list[str]) -> DataError:
         fields = [field.strip() for field in line.split(b"#")[0].split(b"," if self.with_commas else None)]
         if len(fields) != len(names):
-            remedy = f"each line must hold the {len(names)}: {' '.join(names)}"
-            return DataError(self.path, f"{line_name} has {len(fields)} fields", remedy)
+            remedy = f"each line must hold the {len(names)}, between commas or blanks: {' '.join(names)}"
+            beginning = line[:60].decode("utf-8", "replace")
+            return DataError(self.path, f"{line_name} has {len(fields)} fields: {beginning!r}", remedy)
         bad = next(i for i, field in enumerate(fields) if not _NUMBER.fullmatch(field))
         value = fields[bad][:40].decode("ascii", "replace") or "nothing"
         return DataError(self.path, f"{line_name} has {names[bad]} = {value}", "write plain decimal numbers")

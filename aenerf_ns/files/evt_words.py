@@ -163,7 +163,7 @@ def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_ou
     """Blank out upper bits of a time that jump and come back within a few words, and the events that they would date.
 
     Such words would move all later events by up to a lap of the time. At the end of the words, upper bits that jump are
-    blanked out as well, because none confirm them, and at the beginning those that the next ones contradict.
+    blanked out as well, because none confirm them, and at the beginning those that the next two contradict.
 
     Args:
         blocks: (N,) words in pieces, which may end anywhere.
@@ -199,13 +199,7 @@ def _goes_on(before: NDArray | int, after: NDArray, encoding: Encoding) -> NDArr
 
 
 def _first_time_high(high: NDArray[np.int64], encoding: Encoding) -> int:
-    """Return the first of (N,) upper bits that are confirmed, or the first of all if none are."""
-    if len(high) > _CONFIRMING:
-        rows = np.lib.stride_tricks.sliding_window_view(high, 1 + _CONFIRMING)
-        confirmed = np.flatnonzero(_goes_on(rows[:, :1], rows[:, 1:], encoding).all(1))
-        if len(confirmed):
-            return int(high[confirmed[0]])
-    # Of a few words, the first is damaged if the second and the third contradict it and fit each other.
+    """Return the first of (N,) upper bits, or the second if it and the third fit each other and not the first."""
     contradicted = len(high) > 2 and not _goes_on(high[0], high[1:3], encoding).any()
     return int(high[int(contradicted and bool(_goes_on(high[1], high[2], encoding)))])
 

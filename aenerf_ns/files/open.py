@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from aenerf_ns.errors import DataError
@@ -26,6 +27,7 @@ _FORMAT_OF_MAGIC = {
     **dict.fromkeys(BAG_MAGIC, "bag"),
 }
 _FORMAT_OF_SUFFIX = {".npz": "NumPy", ".npy": "NumPy", ".csv": "CSV", ".txt": "text"}
+_COMMENTED_TABLE = re.compile(rb"(% [^\n]*\n)+[\d\s,.;+-]{8}")
 _WITH_TOPICS = ("AEDAT4", "bag")
 # Formats that may leave the unit of the times open.
 _WITH_TIME_UNIT = ("HDF5", "NumPy", "CSV", "text")
@@ -105,11 +107,13 @@ def _read_beginning(path: Path) -> bytes:
 def _format(path: Path, beginning: bytes) -> str:
     if not beginning:
         return "bag"
+    by_suffix = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
     for magic, name in _FORMAT_OF_MAGIC.items():
-        if beginning.startswith(magic):
+        # Comments of Metavision's CSV begin like the header of its RAW files.
+        is_table = by_suffix in ("CSV", "text") and _COMMENTED_TABLE.match(beginning)
+        if beginning.startswith(magic) and not is_table:
             return name
     # The first bytes of other files do not tell what they are.
-    by_suffix = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
     if by_suffix is None:
         raise DataError(
             path,

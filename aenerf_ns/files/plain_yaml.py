@@ -29,6 +29,9 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)
+
+
 def read_yaml_text(path: Path, max_bytes: int) -> str:
     """Return the text of a YAML file.
 
@@ -49,8 +52,10 @@ def read_plain_yaml(path: Path) -> Any:
         DataError: the file is missing, too large, or not valid YAML, or it has aliases.
     """
     try:
-        return yaml.load(read_yaml_text(path, _MAX_BYTES), _Loader)
+        # OpenCV's first line is no YAML, and rostopic's last line ends a message.
+        text = read_yaml_text(path, _MAX_BYTES).removeprefix("%YAML:1.0").rstrip().removesuffix("\n---")
+        return yaml.load(text, _Loader)
     except DataError:
         raise
     except YAML_ERRORS as error:
-        raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "copy it again") from None
+        raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "correct it there") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from decimal import Decimal
 from pathlib import Path
@@ -24,6 +25,12 @@ POSE_COLUMNS = "t tx ty tz qx qy qz qw"
 """The columns of a trajectory in the format of the TUM RGB-D benchmark."""
 
 
+def require_utf8(path: Path, beginning: bytes) -> None:
+    """Raise a DataError if the first bytes of a file are those of text in UTF-16, as Windows' programs write it."""
+    if beginning.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in beginning[:64]:
+        raise DataError(path, "it is text in UTF-16, or no text", "save it as UTF-8")
+
+
 def read_rows(path: Path, columns: str) -> list[list[str]]:
     """Read rows of fields between white space or commas. Leave out empty lines, comments after #, and a first line of
     names.
@@ -36,6 +43,7 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     rows: list[list[str]] = []
     with bounded(path, "table of numbers"), path.open(encoding="utf-8-sig", errors="replace") as file:
         require_at_most(path, MAX_TABLE_BYTES)
+        require_utf8(path, file.buffer.peek())
         for number, line in enumerate(file, start=1):
             line = line.split("#", 1)[0]
             fields = line.split()
@@ -45,7 +53,7 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
                 continue
             if len(fields) != expected:
                 remedy = f"each line must hold the {expected}, between blanks or commas: {columns}"
-                raise DataError(path, f"line {number} has {len(fields)} fields", remedy)
+                raise DataError(path, f"line {number} has {len(fields)} fields: {line.rstrip()[:60]!r}", remedy)
             if len(rows) == MAX_ROWS:
                 raise DataError(path, f"it has more than {MAX_ROWS:,} rows", "cut the recording, or leave rows out")
             rows.append(fields)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +19,15 @@ from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, format_seconds, parse_n
 
 # Trajectories are commonly printed with six or more digits, so quaternions have rounding errors.
 _MAX_NORM_ERROR = 1e-3
+# What a line of a pose begins with.
+_POSE = re.compile(r"\s*[-+.\d]")
 
 
 def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     """Read camera-to-world poses, with the axes of the file, from lines of t tx ty tz qx qy qz qw.
 
-    Some datasets have the same rows with other units of the times. # starts a comment. The first line may name the
-    columns, and then counts: EuRoC's has nanoseconds and qw first.
+    Some datasets have the same rows with other units of the times. # starts a comment. A line ahead of the poses may
+    name the columns, and then counts: EuRoC's has nanoseconds and qw first.
 
     Raises:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
@@ -35,11 +38,13 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        header = file.readline(MAX_LINE)
-    stated = re.match(r"\W*\w+ *\[(ns|us|ms|s)\]", header)
+        lines = takewhile(lambda line: not _POSE.match(line), iter(lambda: file.readline(MAX_LINE), ""))
+        header = [line.lower() for line in lines]
+    stated = next(filter(None, (re.match(r"\W*\w+ *\[(ns|us|ms|s)\]", line) for line in header)), None)
     times = parse_times(path, [row[0] for row in rows], stated[1] if stated else unit)  # type: ignore[arg-type]
     values = parse_numbers(path, [row[1:] for row in rows])
-    if re.findall(r"\bq\w*?([wxyz])\b", header)[:4] == list("wxyz"):
+    orders = [re.findall(r"\bq\w*?([wxyz])\b", line)[:4] for line in header]
+    if "".join(next((order for order in reversed(orders) if len(order) == 4), [])) == "wxyz":
         values = values[:, [0, 1, 2, 4, 5, 6, 3]]
     return Trajectory(times, poses_from_quaternions(path, values[:, :3], values[:, 3:]), path)
 

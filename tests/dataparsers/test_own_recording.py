@@ -220,13 +220,27 @@ def test_refuse_a_focal_length_of_colmap_that_is_not_the_calibrated_one(is_binar
         recording_of(OwnRecordingDataParserConfig(data=truth.data))
 
 
-def test_read_the_camera_info_of_ros(tmp_path: Path) -> None:
-    (tmp_path / "camera_info.yaml").write_text(
-        "image_width: 96\nimage_height: 72\ncamera_name: dvs\n"
-        "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [90.0, 0.0, 47.5, 0.0, 91.0, 35.5, 0.0, 0.0, 1.0]\n"
-        "distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n"
-        "  data: [-0.1, 0.01, 0.0, 0.0, 0.0]\n"
-    )
+CAMERA_INFO = (
+    "image_width: 96\nimage_height: 72\ncamera_name: dvs\n"
+    "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [90.0, 0.0, 47.5, 0.0, 91.0, 35.5, 0.0, 0.0, 1.0]\n"
+    "distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n"
+    "  data: [-0.1, 0.01, 0.0, 0.0, 0.0]\n"
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        CAMERA_INFO,
+        "%YAML:1.0\n---\n"
+        + CAMERA_INFO.replace("_matrix:", "_matrix: !!opencv-matrix").replace("data:", "dt: d\n  data:"),
+        "header: {seq: 0}\nheight: 72\nwidth: 96\ndistortion_model: plumb_bob\nD: [-0.1, 0.01, 0.0, 0.0, 0.0]\n"
+        "K: [90.0, 0.0, 47.5, 0.0, 91.0, 35.5, 0.0, 0.0, 1.0]\n---\n",
+    ],
+    ids=["file", "file of OpenCV", "message"],
+)
+def test_read_the_camera_info_of_ros(text: str, tmp_path: Path) -> None:
+    (tmp_path / "camera_info.yaml").write_text(text)
     write_poses(tmp_path / "trajectory.txt")
     np.savez(tmp_path / "events.npz", **random_events())
     recording = recording_of(OwnRecordingDataParserConfig(data=tmp_path))

@@ -129,6 +129,8 @@ SPELLINGS = {
     "bom.csv": "\ufeffx,y,t,p\n" + "".join(f"{x},{y},{t},{p}\n" for x, y, t, p in PLAIN),
     "bom.txt": "\ufeff" + "".join(f"{t} {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "metavision.csv": "".join(f"{x},{y},{p},{t}\n" for x, y, t, p in PLAIN),
+    "format.csv": "% geometry 96x72\n% format CSV\n" + "".join(f"{x},{y},{p},{t}\n" for x, y, t, p in PLAIN),
+    "numbered.csv": ",x,y,t,p\n" + "".join(f"{i},{x},{y},{t},{p}\n" for i, (x, y, t, p) in enumerate(PLAIN)),
     "geometry.csv": "%geometry:96,72\n" + "".join(f"{x},{y},{p},{t}\n" for x, y, t, p in PLAIN),
     "e2vid.txt": "96 72\n" + "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "plus_minus.txt": "".join(f"{t / 1e6:.6f} {x} {y} {2 * p - 1}\n" for x, y, t, p in PLAIN),

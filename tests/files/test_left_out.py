@@ -149,11 +149,6 @@ DAMAGED = {
         [FIRST, NEXT],
         3,
     ),
-    "evt3: twice at the beginning": (
-        evt3_of(0x8A10, 0x8A10, 0x6001, 1, 0x2001, *6 * (0x8010,), 0x6001, 0x2001, 0x6003, 0x2001),
-        [FIRST, NEXT],
-        1,
-    ),
     "evt3: vectors": (after_an_event(0x3001, 0x8810, 0x4005, 0x5003, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 4),
     "evt3: at the beginning": (
         evt3_of(0x8A10, 0x6001, 1, 0x2001, 0x8010, 0x6001, 0x2001, 0x8010, 0x6003, 0x2001),

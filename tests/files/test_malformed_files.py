@@ -164,7 +164,10 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     "csv: without header": (b"1,2,3,1\n", "first line is '1,2,3,1'; it must name"),
     "csv: without events": (b"x,y,t,p\n", "the file holds no events"),
     "csv: with a word": (b"x,y,t,p\n1,2,now,1\n", "line 2 has t = now; write"),
-    "csv: with five": (b"x,y,t,p\n1,2,3,1,9\n", "has 5 fields; .* the 4: x y t p"),
+    "csv: with five": (
+        b"x,y,t,p\n1,2,3,1,9\n",
+        "has 5 fields: '1,2,3,1,9'; .* the 4, between commas or blanks",
+    ),
     "csv: with an empty field": (b"x,y,t,p\n1,,3,1\n", "line 2 has y = nothing"),
     "csv: with blanks between": (b"x,y,t,p\n1,2 3,4,1\n", "line 2 has y = 2 3;"),
     "csv: with three polarities": (b"x,y,t,p\n1,2,3,-1\n#\n1,2,3,0\n", "line 4 has p = 0; .* of polarity -1"),
@@ -176,7 +179,11 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object] | None, str]] = {
     ),
     "txt: with a bad end": (b"1 1 2 1\n" * 90 + b"1 1 2\n", "the last line has 3"),
     "txt: without line ends": (b"1 1 2 1 " * 90, "line 1 has 360 fields"),
-    "txt: of zeros": (bytes(5000), "line 1 has 1 fields"),
+    "txt: of zeros": (bytes(5000), "it is text in UTF-16, or no text; save it as UTF-8"),
+    "txt: in UTF-16": ("1 2 3 1\n".encode("utf-16"), "it is text in UTF-16"),
+    "csv: in UTF-16 without a mark": ("x,y,t,p\n1,2,3,1\n".encode("utf-16-le"), "it is text in UTF-16"),
+    "csv: with semicolons": (b"1;2;3;1\n", "line 1 has 1 fields: '1;2;3;1'"),
+    "csv: of another size": (b"%geometry:640,480\n1,2,1,3\n", "says 640 x 480 pixels, the calibration"),
 }
 READERS: dict[str, Callable[..., EventFile]] = {
     "npz": open_array_events,

@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers.small_datasets import make_trajectory
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.files.text import format_seconds, parse_times
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 
@@ -36,6 +37,9 @@ POSES = {
     "EuRoC": "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n"
     "492000000,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n496000000,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
     "another order in a remark": f"# t x y z qx qy qz qw (not qw qx qy qz)\n0.492 {POSE}\n0.496 {POSE}\n",
+    "w first, below another remark": "# mine\n# T TX TY TZ QW QX QY QZ\n0.492 3.5 -0.25 1.5 0.5 -0.5 0.5 0.5\n"
+    "0.496 3.5 -0.25 1.5 0.5 -0.5 0.5 0.5\n",
+    "two orders in remarks": f"# made of qw qx qy qz\n# t tx ty tz qx qy qz qw\n0.492 {POSE}\n0.496 {POSE}\n",
     "w first": "t,tx,ty,tz,qw,qx,qy,qz\n0.492,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n0.496,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
 }
 
@@ -47,3 +51,9 @@ def test_read_the_spellings_that_are_unambiguous(spelling: str, tmp_path: Path) 
     plain, read = (read_tum_trajectory(tmp_path / name) for name in ("plain.txt", "poses.txt"))
     assert read.times.tolist() == plain.times.tolist() == [492_000_000, 496_000_000]
     assert (read.camera_to_worlds == plain.camera_to_worlds).all()
+
+
+def test_refuse_poses_in_utf16(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(f"0.492 {POSE}\n0.496 {POSE}\n", encoding="utf-16")
+    with pytest.raises(DataError, match="it is text in UTF-16, or no text; save it as UTF-8"):
+        read_tum_trajectory(tmp_path / "poses.txt")
