@@ -25,9 +25,9 @@ IMAGE_LIST = "images.txt"
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
-MAX_VIEWS = 20
-"""Images of a split that a published format uses at most. Each is rendered to fit the color correction or to evaluate,
-and cameras take thousands."""
+MAX_VIEWS = 30
+"""Images of a split that a published format uses at most: as many as the paper evaluates TUM-VIE on. Each is rendered
+to fit the color correction or to evaluate, and cameras take thousands."""
 
 # Training cameras only serve the viewer. The viewer and Nerfstudio's start slow down with their number.
 _MAX_SHOWN = 24

@@ -110,7 +110,7 @@ def test_images_are_thinned_within_the_window(tmp_path: Path) -> None:
     lines = [f"{stamp} images/{index:05d}.png\n" for index, stamp in enumerate(stamps)]
     (truth.data / "images.txt").write_text("".join(lines))
     config = config_of("event-recording-data", truth.data)
-    assert [len(parse(config, split).image_filenames) for split in ("val", "test")] == [20, 20]
+    assert [len(parse(config, split).image_filenames) for split in ("val", "test")] == [30, 30]
     # A tenth of the time, and all of its images.
     window = {"start_time_ns": start + length // 2, "end_time_ns": start + length * 6 // 10}
     windowed = config_of("event-recording-data", truth.data, **window)
