@@ -178,6 +178,11 @@ def _read_colmap(
         times = [time for time, file in timed if file.as_posix().endswith(f"/{name}")]
         if len(times) != 1:
             raise DataError(images, f"it lists {name} {len(times)} times", "list every image of the COLMAP model once")
+        if times[0] in known:
+            seconds = times[0] * 1e-9
+            raise DataError(
+                images, f"several images are at {seconds:.9f} s", "give each image its own time, with all digits"
+            )
         known[times[0]] = pose
     order = sorted(known)
     if len(order) < len(timed):

@@ -73,7 +73,8 @@ class EventStream:
                 raise DataError(
                     self.source,
                     f"event {index} has {name} = {column[index]} on a sensor of {size} {limit}",
-                    "check the sensor size and the order of the columns",
+                    "check the sensor size and the order of the columns; a few such events can be left out "
+                    "(--drop-malformed)",
                 )
         if (self.t[1:] < self.t[:-1]).any():
             index = int(np.argmax(self.t[1:] < self.t[:-1])) + 1

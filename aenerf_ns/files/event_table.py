@@ -198,7 +198,8 @@ def events_from_columns(
         good = (values >= 0) & (values < size)
         if values.dtype.kind == "f":
             good &= values == np.floor(values)
-        remedy = f"it must be a whole number below {size}: check the sensor size and the order of the columns"
+        remedy = f"it must be a whole number below {size}: check the sensor size and the order of the columns; a few "
+        remedy += "such events can be left out (--drop-malformed)"
         require(name, good, remedy)
 
     times, polarities = columns["t"], columns["p"]

@@ -17,6 +17,7 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
 
+_MOUNT = "T_frame_event"
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
@@ -124,6 +125,10 @@ def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
     """
     values = read_json(path, dict)
     camera = values.get("event_camera")
+    stated = [name for part in (values, camera) if isinstance(part, dict) for name in part if name.startswith("T_")]
+    if stated and not (isinstance(camera, dict) and _MOUNT in camera):
+        remedy = f"state {_MOUNT} in event_camera, which takes points from its coordinates to the frame camera's"
+        raise DataError(path, f"it states {stated[0]}, which is not read", remedy)
     if isinstance(camera, dict) and camera.keys().isdisjoint(("fl_x", "fl_y", "cx", "cy")):
         size = convert(path, camera, _Size, name="event_camera")
         with value_errors_as_data_error(path):

@@ -160,9 +160,24 @@ def test_refuse_a_mount_that_the_calibration_lacks(tmp_path: Path) -> None:
     path.write_text(json.dumps(calibration))
     with pytest.raises(DataError, match="T_frame_event is missing; state how the one camera is mounted on the other"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data))
+    # A mount of another name is not taken for none, also where both lenses are one.
+    for camera in (calibration, {"event_camera": dict(calibration["event_camera"])}):
+        path.write_text(json.dumps({**camera, "T_event_frame": np.eye(4).tolist()}))
+        with pytest.raises(DataError, match="it states T_event_frame, which is not read; state T_frame_event"):
+            recording_of(OwnRecordingDataParserConfig(data=truth.data))
     calibration["event_camera"]["T_frame_event"] = np.eye(4).tolist()
     path.write_text(json.dumps(calibration))
     recording_of(OwnRecordingDataParserConfig(data=truth.data))
+
+
+def test_refuse_images_of_a_colmap_model_at_one_time(tmp_path: Path) -> None:
+    truth = write_own(tmp_path / "made")
+    (truth.data / "trajectory.txt").unlink()
+    write_colmap(truth.data / "colmap", truth.poses[[0, 5, 10]], [f"{index:05d}.png" for index in range(3)])
+    path = truth.data / "images.txt"
+    path.write_text("".join(f"7.5 {line.split()[1]}\n" for line in path.read_text().splitlines()))
+    with pytest.raises(DataError, match=r"images.txt: several images are at 7\.500000000 s; give each image its own"):
+        recording_of(OwnRecordingDataParserConfig(data=truth.data))
 
 
 def test_refuse_a_colmap_model_of_several_cameras(tmp_path: Path) -> None:
