@@ -43,7 +43,7 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     rows: list[list[str]] = []
     with bounded(path, "table of numbers"), path.open(encoding="utf-8-sig", errors="replace") as file:
         require_at_most(path, MAX_TABLE_BYTES)
-        require_utf8(path, file.buffer.read(64))
+        require_utf8(path, bytes(file.buffer.read(64)))
         file.seek(0)
         for number, line in enumerate(file, start=1):
             line = line.split("#", 1)[0]
