@@ -10,6 +10,8 @@ from aenerf_ns.errors import DataError
 
 # SSIM's window of 11 pixels is mirrored at the edges.
 _MIN_SIDE = 6
+# PSNR, in dB, of pictures that are equal to the last bit. With infinity, the mean over views would be no number.
+_MAX_PSNR = 100.0
 
 
 class ImageMetrics:
@@ -48,7 +50,7 @@ class ImageMetrics:
 
         predicted, reference = (image.moveaxis(-1, 0)[None].float() for image in (predicted, reference))
         metrics = {
-            "psnr": float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)),
+            "psnr": min(float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)), _MAX_PSNR),
             "ssim": float(torch.as_tensor(structural_similarity_index_measure(predicted, reference, data_range=1.0))),
         }
         if self._with_lpips and self.lpips_absent is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.field import to_unit_cube
+from aenerf_ns.method.image_metrics import ImageMetrics
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.supervision.event_pairs import PairLossCoefficients
 
@@ -283,3 +285,11 @@ def test_a_picture_does_not_move_the_steps_that_train_the_proposal_networks() ->
     assert sampler._steps_since_update == 100
     model.train()(make_rays())
     assert sampler._steps_since_update == 0
+
+
+def test_psnr_of_equal_pictures_is_finite() -> None:
+    metrics, picture = ImageMetrics(with_lpips=False), torch.full((8, 8, 3), 0.5)
+    assert metrics(picture, picture)["psnr"] == 100
+    assert metrics(picture + 0.1, picture)["psnr"] == pytest.approx(20, abs=1e-3)
+    # A rendering that is not finite is no good one.
+    assert math.isnan(metrics(picture * torch.nan, picture)["psnr"])
