@@ -103,8 +103,9 @@ def _true_distance(run: TrainedRun, index: int) -> Tensor:
     """Return true distances (H, W, 1) along the rays of a view, 0 where the simulator wrote no depth."""
     assert run.views is not None
     along_ray = run.views.cameras.generate_rays(index).metadata["directions_norm"].to(run.device)
-    file = run.data / view_files(run)[index].replace("images/", "depth/", 1)
-    if not file.is_file():
+    name = view_files(run)[index]
+    file = run.data / name.replace("images/", "depth/", 1)
+    if not name.startswith("images/") or not file.is_file():
         return torch.zeros_like(along_ray)
     return torch.from_numpy(np.asarray(Image.open(file)) / np.float32(1000)).to(run.device)[..., None] * along_ray
 
@@ -122,15 +123,17 @@ def draw_samples(run: TrainedRun, index: int, file: Path) -> None:
     model, units, sampler = run.model, _units(run), run.model.proposal_sampler
     camera = run.views.cameras[index : index + 1].to(run.device)
     moved = replace(camera, camera_to_worlds=model.camera_optimizer.apply_to_camera(camera))
-    pixels = torch.tensor([[int(y * camera.height), int(x * camera.width)] for x, y in _RAYS.values()])
-    rays = moved.generate_rays(torch.zeros(len(pixels), 1, dtype=torch.long), coords=(pixels + 0.5).to(run.device))
+    pixels = torch.tensor(
+        [[int(y * camera.height), int(x * camera.width)] for x, y in _RAYS.values()], device=run.device
+    )
+    rays = moved.generate_rays(torch.zeros_like(pixels[:, :1]), coords=pixels + 0.5)
     # Rendering leaves the field where the poses have moved it.
     surfaces = torch.cat([model.render_rays(rays, "depth")[0] * units, _true_distance(run, index)[tuple(pixels.T)]], 1)
     rays = model.collider(rays)
     samples, _, rounds = sampler(rays, density_fns=model.density_fns)
     fine = sampler.initial_sampler(rays, num_samples=4096)
-    weights = fine.get_weights(model.field.get_density(fine)[0])[..., 0]
-    density = weights / (fine.frustums.ends - fine.frustums.starts)[..., 0]
+    weights = fine.get_weights(model.field.get_density(fine)[0])[..., 0].cpu()
+    density = weights / (fine.frustums.ends - fine.frustums.starts)[..., 0].cpu()
     density /= density.amax(1, keepdim=True).clamp_min(1e-9)
     rows: dict[str, Any] = {
         "even": _middles(sampler.initial_sampler(rays, num_samples=samples.shape[-1])),
@@ -145,7 +148,7 @@ def draw_samples(run: TrainedRun, index: int, file: Path) -> None:
     view.set(xticks=[], yticks=[], title="the rays in the rendered view")
     panels[0].set_title("samples, and how many of them are within 5 % of the surface's distance")
     for ray, (color, axes) in enumerate(zip(_RAYS, panels, strict=True)):
-        view.plot(*pixels[ray].flip(0), "o", color=color, markeredgecolor="white", markersize=9)
+        view.plot(*pixels[ray].flip(0).tolist(), "o", color=color, markeredgecolor="white", markersize=9)
         lines = [float(line) for line in surfaces[ray] if line > 0]
         distances = {name: row[ray] * units for name, row in rows.items()}
         near = [int(((of - lines[-1]).abs() < 0.05 * lines[-1]).sum()) for of in distances.values()]
@@ -171,7 +174,7 @@ def draw_samples(run: TrainedRun, index: int, file: Path) -> None:
 
 def _middles(samples: RaySamples) -> Tensor:
     """Return the distances (rays, samples) of the middles of samples, in scene units."""
-    return ((samples.frustums.starts + samples.frustums.ends) / 2)[..., 0]
+    return ((samples.frustums.starts + samples.frustums.ends) / 2)[..., 0].cpu()
 
 
 def march(run: TrainedRun, rays: RayBundle) -> list[Tensor]:
@@ -199,7 +202,8 @@ def march(run: TrainedRun, rays: RayBundle) -> list[Tensor]:
     occupied = occupied.unflatten(0, samples.shape)
     weights = samples.get_weights(field.get_density(samples)[0] * occupied[..., None])[..., 0]
     arriving = 1 - weights.cumsum(1) + weights
-    return [row[used] for row, used in zip(_middles(samples), occupied & (arriving > 1e-4), strict=True)]
+    used = (occupied & (arriving > 1e-4)).cpu()
+    return [row[mask] for row, mask in zip(_middles(samples), used, strict=True)]
 
 
 if __name__ == "__main__":
