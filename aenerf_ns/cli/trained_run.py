@@ -88,7 +88,7 @@ def _at_its_place(config: TrainerConfig, path: Path, data: Path | None) -> Train
     config.__dict__["opened_folder"] = path.absolute().parent
     folder = config.get_checkpoint_dir()
     if not folder.is_dir():
-        raise DataError(folder, "there is no such folder", "copy the run's checkpoints beside its config.yml")
+        raise DataError(folder, "there is no such folder", "copy it from the run, beside its config.yml")
     dataparser = getattr(config.pipeline.datamanager, "dataparser", None)
     if dataparser is None:
         return config

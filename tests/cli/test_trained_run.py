@@ -168,7 +168,7 @@ def test_values_of_a_wrong_kind_are_one_line(tmp_path: Path) -> None:
             open_run(run)
         assert "\n" not in str(refused.value)
     shutil.rmtree(checkpoint.parent)
-    with pytest.raises(DataError, match="nerfstudio_models: there is no such folder; copy the run's checkpoints"):
+    with pytest.raises(DataError, match="nerfstudio_models: there is no such folder; copy it from the run"):
         open_run(run)
 
 

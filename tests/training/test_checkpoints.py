@@ -146,6 +146,18 @@ def test_a_checkpoint_that_is_not_there_is_one_line(run: Path, tmp_path: Path) -
         checkpoint_to_load(folder)
 
 
+def test_what_lies_around_a_checkpoint_leads_to_it(run: Path, tmp_path: Path) -> None:
+    folder = run / "nerfstudio_models"
+    (run / "config.yml").touch()
+    assert checkpoint_to_load(run / "config.yml") == folder / "step-000000003.ckpt"
+    assert checkpoint_to_load(folder / "step-000000002.ckpt") == folder / "step-000000002.ckpt"
+    method = tmp_path / "experiment" / "aenerf"
+    shutil.copytree(run, method / "now")
+    for above in (method, method.parent):
+        with pytest.raises(DataError, match=f"{above}: it holds no checkpoint; give the run: {method}/now/nerf"):
+            checkpoint_to_load(above)
+
+
 def test_a_run_is_opened_with_its_newest_whole_checkpoint(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # What ns-eval, ns-render, ns-export and ns-viewer call.
     assert eval_setup(run / "config.yml")[3] == 3
