@@ -9,8 +9,6 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-import tyro
-
 from aenerf_ns.errors import DataError
 
 COMMANDS = {
@@ -44,20 +42,33 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     words = _with_positional_first(sys.argv[1:])
     names = words[:1] if words and words[0] in COMMANDS else COMMANDS
-    command = tyro.extras.subcommand_cli_from_dict(
-        {name: load_command(name) for name in names},
-        prog="aenerf",
-        description="AE-NeRF tools; train with ns-train aenerf.",
-        args=words,
-    )
+    command = None
     try:
+        # Imported here, so that Ctrl-C while it is imported is one line, too.
+        import tyro
+
+        command = tyro.extras.subcommand_cli_from_dict(
+            {name: load_command(name) for name in names},
+            prog="aenerf",
+            description="AE-NeRF tools; train with ns-train aenerf.",
+            args=words,
+        )
         command.main()
-    except KeyboardInterrupt:
-        print("Stopped.", file=sys.stderr)
-        sys.exit(128 + signal.SIGINT)
     except DataError as error:
         print(f"Error: {error}", file=sys.stderr)
         sys.exit(getattr(command, "error_status", 1))
+    except BaseException as error:
+        if not _is_interrupt(error):
+            raise
+        print("Stopped.", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C caused an error. Libraries that are being imported make other errors of it."""
+    return error is not None and (
+        isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__cause__ or error.__context__)
+    )
 
 
 def load_command(name: str) -> type[Any]:

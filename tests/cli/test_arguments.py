@@ -6,12 +6,14 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from aenerf_ns.cli import main as main_module
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.dataset import DatasetCommand, training_command
 from aenerf_ns.cli.main import COMMANDS, load_command, main
@@ -243,11 +245,23 @@ if __name__ == "__main__":
     answer_all()
 
 
-def test_an_interrupt_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(self: Check) -> None:
-        raise KeyboardInterrupt
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
 
-    monkeypatch.setattr(Check, "main", interrupted)
+
+def interrupted_in_a_library(*_: object) -> None:
+    try:
+        interrupted()
+    except KeyboardInterrupt as error:
+        raise ImportError("the library cannot be imported") from error
+
+
+@pytest.mark.parametrize("place", [(Check, "main"), (main_module, "load_command")], ids=["command", "import"])
+@pytest.mark.parametrize("interrupt", [interrupted, interrupted_in_a_library])
+def test_an_interrupt_is_one_line(
+    interrupt: Callable, place: tuple[object, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(*place, interrupt)
     monkeypatch.setattr("sys.argv", ["aenerf", "check", "somewhere"])
     with pytest.raises(SystemExit) as stopped:
         main()
