@@ -27,6 +27,7 @@ from aenerf_ns.recording.recording import Recording
 _RATE_PARTS = 60
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _MAX_GAPS_SHOWN = 5
+_MILLISECOND = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -205,6 +206,12 @@ def _check_events(result: CheckResult, noise: NoiseRate) -> None:
         problems.append(
             f"{repeated:.1%} of the events have the pixel and time of another: check that no events were written "
             "twice, and that their times kept all their digits"
+        )
+    pairs = statistics.pair_times - statistics.start
+    if len(pairs) >= _LIMITS.min_events and (pairs % _MILLISECOND == 0).all():
+        problems.append(
+            "all times of events are whole milliseconds: the camera's have microseconds, which tell the order of the "
+            "events; write them with all their digits"
         )
     hot = find_hot_pixels(statistics.counts)
     figures.append(hot_pixel_summary(hot, statistics.counts))
@@ -458,7 +465,7 @@ def _check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording
         inside = ((point >= box[0].numpy()) & (point <= box[1].numpy())).all(1)
         share = weight[inside].sum() / weight.sum()
         result.figures.append(f"Within the scene box: {share:.1%} of it")
-        if share < _LIMITS.min_in_box_share:
+        if share < _LIMITS.min_in_box_share and len(warped.given) >= _LIMITS.min_slices:
             result.problems.append(
                 f"the scene box holds only {share:.1%} of what is seen: state a larger scene_box, or none"
             )

@@ -363,10 +363,11 @@ def test_command_names_mistakes_and_remedies(shorter: Path) -> None:
     order = np.argsort(t, kind="stable")
     x, y = np.append(events.x, np.full(6000, 11, np.uint16)), np.append(events.y, np.full(6000, 7, np.uint16))
     p = np.append(events.p, np.ones(6000, np.int8))
-    rewrite(shorter, EventStream(x[order], y[order], t[order], p[order], 64, 48))
+    whole_milliseconds = t[order] // 1_000_000 * 1_000_000
+    rewrite(shorter, EventStream(x[order], y[order], whole_milliseconds, p[order], 64, 48))
     status, output = run(shorter)
     assert status == 1
-    assert "2 problems" in output
+    assert "all times of events are whole milliseconds" in output
     assert "as if the poses are world-to-camera" in output
     assert "invert each" in output
     assert "hot pixels make" in output
@@ -500,8 +501,11 @@ def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(room, tmp_path / "room")
     rewrite(folder, all_events(open_native(folder))[:3500])
     change_poses(folder, lambda poses: poses @ axes(1, -1, -1))
+    set_in("transforms.json", "scene_box", value=[[-0.5] * 3, [0.5] * 3])(folder)
     _, output = run(folder)
     assert "as if" not in output.split("problem")[-1]
+    assert "the scene box holds only" not in output
+    assert "Within the scene box: " in output
     assert "Because of too few events, the contrast does not tell" in output
 
 
