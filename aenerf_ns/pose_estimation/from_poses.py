@@ -21,13 +21,15 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, move_poses, tracks_of
 from aenerf_ns.pose_estimation.event_images import MIN_IMAGES, match_event_images
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
-from aenerf_ns.pose_estimation.refinement import PoseRefinement
+from aenerf_ns.pose_estimation.refinement import PoseRefinement, SharedError
 from aenerf_ns.recording.recording import Recording
 
 # Pixels and degrees that an observation may be off, round by round.
 _ROUNDS = ((12.0, 8.0), (8.0, 5.0), (5.0, 3.0), *[(4.0, 2.0)] * 4)
 _MIN_TRACKS = 50
 _MAX_IMAGES = 1000
+# From this share of corrections of a visible size on, the clock and the mount are named.
+_SHARED, _SHARED_DEGREES = 0.5, 0.2
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class RefinedPoses:
         times: (N,) times of the images in nanoseconds.
         num_tracks: scene points that images see.
         twists: (N, 6) corrections at the images: translations in the units of the poses, rotation vectors in radians.
+        shared_error: what the clock and the mount explain of the corrections.
         is_weak: (N,) whether the tracks know no better than the given pose, which nearly stays.
         seconds: how long it took.
         draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
@@ -49,6 +52,7 @@ class RefinedPoses:
     times: NDArray[np.int64]
     num_tracks: int
     twists: Array
+    shared_error: SharedError
     is_weak: NDArray[np.bool_]
     seconds: float
     draw: Callable[[Mapping[str, Array]], Image.Image]
@@ -65,6 +69,7 @@ class RefinedPoses:
             "tracks": self.num_tracks,
             "correction_degrees": degrees,
             "correction_translation": translation,
+            "shared_error": self.shared_error.report(),
             "weak_stretches_ns": self.weak_stretches(),
             "seconds": self.seconds,
             "summary": self.summary(),
@@ -77,6 +82,8 @@ class RefinedPoses:
             f"Poses refined: {self.num_tracks:,} tracks in {len(self.times)} images of the events move them by "
             f"{degrees:.2g} degrees and {translation:.2g} of their units (root mean square)"
         )
+        if self.shared_error.share > _SHARED and degrees > _SHARED_DEGREES:
+            line += f"; {self.shared_error.summary()}"
         if self.is_weak.any():
             share = f"{self.is_weak.mean():.0%}"
             line += f"; for {share} of the images the tracks know no better than the given poses, which nearly stay"
@@ -155,6 +162,7 @@ def refine_poses(
         times=times,
         num_tracks=model.num_points3D(),
         twists=refinement.twists,
+        shared_error=refinement.shared_error(),
         is_weak=refinement.is_weak(),
         seconds=time.perf_counter() - begin,
         draw=partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images]),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.linalg import lu_factor, lu_solve
+from scipy.spatial.transform import Rotation
 
 from aenerf_ns.pose_estimation.bundle_adjustment import Array, PoseInformation, TrackAdjustment, Tracks, move_poses
 
@@ -17,6 +21,11 @@ _MIN_VARIANCE = 0.5
 _NUM_TIMES = 6
 # Degrees: where the search for the size of the processes begins.
 _FIRST_SIZE = 0.3
+# Degrees, of a late clock. Around an object at constant speed, that is a world that is turned: tracks say nothing of
+# it, and it keeps this size.
+_FIRST_CLOCK_SIZE = 0.03
+# The variances of the shared components, six of the mount and one of the clock.
+_SHARED = [-2] * 6 + [-1]
 # Degrees. A process of size zero could not grow again.
 _SIZE_LIMITS = (0.003, 10.0)
 _VARIANCE_UPDATES = 6
@@ -26,14 +35,47 @@ _NUM_DRAWS = 8
 _STEPS_PER_ROUND = 3
 
 
+@dataclass(frozen=True)
+class SharedError:
+    """The error that all given poses share: that of the clock, and that of the camera's mount.
+
+    Attributes:
+        clock_offset: seconds by which the clock of the poses is ahead of that of the events.
+        mount: (6,) twist from the given camera to the true one, in the given camera's frame.
+        share: of the variance of the corrections that it makes.
+    """
+
+    clock_offset: float
+    mount: Array
+    share: float
+
+    def report(self) -> dict[str, float]:
+        """Return the figures as plain values for JSON."""
+        return {
+            "clock_offset_seconds": self.clock_offset,
+            "mount_degrees": float(np.rad2deg(np.linalg.norm(self.mount[3:]))),
+            "mount_translation": float(np.linalg.norm(self.mount[:3])),
+            "share": self.share,
+        }
+
+    def summary(self) -> str:
+        """Return it in words."""
+        found, side = self.report(), "ahead of" if self.clock_offset > 0 else "behind"
+        return (
+            f"{self.share:.0%} of it is as if their clock were {abs(self.clock_offset) * 1e3:.1f} ms {side} that of "
+            f"the events, and the camera turned by {found['mount_degrees']:.2f} degrees and moved by "
+            f"{found['mount_translation']:.2g} in its mount"
+        )
+
+
 class PoseRefinement:
     """Find the twists of poses that explain the tracks, with a prior whose size is estimated from the same tracks.
 
-    The errors of the given poses are Gaussian processes with the correlations exp(−(Δt / τ)² / 2) of several times τ.
-    Their variances maximize the evidence (variance components, by MacKay's updates). A translation is as probable as
-    the rotation that moves the picture as much, because tracks can hardly tell them apart. What the tracks say is
-    weighed by how much groups of neighboring tracks disagree. So where the tracks know less than the given poses, the
-    poses stay as given.
+    The errors of the given poses are Gaussian processes with the correlations exp(−(Δt / τ)² / 2) of several times τ,
+    and those of a wrong mount of the camera and of a clock that is off. The variances maximize the evidence (variance
+    components, by MacKay's updates). A translation is as probable as the rotation that moves the picture as much,
+    because tracks can hardly tell them apart. What the tracks say is weighed by how much groups of neighboring tracks
+    disagree. So where the tracks know less than the given poses, the poses stay as given.
 
     Args:
         seconds: (N,) times of the images, increasing.
@@ -52,7 +94,12 @@ class PoseRefinement:
         times = np.geomspace(0.5 * float(np.median(np.diff(seconds))), seconds[-1] - seconds[0], _NUM_TIMES)
         self._correlations = np.exp(-0.5 * np.square(gaps / times[:, None, None]))
         self._roots = np.linalg.cholesky(self._correlations + 1e-6 * np.eye(len(gaps)))
-        self._variances = np.full(_NUM_TIMES, np.square(np.deg2rad(_FIRST_SIZE)))
+        # (6 N, 7) twists that the clock and the mount make, of about a radian each.
+        shared = _shared_moves(seconds, given)
+        self._shared_units = 1 / np.sqrt(np.square(shared / self._units[:, None]).sum(1).mean(0))
+        self._shared = (shared * self._shared_units).reshape(-1, 7)
+        self._shared_found = np.zeros(7)
+        self._variances = np.square(np.deg2rad([*[_FIRST_SIZE] * (_NUM_TIMES + 1), _FIRST_CLOCK_SIZE]))
         self._weight = np.zeros((self.twists.size,) * 2)
 
     @property
@@ -69,6 +116,13 @@ class PoseRefinement:
             adjustment.move_points((twists - self.twists).ravel())
             self.twists = twists
             adjustment.adjust_points(self.poses, 2)
+
+    def shared_error(self) -> SharedError:
+        """Return what the mount and the clock have of the twists."""
+        *mount, clock_offset = self._shared_units * self._shared_found
+        others = self.twists - (self._shared @ self._shared_found).reshape(self.twists.shape)
+        left, total = (np.square(twists / self._units).sum() for twists in (others, self.twists))
+        return SharedError(float(clock_offset), np.array(mount), float(1 - left / max(total, 1e-30)))
 
     def is_weak(self) -> NDArray[np.bool_]:
         """Return for each of the N images whether the tracks leave its orientation about as uncertain as it was.
@@ -89,16 +143,21 @@ class PoseRefinement:
         normal = np.random.default_rng(self._seed).normal(size=(_NUM_TIMES, len(self.twists), 6 * _NUM_DRAWS))
         draws = (self._roots @ normal).reshape(*normal.shape[:2], 6, _NUM_DRAWS) * self._units[:, None]
         draws = draws.transpose(1, 2, 0, 3).reshape(self.twists.size, -1)
-        weighted_draws = self._weight @ draws
+        weighted_draws, weighted_shared = self._weight @ draws, self._weight @ self._shared
         for _ in range(_VARIANCE_UPDATES):
             factors = self._factors()
             force = lu_solve(factors, pull).reshape(self.twists.shape)
             expected = (draws * lu_solve(factors, weighted_draws)).sum(0).reshape(_NUM_TIMES, -1).mean(1)
             found = np.square(self._roots.transpose(0, 2, 1) @ (force * self._units)).sum((1, 2))
+            expected_shared = (self._shared * lu_solve(factors, weighted_shared)).sum(0)
+            found_shared = np.square(self._shared.T @ force.ravel())
+            expected = np.append(expected, [expected_shared[:6].sum(), expected_shared[6]])
+            found = np.append(found, [found_shared[:6].sum(), found_shared[6]])
             # The ones keep the size of a process if the tracks say nothing of it.
             growth = (self._variances * found + 1) / (self._variances * expected + 1)
             self._variances = np.clip(self._variances * np.clip(growth, 0.1, 10), *np.square(np.deg2rad(_SIZE_LIMITS)))
         force = lu_solve(self._factors(), pull)
+        self._shared_found = self._variances[_SHARED] * (self._shared.T @ force)
         return self._times_prior(force[:, None]).reshape(self.twists.shape)
 
     def _factors(self) -> tuple[Array, Array]:
@@ -108,11 +167,12 @@ class PoseRefinement:
     def _times_prior(self, values: Array) -> Array:
         """Multiply the (6 N, 6 N) covariance of the prior with values (6 N, K)."""
         scaled = np.square(self._units)[:, None] * values.reshape(*self.twists.shape, -1)
-        return np.tensordot(self._covariance(), scaled, 1).reshape(values.shape)
+        shared = self._variances[_SHARED, None] * (self._shared.T @ values)
+        return np.tensordot(self._covariance(), scaled, 1).reshape(values.shape) + self._shared @ shared
 
     def _covariance(self) -> Array:
-        """Return the (N, N) covariance of each component of the given poses' errors, in square radians."""
-        return np.tensordot(self._variances, self._correlations, 1)
+        """Return the (N, N) covariance of each component of the errors that change in time, in square radians."""
+        return np.tensordot(self._variances[:_NUM_TIMES], self._correlations, 1)
 
     def _noise(self, information: PoseInformation) -> float:
         """Return the variance of a track's error in square pixels, from how groups of tracks pull at the poses."""
@@ -121,3 +181,12 @@ class PoseRefinement:
         blocks = np.einsum("ncmc,c->nm", information.hessian.reshape(*self.twists.shape * 2), np.square(self._units))
         pulled = np.einsum("gnc,nm,gmc->", pulls, covariance, pulls, optimize=True)
         return _COHERENCE * max(_MIN_VARIANCE, float(pulled / max(np.sum(covariance * blocks), 1e-30)))
+
+
+def _shared_moves(seconds: Array, given: Array) -> Array:
+    """Return the (N, 6, 7) twists of poses by each component of their mount, and by a second of their clock."""
+    rotations = given[:-1, :, :3].transpose(0, 2, 1)
+    turns = Rotation.from_matrix(rotations @ given[1:, :, :3]).as_rotvec()
+    steps = np.concatenate([(rotations @ np.diff(given[:, :, 3:], axis=0))[..., 0], turns], 1)
+    path = CubicSpline(seconds, np.concatenate([np.zeros((1, 6)), steps.cumsum(0)]))
+    return np.concatenate([np.tile(np.eye(6), (len(given), 1, 1)), path(seconds, 1)[..., None]], -1)

@@ -179,24 +179,32 @@ def test_from_a_bare_recording_to_a_video(found: tuple[Path, str], tmp_path: Pat
     assert height > 120
 
 
-@pytest.mark.parametrize(("degrees", "images"), [(0.0, "filter"), (2.0, "filter"), (2.0, "network")])
+@pytest.mark.parametrize(
+    ("degrees", "offset", "images"), [(0.0, 0, "filter"), (0.0, 15_000_000, "filter"), (2.0, 0, "network")]
+)
 def test_refine_given_poses(
-    dataset: tuple[Path, str], tmp_path: Path, degrees: float, images: str, request: pytest.FixtureRequest
+    dataset: tuple[Path, str], tmp_path: Path, degrees: float, offset: int, images: str, request: pytest.FixtureRequest
 ) -> None:
     weights = request.getfixturevalue("firenet_weights") if images == "network" else None
     given = tmp_path / "given"
     shutil.copytree(dataset[0], given)
     truth = read_tum_trajectory(given / "trajectory_ground_truth.txt")
-    write_tum_trajectory(given / "trajectory_estimated.txt", perturb(truth, degrees, degrees * 0.03, 0.15, seed=2))
+    noisy = perturb(truth, degrees, degrees * 0.03, 0.15, seed=2)
+    late = Trajectory(noisy.times + offset, noisy.camera_to_worlds)
+    write_tum_trajectory(given / "trajectory_estimated.txt", late)
     with CONSOLE.capture() as output:
         Convert(given, output=tmp_path / "scene", poses="refined", weights=weights).main()
     report = json.loads((tmp_path / "scene" / "poses_report.json").read_text())
     assert report["summary"].split(";")[0] in " ".join(output.get().split())
     before, after = (report[name]["rotation_error_degrees"] for name in ("errors_given", "errors"))
     refined = read_tum_trajectory(tmp_path / "scene" / "trajectory_estimated.txt")
-    found = pose_errors(refined.camera_to_worlds, truth.interpolate(refined.times))
+    times = refined.knots_covered_by(truth)
+    found = pose_errors(refined.interpolate(times), truth.interpolate(times))
     assert found["rotation_error_degrees"] == pytest.approx(after, abs=1e-4)
-    assert (report["correction_degrees"] > 0.5) == (degrees > 0)
+    assert (report["correction_degrees"] > 0.5) == (degrees + offset > 0)
+    shared = report["shared_error"]
+    assert shared["clock_offset_seconds"] * 1e9 == pytest.approx(offset, abs=3_000_000)
+    assert ("ms ahead of that of the events" in report["summary"]) == (offset > 0)
     assert after < 0.1 + 0.6 * before
     with Image.open(tmp_path / "scene" / "poses_report.png") as picture:
         assert picture.size == (1456, 484)

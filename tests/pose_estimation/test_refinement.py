@@ -113,6 +113,29 @@ def test_wrong_poses_follow_the_tracks(truth: np.ndarray, degrees: float, left: 
     assert refinement.is_weak().mean() < 0.3
 
 
+def test_a_late_clock_and_a_wrong_mount_are_found_and_named() -> None:
+    # The camera looks around while it moves: around an object, a late clock is a world that is turned.
+    eyes = [(2.5 * np.sin(turn), -2.5 * np.cos(turn), 0.3 * np.sin(5 * turn)) for turn in SECONDS]
+    truth = np.stack(
+        [
+            look_at(eye, (np.sin(4 * t), np.cos(3 * t), 0.5 * np.sin(5 * t)))[:3]
+            for eye, t in zip(eyes, SECONDS, strict=True)
+        ]
+    )
+    path = Trajectory((SECONDS * 1e9).astype(np.int64), torch.from_numpy(truth))
+    late = path.interpolate(np.rint((SECONDS - 0.02).clip(0) * 1e9).astype(np.int64)).numpy()
+    given = move_poses(late, np.tile([0, 0, 0, -0.02, -0.03, 0], (COUNT, 1)))
+    refinement = refine(truth, given, pixels=0.3)
+    assert errors(refinement.poses, truth)[0] < 0.2 * errors(given, truth)[0]
+    found = refinement.shared_error()
+    assert found.clock_offset == pytest.approx(0.02, rel=0.1)
+    assert found.mount[3:] == pytest.approx([0.02, 0.03, 0.0], abs=0.012)
+    assert found.share > 0.9
+    assert "20.0 ms ahead" in found.summary()
+    others = refine(truth, noisy(truth, 1.5, 0.04), pixels=0.3).shared_error()
+    assert others.share < 0.5
+
+
 def test_exact_poses_stay(truth: np.ndarray) -> None:
     refinement = refine(truth, truth, pixels=0.6)
     degrees, distance = errors(refinement.poses, truth)
