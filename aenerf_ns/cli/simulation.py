@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -57,6 +57,8 @@ class SimulationCommand:
     """Error of the estimated positions: root mean square of its length, in scene units (meters)."""
     pose_noise_correlation_time: float = 0.25
     """Correlation time of the pose errors in seconds."""
+    pose_noise_kind: Literal["smooth", "gauss-markov"] = "smooth"
+    """Whether the errors change smoothly, or as a first-order Gauss-Markov process that jumps from pose to pose."""
     sensor: SensorName = "ideal"
     """A sensor of this kind (docs/simulator.md lists its values). The options below change single values of it."""
     positive_contrast_threshold: float | None = None
@@ -109,4 +111,4 @@ class SimulationCommand:
         """Add errors to true poses."""
         from aenerf_ns.camera.noise import perturb
 
-        return perturb(poses, *self.pose_noise, self.pose_noise_correlation_time, self.seed)
+        return perturb(poses, *self.pose_noise, self.pose_noise_correlation_time, self.seed, self.pose_noise_kind)

@@ -12,24 +12,29 @@ from typing import Literal
 from aenerf_ns.errors import DataError
 
 Poses = Literal["noise", "colmap"]
-Scale = Literal["full", "tiny"]
+Scale = Literal["full", "medium", "tiny"]
 Table = Literal["methods", "losses"]
 Method = Literal["aenerf", "robust-enerf", "eventnerf", "evnerf", "paev3d", "e2vid-nerf", "nerfacto"]
 
+_FULL_SIZE = ("--width", "346", "--height", "260", "--validation-views", "100", "--test-views", "100")
 _SIMULATE = {
-    "full": ("--width", "346", "--height", "260", "--validation-views", "100", "--test-views", "100"),
+    "full": _FULL_SIZE,
+    "medium": _FULL_SIZE,
     "tiny": ("--width", "96", "--height", "72", "--validation-views", "20", "--test-views", "20"),
 }
 # The errors that COLMAP leaves at full size: 0.5 degrees and 4 cm at easy speed, 1.1 degrees and 8 cm at hard speed
 # (medians over the sequences of the mean errors, benchmarks/results/estimated_poses_scenes_cpu2.json). They are larger
 # at tiny size, where a pixel covers a larger angle.
+_FULL_SIZE_NOISE = ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03")
 _NOISE = {
-    "full": ("--pose-noise-degrees", "0.7", "--pose-noise-translation", "0.03"),
+    "full": _FULL_SIZE_NOISE,
+    "medium": _FULL_SIZE_NOISE,
     "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
 }
-_STEPS = {"full": 30000, "tiny": 1500}
+# At medium scale, a quarter of an hour on a core.
+_STEPS = {"full": 30000, "medium": 8000, "tiny": 1500}
 # Pairs of a batch in the table of losses. They are as many as the methods' own batches hold, at two rays a pair.
-_PAIRS = {"full": 4096, "tiny": 512}
+_PAIRS = {"full": 4096, "medium": 512, "tiny": 512}
 
 OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
     "with pose correction",
@@ -39,6 +44,11 @@ OURS, WITHOUT_CORRECTION, TRUE_POSES, CEILING = (
 )
 """The rows of AE-NeRF and nerfacto in the table of methods. The last two are bounds, not rivals: the event method with
 true poses, and Nerfstudio's own method on sharp images with true poses."""
+POSES_OF_EVENTS = {
+    "poses refined by the events, pose correction": ("--poses", "refined"),
+    "poses from the events, pose correction": ("--poses", "events"),
+}
+"""Further rows of AE-NeRF at medium scale: options of aenerf convert, which makes the poses that are then corrected."""
 
 PEERS: dict[Method, str] = {
     "e2vid-nerf": "E2VID + NeRF",
@@ -168,7 +178,7 @@ class Plan:
     seeds: tuple[int, ...] = (42,)
     """Seeds of the trainings."""
     steps: int | None = None
-    """Steps of every training. By default 30,000 at full scale and 1500 at tiny scale."""
+    """Steps of every training. By default 30,000 at full scale, 8000 at medium and 1500 at tiny scale."""
     simulate: str = ""
     """More options of aenerf simulate, as in --simulate="--bayer-pattern RGGB"."""
     train: str = ""
@@ -190,9 +200,9 @@ class Plan:
             for scene in self.scenes:
                 for speed in self.speeds if "methods" in self.tables else ():
                     runs += [
-                        Run("methods", row, self._dataset(scene, speed), name, steps, seed, options, images)
+                        Run("methods", row, self._dataset(scene, speed), name, steps, seed, options, images, convert)
                         for method in self.methods
-                        for row, (name, options, images) in self._rows_of(method).items()
+                        for row, (name, options, images, convert) in self._rows_of(method).items()
                     ]
                 if "losses" in self.tables:
                     data, name = self._dataset(scene, "hard"), self._registered("aenerf")
@@ -213,12 +223,12 @@ class Plan:
         return Dataset(scene, speed, self.poses, options)
 
     def _registered(self, method: Method) -> str:
-        return f"{method}-small" if self.scale == "tiny" else method
+        return method if self.scale == "full" else f"{method}-small"
 
-    def _rows_of(self, method: Method) -> dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]]:
-        """Return method, options of ns-train and options of aenerf reconstruct by row."""
+    def _rows_of(self, method: Method) -> dict[str, tuple[str, tuple[str, ...], tuple[str, ...], tuple[str, ...]]]:
+        """Return method and options of ns-train, aenerf reconstruct and aenerf convert by row."""
         if method == "nerfacto":
-            return {CEILING: (method, _SMALL_NERFACTO if self.scale == "tiny" else (), ())}
+            return {CEILING: (method, () if self.scale == "full" else _SMALL_NERFACTO, (), ())}
         train = tuple(shlex.split(self.train))
         off, spline = (*train, *_OFF), (*train, *_SPLINE)
         images: tuple[str, ...] = ()
@@ -232,7 +242,10 @@ class Plan:
                 # The default, stated: without options no images are made.
                 name, images = FILTERED, ("--events-per-pixel", "0.35")
             options = {name: off, name + CORRECTED: spline, name + ON_TRUE_POSES: off}
-        return {row: (self._registered(method), words, images) for row, words in options.items()}
+        rows = {row: (self._registered(method), words, images, ()) for row, words in options.items()}
+        if method == "aenerf" and self.scale == "medium":
+            rows |= {row: (self._registered(method), train, (), words) for row, words in POSES_OF_EVENTS.items()}
+        return rows
 
 
 def scene_name(scene: str) -> str:

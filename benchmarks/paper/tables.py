@@ -16,7 +16,7 @@ _TEST_POSES = (
     "PSNR, SSIM and LPIPS: with test poses as placed / refined photometrically on the test images; - where only the "
     "first was measured."
 )
-_OWN_ROWS = (plan.WITHOUT_CORRECTION, plan.OURS, plan.TRUE_POSES, plan.CEILING)
+_OWN_ROWS = (plan.WITHOUT_CORRECTION, plan.OURS, *plan.POSES_OF_EVENTS, plan.TRUE_POSES, plan.CEILING)
 _AE_NERF = "AE-NeRF"
 _SETTINGS = ("estimated poses", "estimated poses, pose correction", "true poses")
 # Rows of a method in these settings, the method of the paper last.

@@ -36,6 +36,7 @@ from benchmarks.paper.plan import (
     ON_TRUE_POSES,
     OURS,
     PEERS,
+    POSES_OF_EVENTS,
     TRUE_POSES,
     WITHOUT_CORRECTION,
     Plan,
@@ -74,6 +75,17 @@ def test_plan_has_every_run_once() -> None:
     assert len({data.options[data.options.index("--seed") + 1] for data in datasets}) == len(datasets) == 2 * 2
     colmap = ("--poses", "colmap", "--frame-rate", "250")
     assert all(run.dataset.options[-4:] == colmap for run in small_plan(poses="colmap"))
+
+
+def test_medium_scale_has_poses_of_events_too() -> None:
+    runs = small_plan(scale="medium", tables=("methods",), seeds=(1,), scenes=("room",), speeds=("hard",))
+    assert {run.row: run.convert for run in runs if run.convert} == POSES_OF_EVENTS
+    assert {run.method for run in runs} == {"aenerf-small", "nerfacto"}
+    assert {run.dataset for run in runs} == {
+        run.dataset
+        for run in small_plan(scale="full", tables=("methods",), seeds=(1,), scenes=("room",), speeds=("hard",))
+    }
+    assert len({run.name for run in runs}) == 6
 
 
 ALL_METHODS = ("aenerf", *PEERS, "nerfacto")

@@ -283,6 +283,19 @@ def test_pose_noise_is_sized_smooth_and_seeded(random_poses: torch.Tensor) -> No
     assert not torch.equal(noisy.camera_to_worlds, other.camera_to_worlds)
 
 
+def test_gauss_markov_noise_keeps_the_same_share_from_pose_to_pose(random_poses: torch.Tensor) -> None:
+    times = np.arange(0, 7 * 10**9, 4 * 10**6)
+    truth = Trajectory(times, Trajectory(10**9 * np.arange(8), random_poses).interpolate(times))
+    # E-3DGS: 0.95 of the error is kept from one pose to the next.
+    noisy = perturb(truth, 2.0, 0.05, -0.004 / math.log(0.95), seed=3, kind="gauss-markov")
+    error = (homogeneous(truth.camera_to_worlds).inverse() @ homogeneous(noisy.camera_to_worlds))[:, :3, 3]
+    assert error.norm(dim=-1).square().mean().sqrt().item() == pytest.approx(0.05, rel=1e-9)
+    kept = (error[1:] * error[:-1]).sum() / error.square().sum()
+    assert kept.item() == pytest.approx(0.95, abs=0.02)
+    new = error[1:] - kept * error[:-1]
+    assert ((new[1:] * new[:-1]).sum() / new.square().sum()).abs() < 0.05
+
+
 def test_no_pose_noise_changes_nothing(random_poses: torch.Tensor) -> None:
     truth = Trajectory(10**9 * np.arange(8), random_poses)
     assert torch.equal(perturb(truth, 0, 0, 0.25, 0).camera_to_worlds, truth.camera_to_worlds)
