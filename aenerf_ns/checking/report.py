@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -67,6 +68,8 @@ class CheckLimits:
     it."""
     half_share: float = 0.52
     """Nor do events that end within this share, wherever they begin: what is in the middle reaches beyond it."""
+    focal_lengths: tuple[float, float] = (0.15, 30.0)
+    """By the width of the sensor. No lens of an event camera is wider or longer."""
     max_principal_point: float = 0.2
     """Distance of the principal point from the middle, as a share of the sensor."""
     equal_poses: float = 1e-12
@@ -327,6 +330,19 @@ def _check_lens(result: CheckResult, camera: CameraIntrinsics) -> bool:
         result.problems.append(
             f"the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of {width} x {height} pixels, "
             "as of another resolution: check the intrinsics, unless this is a part of a larger sensor"
+        )
+    elif math.dist((camera.cx, camera.cy), (height / 2, width / 2)) < math.dist(
+        (camera.cx, camera.cy), (width / 2, height / 2)
+    ):
+        result.problems.append(
+            f"the principal point ({camera.cx:g}, {camera.cy:g}) seems to have x and y swapped, for {width} x {height} "
+            "pixels: check the intrinsics"
+        )
+    low, high = _LIMITS.focal_lengths
+    if not low * width < camera.fx < high * width:
+        result.problems.append(
+            f"a focal length of {camera.fx:g} pixels is {camera.fx / width:.2g} times the width of the sensor: give it "
+            "in pixels (millimeters by the size of a pixel)"
         )
     return len(result.problems) > num_problems
 
