@@ -142,6 +142,8 @@ def find_problems(events: EventStream, recording: Recording, start: int, end: in
         The problems, and whether there were enough events for the contrast to tell whether the poses are right.
     """
     events = events.between(start, end)
+    if len(events) == 0:
+        return ["it holds no events"], True
     try:
         trajectory = recording.trajectory.crop(start, end)
         file = _EventsInMemory(recording.event_file.path, events)

@@ -66,8 +66,8 @@ class Hypothesis:
     still: bool = False
 
     @property
-    def is_one_of_many(self) -> bool:
-        """Whether other values of the clock's offset or of the focal lengths are tried, too."""
+    def is_of_series(self) -> bool:
+        """Whether it is one of several offsets of the clock, or of several focal lengths, that are tried."""
         return self.clock_offset != 0 or self.focal_factor != 1
 
 

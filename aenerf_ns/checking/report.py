@@ -391,7 +391,7 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) 
         f"not warped: {still.contrast:.3f}; shuffled: {mean:.3f} +/- {deviation:.3f}"
     )
     for c in alternatives:
-        if not c.hypothesis.is_one_of_many or c.is_clearly_better:
+        if not c.hypothesis.is_of_series or c.is_clearly_better:
             figures.append(f"  {c.contrast:.3f} (given {c.given:.3f}) if {c.hypothesis.name}")
     clocks = [c.hypothesis.clock_offset for c in alternatives if c.hypothesis.clock_offset and c.is_clearly_worse]
     if clocks:
@@ -414,7 +414,7 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) 
     ]
     if better:
         best = better[0]
-        same = [c for c in better[1:] if best.is_like(c) and not c.hypothesis.is_one_of_many]
+        same = [c for c in better[1:] if best.is_like(c) and not c.hypothesis.is_of_series]
         others = "".join(f"; or as if {c.hypothesis.name}: {c.hypothesis.remedy}" for c in same)
         problems.append(
             f"the events look as if {best.hypothesis.name} (contrast {best.contrast:.3f} instead of {best.given:.3f}, "
@@ -423,8 +423,8 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) 
         )
         return False
     undecided = [c.hypothesis for c in alternatives if c.is_inconclusive and not c.hypothesis.clock_offset]
-    inconclusive = [hypothesis.name for hypothesis in undecided if not hypothesis.is_one_of_many]
-    factors = sorted(hypothesis.focal_factor for hypothesis in undecided if hypothesis.is_one_of_many)
+    inconclusive = [hypothesis.name for hypothesis in undecided if not hypothesis.is_of_series]
+    factors = sorted(hypothesis.focal_factor for hypothesis in undecided if hypothesis.is_of_series)
     if factors:
         inconclusive.append(f"the focal lengths are {' or '.join(map('{:g}'.format, factors))} times the given ones")
     if inconclusive:

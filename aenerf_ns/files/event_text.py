@@ -129,7 +129,7 @@ class TextEventFile(EventReader):
             stated = f"{int(width)} x {int(height)} pixels"
             raise DataError(
                 self.path,
-                f"its first line says {stated}, the calibration {self.width} x {self.height}",
+                f"its header says {stated}, the calibration {self.width} x {self.height}",
                 "give the calibration of this sensor",
             )
 

@@ -162,8 +162,8 @@ EVT3 = Encoding("EVT 3.0", np.dtype("<u2"), _decode_evt3, _EVT3_HIGH_BITS, 1 << 
 def without_damaged_times(blocks: Iterable[NDArray], encoding: Encoding, left_out: LeftOut) -> Iterator[NDArray]:
     """Blank out upper bits of a time that jump and come back within a few words, and the events that they would date.
 
-    Such words would move all later events by up to a lap of the time. At the end of the words, upper bits that jump are
-    blanked out as well, because none confirm them, and at the beginning those that the next two contradict.
+    Such words would move all later events by up to a lap of the time. The very last upper bits are blanked out as well
+    if they jump, because none confirm them, and the first ones if the next two contradict them.
 
     Args:
         blocks: (N,) words in pieces, which may end anywhere.

@@ -27,7 +27,7 @@ _FORMAT_OF_MAGIC = {
     **dict.fromkeys(BAG_MAGIC, "bag"),
 }
 _FORMAT_OF_SUFFIX = {".npz": "NumPy", ".npy": "NumPy", ".csv": "CSV", ".txt": "text"}
-_COMMENTED_TABLE = re.compile(rb"(% [^\n]*\n)+[\d\s,.;+-]{8}")
+_COMMENTED_TABLE = re.compile(rb"(% [^\n]*\n)+[\w\s,.;+\"-]{8}")
 _WITH_TOPICS = ("AEDAT4", "bag")
 # Formats that may leave the unit of the times open.
 _WITH_TIME_UNIT = ("HDF5", "NumPy", "CSV", "text")

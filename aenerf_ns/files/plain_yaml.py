@@ -58,4 +58,4 @@ def read_plain_yaml(path: Path) -> Any:
     except DataError:
         raise
     except YAML_ERRORS as error:
-        raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "correct it there") from None
+        raise DataError(path, f"not valid YAML ({' '.join(str(error).split())})", "correct that line") from None

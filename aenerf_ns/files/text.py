@@ -28,7 +28,7 @@ POSE_COLUMNS = "t tx ty tz qx qy qz qw"
 def require_utf8(path: Path, beginning: bytes) -> None:
     """Raise a DataError if the first bytes of a file are those of text in UTF-16, as Windows' programs write it."""
     if beginning.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in beginning[:64]:
-        raise DataError(path, "it is text in UTF-16, or no text", "save it as UTF-8")
+        raise DataError(path, "it is text in UTF-16, or no text", "save it as UTF-8, or give a file of text")
 
 
 def read_rows(path: Path, columns: str) -> list[list[str]]:

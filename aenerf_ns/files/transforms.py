@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -125,8 +126,9 @@ def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
     """
     values = read_json(path, dict)
     camera = values.get("event_camera")
-    stated = [name for part in (values, camera) if isinstance(part, dict) for name in part if name.startswith("T_")]
-    if stated and not (isinstance(camera, dict) and _MOUNT in camera):
+    parts = [part for part in (values, camera) if isinstance(part, dict)]
+    stated = [name for part in parts for name in part if re.match("T_.*event", name) and name != _MOUNT]
+    if stated and not (isinstance(camera, dict) and camera.get(_MOUNT) is not None):
         remedy = f"state {_MOUNT} in event_camera, which takes points from its coordinates to the frame camera's"
         raise DataError(path, f"it states {stated[0]}, which is not read", remedy)
     if isinstance(camera, dict) and camera.keys().isdisjoint(("fl_x", "fl_y", "cx", "cy")):

@@ -19,6 +19,8 @@ from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, format_seconds, parse_n
 
 # Trajectories are commonly printed with six or more digits, so quaternions have rounding errors.
 _MAX_NORM_ERROR = 1e-3
+# A line of names, which begins with that of the times.
+_NAMES = re.compile(r"\W*(t|ts|time\w*|stamp)\b")
 # What a line of a pose begins with.
 _POSE = re.compile(r"\s*[-+.\d]")
 
@@ -39,7 +41,7 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         lines = takewhile(lambda line: not _POSE.match(line), iter(lambda: file.readline(MAX_LINE), ""))
-        header = [line.lower() for line in lines]
+        header = [line.lower() for line in lines if _NAMES.match(line.lower())]
     stated = next(filter(None, (re.match(r"\W*\w+ *\[(ns|us|ms|s)\]", line) for line in header)), None)
     times = parse_times(path, [row[0] for row in rows], stated[1] if stated else unit)  # type: ignore[arg-type]
     values = parse_numbers(path, [row[1:] for row in rows])

@@ -29,7 +29,7 @@ _ROUNDS = ((12.0, 8.0), (8.0, 5.0), (5.0, 3.0), *[(4.0, 2.0)] * 4)
 _MIN_TRACKS = 50
 _MAX_IMAGES = 1000
 # From this share of corrections of a visible size on, the clock and the mount are named.
-_SHARED, _SHARED_DEGREES = 0.5, 0.2
+_MIN_SHARE, _MIN_DEGREES = 0.5, 0.2
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class RefinedPoses:
             f"Poses refined: {self.num_tracks:,} tracks in {len(self.times)} images of the events move them by "
             f"{degrees:.2g} degrees and {translation:.2g} of their units (root mean square)"
         )
-        if self.shared_error.share > _SHARED and degrees > _SHARED_DEGREES:
+        if self.shared_error.share > _MIN_SHARE and degrees > _MIN_DEGREES:
             line += f"; {self.shared_error.summary()}"
         if self.is_weak.any():
             share = f"{self.is_weak.mean():.0%}"

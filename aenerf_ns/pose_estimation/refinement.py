@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial.transform import Rotation
 
@@ -24,8 +23,10 @@ _FIRST_SIZE = 0.3
 # Degrees, of a late clock. Around an object at constant speed, that is a world that is turned: tracks say nothing of
 # it, and it keeps this size.
 _FIRST_CLOCK_SIZE = 0.03
-# The variances of the shared components, six of the mount and one of the clock.
-_SHARED = [-2] * 6 + [-1]
+# Which variance each of the shared components has, six of the mount and one of the clock.
+_SHARED_VARIANCES = [-2] * 6 + [-1]
+# Seconds, and degrees: smaller errors of the clock and of the mount are not named.
+_VISIBLE_OFFSET, _VISIBLE_DEGREES = 1e-3, 0.1
 # Degrees. A process of size zero could not grow again.
 _SIZE_LIMITS = (0.003, 10.0)
 _VARIANCE_UPDATES = 6
@@ -60,12 +61,14 @@ class SharedError:
 
     def summary(self) -> str:
         """Return it in words."""
-        found, side = self.report(), "ahead of" if self.clock_offset > 0 else "behind"
-        return (
-            f"{self.share:.0%} of it is as if their clock were {abs(self.clock_offset) * 1e3:.1f} ms {side} that of "
-            f"the events, and the camera turned by {found['mount_degrees']:.2f} degrees and moved by "
-            f"{found['mount_translation']:.2g} in its mount"
-        )
+        found, parts = self.report(), []
+        if abs(self.clock_offset) > _VISIBLE_OFFSET:
+            side = "ahead of" if self.clock_offset > 0 else "behind"
+            parts.append(f"their clock were {abs(self.clock_offset) * 1e3:.1f} ms {side} that of the events")
+        if found["mount_degrees"] > _VISIBLE_DEGREES or not parts:
+            turned, moved = found["mount_degrees"], found["mount_translation"]
+            parts.append(f"the camera were turned by {turned:.2f} degrees and moved by {moved:.2g} in its mount")
+        return f"{self.share:.0%} of it is as if {' and '.join(parts)}"
 
 
 class PoseRefinement:
@@ -96,7 +99,9 @@ class PoseRefinement:
         self._roots = np.linalg.cholesky(self._correlations + 1e-6 * np.eye(len(gaps)))
         # (6 N, 7) twists that the clock and the mount make, of about a radian each.
         shared = _shared_moves(seconds, given)
-        self._shared_units = 1 / np.sqrt(np.square(shared / self._units[:, None]).sum(1).mean(0))
+        sizes = np.sqrt(np.square(shared / self._units[:, None]).sum(1).mean(0))
+        # A camera that does not move has no clock.
+        self._shared_units = 1 / np.maximum(sizes, 1e-6)
         self._shared = (shared * self._shared_units).reshape(-1, 7)
         self._shared_found = np.zeros(7)
         self._variances = np.square(np.deg2rad([*[_FIRST_SIZE] * (_NUM_TIMES + 1), _FIRST_CLOCK_SIZE]))
@@ -122,7 +127,7 @@ class PoseRefinement:
         *mount, clock_offset = self._shared_units * self._shared_found
         others = self.twists - (self._shared @ self._shared_found).reshape(self.twists.shape)
         left, total = (np.square(twists / self._units).sum() for twists in (others, self.twists))
-        return SharedError(float(clock_offset), np.array(mount), float(1 - left / max(total, 1e-30)))
+        return SharedError(float(clock_offset), np.array(mount), max(float(1 - left / max(total, 1e-30)), 0.0))
 
     def is_weak(self) -> NDArray[np.bool_]:
         """Return for each of the N images whether the tracks leave its orientation about as uncertain as it was.
@@ -157,7 +162,7 @@ class PoseRefinement:
             growth = (self._variances * found + 1) / (self._variances * expected + 1)
             self._variances = np.clip(self._variances * np.clip(growth, 0.1, 10), *np.square(np.deg2rad(_SIZE_LIMITS)))
         force = lu_solve(self._factors(), pull)
-        self._shared_found = self._variances[_SHARED] * (self._shared.T @ force)
+        self._shared_found = self._variances[_SHARED_VARIANCES] * (self._shared.T @ force)
         return self._times_prior(force[:, None]).reshape(self.twists.shape)
 
     def _factors(self) -> tuple[Array, Array]:
@@ -167,7 +172,7 @@ class PoseRefinement:
     def _times_prior(self, values: Array) -> Array:
         """Multiply the (6 N, 6 N) covariance of the prior with values (6 N, K)."""
         scaled = np.square(self._units)[:, None] * values.reshape(*self.twists.shape, -1)
-        shared = self._variances[_SHARED, None] * (self._shared.T @ values)
+        shared = self._variances[_SHARED_VARIANCES, None] * (self._shared.T @ values)
         return np.tensordot(self._covariance(), scaled, 1).reshape(values.shape) + self._shared @ shared
 
     def _covariance(self) -> Array:
@@ -187,6 +192,9 @@ def _shared_moves(seconds: Array, given: Array) -> Array:
     """Return the (N, 6, 7) twists of poses by each component of their mount, and by a second of their clock."""
     rotations = given[:-1, :, :3].transpose(0, 2, 1)
     turns = Rotation.from_matrix(rotations @ given[1:, :, :3]).as_rotvec()
-    steps = np.concatenate([(rotations @ np.diff(given[:, :, 3:], axis=0))[..., 0], turns], 1)
-    path = CubicSpline(seconds, np.concatenate([np.zeros((1, 6)), steps.cumsum(0)]))
-    return np.concatenate([np.tile(np.eye(6), (len(given), 1, 1)), path(seconds, 1)[..., None]], -1)
+    chords = (rotations @ np.diff(given[:, :, 3:], axis=0))[..., 0]
+    # The camera turns on the way: seen from its middle, a chord points along the arc.
+    steps = np.concatenate([Rotation.from_rotvec(-turns / 2).apply(chords), turns], 1)
+    path = np.concatenate([np.zeros((1, 6)), steps.cumsum(0)])
+    velocities = np.gradient(path, seconds, axis=0, edge_order=2)
+    return np.concatenate([np.tile(np.eye(6), (len(given), 1, 1)), velocities[..., None]], -1)

@@ -15,20 +15,22 @@ from aenerf_ns.errors import DataError
 _ENTRIES = {"step", "pipeline", "optimizers", "schedulers", "scalers"}
 
 
-def checkpoint_to_load(folder: Path, step: int | None = None) -> Path:
+def checkpoint_to_load(path: Path, step: int | None = None) -> Path:
     """Return the checkpoint of a step, or the newest whole one. Newer ones that are broken are named on the console.
 
     Args:
-        folder: a run, its config.yml, its folder of checkpoints, or one of them.
+        path: a run, its config.yml, its folder of checkpoints, or one of them.
         step: the step in the checkpoint's name, or None.
 
     Raises:
         DataError: there is no such checkpoint, or it is broken.
     """
-    if folder.suffix == ".ckpt" and folder.is_file():
-        require_whole(folder)
-        return folder
-    folder = folder.parent if folder.is_file() else folder
+    if path.suffix == ".ckpt" and path.is_file():
+        if step is not None and path.name != f"step-{step:09d}.ckpt":
+            raise DataError(path, f"it is not the checkpoint of step {step}", "leave --load-step out")
+        require_whole(path)
+        return path
+    folder = path.parent if path.name == "config.yml" and path.is_file() else path
     if not folder.is_dir():
         raise DataError(folder, "there is no such folder", "give the folder of a trained run")
     if not _newest_first(folder) and (folder / "nerfstudio_models").is_dir():
@@ -49,8 +51,8 @@ def checkpoint_to_load(folder: Path, step: int | None = None) -> Path:
         broken.append(f"{path.name} ({fault})")
     problem = f"none of its checkpoints is whole: {'; '.join(broken)}" if broken else "it holds no checkpoint"
     # The folder of an experiment or of a method holds runs.
-    below = next((path for depth in range(1, 5) for path in folder.glob("*/" * depth + "step-*.ckpt")), None)
-    remedy = "give the folder of another run, or train again" if below is None else f"give the run: {below.parent}"
+    below = next((path for depth in range(1, 4) for path in folder.glob("*/" * depth + "config.yml")), None)
+    remedy = "give the folder of another run, or train again" if below is None else f"give a run: {below.parent}"
     raise DataError(folder, problem, remedy)
 
 

@@ -31,7 +31,6 @@ _NOISE = {
     "medium": _FULL_SIZE_NOISE,
     "tiny": ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04"),
 }
-# At medium scale, a quarter of an hour on a core.
 _STEPS = {"full": 30000, "medium": 8000, "tiny": 1500}
 # Pairs of a batch in the table of losses. They are as many as the methods' own batches hold, at two rays a pair.
 _PAIRS = {"full": 4096, "medium": 512, "tiny": 512}
@@ -242,10 +241,12 @@ class Plan:
                 # The default, stated: without options no images are made.
                 name, images = FILTERED, ("--events-per-pixel", "0.35")
             options = {name: off, name + CORRECTED: spline, name + ON_TRUE_POSES: off}
-        rows = {row: (self._registered(method), words, images, ()) for row, words in options.items()}
-        if method == "aenerf" and self.scale == "medium":
-            rows |= {row: (self._registered(method), train, (), words) for row, words in POSES_OF_EVENTS.items()}
-        return rows
+        further = POSES_OF_EVENTS if method == "aenerf" and self.scale == "medium" else {}
+        registered = self._registered(method)
+        return {
+            **{row: (registered, words, images, ()) for row, words in options.items()},
+            **{row: (registered, train, (), words) for row, words in further.items()},
+        }
 
 
 def scene_name(scene: str) -> str:

@@ -18,8 +18,14 @@ def test_mistakes_are_found_in_a_window(tmp_path: Path) -> None:
     events = EventStream.concatenate(list(recording.event_file.chunks()))
     found = []
     for kind, change in (("right", lambda *given: given), *MISTAKES.items()):
+        changed_events, changed = change(events, recording)
+        parts = ("trajectory", "event_camera")
+        is_changed = changed_events is not events or any(
+            getattr(changed, p) is not getattr(recording, p) for p in parts
+        )
+        assert is_changed == (kind != "right")
         if kind in ("right", "events binned by 2", "times of the poses in microseconds"):
-            problems, has_enough = find_problems(*change(events, recording), 0, 1_000_000_000)
+            problems, has_enough = find_problems(changed_events, changed, 0, 1_000_000_000)
             found.append({"kind": kind, "enough_events": has_enough, "problems": problems})
     assert [one["problems"] for one in table(found).values()] == [0, 1, 1]
     assert any("16 x 12 of 32 x 24 pixels" in problem for problem in found[2]["problems"])

@@ -154,5 +154,5 @@ def test_read_the_spellings_that_are_unambiguous(name: str, tmp_path: Path) -> N
 
 def test_refuse_the_size_of_another_sensor(tmp_path: Path) -> None:
     path = written(tmp_path / "events.txt", SPELLINGS["e2vid.txt"])
-    with pytest.raises(DataError, match="its first line says 96 x 72 pixels, the calibration 48 x 36"):
+    with pytest.raises(DataError, match="its header says 96 x 72 pixels, the calibration 48 x 36"):
         next(open_event_file(path, 48, 36).chunks())

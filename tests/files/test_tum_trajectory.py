@@ -40,6 +40,7 @@ POSES = {
     "w first, below another remark": "# mine\n# T TX TY TZ QW QX QY QZ\n0.492 3.5 -0.25 1.5 0.5 -0.5 0.5 0.5\n"
     "0.496 3.5 -0.25 1.5 0.5 -0.5 0.5 0.5\n",
     "two orders in remarks": f"# made of qw qx qy qz\n# t tx ty tz qx qy qz qw\n0.492 {POSE}\n0.496 {POSE}\n",
+    "names first": f"# t tx ty tz qx qy qz qw\n# qw qx qy qz\n# exposure [ms]: 5\n0.492 {POSE}\n0.496 {POSE}\n",
     "w first": "t,tx,ty,tz,qw,qx,qy,qz\n0.492,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n0.496,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
 }
 

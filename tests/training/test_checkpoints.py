@@ -151,10 +151,12 @@ def test_what_lies_around_a_checkpoint_leads_to_it(run: Path, tmp_path: Path) ->
     (run / "config.yml").touch()
     assert checkpoint_to_load(run / "config.yml") == folder / "step-000000003.ckpt"
     assert checkpoint_to_load(folder / "step-000000002.ckpt") == folder / "step-000000002.ckpt"
+    with pytest.raises(DataError, match="it is not the checkpoint of step 3"):
+        checkpoint_to_load(folder / "step-000000002.ckpt", 3)
     method = tmp_path / "experiment" / "aenerf"
     shutil.copytree(run, method / "now")
     for above in (method, method.parent):
-        with pytest.raises(DataError, match=f"{above}: it holds no checkpoint; give the run: {method}/now/nerf"):
+        with pytest.raises(DataError, match=f"{above}: it holds no checkpoint; give a run: {method}/now"):
             checkpoint_to_load(above)
 
 
