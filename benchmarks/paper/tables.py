@@ -64,7 +64,8 @@ def report(figures: Sequence[Figures], missing: Mapping[str, str]) -> str:
         parts += ["## Losses (the paper's table 4), hard speed", losses_table(losses)]
     if figures:
         parts += ["## Every scene", scenes_table(figures)]
-    sequences = {(run["scene"], run["speed"]): run for run in figures if run["poses_report"]}
+    # Poses that aenerf convert finds by the events have a report, too.
+    sequences = {(run["scene"], run["speed"]): run for run in figures if run["poses_report"] and not run.get("convert")}
     if sequences:
         parts += ["## Poses from COLMAP", sequences_table(list(sequences.values()))]
     if missing:

@@ -306,6 +306,8 @@ def test_report_lists_colmap_sequences() -> None:
     poses = {"frames": 33, "registered_frames": 30, "errors": errors}
     poses["errors_between_frames"] = {"rotation_error_degrees": 3.0, "translation_error": 0.25}
     figures = [{**figures_of(one, 20.0, "large", (1.0, 0.5)), "poses_report": poses} for one in (run, other)]
+    # Poses that are found by the events have another report.
+    figures.append({**figures[0], "convert": "aenerf convert --poses refined", "poses_report": {"tracks": 9}})
     text = tables.report(figures, {})
     assert text.count("| room | hard | 33 | 30 | 2 | 0.50° | 4.0 cm | 3.00° | 25.0 cm |") == 1
 
