@@ -24,7 +24,7 @@ from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
 from aenerf_ns.recording.recording import Capture, Recording
-from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, views_on_trajectory
+from aenerf_ns.recording.views import IMAGE_LIST, read_image_list, require_distinct_times, views_on_trajectory
 
 _CALIBRATIONS = ("calibration.json", "camchain.yaml", "camera_info.yaml")
 # COLMAP's own estimate may be off by some percent.
@@ -173,22 +173,19 @@ def _read_colmap(
                 "move this folder away and estimate the poses again (aenerf convert --poses colmap), or correct the "
                 "calibration",
             )
-    known: dict[int, Tensor] = {}
+    placed: list[tuple[int, Tensor]] = []
     for name, pose in poses.items():
         times = [time for time, file in timed if file.as_posix().endswith(f"/{name}")]
         if len(times) != 1:
             raise DataError(images, f"it lists {name} {len(times)} times", "list every image of the COLMAP model once")
-        if times[0] in known:
-            seconds = times[0] * 1e-9
-            raise DataError(
-                images, f"several images are at {seconds:.9f} s", "give each image its own time, with all digits"
-            )
-        known[times[0]] = pose
+        placed.append((times[0], pose))
+    require_distinct_times([time for time, _ in placed], images)
+    known = dict(placed)
     order = sorted(known)
     if len(order) < len(timed):
         CONSOLE.print(f"COLMAP placed {len(order)} of the {len(timed)} images: poses are interpolated between these.")
     frames = torch.stack([known[time] for time in order])
-    # The times, of which errors will tell, are in the list.
+    # Errors about times name the list of images, which holds the times.
     return Trajectory(order, frames @ frame_from_event, images)
 
 

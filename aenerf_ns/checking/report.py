@@ -325,15 +325,14 @@ def _check_lens(result: CheckResult, camera: CameraIntrinsics) -> bool:
             "binned or cropped, give the intrinsics of that size (binned by 2: half the focal lengths and the "
             "principal point)"
         )
+    point = camera.cx, camera.cy
     shares = camera.cx / width, camera.cy / height
     if any(abs(share - 0.5) > _LIMITS.max_principal_point for share in shares):
         result.problems.append(
             f"the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of {width} x {height} pixels, "
             "as of another resolution: check the intrinsics, unless this is a part of a larger sensor"
         )
-    elif math.dist((camera.cx, camera.cy), (height / 2, width / 2)) < math.dist(
-        (camera.cx, camera.cy), (width / 2, height / 2)
-    ):
+    elif math.dist(point, (height / 2, width / 2)) < math.dist(point, (width / 2, height / 2)):
         result.problems.append(
             f"the principal point ({camera.cx:g}, {camera.cy:g}) seems to have x and y swapped, for {width} x {height} "
             "pixels: check the intrinsics"

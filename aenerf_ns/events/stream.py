@@ -20,6 +20,11 @@ UNSORTED_REMEDY = (
 )
 """How to mend events that are out of order."""
 
+OUTSIDE_REMEDY = (
+    "check the sensor size and the order of the columns; a few such events can be left out (--drop-malformed)"
+)
+"""How to mend events outside the sensor."""
+
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 
 
@@ -73,8 +78,7 @@ class EventStream:
                 raise DataError(
                     self.source,
                     f"event {index} has {name} = {column[index]} on a sensor of {size} {limit}",
-                    "check the sensor size and the order of the columns; a few such events can be left out "
-                    "(--drop-malformed)",
+                    OUTSIDE_REMEDY,
                 )
         if (self.t[1:] < self.t[:-1]).any():
             index = int(np.argmax(self.t[1:] < self.t[:-1])) + 1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.left_out import LeftOut
-from aenerf_ns.events.stream import EventStream
+from aenerf_ns.events.stream import OUTSIDE_REMEDY, EventStream
 from aenerf_ns.files.event_reader import CHUNK, Columns, EventReader
 from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
@@ -198,9 +198,7 @@ def events_from_columns(
         good = (values >= 0) & (values < size)
         if values.dtype.kind == "f":
             good &= values == np.floor(values)
-        remedy = f"it must be a whole number below {size}: check the sensor size and the order of the columns; a few "
-        remedy += "such events can be left out (--drop-malformed)"
-        require(name, good, remedy)
+        require(name, good, f"it must be a whole number below {size}: {OUTSIDE_REMEDY}")
 
     times, polarities = columns["t"], columns["p"]
     limit = MAX_TIME // tick - abs(offset)

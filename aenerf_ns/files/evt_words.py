@@ -215,7 +215,7 @@ def _damaged_times(high: NDArray[np.int64], last: int, encoding: Encoding, is_en
     jumps = np.minimum(steps, mask + 1 - steps) > encoding.max_steps
     damaged: list[int] = []
     for index in np.flatnonzero(suspicious | jumps).tolist():
-        # What follows the damaged ones is what goes on from those before them.
+        # The first upper bits after damaged ones jump back, and are right.
         if damaged and damaged[-1] >= index - 1:
             continue
         if suspicious[index]:

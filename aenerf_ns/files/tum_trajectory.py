@@ -21,7 +21,7 @@ from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, format_seconds, parse_n
 _MAX_NORM_ERROR = 1e-3
 # A line of names, which begins with that of the times.
 _NAMES = re.compile(r"\W*(t|ts|time\w*|stamp)\b")
-# What a line of a pose begins with.
+# The beginning of a line that holds a pose.
 _POSE = re.compile(r"\s*[-+.\d]")
 
 

@@ -109,13 +109,8 @@ def views_on_trajectory(
         All views as train views, and the same alternating between the validation and the test split.
     """
     times = [time for time, _ in images]
-    if len(set(times)) < len(times):
-        seconds = Counter(times).most_common(1)[0][0] * 1e-9
-        raise DataError(
-            images[0][1].parent,
-            f"several images are at {seconds:.9f} s",
-            "give each image its own time, with all digits",
-        )
+    if images:
+        require_distinct_times(times, images[0][1].parent)
     known = trajectory.known_time(max_pose_gap)
     kept = [(time, file) for time, file in images if known.contains(time)]
     if len(kept) <= max(1, len(images) // 10):
@@ -127,6 +122,14 @@ def views_on_trajectory(
     mount = torch.eye(4, dtype=torch.float64) if event_from_frame is None else event_from_frame
     views = [ReferenceView(file, homogeneous(trajectory.interpolate(time)) @ mount, time) for time, file in kept]
     return {"train": views, "val": views[::2], "test": views[1::2]}
+
+
+def require_distinct_times(times: Sequence[int], source: Path) -> None:
+    """Raise a DataError if two of the images that a file or folder lists were taken at one time, in nanoseconds."""
+    if len(set(times)) < len(times):
+        seconds = Counter(times).most_common(1)[0][0] * 1e-9
+        problem = f"several images are at {seconds:.9f} s"
+        raise DataError(source, problem, "give each image its own time, with all digits")
 
 
 def _require_seconds(times: list[int], source: Path, trajectory: Trajectory) -> None:

@@ -1,4 +1,4 @@
-"""What the benchmark of pairing measures."""
+"""The benchmark of pairing times batches of random events."""
 
 from __future__ import annotations
 
