@@ -47,7 +47,9 @@ _NOISE = "--pose-noise-degrees 1.5 --pose-noise-translation 0.04"
 _SLOW_NOISE = f"{_NOISE} --pose-noise-correlation-time 0.5"
 _SMALL = "--width 96 --height 72"
 _MIDDLE = "--width 160 --height 120"
+_LARGE = "--width 240 --height 180 --max-displacement 1 --validation-views 4 --test-views 10"
 _RGGB = "--bayer-pattern RGGB"
+_LARGE_NOISE = "--pose-noise-degrees 3 --pose-noise-translation 0.08"
 SCENES = {
     name: PoseScene(split, scene, speed, tuple(options.split()), about)  # type: ignore[arg-type]
     for name, split, scene, speed, about, options in (
@@ -60,11 +62,26 @@ SCENES = {
         ("workshop", "report", "workshop", "hard", "a large place", f"{_SMALL} {_NOISE} --seed 13"),
         ("gallery", "report", "gallery", "easy", "a long place, slow noise", f"{_SMALL} {_SLOW_NOISE} --seed 14"),
         ("room large noise", "report", "room", "easy", "large noise, middle size",
-         f"{_MIDDLE} --pose-noise-degrees 3 --pose-noise-translation 0.08 --seed 15"),
+         f"{_MIDDLE} {_LARGE_NOISE} --seed 15"),
+        ("object large noise", "report", "object", "hard", "large noise, middle size",
+         f"{_MIDDLE} {_LARGE_NOISE} --seed 18"),
+        ("room large noise davis346", "report", "room", "easy", "large noise, a real sensor",
+         f"{_MIDDLE} {_LARGE_NOISE} --sensor davis346 --seed 15"),
+        ("object large noise davis346", "report", "object", "hard", "large noise, a real sensor",
+         f"{_MIDDLE} {_LARGE_NOISE} --sensor davis346 --seed 18"),
+        ("room Gauss-Markov", "report", "room", "hard", "noise that jumps from pose to pose",
+         f"{_MIDDLE} {_NOISE} --pose-noise-kind gauss-markov --pose-noise-correlation-time 0.078 --seed 19"),
         ("object COLMAP 25 Hz", "report", "object", "hard", "COLMAP's own errors",
          f"{_MIDDLE} --poses colmap --frame-rate 25 --seed 16"),
         ("room COLMAP 125 Hz", "report", "room", "hard", "COLMAP's own errors",
          f"{_MIDDLE} --poses colmap --frame-rate 125 --seed 17"),
+        *(
+            (f"{scene} 240", "report", scene, speed, "240 x 180", f"{_LARGE} {_NOISE} --seed {seed}")
+            for scene, speed, seed in (
+                ("games", "hard", 11), ("forklift", "easy", 31), ("lounge", "hard", 32),
+                ("living_room", "hard", 22), ("gallery", "easy", 33), ("workshop", "easy", 13),
+            )
+        ),
     )
 }  # fmt: skip
 
