@@ -19,7 +19,10 @@ from aenerf_ns.progress import tracked
 from aenerf_ns.reconstruction.weights import require_weights
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from PIL.Image import Image
+    from torch import Tensor
 
     from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.camera.trajectory import Trajectory
@@ -47,7 +50,8 @@ _Region = Annotated[
 @dataclass
 class Convert(DatasetCommand):
     """Write a dataset of any format as a dataset folder of aenerf-ns, with some of the events left out where asked.
-    The events are read and written piece by piece, and the folder appears when it is complete."""
+    The events are read and written piece by piece, and the folder appears when it is complete. A command that was
+    interrupted while it looked for poses goes on when it is repeated."""
 
     output: Path
     """Dataset folder to create."""
@@ -94,6 +98,10 @@ class Convert(DatasetCommand):
         parser.config.drop_malformed |= self.drop_malformed
         with exclusive_output(self.output) as lock:
             self._convert(parser, filters, lock)
+
+    @property
+    def _colmap_folder(self) -> Path:
+        return self.output.with_name(f".{self.output.name}.colmap")
 
     def _make_filters(self) -> EventFilters:
         from aenerf_ns.events.filters import EventFilters
@@ -172,7 +180,7 @@ class Convert(DatasetCommand):
 
         has_own_frames = capture.frame_camera == capture.event_camera
         if self.poses == "events":
-            found = estimate_poses_from_events(capture, window, self.data, self.seed, self.weights)
+            found = estimate_poses_from_events(capture, window, self.data, self.seed, self.weights, self._colmap_folder)
             return _with_poses(found, capture, images if has_own_frames else [])
         if not has_own_frames:
             raise DataError(
@@ -185,7 +193,9 @@ class Convert(DatasetCommand):
         times, files = [time for time, _ in kept], [file for _, file in kept]
         lens = capture.event_camera
         camera = (lens.width, lens.height) if capture.intrinsics_origin == "guessed" else lens
-        return _with_poses(estimate_poses(files, times, camera, self.data, self.seed), capture, kept)
+        return _with_poses(
+            estimate_poses(files, times, camera, self.data, self.seed, self._colmap_folder), capture, kept
+        )
 
     def _with_refined_poses(self, recording: Recording, window: TimeWindow) -> tuple[Recording, dict[str, Any], Image]:
         """Refine the poses, and return the recording with them, the report on them, and a picture."""
@@ -195,7 +205,7 @@ class Convert(DatasetCommand):
 
         given, truth = recording.trajectory, recording.ground_truth
         knots = None if truth is None else given.knots_covered_by(truth)
-        found = refine_poses(recording, window, self.data, self.seed, self.weights)
+        found = refine_poses(recording, window, self.data, self.seed, self.weights, self._colmap_folder)
         report = found.report()
         say(found.summary())
         paths = {"given": given.camera_to_worlds.numpy(), "refined": found.trajectory.camera_to_worlds.numpy()}
@@ -214,7 +224,8 @@ class Convert(DatasetCommand):
                 f"{before['translation_error']:.2g} as given, {after['rotation_error_degrees']:.2f} degrees and "
                 f"{after['translation_error']:.2g} refined."
             )
-        return replace(recording, trajectory=found.trajectory), report, found.draw(paths)
+        box = recording.scene_box if recording.scene_box is not None else _scene_box(found.scene_box)
+        return replace(recording, trajectory=found.trajectory, scene_box=box), report, found.draw(paths)
 
 
 def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) -> Trajectory:
@@ -259,6 +270,19 @@ def _copy_events(recording: Recording, events: FilteredEventFile, writer: Native
     return num_read, num_written, num_covered
 
 
+def _scene_box(found: NDArray[np.float64] | None) -> Tensor | None:
+    """Return a box that was found as a tensor, and say that the dataset gets it."""
+    import torch
+
+    if found is None:
+        return None
+    say(
+        f"The camera goes around what it sees, so the dataset gets a scene box, {found.round(3).tolist()}. Where more "
+        "is to be seen, delete scene_box from transforms.json."
+    )
+    return torch.from_numpy(found)
+
+
 def _with_poses(
     found: EstimatedPoses, capture: Capture, images: list[tuple[int, Path]]
 ) -> tuple[Recording, dict[str, Any], Image | None]:
@@ -281,6 +305,7 @@ def _with_poses(
         "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale, because images of one "
         "camera tell no lengths."
     )
+    box = _scene_box(found.scene_box)
     if isinstance(capture, Recording):
         truth = capture.reference_trajectory
         knots = trajectory.knots_between(truth.start, truth.end)
@@ -293,8 +318,8 @@ def _with_poses(
                 f"Compared with the given poses, which are kept as ground truth: mean errors "
                 f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units."
             )
-            # The scene box is in the world of the given poses, and the longest gap is about the given poses.
-            recording = replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=None, max_pose_gap=None)
+            # The dataset's scene box is in the world of the given poses, and the longest gap is about these poses.
+            recording = replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=box, max_pose_gap=None)
             return recording, report, found.draw and found.draw(paths)
         say(
             f"The given poses, from {truth.start} to {truth.end} ns, are of another time than the estimated ones, from "
@@ -305,6 +330,7 @@ def _with_poses(
     recording = Recording(
         **{field.name: getattr(capture, field.name) for field in fields(Capture)},
         trajectory=trajectory,
+        scene_box=box,
         reference_views=views,
     )
     return recording, report, found.draw and found.draw(paths)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import shutil
 import statistics
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
 
 import numpy as np
 import pycolmap
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress, TaskID
@@ -27,6 +30,8 @@ _NUM_NEIGHBORS = 10
 # This number of frames, evenly spread, are matched with each other. Without them errors add up along the path, and a
 # loop stays open.
 _NUM_KEY_FRAMES = 100
+# Points that a frame is placed by, at least.
+_MIN_POINTS = 15
 # Pixels that a match may be off.
 _MAX_EPIPOLAR_ERROR = 1.0
 
@@ -66,14 +71,38 @@ class HeldOutMatches:
         return fitting / max(total, 1)
 
 
+@contextlib.contextmanager
+def work_folder(kept: Path | None) -> Iterator[Path]:
+    """Yield a folder for a :class:`ColmapWorkspace`, which is removed in the end.
+
+    Args:
+        kept: the folder, whose content remains if the command is interrupted. By default, a temporary one.
+    """
+    if kept is None:
+        with TemporaryDirectory() as folder:
+            yield Path(folder)
+        return
+    kept.mkdir(parents=True, exist_ok=True)
+    try:
+        yield kept
+    except (KeyboardInterrupt, SystemExit):
+        CONSOLE.print(f"{kept} keeps what COLMAP has found: repeat the command to go on.", soft_wrap=True)
+        raise
+    except BaseException:
+        shutil.rmtree(kept)
+        raise
+    shutil.rmtree(kept)
+
+
 class ColmapWorkspace:
     """COLMAP's database and images in a folder, and the steps of its work.
 
+    In a folder where earlier work on the same frames was interrupted, features and matches that were found are kept.
     Features are found and matched on all cores. Each other step runs on one thread, because its results would depend on
     the order in which threads end.
 
     Args:
-        folder: an empty folder.
+        folder: an empty folder, or one of earlier work.
         num_frames: number of frames.
         seed: of COLMAP's random samples.
         progress: shows each step.
@@ -82,7 +111,7 @@ class ColmapWorkspace:
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
         self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
         self._pairs = folder / "pairs.txt"
-        self._images.mkdir()
+        self._images.mkdir(exist_ok=True)
         # COLMAP's log would break the progress bars.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
@@ -92,6 +121,7 @@ class ColmapWorkspace:
     def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
         """Write the frames as image files for COLMAP."""
         named = zip(self._names, frames, strict=True)
+        self._content = hashlib.sha256()
         for name, frame in self._progress.track(named, total=len(self._names), description="Collecting frames"):
             origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
             with read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
@@ -103,8 +133,15 @@ class ColmapWorkspace:
                     )
                 require_8_bits(image, origin)
                 image.convert("L" if image.mode == "L" else "RGB").save(self._images / name)
+            self._content.update((self._images / name).read_bytes())
 
     def find_features(self, camera: CameraIntrinsics | None) -> None:
+        inputs = f"{pycolmap.__version__} {self._seed} {camera} {self._content.hexdigest()}"
+        stated = self._folder / "inputs.txt"
+        if not stated.exists() or stated.read_text("utf8") != inputs:
+            for file in self._folder.glob("*.db*"):
+                file.unlink()
+            stated.write_text(inputs, "utf8")
         reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
         if camera is None:
             reader.camera_model = "SIMPLE_RADIAL"
@@ -137,6 +174,8 @@ class ColmapWorkspace:
         self._pairs.write_text("\n".join(pairs), encoding="utf-8")
         with self._step("Matching frames"):
             pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
+        # What follows changes the database, and an interrupted command goes on from here.
+        self._database = Path(shutil.copy(self._database, self._folder / "models.db"))
 
     def estimate_intrinsics(self, rounds: Iterable[tuple[float, float, int]]) -> CameraIntrinsics | None:
         """Estimate one focal length and the radial distortion k1 from all matches, and use them from here on.
@@ -199,7 +238,7 @@ class ColmapWorkspace:
         options.num_threads = options.mapper.num_threads = 1
         options.ba_refine_focal_length = options.ba_refine_extra_params = refine_intrinsics
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
-        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = 15, 50
+        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = _MIN_POINTS, 50
         options.extract_colors = False
         output = self._new_folder()
         with self._step("Placing frames", len(self._names)) as task:
@@ -326,11 +365,14 @@ def _keep_intrinsics(adjustment: Any) -> None:
 
 
 def poses_of(model: Any) -> dict[int, NDArray[np.float64]]:
-    """Return the (3, 4) camera-to-world poses, with OpenCV camera axes, by the index of the frame."""
+    """Return the (3, 4) camera-to-world poses, with OpenCV camera axes, by the index of the frame.
+
+    A frame that sees few points has none: an adjustment puts it anywhere.
+    """
     return {
         int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
         for image in model.images.values()
-        if image.has_pose
+        if image.has_pose and image.num_points3D >= _MIN_POINTS
     }
 
 

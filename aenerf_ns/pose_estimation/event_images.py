@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile
-from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_folder
 from aenerf_ns.progress import progress_bar, tracked
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL, batches_of
 from aenerf_ns.reconstruction.images import NetworkImages
@@ -35,7 +34,12 @@ MIN_IMAGES = 3
 
 @contextmanager
 def match_event_images(
-    capture: Capture, window: TimeWindow, source: str | Path, seed: int, weights: Path | None
+    capture: Capture,
+    window: TimeWindow,
+    source: str | Path,
+    seed: int,
+    weights: Path | None,
+    folder: Path | None,
 ) -> Iterator[tuple[ColmapWorkspace, NDArray[np.int64], list[NDArray[np.uint8]]]]:
     """Make images of the events whenever the picture has got about one event per pixel, and match their features.
 
@@ -45,6 +49,7 @@ def match_event_images(
         source: the dataset, for messages.
         seed: of COLMAP's random samples.
         weights: file of a network that makes the images; by default, a filter makes them.
+        folder: see :func:`~aenerf_ns.pose_estimation.colmap_workspace.work_folder`.
 
     Yields:
         COLMAP's workspace, and the (N,) times in nanoseconds, increasing, and the images: (height, width) gray, or
@@ -75,8 +80,8 @@ def match_event_images(
     # Events of one time may end one image and begin the next.
     later = np.append(True, np.diff(times) > 0)
     times, pictures = times[later], [image for (_, image), is_later in zip(images, later, strict=True) if is_later]
-    with TemporaryDirectory() as folder, progress_bar() as progress:
-        workspace = ColmapWorkspace(Path(folder), len(times), seed, progress)
+    with work_folder(folder) as place, progress_bar() as progress:
+        workspace = ColmapWorkspace(place, len(times), seed, progress)
         workspace.add_frames(pictures, (camera.width, camera.height), source)
         workspace.find_features(None if capture.intrinsics_origin == "guessed" else camera)
         workspace.match()

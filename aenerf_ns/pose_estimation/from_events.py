@@ -13,6 +13,7 @@ from aenerf_ns.pose_estimation.colmap_workspace import trajectory_of
 from aenerf_ns.pose_estimation.event_images import match_event_images
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
+from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.recording.recording import Capture
 
 # Share of the pairs of images whose matches judge the models, and are used for nothing else.
@@ -22,7 +23,12 @@ _ROUNDS = ((12.0, 8.0, 30), (8.0, 5.0, 30), (5.0, 3.0, 30), (4.0, 2.0, 60))
 
 
 def estimate_poses_from_events(
-    capture: Capture, window: TimeWindow, source: str | Path, seed: int = 0, weights: Path | None = None
+    capture: Capture,
+    window: TimeWindow,
+    source: str | Path,
+    seed: int = 0,
+    weights: Path | None = None,
+    folder: Path | None = None,
 ) -> EstimatedPoses:
     """Estimate the poses of an event camera from its events, on the CPU.
 
@@ -36,13 +42,13 @@ def estimate_poses_from_events(
         window: events outside it are left out.
         source: the dataset, for messages.
         seed: of COLMAP's random samples.
-        weights: see :func:`match_event_images`.
+        weights, folder: see :func:`match_event_images`.
 
     Raises:
         DataError: there are too few events for three images, or COLMAP places no images.
     """
     begin = time.perf_counter()
-    with match_event_images(capture, window, source, seed, weights) as (workspace, times, pictures):
+    with match_event_images(capture, window, source, seed, weights, folder) as (workspace, times, pictures):
         is_calibrated = capture.intrinsics_origin != "guessed"
         camera = capture.event_camera if is_calibrated else workspace.estimate_intrinsics(_ROUNDS)
         features, pairs = workspace.count_features_and_pairs()
@@ -77,6 +83,7 @@ def estimate_poses_from_events(
         reprojection_error=model.compute_mean_reprojection_error(),
         features=features,
         seconds=time.perf_counter() - begin,
+        scene_box=box_of(model),
         images="images of the events",
         mapper=mapper,
         agreement=held_out.agreement(model),

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,8 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import runs_of
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, intrinsics_of, trajectory_of
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, intrinsics_of, trajectory_of, work_folder
+from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.progress import progress_bar
 
 # Beyond these errors, a pose is not inaccurate but wrong: COLMAP put the camera elsewhere.
@@ -46,6 +46,7 @@ class EstimatedPoses:
         reprojection_error: mean over their observations, in pixels.
         features: median number of features in a frame.
         seconds: how long it took.
+        scene_box: (2, 3) corners of a box around what the camera goes around; None if it does not.
         images: what the frames are, for people to read.
         mapper: COLMAP's mapper whose model was taken, incremental or global.
         agreement: share of the matches kept apart that fit the poses; None where none were kept apart.
@@ -61,6 +62,7 @@ class EstimatedPoses:
     reprojection_error: float
     features: float
     seconds: float
+    scene_box: NDArray[np.float64] | None = None
     images: str = "frames"
     mapper: str = "incremental"
     agreement: float | None = None
@@ -116,6 +118,7 @@ def estimate_poses(
     camera: CameraIntrinsics | tuple[int, int],
     source: str | Path,
     seed: int = 0,
+    folder: Path | None = None,
 ) -> EstimatedPoses:
     """Estimate the poses of a video by COLMAP's incremental structure from motion, on the CPU.
 
@@ -131,6 +134,7 @@ def estimate_poses(
             length and the radial distortion k1, and the principal point is the middle of the image.
         source: the file or folder of the frames, for messages.
         seed: of COLMAP's random samples.
+        folder: see :func:`~aenerf_ns.pose_estimation.colmap_workspace.work_folder`.
 
     Raises:
         DataError: there are fewer than two frames, a frame is of another size than the camera, the times do not
@@ -145,8 +149,8 @@ def estimate_poses(
     begin = time.perf_counter()
     given = camera if isinstance(camera, CameraIntrinsics) else None
     size = (camera.width, camera.height) if isinstance(camera, CameraIntrinsics) else camera
-    with TemporaryDirectory() as folder, progress_bar() as progress:
-        workspace = ColmapWorkspace(Path(folder), len(times), seed, progress)
+    with work_folder(folder) as place, progress_bar() as progress:
+        workspace = ColmapWorkspace(place, len(times), seed, progress)
         workspace.add_frames(frames, size, source)
         workspace.find_features(given)
         workspace.match()
@@ -171,6 +175,7 @@ def estimate_poses(
         reprojection_error=model.compute_mean_reprojection_error(),
         features=features,
         seconds=time.perf_counter() - begin,
+        scene_box=box_of(model),
     )
 
 

@@ -22,6 +22,7 @@ from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, move_pose
 from aenerf_ns.pose_estimation.event_images import MIN_IMAGES, match_event_images
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
 from aenerf_ns.pose_estimation.refinement import PoseRefinement, SharedError
+from aenerf_ns.pose_estimation.scene_box import box_around
 from aenerf_ns.recording.recording import Recording
 
 # Pixels and degrees that an observation may be off, round by round.
@@ -43,6 +44,7 @@ class RefinedPoses:
         twists: (N, 6) corrections at the images: translations in the units of the poses, rotation vectors in radians.
         shared_error: what the clock and the mount explain of the corrections.
         is_weak: (N,) whether the tracks know no better than the given pose, which nearly stays.
+        scene_box: (2, 3) corners of a box around what the camera goes around; None if it does not.
         seconds: how long it took.
         draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
             the paths.
@@ -54,6 +56,7 @@ class RefinedPoses:
     twists: Array
     shared_error: SharedError
     is_weak: NDArray[np.bool_]
+    scene_box: Array | None
     seconds: float
     draw: Callable[[Mapping[str, Array]], Image.Image]
 
@@ -96,7 +99,12 @@ class RefinedPoses:
 
 
 def refine_poses(
-    recording: Recording, window: TimeWindow, source: str | Path, seed: int = 0, weights: Path | None = None
+    recording: Recording,
+    window: TimeWindow,
+    source: str | Path,
+    seed: int = 0,
+    weights: Path | None = None,
+    folder: Path | None = None,
 ) -> RefinedPoses:
     """Refine the poses of a recording by its events, on the CPU.
 
@@ -111,7 +119,7 @@ def refine_poses(
         window: events outside it are left out.
         source: the dataset, for messages.
         seed: of COLMAP's random samples.
-        weights: see :func:`match_event_images`.
+        weights, folder: see :func:`match_event_images`.
 
     Raises:
         DataError: there are too few events for three images with a pose, or too few tracks.
@@ -122,7 +130,7 @@ def refine_poses(
     window = TimeWindow(max(given.start, window.start), min(given.end, window.end))
     if window.start >= window.end:
         raise DataError(source, "none of its poses are in the time window", "widen it")
-    with match_event_images(recording, window, source, seed, weights) as (workspace, all_times, pictures):
+    with match_event_images(recording, window, source, seed, weights, folder) as (workspace, all_times, pictures):
         images = np.flatnonzero(given.known_time(recording.max_pose_gap).contains(all_times))
         # Time and memory grow with the number's third and second power.
         images = images[:: math.ceil(len(images) / _MAX_IMAGES) or 1]
@@ -164,6 +172,7 @@ def refine_poses(
         twists=refinement.twists,
         shared_error=refinement.shared_error(),
         is_weak=refinement.is_weak(),
+        scene_box=box_around(tracks, refinement.poses),
         seconds=time.perf_counter() - begin,
         draw=partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images]),
     )
