@@ -302,8 +302,8 @@ def _with_poses(
     paths = {"estimated": trajectory.camera_to_worlds.numpy()}
     say(found.summary())
     say(
-        "The poses are in a world of COLMAP's own, of arbitrary position, orientation and scale, because images of one "
-        "camera tell no lengths."
+        "The poses are in a world of their own: z is up if the camera was held level, and the scale is arbitrary, as "
+        "images of one camera tell no lengths."
     )
     box = _scene_box(found.scene_box)
     if isinstance(capture, Recording):

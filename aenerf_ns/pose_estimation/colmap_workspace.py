@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 import pycolmap
 import torch
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress, TaskID
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.images import read_image, require_8_bits
 
@@ -374,6 +375,13 @@ def poses_of(model: Any) -> dict[int, NDArray[np.float64]]:
         for image in model.images.values()
         if image.has_pose and image.num_points3D >= _MIN_POINTS
     }
+
+
+def stand_upright(model: Any) -> None:
+    """Turn and move the world of a model: z is up if its frames were held level, and the origin is amid them."""
+    poses = torch.from_numpy(np.stack(list(poses_of(model).values())))
+    transform = auto_orient_and_center_poses((homogeneous(poses) @ OPENCV_TO_OPENGL).float(), "vertical", "poses")[1]
+    model.transform(pycolmap.Sim3d(transform.double().numpy()))
 
 
 def intrinsics_of(model: Any) -> CameraIntrinsics:

@@ -9,7 +9,7 @@ from typing import Any
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import trajectory_of
+from aenerf_ns.pose_estimation.colmap_workspace import stand_upright, trajectory_of
 from aenerf_ns.pose_estimation.event_images import match_event_images
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
@@ -74,6 +74,7 @@ def estimate_poses_from_events(
 
         mapper = max(models, key=rank)
         model = models[mapper]
+        stand_upright(model)
     return EstimatedPoses(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),

@@ -19,7 +19,13 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import runs_of
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, intrinsics_of, trajectory_of, work_folder
+from aenerf_ns.pose_estimation.colmap_workspace import (
+    ColmapWorkspace,
+    intrinsics_of,
+    stand_upright,
+    trajectory_of,
+    work_folder,
+)
 from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.progress import progress_bar
 
@@ -38,7 +44,7 @@ class EstimatedPoses:
     Attributes:
         frame_times: (N,) times of all frames in nanoseconds.
         trajectory: poses of the frames that the largest model places, camera-to-world, OpenCV camera axes, in a world
-            of arbitrary position, orientation and scale.
+            of arbitrary heading and scale, with z up if the frames were held level, and the origin amid them.
         camera: intrinsics of the frames, as they were given or as COLMAP estimates them.
         model_sizes: numbers of frames that the models place, the largest first. More than one model means that the
             video fell apart into pieces whose relative poses are not known. COLMAP drops pieces of less than 10 frames.
@@ -164,6 +170,7 @@ def estimate_poses(
             "it needs a moving camera and sharp, textured frames: a shorter exposure, a higher frame rate, more pixels",
         )
     model = models[0]
+    stand_upright(model)
     if given is None:
         given = intrinsics_of(model)
     return EstimatedPoses(

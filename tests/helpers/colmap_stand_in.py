@@ -14,7 +14,7 @@ from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let COLMAP place the first frames along a straight line, and estimate a lens where it is asked for one."""
 
-    def place(frames, times, camera, source, seed) -> EstimatedPoses:
+    def place(frames, times, camera, source, seed, folder=None) -> EstimatedPoses:
         assert len(list(frames)) == len(times)
         if not isinstance(camera, CameraIntrinsics):
             camera = CameraIntrinsics(*camera, 22.0, 22.0, 12.0, 8.0, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))

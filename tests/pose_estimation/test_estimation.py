@@ -6,10 +6,13 @@ import contextlib
 import dataclasses
 import json
 import shutil
+import sqlite3
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from helpers.small_trainings import train_small_model
@@ -31,6 +34,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, poses_of
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses, compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
 from aenerf_ns.recording.recording import ReferenceView
@@ -166,6 +170,49 @@ def test_find_poses_and_lens_of_a_bare_recording(
     assert outputs.cameras.camera_to_worlds[..., 3].abs().max() == pytest.approx(1, rel=0.1)
     scene = outputs.metadata[SCENE_KEY]
     assert (scene.window.start, scene.window.end) == (trajectory.start, trajectory.end)
+
+
+def test_an_interrupted_search_goes_on(
+    found: tuple[Path, str], bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command, kept = Convert(bare, output=tmp_path / "data", poses="events"), tmp_path / ".data.colmap"
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    def matches_of_first_pair(change: str = "") -> int:
+        with contextlib.closing(sqlite3.connect(kept / "database.db")) as database, database:
+            database.execute(change)
+            return database.execute("select rows from matches order by pair_id").fetchone()[0]
+
+    with monkeypatch.context() as patch, CONSOLE.capture() as output:
+        patch.setattr(ColmapWorkspace, "reconstruct", interrupt)
+        # Another seed begins anew.
+        for first, seed in ((1, 1), (1, 0)):
+            command.seed = first
+            with pytest.raises(KeyboardInterrupt):
+                command.main()
+            command.seed = seed
+            assert matches_of_first_pair("update matches set rows = 0, data = x''") == 0
+            with pytest.raises(KeyboardInterrupt):
+                command.main()
+            assert (matches_of_first_pair() == 0) == (seed == first)
+    assert f"{kept} keeps what COLMAP has found" in " ".join(output.get().split())
+    command.main()
+    assert not kept.exists()
+    for name in ("trajectory_estimated.txt", "transforms.json"):
+        assert (tmp_path / "data" / name).read_bytes() == (found[0] / "data" / name).read_bytes()
+
+
+def test_frames_that_see_few_points_have_no_pose() -> None:
+    def frame(index: int, num_points: int) -> SimpleNamespace:
+        pose = pycolmap.Rigid3d(np.eye(4)[:3])
+        return SimpleNamespace(
+            name=f"{index:08d}.png", has_pose=True, num_points3D=num_points, cam_from_world=lambda: pose
+        )
+
+    model = SimpleNamespace(images={1: frame(0, 14), 2: frame(1, 15)})
+    assert list(poses_of(model)) == [1]
 
 
 @pytest.mark.slow
