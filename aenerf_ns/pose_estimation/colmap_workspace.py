@@ -178,7 +178,7 @@ class ColmapWorkspace:
         # What follows changes the database, and an interrupted command goes on from here.
         self._database = Path(shutil.copy(self._database, self._folder / "models.db"))
 
-    def estimate_intrinsics(self, rounds: Iterable[tuple[float, float, int]]) -> CameraIntrinsics | None:
+    def estimate_intrinsics(self, rounds: Iterable[tuple[float, float, int, float]]) -> CameraIntrinsics | None:
         """Estimate one focal length and the radial distortion k1 from all matches, and use them from here on.
 
         Args:
@@ -299,7 +299,13 @@ class ColmapWorkspace:
         return posed
 
     def adjust(
-        self, model: Any, max_pixels: float, max_degrees: float, max_iterations: int, refine_intrinsics: bool = False
+        self,
+        model: Any,
+        max_pixels: float,
+        max_degrees: float,
+        max_iterations: int,
+        loss_scale: float,
+        refine_intrinsics: bool = False,
     ) -> Any:
         """Triangulate all matches again from the poses of a model, and adjust poses and points to them.
 
@@ -307,15 +313,15 @@ class ColmapWorkspace:
             model: its poses.
             max_pixels, max_degrees: see :meth:`triangulate`.
             max_iterations: of the bundle adjustment.
+            loss_scale: pixels beyond which an observation counts less, as tracks of images of events are often wrong.
             refine_intrinsics: whether to adjust focal length and distortion too.
         """
         posed = self.triangulate(poses_of(model), max_pixels, max_degrees)
         adjustment = pycolmap.BundleAdjustmentOptions()
         _keep_intrinsics(adjustment)
         adjustment.refine_focal_length = adjustment.refine_extra_params = refine_intrinsics
-        # Tracks of images of events are often wrong.
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        adjustment.ceres.loss_function_scale = 1.0
+        adjustment.ceres.loss_function_scale = loss_scale
         adjustment.ceres.solver_options.max_num_iterations = max_iterations
         config = pycolmap.BundleAdjustmentConfig()
         for image in posed.images:

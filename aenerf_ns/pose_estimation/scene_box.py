@@ -9,9 +9,11 @@ import numpy as np
 from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, tracks_of
 from aenerf_ns.pose_estimation.colmap_workspace import poses_of
 
-# Share of the features that may lie beyond each side of the box, before it gets a margin, in its longest sides. Some
-# tracks are wrong, and plain surfaces have none.
-_MAX_BEYOND, _MARGIN = 0.005, 0.1
+# Shorter tracks are often wrong.
+_MIN_LENGTH = 4
+# Share of the features that may lie beyond each side of the box. It then gets a margin, in its longest sides, because
+# plain surfaces have no features.
+_MAX_BEYOND, _MARGIN = 0.01, 0.1
 
 
 def box_around(tracks: Tracks, poses: Array) -> Array | None:
@@ -24,7 +26,10 @@ def box_around(tracks: Tracks, poses: Array) -> Array | None:
         poses: (N, 3, 4) camera-to-world poses of the images, in the world of the tracks.
     """
     # A point counts as often as it was seen.
-    seen = tracks.positions[tracks.points]
+    points = tracks.points[np.bincount(tracks.points)[tracks.points] >= _MIN_LENGTH]
+    if len(points) == 0:
+        return None
+    seen = tracks.positions[points]
     low, high = np.quantile(seen, [_MAX_BEYOND, 1 - _MAX_BEYOND], axis=0)
     margin = _MARGIN * (high - low).max()
     low, high = low - margin, high + margin
