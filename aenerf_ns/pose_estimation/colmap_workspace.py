@@ -112,7 +112,9 @@ class ColmapWorkspace:
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
         self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
         self._pairs = folder / "pairs.txt"
-        self._images.mkdir(exist_ok=True)
+        # COLMAP takes every image that it finds there.
+        shutil.rmtree(self._images, ignore_errors=True)
+        self._images.mkdir()
         # COLMAP's log would break the progress bars.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
@@ -194,6 +196,8 @@ class ColmapWorkspace:
         for limits in rounds:
             self._store_intrinsics(model)
             model = self.adjust(model, *limits, refine_intrinsics=True)
+            if not is_placed(model):
+                return None
         self._store_intrinsics(model)
         with contextlib.closing(pycolmap.Database.open(self._database)) as database:
             database.clear_two_view_geometries()
@@ -361,7 +365,7 @@ def _choose_pairs(num_frames: int) -> list[tuple[int, int]]:
 
 
 def _largest_first(models: dict[int, Any]) -> list[Any]:
-    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+    return sorted(filter(is_placed, models.values()), key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _keep_intrinsics(adjustment: Any) -> None:
@@ -381,6 +385,11 @@ def poses_of(model: Any) -> dict[int, NDArray[np.float64]]:
         for image in model.images.values()
         if image.has_pose and image.num_points3D >= _MIN_POINTS
     }
+
+
+def is_placed(model: Any) -> bool:
+    """Return whether a model places two frames or more, which a trajectory needs."""
+    return len(poses_of(model)) > 1
 
 
 def stand_upright(model: Any) -> None:

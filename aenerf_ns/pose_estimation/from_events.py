@@ -9,7 +9,7 @@ from typing import Any
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import stand_upright, trajectory_of
+from aenerf_ns.pose_estimation.colmap_workspace import is_placed, stand_upright, trajectory_of
 from aenerf_ns.pose_estimation.event_images import match_event_images
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
@@ -57,6 +57,9 @@ def estimate_poses_from_events(
         # Not side by side: the global mapper then gives other poses each time.
         found = {"incremental": workspace.reconstruct(), "global": workspace.reconstruct_globally()}
         models: dict[str, Any] = {mapper: models[0] for mapper, models in found.items() if models}
+        for limits in _ROUNDS:
+            adjusted = {mapper: workspace.adjust(model, *limits) for mapper, model in models.items()}
+            models = {mapper: model for mapper, model in adjusted.items() if is_placed(model)}
         if camera is None or not models:
             raise DataError(
                 source,
@@ -65,8 +68,6 @@ def estimate_poses_from_events(
                 "poses need a camera that moves sideways and sees textured surfaces; "
                 + ("check the calibration too" if is_calibrated else "a calibration helps"),
             )
-        for limits in _ROUNDS:
-            models = {mapper: workspace.adjust(model, *limits) for mapper, model in models.items()}
 
         def rank(mapper: str) -> tuple[bool, float]:
             # The global mapper may throw images far out where it sees nothing, and no adjustment takes them back.

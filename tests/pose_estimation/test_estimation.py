@@ -198,6 +198,8 @@ def test_an_interrupted_search_goes_on(
                 command.main()
             assert (matches_of_first_pair() == 0) == (seed == first)
     assert f"{kept} keeps what COLMAP has found" in " ".join(output.get().split())
+    # An image of another command.
+    shutil.copy(kept / "images" / "00000000.png", kept / "images" / "99999999.png")
     command.main()
     assert not kept.exists()
     for name in ("trajectory_estimated.txt", "transforms.json"):
