@@ -31,8 +31,8 @@ _NUM_NEIGHBORS = 10
 # This number of frames, evenly spread, are matched with each other. Without them errors add up along the path, and a
 # loop stays open.
 _NUM_KEY_FRAMES = 100
-# Points that a frame is placed by, at least.
-_MIN_POINTS = 15
+# Points that a frame is placed by, at least, and the share of the median of all frames that is far fewer than usual.
+_MIN_POINTS, _FEW = 15, 1 / 3
 # Pixels that a match may be off.
 _MAX_EPIPOLAR_ERROR = 1.0
 
@@ -320,7 +320,7 @@ class ColmapWorkspace:
             loss_scale: pixels beyond which an observation counts less, as tracks of images of events are often wrong.
             refine_intrinsics: whether to adjust focal length and distortion too.
         """
-        posed = self.triangulate(poses_of(model), max_pixels, max_degrees)
+        posed = self.triangulate(poses_of(model, _MIN_POINTS), max_pixels, max_degrees)
         adjustment = pycolmap.BundleAdjustmentOptions()
         _keep_intrinsics(adjustment)
         adjustment.refine_focal_length = adjustment.refine_extra_params = refine_intrinsics
@@ -375,15 +375,22 @@ def _keep_intrinsics(adjustment: Any) -> None:
     adjustment.ceres.solver_options.num_threads = 1
 
 
-def poses_of(model: Any) -> dict[int, NDArray[np.float64]]:
+def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.float64]]:
     """Return the (3, 4) camera-to-world poses, with OpenCV camera axes, by the index of the frame.
 
-    A frame that sees few points has none: an adjustment puts it anywhere.
+    Args:
+        model: COLMAP's.
+        min_points: frames that see fewer points have no pose. By default, those that see far fewer than most: their
+            poses are off by degrees, and those between their neighbors are better.
     """
+    images = [image for image in model.images.values() if image.has_pose]
+    if min_points is None:
+        typical = statistics.median([image.num_points3D for image in images] or [0])
+        min_points = max(round(_FEW * typical), _MIN_POINTS)
     return {
         int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
-        for image in model.images.values()
-        if image.has_pose and image.num_points3D >= _MIN_POINTS
+        for image in images
+        if image.num_points3D >= min_points
     }
 
 

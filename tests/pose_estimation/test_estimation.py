@@ -206,15 +206,18 @@ def test_an_interrupted_search_goes_on(
         assert (tmp_path / "data" / name).read_bytes() == (found[0] / "data" / name).read_bytes()
 
 
-def test_frames_that_see_few_points_have_no_pose() -> None:
+@pytest.mark.parametrize(("typical", "placed"), [(20, 15), (90, 30)])
+def test_frames_that_see_few_points_have_no_pose(typical: int, placed: int) -> None:
     def frame(index: int, num_points: int) -> SimpleNamespace:
         pose = pycolmap.Rigid3d(np.eye(4)[:3])
         return SimpleNamespace(
             name=f"{index:08d}.png", has_pose=True, num_points3D=num_points, cam_from_world=lambda: pose
         )
 
-    model = SimpleNamespace(images={1: frame(0, 14), 2: frame(1, 15)})
-    assert list(poses_of(model)) == [1]
+    counts = [placed - 1, placed, *[typical] * 5]
+    model = SimpleNamespace(images={index: frame(index, count) for index, count in enumerate(counts)})
+    assert list(poses_of(model)) == [1, 2, 3, 4, 5, 6]
+    assert list(poses_of(model, 1)) == [0, 1, 2, 3, 4, 5, 6]
 
 
 @pytest.mark.slow
