@@ -138,7 +138,7 @@ class Convert(DatasetCommand):
             recording = parser.recording
             parser.event_span(recording)
             if self.poses == "refined":
-                recording, report, picture = self._with_refined_poses(recording, filters.window)
+                recording, report, picture = self._with_refined_poses(parser, recording, filters.window)
         else:
             recording, report, picture = self._with_estimated_poses(capture, images, filters.window)
         trajectory = _cut(recording, events, filters.window)
@@ -197,7 +197,9 @@ class Convert(DatasetCommand):
             estimate_poses(files, times, camera, self.data, self.seed, self._colmap_folder), capture, kept
         )
 
-    def _with_refined_poses(self, recording: Recording, window: TimeWindow) -> tuple[Recording, dict[str, Any], Image]:
+    def _with_refined_poses(
+        self, parser: EventDataParser, recording: Recording, window: TimeWindow
+    ) -> tuple[Recording, dict[str, Any], Image]:
         """Refine the poses, and return the recording with them, the report on them, and a picture."""
         from aenerf_ns.camera.alignment import pose_errors
         from aenerf_ns.pose_estimation.from_poses import refine_poses
@@ -224,8 +226,10 @@ class Convert(DatasetCommand):
                 f"{before['translation_error']:.2g} as given, {after['rotation_error_degrees']:.2f} degrees and "
                 f"{after['translation_error']:.2g} refined."
             )
-        box = recording.scene_box if recording.scene_box is not None else _scene_box(found.scene_box)
-        return replace(recording, trajectory=found.trajectory, scene_box=box), report, found.draw(paths)
+        # Near and far planes of poses that training does not scale are in the units of these.
+        if recording.scene_box is None and parser.scales_poses(recording):
+            recording = replace(recording, scene_box=_scene_box(found.scene_box))
+        return replace(recording, trajectory=found.trajectory), report, found.draw(paths)
 
 
 def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) -> Trajectory:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress, TaskID
 
+from aenerf_ns import __version__
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
@@ -33,6 +34,8 @@ _NUM_NEIGHBORS = 10
 _NUM_KEY_FRAMES = 100
 # Points that a frame is placed by, at least, and the share of the median of all frames that is far fewer than usual.
 _MIN_POINTS, _FEW = 15, 1 / 3
+# Files that are kept if a command is interrupted.
+_DATABASE, _INPUTS = "database.db", "inputs.txt"
 # Pixels that a match may be off.
 _MAX_EPIPOLAR_ERROR = 1.0
 
@@ -55,7 +58,7 @@ class HeldOutMatches:
 
         A match fits if its epipolar error (Sampson's distance) is less than a pixel.
         """
-        poses = {image.image_id: image.cam_from_world().matrix() for image in model.images.values() if image.has_pose}
+        poses = {image.image_id: image.cam_from_world().matrix() for image in _placed(model)}
         fitting = total = 0
         for (first, second), rays in self.pairs:
             total += len(rays[0])
@@ -74,47 +77,52 @@ class HeldOutMatches:
 
 @contextlib.contextmanager
 def work_folder(kept: Path | None) -> Iterator[Path]:
-    """Yield a folder for a :class:`ColmapWorkspace`, which is removed in the end.
+    """Yield a temporary folder for a :class:`ColmapWorkspace`.
 
     Args:
-        kept: the folder, whose content remains if the command is interrupted. By default, a temporary one.
+        kept: where the features and matches are kept if the command is interrupted, and where they are then found. The
+            folder is removed in the end.
     """
-    if kept is None:
-        with TemporaryDirectory() as folder:
-            yield Path(folder)
-        return
-    kept.mkdir(parents=True, exist_ok=True)
-    try:
-        yield kept
-    except (KeyboardInterrupt, SystemExit):
-        CONSOLE.print(f"{kept} keeps what COLMAP has found: repeat the command to go on.", soft_wrap=True)
-        raise
-    except BaseException:
-        shutil.rmtree(kept)
-        raise
-    shutil.rmtree(kept)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        if kept is not None and kept.is_dir():
+            shutil.copytree(kept, folder, dirs_exist_ok=True)
+        is_kept = False
+        try:
+            yield folder
+        except (KeyboardInterrupt, SystemExit):
+            if kept is not None and (folder / _DATABASE).exists():
+                is_kept = True
+                kept.mkdir(exist_ok=True)
+                for file in (_DATABASE, _INPUTS):
+                    shutil.copyfile(folder / file, kept / file)
+                words = f"{kept} keeps the features and matches that were found: repeat the command to go on."
+                CONSOLE.print(words, markup=False, highlight=False, soft_wrap=True)
+            raise
+        finally:
+            if kept is not None and not is_kept:
+                shutil.rmtree(kept, ignore_errors=True)
 
 
 class ColmapWorkspace:
     """COLMAP's database and images in a folder, and the steps of its work.
 
-    In a folder where earlier work on the same frames was interrupted, features and matches that were found are kept.
+    Features and matches that earlier work on the same frames left in the folder are taken.
     Features are found and matched on all cores. Each other step runs on one thread, because its results would depend on
     the order in which threads end.
 
     Args:
-        folder: an empty folder, or one of earlier work.
+        folder: see :func:`work_folder`.
         num_frames: number of frames.
         seed: of COLMAP's random samples.
         progress: shows each step.
     """
 
     def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
-        self._folder, self._images, self._database = folder, folder / "images", folder / "database.db"
+        self._folder, self._images, self._database = folder, folder / "images", folder / _DATABASE
         self._pairs = folder / "pairs.txt"
-        # COLMAP takes every image that it finds there.
-        shutil.rmtree(self._images, ignore_errors=True)
         self._images.mkdir()
+        self._content = hashlib.sha256()
         # COLMAP's log would break the progress bars.
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
@@ -124,7 +132,6 @@ class ColmapWorkspace:
     def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
         """Write the frames as image files for COLMAP."""
         named = zip(self._names, frames, strict=True)
-        self._content = hashlib.sha256()
         for name, frame in self._progress.track(named, total=len(self._names), description="Collecting frames"):
             origin = frame if isinstance(frame, Path) else f"{source}, frame {int(Path(name).stem)}"
             with read_image(frame) if isinstance(frame, Path) else Image.fromarray(frame) as image:
@@ -139,11 +146,12 @@ class ColmapWorkspace:
             self._content.update((self._images / name).read_bytes())
 
     def find_features(self, camera: CameraIntrinsics | None) -> None:
-        inputs = f"{pycolmap.__version__} {self._seed} {camera} {self._content.hexdigest()}"
-        stated = self._folder / "inputs.txt"
+        """Find the features of the frames, unless earlier work on the same frames found them. Other work is removed."""
+        versions = f"aenerf-ns {__version__}, pycolmap {pycolmap.__version__}"
+        inputs = f"{versions}, seed {self._seed}, {camera}, {self._content.hexdigest()}"
+        stated = self._folder / _INPUTS
         if not stated.exists() or stated.read_text("utf8") != inputs:
-            for file in self._folder.glob("*.db*"):
-                file.unlink()
+            self._database.unlink(missing_ok=True)
             stated.write_text(inputs, "utf8")
         reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
         if camera is None:
@@ -177,7 +185,7 @@ class ColmapWorkspace:
         self._pairs.write_text("\n".join(pairs), encoding="utf-8")
         with self._step("Matching frames"):
             pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
-        # What follows changes the database, and an interrupted command goes on from here.
+        # What follows may change the database, and an interrupted command goes on from here.
         self._database = Path(shutil.copy(self._database, self._folder / "models.db"))
 
     def estimate_intrinsics(self, rounds: Iterable[tuple[float, float, int, float]]) -> CameraIntrinsics | None:
@@ -187,7 +195,7 @@ class ColmapWorkspace:
             rounds: limits of the adjustments, as :meth:`adjust` takes them.
 
         Returns:
-            The intrinsics; None where the mapper places no frames.
+            The intrinsics; None where the frames cannot be placed.
         """
         models = self.reconstruct(refine_intrinsics=True)
         if not models:
@@ -375,6 +383,14 @@ def _keep_intrinsics(adjustment: Any) -> None:
     adjustment.ceres.solver_options.num_threads = 1
 
 
+def _placed(model: Any, min_points: int | None = None) -> list[Any]:
+    images = [image for image in model.images.values() if image.has_pose]
+    if min_points is None:
+        typical = statistics.median([image.num_points3D for image in images] or [0])
+        min_points = max(round(_FEW * typical), _MIN_POINTS)
+    return [image for image in images if image.num_points3D >= min_points]
+
+
 def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.float64]]:
     """Return the (3, 4) camera-to-world poses, with OpenCV camera axes, by the index of the frame.
 
@@ -383,20 +399,14 @@ def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.
         min_points: frames that see fewer points have no pose. By default, those that see far fewer than most: their
             poses are off by degrees, and those between their neighbors are better.
     """
-    images = [image for image in model.images.values() if image.has_pose]
-    if min_points is None:
-        typical = statistics.median([image.num_points3D for image in images] or [0])
-        min_points = max(round(_FEW * typical), _MIN_POINTS)
     return {
-        int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
-        for image in images
-        if image.num_points3D >= min_points
+        int(Path(image.name).stem): image.cam_from_world().inverse().matrix() for image in _placed(model, min_points)
     }
 
 
 def is_placed(model: Any) -> bool:
-    """Return whether a model places two frames or more, which a trajectory needs."""
-    return len(poses_of(model)) > 1
+    """Return whether a model places three frames or more: fewer have no world."""
+    return len(_placed(model)) > 2
 
 
 def stand_upright(model: Any) -> None:
@@ -415,7 +425,7 @@ def intrinsics_of(model: Any) -> CameraIntrinsics:
 
 
 def trajectory_of(model: Any, times: NDArray[np.int64], source: str | Path) -> Trajectory:
-    """Return the camera-to-world poses of the frames that a model places, with OpenCV camera axes.
+    """Return the camera-to-world poses of the frames that :func:`poses_of` a model has, with OpenCV camera axes.
 
     Args:
         model: COLMAP's.

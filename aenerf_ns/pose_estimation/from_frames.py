@@ -43,15 +43,15 @@ class EstimatedPoses:
 
     Attributes:
         frame_times: (N,) times of all frames in nanoseconds.
-        trajectory: poses of the frames that the largest model places, camera-to-world, OpenCV camera axes, in a world
-            of arbitrary heading and scale, with z up if the frames were held level, and the origin amid them.
+        trajectory: poses of the frames that the largest model places well, camera-to-world, OpenCV camera axes, in a
+            world of arbitrary heading and scale, with z up if the frames were held level, and the origin amid them.
         camera: intrinsics of the frames, as they were given or as COLMAP estimates them.
         model_sizes: numbers of frames that the models place, the largest first. More than one model means that the
             video fell apart into pieces whose relative poses are not known. COLMAP drops pieces of less than 10 frames.
         num_points: 3D points of the largest model.
         reprojection_error: mean over their observations, in pixels.
         features: median number of features in a frame.
-        seconds: how long it took.
+        seconds: how long the last command took.
         scene_box: (2, 3) corners of a box around what the camera goes around; None if it does not.
         images: what the frames are, for people to read.
         mapper: COLMAP's mapper whose model was taken, incremental or global.

@@ -22,7 +22,7 @@ from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, move_pose
 from aenerf_ns.pose_estimation.event_images import MIN_IMAGES, match_event_images
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
 from aenerf_ns.pose_estimation.refinement import PoseRefinement, SharedError
-from aenerf_ns.pose_estimation.scene_box import box_around
+from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.recording.recording import Recording
 
 # Pixels and degrees that an observation may be off, round by round.
@@ -45,7 +45,7 @@ class RefinedPoses:
         shared_error: what the clock and the mount explain of the corrections.
         is_weak: (N,) whether the tracks know no better than the given pose, which nearly stays.
         scene_box: (2, 3) corners of a box around what the camera goes around; None if it does not.
-        seconds: how long it took.
+        seconds: how long the last command took.
         draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
             the paths.
     """
@@ -172,7 +172,7 @@ def refine_poses(
         twists=refinement.twists,
         shared_error=refinement.shared_error(),
         is_weak=refinement.is_weak(),
-        scene_box=box_around(tracks, refinement.poses),
+        scene_box=box_of(model),
         seconds=time.perf_counter() - begin,
         draw=partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images]),
     )

@@ -1,47 +1,38 @@
-"""A box around what the camera goes around, from the tracks of features."""
+"""A box around what the camera goes around."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, tracks_of
 from aenerf_ns.pose_estimation.colmap_workspace import poses_of
 
-# Shorter tracks are often wrong.
-_MIN_LENGTH = 4
+# Shorter tracks are often wrong, and a few tell of no box.
+_MIN_LENGTH, _MIN_TRACKS = 4, 50
 # Share of the features that may lie beyond each side of the box. It then gets a margin, in its longest sides, because
 # plain surfaces have no features.
 _MAX_BEYOND, _MARGIN = 0.01, 0.1
 
 
-def box_around(tracks: Tracks, poses: Array) -> Array | None:
+def box_of(model: Any) -> NDArray[np.float64] | None:
     """Return the (2, 3) corners of a box that holds what the camera goes around, or None if it does not.
 
     A camera goes around a scene if it stays outside the box, and sees it from directions more than 90 degrees apart.
 
     Args:
-        tracks: of the images.
-        poses: (N, 3, 4) camera-to-world poses of the images, in the world of the tracks.
+        model: COLMAP's. The box is in its world.
     """
-    # A point counts as often as it was seen.
-    points = tracks.points[np.bincount(tracks.points)[tracks.points] >= _MIN_LENGTH]
-    if len(points) == 0:
+    points = [point for point in model.points3D.values() if point.track.length() >= _MIN_LENGTH]
+    if len(points) < _MIN_TRACKS:
         return None
-    seen = tracks.positions[points]
+    # A point counts as often as it was seen.
+    seen = np.repeat([point.xyz for point in points], [point.track.length() for point in points], axis=0)
     low, high = np.quantile(seen, [_MAX_BEYOND, 1 - _MAX_BEYOND], axis=0)
     margin = _MARGIN * (high - low).max()
     low, high = low - margin, high + margin
-    cameras = poses[:, :, 3]
+    cameras = np.stack(list(poses_of(model).values()))[:, :, 3]
     directions = cameras - (low + high) / 2
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     is_inside = ((low < cameras) & (cameras < high)).all(1).any()
     return None if is_inside or (directions @ directions.T).min() > 0 else np.stack([low, high])
-
-
-def box_of(model: Any) -> Array | None:
-    """Return :func:`box_around` the points of a COLMAP model."""
-    poses = poses_of(model)
-    images = sorted(poses)
-    return box_around(tracks_of(model, images), np.stack([poses[image] for image in images]))

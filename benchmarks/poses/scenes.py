@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.paper.plan import Poses
 
-Split = Literal["choose", "report"]
+Split = Literal["choose", "report", "events"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,8 @@ class PoseScene:
     """A recording with wrong poses.
 
     Attributes:
-        split: whether settings are chosen on it or reported on it.
+        split: whether settings are chosen on it or reported on it. "events" are reported too, with poses that are
+            refined by the events or found from these.
         scene: a built-in scene, a scene of ``benchmarks.scenes.build``, or OUTWARDS.
         speed: of the camera.
         options: of aenerf simulate.
@@ -47,7 +48,7 @@ _NOISE = "--pose-noise-degrees 1.5 --pose-noise-translation 0.04"
 _SLOW_NOISE = f"{_NOISE} --pose-noise-correlation-time 0.5"
 _SMALL = "--width 96 --height 72"
 _MIDDLE = "--width 160 --height 120"
-_LARGE = "--width 240 --height 180 --max-displacement 1 --validation-views 4 --test-views 10"
+_SENSOR_240 = "--width 240 --height 180 --max-displacement 1 --validation-views 4 --test-views 10"
 _RGGB = "--bayer-pattern RGGB"
 _LARGE_NOISE = "--pose-noise-degrees 3 --pose-noise-translation 0.08"
 SCENES = {
@@ -63,20 +64,20 @@ SCENES = {
         ("gallery", "report", "gallery", "easy", "a long place, slow noise", f"{_SMALL} {_SLOW_NOISE} --seed 14"),
         ("room large noise", "report", "room", "easy", "large noise, middle size",
          f"{_MIDDLE} {_LARGE_NOISE} --seed 15"),
-        ("object large noise", "report", "object", "hard", "large noise, middle size",
+        ("object large noise", "events", "object", "hard", "large noise, middle size",
          f"{_MIDDLE} {_LARGE_NOISE} --seed 18"),
-        ("room large noise davis346", "report", "room", "easy", "large noise, a real sensor",
+        ("room large noise davis346", "events", "room", "easy", "large noise, a real sensor",
          f"{_MIDDLE} {_LARGE_NOISE} --sensor davis346 --seed 15"),
-        ("object large noise davis346", "report", "object", "hard", "large noise, a real sensor",
+        ("object large noise davis346", "events", "object", "hard", "large noise, a real sensor",
          f"{_MIDDLE} {_LARGE_NOISE} --sensor davis346 --seed 18"),
-        ("room Gauss-Markov", "report", "room", "hard", "noise that jumps from pose to pose",
+        ("room Gauss-Markov", "events", "room", "hard", "noise that jumps from pose to pose",
          f"{_MIDDLE} {_NOISE} --pose-noise-kind gauss-markov --pose-noise-correlation-time 0.078 --seed 19"),
         ("object COLMAP 25 Hz", "report", "object", "hard", "COLMAP's own errors",
          f"{_MIDDLE} --poses colmap --frame-rate 25 --seed 16"),
         ("room COLMAP 125 Hz", "report", "room", "hard", "COLMAP's own errors",
          f"{_MIDDLE} --poses colmap --frame-rate 125 --seed 17"),
         *(
-            (f"{scene} 240", "report", scene, speed, "240 x 180", f"{_LARGE} {_NOISE} --seed {seed}")
+            (f"{scene} 240", "events", scene, speed, "240 x 180", f"{_SENSOR_240} {_NOISE} --seed {seed}")
             for scene, speed, seed in (
                 ("games", "hard", 11), ("forklift", "easy", 31), ("lounge", "hard", 32),
                 ("living_room", "hard", 22), ("gallery", "easy", 33), ("workshop", "easy", 13),

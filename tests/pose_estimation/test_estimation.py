@@ -193,13 +193,12 @@ def test_an_interrupted_search_goes_on(
             with pytest.raises(KeyboardInterrupt):
                 command.main()
             command.seed = seed
-            assert matches_of_first_pair("update matches set rows = 0, data = x''") == 0
+            assert matches_of_first_pair() > 0
+            matches_of_first_pair("update matches set rows = 0, data = x''")
             with pytest.raises(KeyboardInterrupt):
                 command.main()
             assert (matches_of_first_pair() == 0) == (seed == first)
-    assert f"{kept} keeps what COLMAP has found" in " ".join(output.get().split())
-    # An image of another command.
-    shutil.copy(kept / "images" / "00000000.png", kept / "images" / "99999999.png")
+    assert f"{kept} keeps the features and matches" in " ".join(output.get().split())
     command.main()
     assert not kept.exists()
     for name in ("trajectory_estimated.txt", "transforms.json"):

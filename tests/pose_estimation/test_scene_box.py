@@ -2,42 +2,60 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import pycolmap
 import pytest
 
-from aenerf_ns.pose_estimation.bundle_adjustment import Tracks
-from aenerf_ns.pose_estimation.scene_box import box_around
+from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.simulator.paths import look_at
 
 
-def look_around(radius: float, turn: float) -> np.ndarray:
-    """(20, 3, 4) poses on a part of a circle around the origin, in radians."""
+def model(radius: float, turn: float, num_wrong: int = 0, num_points: int = 2000) -> SimpleNamespace:
+    """A model of points in the cube of side 2, seen ten times each, and of cameras on a part of a circle around it.
+
+    Wrong points are far out, and seen three times.
+    """
     angles = np.linspace(0, turn, 20)
-    return np.stack([look_at((radius * np.cos(a), radius * np.sin(a), 0.4), (0.0, 0.0, 0.0))[:3] for a in angles])
-
-
-def tracks(num_wrong: int = 0) -> Tracks:
-    """Tracks of 2000 points in the cube of side 2, seen four times each. Half of those far out are seen once."""
-    positions = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
+    poses = [look_at((radius * np.cos(a), radius * np.sin(a), 0.4), (0.0, 0.0, 0.0))[:3] for a in angles]
+    images = {
+        index: SimpleNamespace(
+            name=f"{index}.png",
+            has_pose=True,
+            num_points3D=100,
+            cam_from_world=pycolmap.Rigid3d(pose).inverse,
+        )
+        for index, pose in enumerate(poses)
+    }
+    # A camera without a place of its own, within the cube.
+    images[20] = SimpleNamespace(name="20.png", has_pose=True, num_points3D=5, cam_from_world=pycolmap.Rigid3d)
+    positions = np.random.default_rng(0).uniform(-1, 1, (num_points, 3))
     positions[:num_wrong] *= 100
-    points = np.repeat(np.arange(2000), np.where(np.arange(2000) < num_wrong // 2, 1, 4))
-    return Tracks(np.zeros(len(points), np.int64), points, np.zeros((len(points), 2)), positions, 100.0)
+    points = {
+        index: SimpleNamespace(
+            xyz=xyz, track=SimpleNamespace(length=lambda index=index: 3 if index < num_wrong else 10)
+        )
+        for index, xyz in enumerate(positions)
+    }
+    return SimpleNamespace(images=images, points3D=points)
 
 
-@pytest.mark.parametrize("num_wrong", [0, 30])
+@pytest.mark.parametrize("num_wrong", [0, 200])
 def test_the_box_holds_what_is_seen_and_little_more(num_wrong: int) -> None:
-    box = box_around(tracks(num_wrong), look_around(3.0, 2 * np.pi))
+    box = box_of(model(3.0, 2 * np.pi, num_wrong))
     assert box is not None
-    np.testing.assert_allclose(box, [[-1.19] * 3, [1.19] * 3], atol=0.03)
+    np.testing.assert_allclose(box, [[-1.18] * 3, [1.18] * 3], atol=0.03)
 
 
 @pytest.mark.parametrize(
-    ("radius", "turn"),
+    ("radius", "turn", "num_points"),
     [
-        pytest.param(0.5, 6.0, id="within"),
-        pytest.param(1.1, 6.0, id="passing the margin"),
-        pytest.param(3.0, 1.4, id="from one side"),
+        pytest.param(0.5, 6.0, 2000, id="within"),
+        pytest.param(1.1, 6.0, 2000, id="passing the margin"),
+        pytest.param(3.0, 1.4, 2000, id="from one side"),
+        pytest.param(3.0, 6.0, 40, id="few points"),
     ],
 )
-def test_no_box_where_the_camera_does_not_go_around(radius: float, turn: float) -> None:
-    assert box_around(tracks(), look_around(radius, turn)) is None
+def test_no_box_where_the_camera_does_not_go_around(radius: float, turn: float, num_points: int) -> None:
+    assert box_of(model(radius, turn, num_points=num_points)) is None
