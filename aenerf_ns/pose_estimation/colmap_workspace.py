@@ -8,6 +8,7 @@ import shutil
 import statistics
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
@@ -21,7 +22,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress, TaskID
 
-from aenerf_ns import __version__
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
@@ -147,7 +147,7 @@ class ColmapWorkspace:
 
     def find_features(self, camera: CameraIntrinsics | None) -> None:
         """Find the features of the frames, unless earlier work on the same frames found them. Other work is removed."""
-        versions = f"aenerf-ns {__version__}, pycolmap {pycolmap.__version__}"
+        versions = f"aenerf-ns {version('aenerf-ns')}, pycolmap {pycolmap.__version__}"
         inputs = f"{versions}, seed {self._seed}, {camera}, {self._content.hexdigest()}"
         stated = self._folder / _INPUTS
         if not stated.exists() or stated.read_text("utf8") != inputs:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.colmap_stand_in import place_frames
+from helpers.colmap_stand_in import FOUND_BOX, place_frames
 from helpers.commands import run
 from helpers.dataset_faults import put, remove, set_in
 from helpers.small_datasets import (
@@ -207,6 +207,7 @@ def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: p
     assert report["registered_frames"] == 3
     # Both trajectories are straight, at constant speed.
     assert report["errors"]["translation_error"] < 1e-9
+    np.testing.assert_array_equal(with_truth.scene_box, FOUND_BOX)
     # All images are kept, with the true poses.
     assert [len(with_truth.reference_views[split]) for split in ("train", "val", "test")] == [4, 2, 2]
     (data / "groundtruth.txt").unlink()

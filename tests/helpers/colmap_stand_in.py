@@ -10,6 +10,8 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 
+FOUND_BOX = np.array([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]])
+
 
 def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let COLMAP place the first frames along a straight line, and estimate a lens where it is asked for one."""
@@ -21,6 +23,6 @@ def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:
         poses = torch.eye(4, dtype=torch.float64).repeat(num_placed, 1, 1)
         poses[:, 0, 3] = torch.arange(num_placed)
         trajectory = Trajectory(times[:num_placed], poses, source)
-        return EstimatedPoses(np.array(times), trajectory, camera, [num_placed], 9, 0.5, 100.0, 1.0)
+        return EstimatedPoses(np.array(times), trajectory, camera, [num_placed], 9, 0.5, 100.0, 1.0, FOUND_BOX)
 
     monkeypatch.setattr("aenerf_ns.pose_estimation.from_frames.estimate_poses", place)

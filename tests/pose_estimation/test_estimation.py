@@ -34,7 +34,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
-from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, poses_of
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, poses_of, stand_upright
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses, compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
 from aenerf_ns.recording.recording import ReferenceView
@@ -217,6 +217,21 @@ def test_frames_that_see_few_points_have_no_pose(typical: int, placed: int) -> N
     model = SimpleNamespace(images={index: frame(index, count) for index, count in enumerate(counts)})
     assert list(poses_of(model)) == [1, 2, 3, 4, 5, 6]
     assert list(poses_of(model, 1)) == [0, 1, 2, 3, 4, 5, 6]
+
+
+def test_worlds_stand_upright() -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
+    model = pycolmap.synthesize_dataset(options)
+    for image in model.images.values():
+        image.name = f"{image.image_id}.png"
+    stand_upright(model)
+    poses = np.stack(list(poses_of(model, 0).values()))
+    np.testing.assert_allclose(poses[:, :, 3].mean(0), 0, atol=1e-5)
+    # The direction that the pictures' rows are most level to.
+    assert np.square(poses[:, 2, 0]).sum() == pytest.approx(np.linalg.svd(poses[:, :, 0])[1][-1] ** 2, rel=1e-4)
+    assert poses[:, 2, 1].mean() < 0
+    assert model.compute_mean_reprojection_error() < 1e-3
 
 
 @pytest.mark.slow
