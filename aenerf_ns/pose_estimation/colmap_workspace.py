@@ -32,8 +32,9 @@ _NUM_NEIGHBORS = 10
 # This number of frames, evenly spread, are matched with each other. Without them errors add up along the path, and a
 # loop stays open.
 _NUM_KEY_FRAMES = 100
-# Points that a frame is placed by, at least, and the share of the median of all frames that is far fewer than usual.
-_MIN_POINTS, _FEW = 15, 1 / 3
+# Points that a frame is placed by, at least, and that it keeps its pose by: a share of the median of all frames, within
+# limits.
+_MIN_POINTS, _ENOUGH_POINTS, _SHARE = 15, 30, 0.25
 # Files that are kept if a command is interrupted.
 _DATABASE, _INPUTS = "database.db", "inputs.txt"
 # Pixels that a match may be off.
@@ -387,7 +388,7 @@ def _placed(model: Any, min_points: int | None = None) -> list[Any]:
     images = [image for image in model.images.values() if image.has_pose]
     if min_points is None:
         typical = statistics.median([image.num_points3D for image in images] or [0])
-        min_points = max(round(_FEW * typical), _MIN_POINTS)
+        min_points = min(max(round(_SHARE * typical), _MIN_POINTS), _ENOUGH_POINTS)
     return [image for image in images if image.num_points3D >= min_points]
 
 

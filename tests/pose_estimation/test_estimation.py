@@ -205,7 +205,7 @@ def test_an_interrupted_search_goes_on(
         assert (tmp_path / "data" / name).read_bytes() == (found[0] / "data" / name).read_bytes()
 
 
-@pytest.mark.parametrize(("typical", "placed"), [(20, 15), (90, 30)])
+@pytest.mark.parametrize(("typical", "placed"), [(20, 15), (100, 25), (400, 30)])
 def test_frames_that_see_few_points_have_no_pose(typical: int, placed: int) -> None:
     def frame(index: int, num_points: int) -> SimpleNamespace:
         pose = pycolmap.Rigid3d(np.eye(4)[:3])
