@@ -186,7 +186,7 @@ class ColmapWorkspace:
         self._pairs.write_text("\n".join(pairs), encoding="utf-8")
         with self._step("Matching frames"):
             pycolmap.match_image_pairs(self._database, matching, pairing, verification, device=pycolmap.Device.cpu)
-        # What follows may change the database, and an interrupted command goes on from here.
+        # Later steps change the database. An interrupted command goes on from the one without their changes.
         self._database = Path(shutil.copy(self._database, self._folder / "models.db"))
 
     def estimate_intrinsics(self, rounds: Iterable[tuple[float, float, int, float]]) -> CameraIntrinsics | None:

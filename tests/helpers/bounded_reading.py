@@ -12,8 +12,8 @@ from tempfile import TemporaryDirectory
 
 from aenerf_ns.errors import DataError
 
-# What a refusal may take, above what the process has: seconds on a slow machine. Reading all would take more.
-MAX_BYTES, MAX_SECONDS = 1 << 30, 8.0
+# What a refusal may take, above what the process has.
+MAX_BYTES, MAX_SECONDS = 1 << 30, 2.0
 
 
 @contextmanager
