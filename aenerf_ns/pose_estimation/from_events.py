@@ -69,12 +69,10 @@ def estimate_poses_from_events(
                 + ("check the calibration too" if is_calibrated else "a calibration helps"),
             )
 
-        def rank(mapper: str) -> tuple[bool, float]:
-            # The global mapper may throw images far out where it sees nothing, and no adjustment takes them back.
-            is_sane = models[mapper].compute_mean_reprojection_error() < _ROUNDS[-1][0]
-            return is_sane, held_out.agreement(models[mapper])
-
-        mapper = max(models, key=rank)
+        agreements = {mapper: held_out.agreement(model) for mapper, model in models.items()}
+        errors = {mapper: model.compute_mean_reprojection_error() for mapper, model in models.items()}
+        # The global mapper may throw images far out where it sees nothing, and no adjustment takes them back.
+        mapper = max(models, key=lambda name: (errors[name] < _ROUNDS[-1][0], agreements[name]))
         model = models[mapper]
         stand_upright(model)
     return EstimatedPoses(
@@ -83,12 +81,12 @@ def estimate_poses_from_events(
         camera=camera,
         model_sizes=[model.num_reg_images() for model in found[mapper]],
         num_points=model.num_points3D(),
-        reprojection_error=model.compute_mean_reprojection_error(),
+        reprojection_error=errors[mapper],
         features=features,
         seconds=time.perf_counter() - begin,
         scene_box=box_of(model),
         images="images of the events",
         mapper=mapper,
-        agreement=held_out.agreement(model),
+        agreement=agreements[mapper],
         draw=partial(draw_poses, pictures, observations_of(model, len(times))),
     )
