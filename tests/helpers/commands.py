@@ -13,8 +13,8 @@ import tyro
 from aenerf_ns.cli.simulate import Simulate
 
 CPU = ("--machine.device-type", "cpu")
-# Seconds after which a command hangs. No test rests on it, and a slow machine may need long.
-_TIMEOUT = 1200
+TIMEOUT = 1200
+"""Seconds after which a command hangs. No test rests on it, and a slow machine may need long."""
 
 
 def run(*command: str | Path, cwd: Path, fails: bool = False, gpu: bool = False) -> str:
@@ -24,7 +24,7 @@ def run(*command: str | Path, cwd: Path, fails: bool = False, gpu: bool = False)
         environment["CUDA_VISIBLE_DEVICES"] = ""
     script = Path(sys.executable).parent / str(command[0])
     done = subprocess.run(
-        [script, *command[1:]], cwd=cwd, env=environment, capture_output=True, text=True, timeout=_TIMEOUT, check=False
+        [script, *command[1:]], cwd=cwd, env=environment, capture_output=True, text=True, timeout=TIMEOUT, check=False
     )
     output = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", done.stdout + done.stderr)
     assert (done.returncode != 0) == fails, output[-3000:]

@@ -448,7 +448,7 @@ def test_the_viewer_shows_a_trained_run(trained: Path, workspace: Path) -> None:
 
 
 def wait_for_page(port: int, viewer: subprocess.Popen, log: Path) -> bytes:
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + TIMEOUT
     while True:
         assert viewer.poll() is None, log.read_text()[-3000:]
         try:
