@@ -240,7 +240,8 @@ class WarpedEvents:
 
     def _geometry(self, events: EventStream, hypothesis: Hypothesis) -> _SliceGeometry:
         camera, num_poses, focal_factor = self._camera, _SETTINGS.num_poses, hypothesis.focal_factor
-        times = np.linspace(events.t[0], events.t[-1], num_poses).astype(np.int64)
+        # Times since 1970 would be rounded by 128 ns as decimals, and may then lie outside the poses.
+        times = events.t[0] + np.linspace(0, events.t[-1] - events.t[0], num_poses).astype(np.int64)
         if hypothesis.still:
             poses = torch.eye(4, dtype=torch.float64).expand(num_poses, 4, 4)
         else:

@@ -130,7 +130,7 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     noise = NoiseRate(recording.event_file.width, recording.event_file.height)
     statistics, num_covered = _count_events(recording, window, changes, balance, noise)
     result = CheckResult(statistics)
-    _check_events(result, noise)
+    _check_events(result, noise, recording.sensor.bayer_pattern)
     correlation = changes.correlation()
     _check_polarity(result, correlation)
     _check_thresholds(result, recording, changes, balance, correlation or 0.0)
@@ -186,7 +186,7 @@ def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> li
     return [EventStream.concatenate(part) for part in parts]
 
 
-def _check_events(result: CheckResult, noise: NoiseRate) -> None:
+def _check_events(result: CheckResult, noise: NoiseRate, bayer_pattern: str | None) -> None:
     statistics, figures, problems = result.statistics, result.figures, result.problems
     count, seconds = statistics.num_events, max(statistics.end - statistics.start, 1) * 1e-9
     height, width = statistics.counts.shape
@@ -216,7 +216,7 @@ def _check_events(result: CheckResult, noise: NoiseRate) -> None:
             "all times of events are whole milliseconds: the camera's have microseconds, which tell the order of the "
             "events; write them with all their digits"
         )
-    hot = find_hot_pixels(statistics.counts)
+    hot = find_hot_pixels(statistics.counts, bayer_pattern)
     figures.append(hot_pixel_summary(hot, statistics.counts))
     noise_rate = noise.rate(hot)
     if noise_rate is not None:

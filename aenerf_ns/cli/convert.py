@@ -119,20 +119,27 @@ class Convert(DatasetCommand):
 
     def _convert(self, parser: EventDataParser, filters: EventFilters, lock: OutputLock) -> None:
         from aenerf_ns.events.filters import FilteredEventFile
+        from aenerf_ns.recording.images import check_image
         from aenerf_ns.recording.poses_report import POSES_PICTURE
         from aenerf_ns.recording.time_units import require_covered
         from aenerf_ns.recording.views import thin_views
 
         has_given_poses = self.poses in ("given", "refined")
         capture, images = (parser.recording, []) if has_given_poses else parser.read_frames()
+        events = FilteredEventFile(capture.event_file, filters, capture.sensor.bayer_pattern)
         # Refused before poses are found, which may take hours.
-        events = FilteredEventFile(capture.event_file, filters)
         if self.region is not None and capture.sensor.bayer_pattern and (self.region[0] % 2 or self.region[1] % 2):
             raise DataError(
                 "aenerf convert",
                 f"a region of interest from pixel {self.region[0]} {self.region[1]} of a color sensor",
                 "begin it at an even column and row, so that the Bayer pattern begins there as on the whole sensor",
             )
+        copied = images if self.poses == "events" and capture.frame_camera == capture.event_camera else []
+        if self.poses == "refined":
+            _, copied = parser.read_frames()
+        for time, file in copied:
+            if filters.window.contains(time):
+                check_image(file, capture.frame_camera)
         report = picture = None
         if has_given_poses:
             recording = parser.recording
@@ -141,6 +148,9 @@ class Convert(DatasetCommand):
                 recording, report, picture = self._with_refined_poses(parser, recording, filters.window)
         else:
             recording, report, picture = self._with_estimated_poses(capture, images, filters.window)
+            # The dataset's own longest gap is about its own poses, but one that was given is about these.
+            if any(option.startswith("max_pose_gap_ns=") for option in self.format_options):
+                recording = replace(recording, max_pose_gap=parser.config.max_pose_gap_ns)
         trajectory = _cut(recording, events, filters.window)
         views = {
             split: thin_views(
@@ -294,7 +304,7 @@ def _with_poses(
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.pose_estimation.from_frames import compare_with_truth
     from aenerf_ns.recording.recording import Capture, Recording
-    from aenerf_ns.recording.views import views_on_trajectory
+    from aenerf_ns.recording.views import MAX_VIEWS, views_on_trajectory
 
     trajectory, report = found.trajectory, found.report()
     if capture.intrinsics_origin == "guessed":
@@ -336,5 +346,6 @@ def _with_poses(
         trajectory=trajectory,
         scene_box=box,
         reference_views=views,
+        max_views=MAX_VIEWS,
     )
     return recording, report, found.draw and found.draw(paths)

@@ -54,6 +54,8 @@ class ExportTrajectory(RunCommand):
         times = trajectory.times
         if self.rate is not None:
             times = regular_times(trajectory.start, trajectory.end, self.rate).to(times.device)
+            if len(times) < 2:
+                raise DataError("--rate", f"{self.rate:g} poses a second give no two poses", "give a higher one")
         source = correction if self.poses == "corrected" else trajectory
         with torch.no_grad():
             poses = source.pose(trajectory.seconds(times))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numba
@@ -76,7 +77,7 @@ def count_events(chunks: Iterable[EventStream], width: int, height: int) -> NDAr
     return counts.reshape(height, width)
 
 
-def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+def find_hot_pixels(counts: NDArray[np.integer], bayer_pattern: str | None = None) -> NDArray[np.bool_]:
     """Find the pixels that fire by themselves.
 
     Edges pass over many pixels when the camera moves, so that a pixel has about as many events as the pixels around it.
@@ -87,14 +88,36 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
 
     Args:
         counts: (height, width) number of events of every pixel.
+        bayer_pattern: of a color sensor, on which a pixel is compared with those of its own filter.
 
     Returns:
         (height, width) bool, whether a pixel is hot.
     """
-    around = cv2.medianBlur(counts.astype(np.float32), 5)
+    step = 2 if bayer_pattern else 1
+    around = np.zeros(counts.shape)
+    for row, column in product(range(step), repeat=2):
+        around[row::step, column::step] = _median_around(counts[row::step, column::step])
     excess = 2 * (np.sqrt(counts + 0.375) - np.sqrt(around + 0.375))
     spread = max(1.4826 * float(np.median(np.abs(excess))), 1.0)
     return (counts > _HOT_FACTOR * around) & (excess > _HOT_DEVIATIONS * spread)
+
+
+def _median_around(counts: NDArray[np.integer]) -> NDArray[np.float32]:
+    """Return the median of the 5 x 5 pixels around each pixel.
+
+    Most pixels around a pixel with events may have none, as where a share of the pixels was kept. The median is then
+    that of the others around it that have events, or of the whole sensor's, if there are no others.
+    """
+    around = np.asarray(cv2.medianBlur(counts.astype(np.float32, order="C"), 5), np.float32)
+    has_events = counts > 0
+    between = has_events & (around == 0)
+    if between.any():
+        padded = np.pad(np.where(has_events, counts, np.nan), 2, constant_values=np.nan)
+        near = np.lib.stride_tricks.sliding_window_view(padded, (5, 5))[between].reshape(-1, 25)
+        others = np.delete(near, 12, axis=1)
+        others[np.isnan(others).all(axis=1)] = np.median(counts[has_events])
+        around[between] = np.nanmedian(others, axis=1)
+    return around
 
 
 def hot_pixel_summary(hot: NDArray[np.bool_], counts: NDArray[np.integer]) -> str:
@@ -120,6 +143,7 @@ class FilteredEventFile(EventFile):
     Args:
         source: the event file.
         filters: the events to keep.
+        bayer_pattern: of a color sensor; see :func:`find_hot_pixels`.
 
     Raises:
         DataError: the region of interest is not on the sensor.
@@ -130,7 +154,7 @@ class FilteredEventFile(EventFile):
         counts: (height, width) number of events of every pixel of the source; None when ``hot_pixels`` is None.
     """
 
-    def __init__(self, source: EventFile, filters: EventFilters) -> None:
+    def __init__(self, source: EventFile, filters: EventFilters, bayer_pattern: str | None = None) -> None:
         x, y, width, height = filters.region or (0, 0, source.width, source.height)
         if x + width > source.width or y + height > source.height:
             raise DataError(
@@ -141,7 +165,7 @@ class FilteredEventFile(EventFile):
             )
         super().__init__(source.path, width, height)
         self._source = source
-        self._filters = filters
+        self._filters, self._bayer_pattern = filters, bayer_pattern
         self._corner = (x, y)
         self.hot_pixels: NDArray[np.bool_] | None = None
         self.counts: NDArray[np.int64] | None = None
@@ -155,7 +179,7 @@ class FilteredEventFile(EventFile):
         if self._filters.hot_pixels:
             within = self._within(self._source.chunks() if chunks is None else chunks)
             self.counts = count_events(within, self._source.width, self._source.height)
-            self.hot_pixels = find_hot_pixels(self.counts)
+            self.hot_pixels = find_hot_pixels(self.counts, self._bayer_pattern)
 
     def read_chunks(self) -> Iterator[EventStream]:
         yield from self.filtered(self._source.chunks())

@@ -11,6 +11,7 @@ from torch import Tensor
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.limits import MAX_ROWS
+from aenerf_ns.files.text import format_seconds
 
 
 def spread_times(window: TimeWindow, count: int) -> Tensor:
@@ -53,7 +54,7 @@ def times_from_seconds(window: TimeWindow, seconds: Sequence[float]) -> Tensor:
         if not window.contains(times[-1]):
             raise DataError(
                 "--times",
-                f"{value:g} s is not in the run's time, {window.start * 1e-9:g} to {window.end * 1e-9:g} s",
+                f"{value} s is not in the run's time, {format_seconds(window.start)} to {format_seconds(window.end)} s",
                 "give times on the clock of the events, in which poses are known",
             )
     return torch.tensor(times)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from aenerf_ns.errors import DataError, reading, reason
@@ -61,12 +62,23 @@ def require_writable(output: Path, option: str = "--output") -> None:
 
 @contextmanager
 def creating(output: Path, option: str = "--output") -> Iterator[None]:
-    """Make the folder of a file that is written within the context, and turn errors of the system into a DataError."""
+    """Make the folder of what is written within the context, and turn errors of the system into a DataError.
+
+    What was not there before is removed if an error or Ctrl-C leaves it unfinished.
+    """
+    is_new = not output.exists()
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         yield
-    except OSError as error:
-        raise output_error(output, error, option) from None
+    except BaseException as error:
+        if is_new and output.is_dir():
+            shutil.rmtree(output, ignore_errors=True)
+        elif is_new:
+            with suppress(OSError):
+                output.unlink()
+        if isinstance(error, OSError):
+            raise output_error(output, error, option) from None
+        raise
 
 
 def output_error(output: Path, error: OSError | ValueError, option: str = "--output") -> DataError:

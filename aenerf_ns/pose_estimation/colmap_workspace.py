@@ -54,8 +54,10 @@ class HeldOutMatches:
     pairs: list[tuple[tuple[int, int], list[NDArray[np.float64]]]]
     focal_length: float
 
-    def agreement(self, model: Any) -> float:
+    def agreement(self, model: Any) -> float | None:
         """Return the share of the matches that fit the poses of a model: matches of frames without a pose do not.
+
+        None where there are no matches.
 
         A match fits if its epipolar error (Sampson's distance) is less than a pixel.
         """
@@ -73,7 +75,7 @@ class HeldOutMatches:
             slopes = np.square(lines_in_second[:, :2]).sum(1) + np.square(lines_in_first[:, :2]).sum(1)
             errors = np.abs((y * lines_in_second).sum(1)) / np.sqrt(slopes + 1e-30)
             fitting += int((errors * self.focal_length < _MAX_EPIPOLAR_ERROR).sum())
-        return fitting / max(total, 1)
+        return fitting / total if total else None
 
 
 @contextlib.contextmanager

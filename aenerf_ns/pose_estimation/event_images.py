@@ -61,7 +61,8 @@ def match_event_images(
     camera, events = capture.event_camera, capture.event_file
     num_events = round(_BATCHES * EVENTS_PER_PIXEL * camera.width * camera.height)
     # Pixels that fire by themselves would be features that do not move.
-    kept = FilteredEventFile(events, EventFilters(start=window.start, end=window.end, hot_pixels=True))
+    filters = EventFilters(start=window.start, end=window.end, hot_pixels=True)
+    kept = FilteredEventFile(events, filters, capture.sensor.bayer_pattern)
     kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
     chunks = kept.filtered(tracked(events.chunks(), "Making images of the events", events.count()))
     if weights is None:

@@ -72,7 +72,7 @@ def estimate_poses_from_events(
         agreements = {mapper: held_out.agreement(model) for mapper, model in models.items()}
         errors = {mapper: model.compute_mean_reprojection_error() for mapper, model in models.items()}
         # The global mapper may throw images far out where it sees nothing, and no adjustment takes them back.
-        mapper = max(models, key=lambda name: (errors[name] < _ROUNDS[-1][0], agreements[name]))
+        mapper = max(models, key=lambda name: (errors[name] < _ROUNDS[-1][0], agreements[name] or 0.0))
         model = models[mapper]
         stand_upright(model)
     return EstimatedPoses(

@@ -129,7 +129,8 @@ def estimate_poses(
     """Estimate the poses of a video by COLMAP's incremental structure from motion, on the CPU.
 
     Intrinsics and distortion that are given stay as given. Every frame is matched with its neighbors, and a hundred
-    frames with each other. A seed gives the same poses again, to the last bit on one machine with one version of COLMAP.
+    frames with each other. A seed gives the same poses again, to the last bit on one machine with one version of
+    COLMAP.
 
     Args:
         frames: (height, width) gray or (height, width, 3) RGB arrays, or files that hold such pictures, in the order of

@@ -25,14 +25,15 @@ def box_of(model: Any) -> NDArray[np.float64] | None:
         model: COLMAP's. The box is in its world.
     """
     points = [point for point in model.points3D.values() if point.track.length() >= _MIN_LENGTH]
-    if len(points) < _MIN_TRACKS:
+    poses = poses_of(model)
+    if len(points) < _MIN_TRACKS or not poses:
         return None
     # A point counts as often as it was seen.
     seen = np.repeat([point.xyz for point in points], [point.track.length() for point in points], axis=0)
     low, high = np.quantile(seen, [_MAX_BEYOND, 1 - _MAX_BEYOND], axis=0)
     margin = _MARGIN * (high - low).max()
     low, high = low - margin, high + margin
-    cameras = np.stack(list(poses_of(model).values()))[:, :, 3]
+    cameras = np.stack(list(poses.values()))[:, :, 3]
     directions = cameras - (low + high) / 2
     is_inside = ((low < cameras) & (cameras < high)).all(1).any()
     return None if is_inside or (directions @ directions.T).min() > 0 else np.stack([low, high])

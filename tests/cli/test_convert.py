@@ -232,11 +232,27 @@ def test_given_poses_of_another_time_are_left_out(tmp_path: Path, monkeypatch: p
     given = read_tum_trajectory(data / "groundtruth.txt")
     write_tum_trajectory(data / "groundtruth.txt", Trajectory(given.times + 10**12, given.camera_to_worlds))
     with CONSOLE.capture() as output:
-        found = convert(data, tmp_path / "found", poses="events")
+        options = {"format": "ecd-data", "format_options": ("max_pose_gap_ns=150000000",)}
+        found = convert(data, tmp_path / "found", poses="events", **options)
+    assert found.max_pose_gap == 150_000_000
     assert "The given poses, from 1000000000000 to " in output.get()
     assert "are of another time than the estimated ones, from 50000000 to 250000000 ns: they are left" in output.get()
     assert found.ground_truth is None
     assert found.trajectory.times.tolist() == [50_000_000, 150_000_000, 250_000_000]
+
+
+@pytest.mark.parametrize(
+    ("poses", "search"), [("events", "from_events.estimate_poses_from_events"), ("refined", "from_poses.refine_poses")]
+)
+def test_broken_images_are_refused_before_poses_are_found(
+    poses: str, search: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"aenerf_ns.pose_estimation.{search}", lambda *_: pytest.fail("it searched"))
+    data = write_ecd(tmp_path / "made")
+    for image in (data / "images").iterdir():
+        image.write_bytes(b"no image")
+    with pytest.raises(DataError, match=r"images/\S+\.png: "):
+        convert(data, tmp_path / "converted", poses=poses)
 
 
 def test_the_report_on_poses_stays_with_them(tmp_path: Path) -> None:
@@ -268,6 +284,7 @@ def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
         ({"poses": "events", "region": (0, 0, 7, 4)}, "region of interest 0 0 7 4 .* beyond its 6 x 4 pixels"),
         ({"poses": "refined", "region": (1, 0, 4, 4)}, "from pixel 1 0 of a color sensor; begin it at an even"),
         ({"poses": "colmap", "end_time_ns": START + 1}, "1 frames; poses can be estimated from two"),
+        ({"poses": "events", "seed": 2**31}, "--seed: 2147483648 is out of range"),
     ],
 )
 def test_impossible_options_are_one_line(options: dict, message: str, tmp_path: Path) -> None:

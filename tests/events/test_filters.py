@@ -133,6 +133,22 @@ def test_planted_hot_pixels_are_found_and_no_others() -> None:
     assert not find_hot_pixels(np.zeros((10, 10), np.int64)).any()
 
 
+@pytest.mark.parametrize("share", [0.05, 0.25, 0.4, 0.5, 0.6, 0.8])
+def test_pixels_between_removed_ones_are_not_hot(share: float) -> None:
+    rng = np.random.default_rng(1)
+    counts = rng.poisson(60, (60, 80)) * (rng.random((60, 80)) < share)
+    counts[30, 40] = 2000
+    assert np.argwhere(find_hot_pixels(counts)).tolist() == [[30, 40]]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_a_filter_that_alone_sees_light_is_not_hot(share: float) -> None:
+    counts = np.random.default_rng(2).poisson(60 * share, (60, 80))
+    counts[::2, :40:2] += np.random.default_rng(3).poisson(60, (30, 20))
+    counts[30, 20] = 2000
+    assert np.argwhere(find_hot_pixels(counts, "RGGB")).tolist() == [[30, 20]]
+
+
 def test_hot_pixels_are_left_out_and_told() -> None:
     rng = np.random.default_rng(0)
     rows = [(int(x), int(y), 2 * i, 1) for i, (x, y) in enumerate(rng.integers(0, (WIDTH, HEIGHT), (300, 2)))]

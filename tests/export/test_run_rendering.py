@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +93,7 @@ def test_times_leave_gaps_out() -> None:
     assert times_at_rate(window, 20).tolist() == [0, 5 * 10**7, 10**8, *range(SECOND // 2, SECOND + 1, 5 * 10**7)]
     assert times_from_seconds(window, [0.05, 0.75]).tolist() == [5 * 10**7, 75 * 10**7]
     for seconds in (0.2, 1.5, float("nan"), float("inf")):
-        with pytest.raises(DataError, match="is not in the run's time, 0 to 1 s"):
+        with pytest.raises(DataError, match=r"is not in the run's time, 0\.0+ to 1\.0+ s"):
             times_from_seconds(window, [seconds])
     with pytest.raises(DataError, match="1e\\+09 gives 1e\\+09 times"):
         times_at_rate(window, 1e9)
@@ -110,9 +111,13 @@ def test_mesh_is_in_recording_units(run: TrainedRun, monkeypatch: pytest.MonkeyP
         along = directions @ to_center
         half_chord = radius**2 - (to_center @ to_center - along**2)
         depth = np.where(half_chord > 0, along - np.sqrt(half_chord.clip(0)), 0.0)
+        # In one view Open3D sees nothing: it looks at every fourth pixel.
+        if next(views) == 0:
+            depth[::4, ::4] = 0
         color = np.broadcast_to([1.0, 0.5, 0.0], directions.shape)
         return {"rgb": torch.from_numpy(color.copy()).float(), "depth": torch.from_numpy(depth[..., None])}
 
+    views = count()
     monkeypatch.setattr(mesh, "render", render)
     lens = CameraIntrinsics(96, 72, 80.0, 80.0, 48.0, 36.0)
     run = replace(run, recording=replace(run.recording, event_camera=lens))

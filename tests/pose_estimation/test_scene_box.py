@@ -59,3 +59,10 @@ def test_the_box_holds_what_is_seen_and_little_more(num_wrong: int) -> None:
 )
 def test_no_box_where_the_camera_does_not_go_around(radius: float, turn: float, num_points: int) -> None:
     assert box_of(model(radius, turn, num_points=num_points)) is None
+
+
+def test_no_box_where_no_image_sees_enough() -> None:
+    weak = model(3.0, 6.0)
+    for image in weak.images.values():
+        image.num_points3D = 10
+    assert box_of(weak) is None

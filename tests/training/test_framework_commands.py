@@ -26,7 +26,7 @@ import trimesh
 import websockets.sync.client
 import yaml
 from helpers.browser import chromium
-from helpers.commands import CPU, newest_config, run
+from helpers.commands import CPU, TIMEOUT, newest_config, run
 from helpers.dataset_faults import set_in
 from helpers.small_trainings import own_log
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
