@@ -8,9 +8,10 @@ from rosbags.highlevel import AnyReader
 
 bag, topic = Path("recording/events.bag"), "/dvs/image_raw"
 folder = bag.parent
-(folder / "images").mkdir()
 with AnyReader([bag]) as reader, (folder / "images.txt").open("w") as file_list:
     connections = [connection for connection in reader.connections if connection.topic == topic]
+    assert connections, f"no topic {topic}; the bag has {sorted(reader.topics)}"
+    (folder / "images").mkdir()
     for index, (connection, _, raw) in enumerate(reader.messages(connections)):
         message = reader.deserialize(raw, connection.msgtype)
         assert message.encoding == "mono8", message.encoding

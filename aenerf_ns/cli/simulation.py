@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 # Wider than anybody needs. Outside them a simulation would run for days, or fill the memory.
 _RANGES = {
+    # The simulator's thresholds are not below 0.01.
+    "positive_contrast_threshold": (0.01, 1e3),
+    "negative_contrast_threshold": (0.01, 1e3),
     "pose_noise_degrees": (0, 180),
     "pose_noise_translation": (0, 1e6),
     "pose_noise_correlation_time": (1e-6, 1e6),

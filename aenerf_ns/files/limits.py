@@ -141,12 +141,12 @@ def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> 
 
 
 def list_files(folder: Path, pattern: str) -> list[Path]:
-    """List the files of a dataset's folder that match a pattern, in the order of their names.
+    """List the files of a dataset's folder that match a pattern, in the order of their names, but not hidden ones.
 
     Raises:
         DataError: there is none.
     """
-    files = sorted(folder.glob(pattern))
+    files = sorted(file for file in folder.glob(pattern) if not file.name.startswith("."))
     if not files:
         raise DataError(folder, f"it holds no {pattern}", "copy all files of the dataset")
     return files

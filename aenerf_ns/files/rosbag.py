@@ -147,7 +147,9 @@ class RosbagEventFile(EventReader):
                     raise DataError(
                         self.path, f"a message of {topic} does not have the parts of its type", "copy it again"
                     ) from None
-                self._size = resolve_sensor_size(self.path, (message.width, message.height), *self._size)
+                # Zeros are what a message has that states no size.
+                stated = (message.width, message.height) if message.width or message.height else None
+                self._size = resolve_sensor_size(self.path, stated, *self._size)
                 yield message
 
     def _columns(self, start: int | None = None) -> Iterator[Columns]:

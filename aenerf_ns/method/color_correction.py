@@ -51,6 +51,11 @@ class NoColorCorrection(nn.Module):
         """The protocol and what it was fitted on, in words."""
         return self.protocol
 
+    @property
+    def fitted_on(self) -> str:
+        """The views that the map was fitted on, in words: none."""
+        return "nothing"
+
 
 class AffineColorCorrection(nn.Module):
     """Protocol ``affine``: an affine map of log-radiance per channel (paper, "Color Correction of Synthesized Views").
@@ -88,7 +93,7 @@ class AffineColorCorrection(nn.Module):
             name = {"val": "validation", "test": "test"}[self.split]
             return f"percentile stretch, no {name} views (protocol {self.protocol})"
         warning = ", with a negative slope, as if the events' polarities were reversed" if self.is_reversed else ""
-        return f"{self.protocol}, fitted on {self._fitted_on}{warning}"
+        return f"{self.protocol}, fitted on {self.fitted_on}{self._found}{warning}"
 
     @property
     def is_reversed(self) -> bool:
@@ -96,8 +101,14 @@ class AffineColorCorrection(nn.Module):
         return int(self.num_views) > 0 and float(self.scale.mean()) < 0
 
     @property
-    def _fitted_on(self) -> str:
+    def fitted_on(self) -> str:
+        """The views that the map was fitted on, in words."""
         return f"{int(self.num_views)} validation views"
+
+    @property
+    def _found(self) -> str:
+        """What the fit found, in words that follow on others."""
+        return ""
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
@@ -144,7 +155,8 @@ class AffineTestColorCorrection(AffineColorCorrection):
     split = "test"
 
     @property
-    def _fitted_on(self) -> str:
+    def fitted_on(self) -> str:
+        """The views that the map was fitted on, in words."""
         return f"the {int(self.num_views)} test views themselves"
 
 
@@ -167,9 +179,8 @@ class TranslatedGammaColorCorrection(AffineColorCorrection):
         return encode(torch.exp(self.scale * log_radiance + self.offset) - self.black, self.encoding)
 
     @property
-    def _fitted_on(self) -> str:
-        exponents = ", ".join(f"{exponent:.3f}" for exponent in self.scale.tolist())
-        return f"{super()._fitted_on}, exponent a = {exponents}"
+    def _found(self) -> str:
+        return f", exponent a = {', '.join(f'{exponent:.3f}' for exponent in self.scale.tolist())}"
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
@@ -251,9 +262,8 @@ class NetworkColorCorrection(AffineColorCorrection):
         return (super().forward(log_radiance) + self._residual(log_radiance, self._layers)).clamp(0, 1)
 
     @property
-    def _fitted_on(self) -> str:
-        views = super()._fitted_on
-        return views if self._layers[-1][0].any() else f"{views}, its affine part only"
+    def _found(self) -> str:
+        return "" if self._layers[-1][0].any() else ", its affine part only"
 
     @property
     def _layers(self) -> list[tuple[Tensor, Tensor]]:

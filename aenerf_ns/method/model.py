@@ -382,7 +382,7 @@ def _density(network: Field, samples: RaySamples) -> Tensor:
 
 
 def _require_possible(config: AENeRFModelConfig) -> None:
-    """Raise a DataError for planes that no ray can meet, and for chunks of no rays."""
+    """Raise a DataError for planes that no ray can meet, and for numbers that fit nothing."""
     near, far = config.near_plane, config.far_plane
     if not 0 <= near < far < math.inf:
         raise DataError(
@@ -390,6 +390,15 @@ def _require_possible(config: AENeRFModelConfig) -> None:
         )
     if config.eval_num_rays_per_chunk < 1:
         raise DataError("model", f"eval_num_rays_per_chunk {config.eval_num_rays_per_chunk}", "give one or more rays")
+    rounds, networks = len(config.proposal.num_samples_per_ray), len(config.proposal.max_resolutions)
+    if rounds == 0 or (config.backbone == "hash" and rounds != networks):
+        raise DataError(
+            "model",
+            f"proposal.num_samples_per_ray has {rounds} values, proposal.max_resolutions {networks}",
+            "give as many of each, at least one",
+        )
+    if not config.camera_optimizer.knot_interval > 0:
+        raise DataError("model", f"knot_interval {config.camera_optimizer.knot_interval:g}", "give seconds above 0")
 
 
 def _with_room(aabb: Tensor) -> Tensor:

@@ -187,6 +187,10 @@ class PoseCorrection(CameraOptimizer):
             pose, rate = both.split(3, -2)
         return pose, rate
 
+    def at_first(self, seconds: Tensor) -> Tensor:
+        """Return the times on the trajectory at which training begins to look up poses, for times of events."""
+        return (seconds + (self.config.clock_offset or 0.0)).clamp(0, self.trajectory.duration)
+
     def _on_clock_of_poses(self, seconds: Tensor) -> Tensor:
         """Return the times on the trajectory at which base poses are looked up, for times of events."""
         if self.clock_change is None:
@@ -245,12 +249,12 @@ class PoseCorrection(CameraOptimizer):
     def world_twists(self, seconds: Tensor, base: Tensor) -> Tensor:
         """Return the float64 twists (N, 6) in the world that correct poses, in scene units and radians.
 
-        The corrected pose is exp(twist) · base pose, to first order base pose + (v + ω × position). The clock offset
-        adds δ times the twist at which the base pose moves.
+        The corrected pose is exp(twist) · base pose, to first order base pose + (v + ω × position). What is learned of
+        the clock offset adds as many seconds of the twist at which the base pose moves.
 
         Args:
             seconds: (N,) float64 times since the trajectory's start.
-            base: (N, 3, 4) base poses at these times.
+            base: (N, 3, 4) base poses at these times, on the clock that training begins with.
         """
         if self.twists is not None:
             twists = self._twist_units * self.twists(seconds, base)
@@ -260,11 +264,11 @@ class PoseCorrection(CameraOptimizer):
             twists = twists + self._rigid_twists(len(base))
         translation, rotation = (base[:, None, :, :3] @ twists.unflatten(-1, (2, 3, 1)))[..., 0].unbind(1)
         if self.clock_change is not None:
-            _, rate = self.trajectory.pose_and_rate(seconds)
+            _, rate = self.trajectory.pose_and_rate(self.at_first(seconds))
             # The derivative of a rotation R is [ω]ₓ R.
             turning = rate[..., :3] @ base[..., :3].mT
             omega = torch.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], -1)
-            offset = self.clock_offset()
+            offset = _MAX_CLOCK_CHANGE * self.clock_change_share()
             translation, rotation = translation + offset * rate[..., 3], rotation + offset * omega
         return torch.cat([translation + torch.linalg.cross(base[..., 3], rotation), rotation], -1)
 

@@ -67,7 +67,7 @@ class PoseFollowingWarp(nn.Module):
         self._interval = duration / (count - 1)
         seconds = torch.linspace(0, duration, count, dtype=torch.float64)
         self.register_buffer("_seconds", seconds, persistent=False)
-        self.register_buffer("_base_poses", correction.trajectory.pose(seconds), persistent=False)
+        self.register_buffer("_base_poses", correction.trajectory.pose(correction.at_first(seconds)), persistent=False)
         self.register_buffer("_seen", torch.zeros(_RESOLUTION**3, count))
         self.register_buffer("_weights", torch.full((_RESOLUTION**3, count), 1 / count))
         self.register_buffer("_strides", torch.tensor([_RESOLUTION**2, _RESOLUTION, 1]), persistent=False)

@@ -37,7 +37,9 @@ Item = TypeVar("Item")
 
 def image_files(folder: Path) -> list[Path]:
     """Return the PNG and JPEG images of a folder in the order of their names; none if the folder does not exist."""
-    return sorted(file for file in folder.glob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
+    # macOS puts a hidden file beside each file that it copies to other disks.
+    files = (file for file in folder.glob("*") if not file.name.startswith("."))
+    return sorted(file for file in files if file.suffix.lower() in IMAGE_SUFFIXES)
 
 
 def image_files_of_poses(folder: Path, num_poses: int) -> list[Path]:

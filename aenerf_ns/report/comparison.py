@@ -35,7 +35,9 @@ def read_protocol(run: TrainedRun) -> Protocol:
     if run.views is not None:
         for index, file in enumerate(view_files(run)):
             truths[file] = zlib.crc32(run.views.get_numpy_image(index).tobytes())
-    return Protocol(run.model.color_correction.description, describe_test_poses(run.model.camera_optimizer), truths)
+    correction = run.model.color_correction
+    color_correction = f"{correction.protocol}, fitted on {correction.fitted_on}"
+    return Protocol(color_correction, describe_test_poses(run.model.camera_optimizer), truths)
 
 
 def protocol_differences(names: Sequence[str], protocols: Sequence[Protocol]) -> list[str]:

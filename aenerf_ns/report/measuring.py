@@ -198,7 +198,7 @@ def _measure_data(report: RunReport, run: TrainedRun) -> None:
         report.missing.append("The check's picture: too few events have a pose.")
     report.pairs = measure_pair_residuals(run)
     if report.pairs is None:
-        report.missing.append("Rendered against measured changes: the batches of this method are no pairs of events.")
+        report.missing.append("Rendered against measured changes: no pairs that this run draws end at events.")
     else:
         report.num_pairs = run.dataset.pairs.summary()
         report.drift = run.dataset.polarity_drift

@@ -50,24 +50,27 @@ class PairResiduals:
 def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
     """Render newly drawn pairs that end at events, the same in every call, and compare their changes.
 
-    None for a run whose batches are not pairs. The run is in evaluation mode, and its events are there.
+    None for a run whose batches are not pairs, or whose pairs all end between events. The run is in evaluation mode,
+    and its events are there.
     """
     drawn = None if run.sampler is None else run.sampler.residual_batch(2 * _NUM_PAIRS)
     if drawn is None:
         return None
     rays, batch = drawn
+    at_events = ~batch.ends_between_events.cpu().numpy()
+    if not at_events.any():
+        return None
     supervision = run.model.supervision
     assert isinstance(supervision, PairSupervision)
     num_pairs = len(batch)
     pieces = []
-    chunk = run.model.config.eval_num_rays_per_chunk // 2
+    chunk = max(run.model.config.eval_num_rays_per_chunk // 2, 1)
     for begin in range(0, num_pairs, chunk):
         chosen = torch.arange(begin, min(begin + chunk, num_pairs), device=run.device)
         outputs = run.model(rays[torch.cat([chosen, chosen + num_pairs])])
         unit = supervision.loss_unit(outputs)
         pieces.append(torch.stack([change / unit for change in supervision.changes(outputs, batch[chosen])]))
     rendered, measured = torch.cat(pieces, -1).double().cpu().numpy()
-    at_events = ~batch.ends_between_events.cpu().numpy()
     length = (batch.num_positive + batch.num_negative).floor().cpu().numpy()[at_events]
     pixel = batch.pixel.cpu().numpy()[at_events]
     rendered, measured = rendered[at_events], measured[at_events]

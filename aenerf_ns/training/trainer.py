@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shlex
 import shutil
 import signal
 import sys
@@ -193,14 +194,17 @@ class AENeRFTrainer(Trainer):
                 signal.signal(number, before[number])
 
     def _stop_if_asked(self, step: int) -> None:
-        if self._stopped_by and self._record is not None:
+        # A training that is complete ends by itself.
+        if self._stopped_by and self._record is not None and step + 1 < self._steps.stop:
+            self.pipeline.color_fit.fit()
             self.save_checkpoint(step)
             self._record.write("stopped", step + 1 - self._steps.start)
             self._record = None
             left = framework.iterations_to_reach(self._steps.stop, step)
             print(
-                f"Stopped after step {step}. Go on with the same command, and after the method's name "
-                f"--load-dir {self.base_dir} --max-num-iterations {left}",
+                f"Stopped after step {step}. Go on with the same command, and "
+                f"--load-dir {shlex.quote(str(self.base_dir))} --max-num-iterations {left} after the method's name, in "
+                "place of these options where it has them",
                 flush=True,
             )
             raise SystemExit(128 + self._stopped_by)

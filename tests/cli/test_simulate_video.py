@@ -193,7 +193,7 @@ LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
         (("calibration",), {"event_camera": "cam1"}, "its camera has 25 x 16 pixels, the frames of .* 24 x 16; give"),
         ((), {"intrinsics": (0.0, 21.0, 11.5, 7.5)}, "--intrinsics: fx must be from"),
         ((), {"pose_noise_degrees": 1.0}, "without poses to add it to; give --trajectory"),
-        ((), {"positive_contrast_threshold": 0.0}, "positive_contrast_threshold must be from"),
+        ((), {"positive_contrast_threshold": 0.0}, "--positive-contrast-threshold: 0.0 is out of range"),
         ((), {"positive_contrast_threshold": 9.0, "negative_contrast_threshold": 9.0}, "no pixel changes by a"),
     ],
 )

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.limits import bounded, bounded_items
+from aenerf_ns.files.limits import bounded, bounded_items, list_files
+
 
 LIMITS = (resource.RLIMIT_DATA, resource.RLIMIT_FSIZE)
 
@@ -52,3 +53,9 @@ def test_limits_hold_while_an_item_is_read(tmp_path: Path) -> None:
         assert resource.getrlimit(resource.RLIMIT_DATA) == before
     assert len(inside) == 2
     assert before not in inside
+
+
+def test_hidden_files_are_no_data(tmp_path: Path) -> None:
+    for name in ("b.txt", "a.txt", "._a.txt"):
+        (tmp_path / name).touch()
+    assert [file.name for file in list_files(tmp_path, "*.txt")] == ["a.txt", "b.txt"]

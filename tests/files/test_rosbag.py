@@ -41,6 +41,14 @@ def test_arrays_of_events_in_a_bag(compress: str, folder: Path, monkeypatch: pyt
     np.testing.assert_array_equal(read(file), table(rows))
 
 
+def test_arrays_that_state_no_size_take_the_given_one(folder: Path) -> None:
+    rows = [(1, 2, START // 1000, 1)]
+    path = write_bag(folder / "zeros.bag", {"/events": (ARRAY, [(START, array_message(rows, (0, 0)))])})
+    np.testing.assert_array_equal(read(open_event_file(path, WIDTH, HEIGHT)), table(rows))
+    with pytest.raises(DataError, match="does not state the size"):
+        open_event_file(path)
+
+
 def test_packets_have_the_times_of_ros(folder: Path) -> None:
     # Ten seconds, which wrap once; two packets an event.
     rows = [(x, 5, 12_000_000 + 200_000 * x, 1 - 2 * (x % 2)) for x in range(50)]

@@ -16,6 +16,7 @@ from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.viewer.utils import CameraState, get_camera
 from torch import Tensor
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.field import to_unit_cube
 from aenerf_ns.method.image_metrics import ImageMetrics
@@ -256,6 +257,18 @@ def test_pictures_are_also_rendered_without_color_correction() -> None:
     assert (after["rgb"] - before["rgb"]).abs().max() > 0.01
     torch.testing.assert_close(after["uncorrected_rgb"], before["uncorrected_rgb"])
     torch.testing.assert_close(after["mean_log_radiance"], after["log_radiance"].mean(-1, keepdim=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"proposal": {"num_samples_per_ray": (8, 8), "max_resolutions": (32,)}}, "2 values, .*_resolutions 1"),
+        ({"camera_optimizer": PoseCorrectionConfig(knot_interval=0.0)}, "knot_interval 0; give seconds above 0"),
+    ],
+)
+def test_impossible_options_are_one_line(options: dict, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        make_model(**options)
 
 
 def test_rendering_in_chunks_changes_nothing() -> None:

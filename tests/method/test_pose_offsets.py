@@ -98,14 +98,14 @@ def test_a_camera_that_stands_still_has_finite_offsets() -> None:
     assert correction.pose(torch.tensor([0.0, 0.5], dtype=torch.float64)).isfinite().all()
 
 
-@pytest.mark.parametrize("offsets", [{"rigid_offset": True}, {"clock_offset": 0.0}])
+@pytest.mark.parametrize("offsets", [{"rigid_offset": True}, {"clock_offset": 0.0}, {"clock_offset": 0.05}])
 def test_world_twists_are_the_corrections_to_first_order(offsets: dict[str, Any]) -> None:
     seconds = torch.linspace(0.1, 1.9, 20, dtype=torch.float64)
     errors = []
     for size in (1e-2, 1e-3):
         correction = _correction(mode="spline", **offsets)
         _set(correction, size)
-        base = correction.trajectory.pose(seconds)
+        base = correction.trajectory.pose(correction.at_first(seconds))
         twists = correction.world_twists(seconds, base)
         moved = homogeneous(correction.pose(seconds))
         expected = motion_from_twist(twists) @ homogeneous(base)

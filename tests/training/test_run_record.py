@@ -101,4 +101,4 @@ def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint(
     assert (file.parent / "nerfstudio_models" / "step-000000005.ckpt").is_file()
     said = capsys.readouterr().out
     assert "Stopped after step 5. Go on with the same command" in said
-    assert f"--load-dir {file.parent} --max-num-iterations 6" in said
+    assert f"--load-dir {file.parent} --max-num-iterations 6 after the method's name, in place" in said
