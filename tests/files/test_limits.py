@@ -10,7 +10,6 @@ import pytest
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.limits import bounded, bounded_items, list_files
 
-
 LIMITS = (resource.RLIMIT_DATA, resource.RLIMIT_FSIZE)
 
 
