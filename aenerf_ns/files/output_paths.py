@@ -64,7 +64,7 @@ def require_writable(output: Path, option: str = "--output") -> None:
 def creating(output: Path, option: str = "--output") -> Iterator[None]:
     """Make the folder of what is written within the context, and turn errors of the system into a DataError.
 
-    What was not there before is removed if an error or Ctrl-C leaves it unfinished.
+    If an error or Ctrl-C ends the context, a new output is removed, because it is unfinished. An older output stays.
     """
     is_new = not output.exists()
     try:

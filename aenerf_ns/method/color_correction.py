@@ -93,7 +93,7 @@ class AffineColorCorrection(nn.Module):
             name = {"val": "validation", "test": "test"}[self.split]
             return f"percentile stretch, no {name} views (protocol {self.protocol})"
         warning = ", with a negative slope, as if the events' polarities were reversed" if self.is_reversed else ""
-        return f"{self.protocol}, fitted on {self.fitted_on}{self._found}{warning}"
+        return f"{self.protocol}, fitted on {self.fitted_on}{warning}"
 
     @property
     def is_reversed(self) -> bool:
@@ -104,11 +104,6 @@ class AffineColorCorrection(nn.Module):
     def fitted_on(self) -> str:
         """The views that the map was fitted on, in words."""
         return f"{int(self.num_views)} validation views"
-
-    @property
-    def _found(self) -> str:
-        """What the fit found, in words that follow on others."""
-        return ""
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
@@ -179,8 +174,10 @@ class TranslatedGammaColorCorrection(AffineColorCorrection):
         return encode(torch.exp(self.scale * log_radiance + self.offset) - self.black, self.encoding)
 
     @property
-    def _found(self) -> str:
-        return f", exponent a = {', '.join(f'{exponent:.3f}' for exponent in self.scale.tolist())}"
+    def description(self) -> str:
+        """The protocol, what it was fitted on, and the exponents that were found, in words."""
+        exponents = ", ".join(f"{exponent:.3f}" for exponent in self.scale.tolist())
+        return super().description + (f", exponent a = {exponents}" if self.num_views else "")
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
@@ -262,8 +259,10 @@ class NetworkColorCorrection(AffineColorCorrection):
         return (super().forward(log_radiance) + self._residual(log_radiance, self._layers)).clamp(0, 1)
 
     @property
-    def _found(self) -> str:
-        return "" if self._layers[-1][0].any() else ", its affine part only"
+    def fitted_on(self) -> str:
+        """The views that the map was fitted on, in words."""
+        views = super().fitted_on
+        return views if self._layers[-1][0].any() else f"{views}, its affine part only"
 
     @property
     def _layers(self) -> list[tuple[Tensor, Tensor]]:

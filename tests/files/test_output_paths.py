@@ -1,4 +1,4 @@
-"""What a command leaves where it fails."""
+"""Outputs of commands that fail."""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 
 from aenerf_ns.errors import DataError
 
-# What a refusal may take, above what the process has: memory, and CPU time. Where the machine needs longer to unpack
-# some bytes, the time is that, because a bound in seconds alone would be one on the machine.
+# A refusal may take this much memory, beyond what the process has, and this much CPU time. On a slow machine it may
+# take as long as the machine needs to unpack the last number of bytes, because seconds alone would measure the machine.
 MAX_BYTES, MAX_SECONDS, _MAX_UNPACKED = 1 << 30, 2.0, 2 << 30
 
 

@@ -91,7 +91,7 @@ def test_translated_gamma_recovers_exponent_gain_and_black_level() -> None:
     torch.testing.assert_close(gamma.offset.exp(), torch.tensor([0.3, 0.25, 0.1]), atol=1e-4, rtol=0)
     torch.testing.assert_close(gamma.black, torch.tensor([-0.05, 0.02, -0.1]), atol=1e-4, rtol=0)
     assert gamma.description == "translated-gamma, fitted on 4 validation views, exponent a = 0.700, 1.000, 1.600"
-    # What a fit finds is no part of how it is made.
+    # Two runs are measured alike even if their fits find other exponents.
     assert gamma.fitted_on == "4 validation views"
     held_out = black_level(2000, seed=1)
     assert mean_squared_error(gamma, *held_out) < 1e-8
