@@ -9,19 +9,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from aenerf_ns.cli.ranges import require_range, require_seed
-from aenerf_ns.errors import value_errors_as_data_error
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.files.output_paths import require_absent
-from aenerf_ns.simulator.options import DURATIONS, SENSORS, SensorName, SensorNoise
+from aenerf_ns.simulator.options import DURATIONS, MIN_CONTRAST_THRESHOLD, SENSORS, SensorName, SensorNoise
 
 if TYPE_CHECKING:
     from aenerf_ns.camera.trajectory import Trajectory
 
 # Wider than anybody needs. Outside them a simulation would run for days, or fill the memory.
 _RANGES = {
-    # The simulator's thresholds are not below 0.01.
-    "positive_contrast_threshold": (0.01, 1e3),
-    "negative_contrast_threshold": (0.01, 1e3),
+    "positive_contrast_threshold": (MIN_CONTRAST_THRESHOLD, 1e3),
+    "negative_contrast_threshold": (MIN_CONTRAST_THRESHOLD, 1e3),
+    "refractory_period_ns": (0, 10**12),
     "pose_noise_degrees": (0, 180),
     "pose_noise_translation": (0, 1e6),
     "pose_noise_correlation_time": (1e-6, 1e6),
@@ -98,17 +97,15 @@ class SimulationCommand:
         require_seed(self.seed)
 
     def make_sensor(self) -> tuple[SensorModel, SensorNoise]:
-        """Make the sensor and its noise. A DataError is raised if a value is impossible."""
+        """Make the sensor and its noise."""
         sensor, noise = SENSORS[self.sensor]
         given: dict[str, Any] = {
             "positive_contrast_threshold": self.positive_contrast_threshold,
             "negative_contrast_threshold": self.negative_contrast_threshold,
             "refractory_period": self.refractory_period_ns,
         }
-        with value_errors_as_data_error("aenerf simulate", "see aenerf simulate --help"):
-            changed = {name: value for name, value in given.items() if value is not None}
-            sensor = replace(sensor, bayer_pattern=self.bayer_pattern, **changed)
-        return sensor, self.noise.with_defaults(noise)
+        changed = {name: value for name, value in given.items() if value is not None}
+        return replace(sensor, bayer_pattern=self.bayer_pattern, **changed), self.noise.with_defaults(noise)
 
     def add_pose_noise(self, poses: Trajectory) -> Trajectory:
         """Add errors to true poses."""

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.camera.image_encoding import LUMINANCE
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.simulator.options import SensorNoise
+from aenerf_ns.simulator.options import MIN_CONTRAST_THRESHOLD, SensorNoise
 
-_MIN_CONTRAST_THRESHOLD = 0.01
 # Both from v2e (Hu et al., CVPRW 2021): the part of the shot noise that vanishes at white, and the radiance that a dark
 # pixel seems to see where its bandwidth is concerned.
 _BRIGHT_REDUCTION = 0.75
@@ -348,7 +347,7 @@ class EventSimulator:
 
     def _draw_thresholds(self, mean: float, spread: float) -> NDArray[np.float64]:
         thresholds = self._rng.normal(mean, spread, (self.height, self.width))
-        return np.maximum(thresholds, _MIN_CONTRAST_THRESHOLD)
+        return np.maximum(thresholds, MIN_CONTRAST_THRESHOLD)
 
     def _shot_noise(self, intensity: NDArray[np.float64], time_ns: int) -> tuple[NDArray[np.int64], ...]:
         """Draw the noise events of a frame interval: pixels, row by row, times and polarities."""

@@ -17,6 +17,8 @@ MESH_SUFFIXES = (".glb", ".obj", ".ply")
 BLENDER_SUFFIX = ".blend"
 DURATIONS = (1e-3, 1e5)
 """Shortest and longest duration in seconds."""
+MIN_CONTRAST_THRESHOLD = 0.01
+"""Threshold below which no pixel of the simulator's sensors lies, whatever the spread."""
 Interpolation = Literal["linear", "flow"]
 """How the log-radiance changes between two frames of a video."""
 
