@@ -114,7 +114,7 @@ class ExportFrames(RunCommand):
     """Folder to create."""
     rate: float | None = None
     """Frames a second of the recording; 10 by default."""
-    times: tuple[float, ...] = ()
+    times: tuple[str, ...] = ()
     """Times of the frames in seconds, on the clock of the events, in place of a rate."""
     num_points: int = 20_000
     """The most points of the scene to write."""

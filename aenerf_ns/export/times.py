@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from torch import Tensor
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.limits import MAX_ROWS
-from aenerf_ns.files.text import format_seconds
+from aenerf_ns.files.text import format_seconds, parse_times
 
 
 def spread_times(window: TimeWindow, count: int) -> Tensor:
@@ -42,19 +42,18 @@ def times_at_rate(window: TimeWindow, rate: float) -> Tensor:
     return times[torch.from_numpy(window.contains(times))]
 
 
-def times_from_seconds(window: TimeWindow, seconds: Sequence[float]) -> Tensor:
-    """Convert times in seconds on the clock of the events to nanoseconds.
+def times_from_seconds(window: TimeWindow, seconds: Sequence[str]) -> Tensor:
+    """Convert decimal times in seconds on the clock of the events to nanoseconds, exactly.
 
     Raises:
-        DataError: a time is not in the time window of the run.
+        DataError: a time is not a number, or not in the time window of the run.
     """
-    times = []
-    for value in seconds:
-        times.append(round(value * 1e9) if math.isfinite(value * 1e9) else window.start - 1)
-        if not window.contains(times[-1]):
+    times = parse_times(Path("--times"), seconds)
+    for value, inside in zip(seconds, window.contains(times), strict=True):
+        if not inside:
             raise DataError(
                 "--times",
                 f"{value} s is not in the run's time, {format_seconds(window.start)} to {format_seconds(window.end)} s",
                 "give times on the clock of the events, in which poses are known",
             )
-    return torch.tensor(times)
+    return torch.from_numpy(times)

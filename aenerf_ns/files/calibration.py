@@ -61,9 +61,11 @@ def read_calibration(
         has_images: whether there are images. Of several cameras, the one that took them must then be named.
 
     Raises:
-        DataError: the file is missing or malformed, or it holds several cameras and one that is needed is not named.
+        DataError: the file is missing or malformed, it holds several cameras and one that is needed is not named, or it
+            has no camera of a name.
     """
     if path.suffix == ".json":
+        _require_no_names(path, event_camera, frame_camera)
         meta, lens = read_transforms(path)
         with value_errors_as_data_error(path):
             sensor = SensorModel(**sensor_values(meta.event_camera))
@@ -75,6 +77,7 @@ def read_calibration(
     if isinstance(content, dict) and not content.keys().isdisjoint("Kk"):
         content = _as_file(content)
     if isinstance(content, dict) and "camera_matrix" in content:
+        _require_no_names(path, event_camera, frame_camera)
         lens = _camera_info(path, content)
         return Calibration(lens, lens, torch.eye(4, dtype=torch.float64), SensorModel(), "linear")
     cameras = read_camchain(path)
@@ -90,6 +93,13 @@ def read_calibration(
             raise DataError(path, f"it has no camera {name}", f"name one of {', '.join(cameras)}")
     motion = motion_between(path, cameras, event_name, frame_name)
     return Calibration(cameras[event_name].lens(), cameras[frame_name].lens(), motion, SensorModel(), "linear")
+
+
+def _require_no_names(path: Path, *names: str | None) -> None:
+    """Raise a DataError if a camera is named for a file in which cameras have no names."""
+    for name in names:
+        if name is not None:
+            raise DataError(path, f"it has no camera {name}", "leave the name out; only Kalibr's camchain has names")
 
 
 def _as_file(message: dict[str, Any]) -> dict[str, Any]:

@@ -216,6 +216,7 @@ class Hdf5EventWriter:
         self._file = h5py.File(path, "w")
         self._reserved = 0
         self._waiting: list[EventStream] = []
+        self._num_waiting = 0
         self._last_time: int | None = None
         try:
             self._reserve(0)
@@ -286,15 +287,16 @@ class Hdf5EventWriter:
             )
         self._last_time = int(events.t[-1])
         self._waiting.append(events)
-        if sum(map(len, self._waiting)) >= _WRITE_CHUNK:
+        self._num_waiting += len(events)
+        if self._num_waiting >= _WRITE_CHUNK:
             self._flush()
 
     def _flush(self) -> None:
         if not self._waiting:
             return
-        self._reserve(sum(map(len, self._waiting)) * sum(np.dtype(dtype).itemsize for dtype in _DTYPES.values()))
+        self._reserve(self._num_waiting * sum(np.dtype(dtype).itemsize for dtype in _DTYPES.values()))
         for name, column in self._columns.items():
             values = np.concatenate([getattr(events, name) for events in self._waiting])
             column.resize(len(column) + len(values), axis=0)
             column[len(column) - len(values) :] = values
-        self._waiting = []
+        self._waiting, self._num_waiting = [], 0

@@ -70,10 +70,6 @@ def bounded(path: Path, kind: str, extra: str = "") -> Iterator[None]:
         raise DataError(
             path, f"a package is missing to read it ({error})", f"pip install 'aenerf-ns[{extra}]'"
         ) from error
-    except MemoryError as error:
-        raise DataError(
-            path, "it takes far more memory than its size explains", "it is damaged, or made to fill the memory"
-        ) from error
     # Libraries raise whatever they stumble over in a damaged file.
     except Exception as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
@@ -97,13 +93,17 @@ def _little_memory(path: Path) -> Iterator[None]:
     """Within the context, let the process take only as much more memory, and write only files as large, as the size
     of a file explains."""
     allowed = _max_unpacked(size_on_disk(path))
+    reason, remedy = "far more memory than its size explains", "it is damaged, or made to fill the memory"
     available = re.search(r"MemAvailable:\s*(\d+)", _MEMORY.read_text())
-    if available:
-        allowed = min(allowed, int(available[1]) << 10)
+    if available and (free := int(available[1]) << 10) < allowed:
+        allowed, reason, remedy = free, f"more memory than the {free:,} bytes that are free", "end other programs"
     # The sixth number is memory that is written to, in pages.
     in_use = int(_STATUS.read_text().split()[5]) * resource.getpagesize()
-    with _lock, _limit(resource.RLIMIT_DATA, in_use + allowed), _limit(resource.RLIMIT_FSIZE, allowed):
-        yield
+    try:
+        with _lock, _limit(resource.RLIMIT_DATA, in_use + allowed), _limit(resource.RLIMIT_FSIZE, allowed):
+            yield
+    except MemoryError as error:
+        raise DataError(path, f"it takes {reason}", remedy) from error
 
 
 @contextmanager

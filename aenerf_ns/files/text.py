@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import re
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Literal
@@ -76,7 +77,7 @@ def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:
         raise DataError(path, f"not a number ({error})", "write plain decimal numbers") from None
 
 
-def parse_times(path: Path, fields: list[str], unit: TimeUnit = "s") -> NDArray[np.int64]:
+def parse_times(path: Path, fields: Sequence[str], unit: TimeUnit = "s") -> NDArray[np.int64]:
     """Return the exact (N,) nanoseconds of decimal times. float64 cannot hold the nanoseconds of the Unix time.
 
     Raises:

@@ -25,6 +25,8 @@ _MAX_COMPARED = 2000
 # A step of the optimizer changes hundreds of weights behind each number of a network's twist, but few behind a number
 # of a spline's. With this factor on the network's output, both move about as far at one learning rate.
 _NETWORK_OUTPUT_SCALE = 2e-3
+# Poses that the network takes at once where nothing is learned. It takes some 50 kB of memory for each.
+_CHUNK = 2000
 _MIN_EXTENT = 1e-6
 _MIN_SPEED = 1e-6
 # Seconds by which a learned clock offset may differ from the value it begins with. Larger errors smear the field so far
@@ -392,6 +394,8 @@ class TwistNetwork(nn.Module):
 
     def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
         """Return float64 twists (N, 6) at (N,) seconds, for estimated poses (N, 3, 4)."""
+        if len(seconds) > _CHUNK and not torch.is_grad_enabled():
+            return torch.cat([self(*part) for part in zip(seconds.split(_CHUNK), base.split(_CHUNK), strict=True)])
         dtype = self.output.weight.dtype
         time = (2 * seconds / self._duration - 1).to(dtype)[:, None]
         # Half precision cannot tell the two ends of an interval apart.

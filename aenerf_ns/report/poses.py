@@ -15,8 +15,6 @@ from aenerf_ns.evaluation.run import TrainedRun
 
 # Poses that are drawn. More are not seen, and make the page large.
 _MAX_DRAWN = 600
-# Poses corrected at once. A network of corrections takes some 50 kB for each pose.
-_CHUNK = 2000
 
 
 @dataclass(frozen=True)
@@ -55,8 +53,7 @@ def measure_poses(run: TrainedRun) -> RunPoses:
     given, true = scene.trajectory, scene.ground_truth
     times = given.times if true is None else given.knots_covered_by(true)
     seconds = given.seconds(times)
-    corrected = [psi.pose(part.to(run.device)).cpu() for part in seconds.split(_CHUNK)]
-    poses = {"estimated": given.interpolate(times), "corrected": torch.cat(corrected)}
+    poses = {"estimated": given.interpolate(times), "corrected": psi.pose(seconds.to(run.device)).cpu()}
     reference = poses["estimated"] if true is None else true.interpolate(times)
     positions = {name: align(part, reference)(part.double()) for name, part in poses.items()}
     if true is not None:

@@ -116,20 +116,20 @@ class Runner:
         return self._folder / "runs" / f"{run.name}.json"
 
     def _dataset(self, dataset: Dataset) -> Path:
-        if dataset.name in self._failed:
-            # Each run of this dataset would simulate again and fail again.
-            raise self._failed[dataset.name]
         # A file is relative to the folder in which the benchmark was started. A built-in scene has no suffix.
         scene = str(Path(dataset.scene).resolve()) if Path(dataset.scene).suffix else dataset.scene
-        try:
-            return self._make_dataset(dataset.name, "simulate", "--scene", scene, *dataset.command[2:])
-        except DataError as error:
-            self._failed[dataset.name] = error
-            raise
+        return self._make_dataset(dataset.name, "simulate", "--scene", scene, *dataset.command[2:])
 
     def _make_dataset(self, name: str, command: str, *arguments: str) -> Path:
+        if name in self._failed:
+            # Each run of this dataset would make it again and fail again.
+            raise self._failed[name]
         folder, log = self._folder / "datasets" / name, self._folder / "logs" / f"{name}.log"
-        return make_dataset(folder, log, command, arguments, self._folder, **self._variables)
+        try:
+            return make_dataset(folder, log, command, arguments, self._folder, **self._variables)
+        except DataError as error:
+            self._failed[name] = error
+            raise
 
     def _train(self, run: Run, data: Path) -> tuple[str, ...]:
         """Train, evaluate, and return the command of the training, without the folders of this machine."""

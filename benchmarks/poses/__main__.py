@@ -100,13 +100,18 @@ class Poses:
             name: {"about": SCENES[name].about, "simulate": shlex.join(datasets[name].command)} for name in names
         }
         about = {"method": self.method, "steps": self.steps, "variants": variants, "scenes": described}
-        runner, runs = Runner(self.work, "cpu"), []
+        runner, runs, failed = Runner(self.work, "cpu"), [], []
 
         def measure(name: str, case: str, variant: str, seed: int) -> dict[str, Any] | None:
             row, of_case, convert = _CASES[case]
             options = (*of_case, *shlex.split(variants[variant]))
             run = Run("poses", row, datasets[name], self.method, self.steps, seed, options, convert=convert)
-            made = runner.make(run)
+            try:
+                made = runner.make(run)
+            except DataError as error:
+                # Such as a recording whose poses are not found. The others go on.
+                failed.append({"scene": name, "case": case, "variant": variant, "seed": seed, "error": str(error)})
+                return None
             if made is None:
                 return None
             placed = made["results"]
@@ -116,10 +121,11 @@ class Poses:
 
         with progress_bar() as progress, ThreadPoolExecutor(self.jobs) as pool:
             finished = pool.map(lambda chosen: measure(*chosen), settings)
-            for result in progress.track(finished, total=len(settings), description="Poses"):
-                if result is not None:
-                    runs.append(result)
-                    write_result(self.output, {**about, "table": table(runs), "runs": runs}, show=False)
+            for measured in progress.track(finished, total=len(settings), description="Poses"):
+                if measured is not None:
+                    runs.append(measured)
+                result = {**about, "table": table(runs), "runs": runs, "failed": failed}
+                write_result(self.output, result, show=False)
 
     def _dataset(self, name: str) -> Dataset:
         scene = SCENES[name]

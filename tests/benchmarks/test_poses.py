@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 from aenerf_ns.camera.rotation import motion_from_twist
-from benchmarks.poses.__main__ import pixel_errors, table
+from aenerf_ns.errors import DataError
+from benchmarks.paper.running import Run, Runner
+from benchmarks.poses.__main__ import Poses, pixel_errors, table
 
 _CAMERA = {"fx": 100.0, "fy": 100.0, "width": 100.0, "height": 80.0, "depth": 2.0}
 
@@ -70,3 +74,19 @@ def test_table_of_differences() -> None:
     assert corrected["psnr_placed"] == {"mean": 25.0, "spread": 10.0}
     assert corrected["psnr_placed_less_than_true_poses"] == {"mean": 2.0, "spread": 2.0}
     assert rows["noise, corrected", "other"]["psnr_placed_more_than_default"] == {"mean": 1.5, "spread": 1.0}
+
+
+def test_a_recording_without_poses_does_not_end_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def make(_: Runner, run: Run) -> dict:
+        if "--poses events" in " ".join(run.convert):
+            raise DataError("events", "they give no poses", "record longer")
+        return {"results": {**_run("", "", 0, 30.0)["placed"], "refined_test_poses": {"psnr": 31.0}}}
+
+    monkeypatch.setattr(Runner, "make", make)
+    monkeypatch.setattr(Poses, "_pose_errors", lambda *_: _run("", "", 0, 30.0)["poses"])
+    cases = ("from nothing, corrected", "true poses")
+    Poses(tmp_path / "r.json", tmp_path / "work", tmp_path, scenes=("room",), cases=cases, seeds=(1,)).main()
+    result = json.loads((tmp_path / "r.json").read_text())
+    assert [run["case"] for run in result["runs"]] == ["true poses"]
+    (failed,) = result["failed"]
+    assert (failed["case"], failed["error"]) == (cases[0], "events: they give no poses; record longer")

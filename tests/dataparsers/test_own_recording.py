@@ -70,6 +70,8 @@ def test_intrinsics_may_be_missing(tmp_path: Path) -> None:
     lens = {"fl_x", "fl_y", "cx", "cy", "k1", "p2"}
     meta["event_camera"] = {key: value for key, value in meta["event_camera"].items() if key not in lens}
     file.write_text(json.dumps(meta))
+    with pytest.raises(DataError, match="it has no camera cam1; leave the name out"):
+        recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1"))
     parser = OwnRecordingDataParserConfig(data=truth.data).setup()
     with pytest.raises(DataError, match=r"intrinsics .* are not known; calibrate it, or .* --poses events"):
         parser.get_dataparser_outputs("train")

@@ -91,10 +91,16 @@ def test_times_leave_gaps_out() -> None:
     assert int((times <= SECOND // 10).sum()) == 10
     assert (np.diff(times)[np.diff(times) < SECOND // 10] - SECOND // 100 <= 1).all()
     assert times_at_rate(window, 20).tolist() == [0, 5 * 10**7, 10**8, *range(SECOND // 2, SECOND + 1, 5 * 10**7)]
-    assert times_from_seconds(window, [0.05, 0.75]).tolist() == [5 * 10**7, 75 * 10**7]
-    for seconds in (0.2, 1.5, float("nan"), float("inf")):
+    assert times_from_seconds(window, ["0.05", "75e-2"]).tolist() == [5 * 10**7, 75 * 10**7]
+    for seconds in ("0.2", "1.5"):
         with pytest.raises(DataError, match=r"is not in the run's time, 0\.0+ to 1\.0+ s"):
             times_from_seconds(window, [seconds])
+    with pytest.raises(DataError, match="--times: nan is not a time in seconds"):
+        times_from_seconds(window, ["nan"])
+    # float64 holds neither end.
+    unix = TimeWindow(1_700_000_000 * SECOND + 1, 1_700_000_001 * SECOND - 1)
+    ends = ["1700000000.000000001", "1700000000.999999999"]
+    assert times_from_seconds(unix, ends).tolist() == [unix.start, unix.end]
     with pytest.raises(DataError, match="1e\\+09 gives 1e\\+09 times"):
         times_at_rate(window, 1e9)
     # Less than one time in the run.

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from aenerf_ns.errors import DataError
+from aenerf_ns.files import limits
 from aenerf_ns.files.limits import bounded, bounded_items, list_files
 
 LIMITS = (resource.RLIMIT_DATA, resource.RLIMIT_FSIZE)
@@ -40,6 +41,15 @@ def test_failure_is_one_line_and_ends_limits(read: object, message: str, tmp_pat
     with pytest.raises(DataError, match=message), bounded(path, "thing"):
         read(path)  # type: ignore[operator]
     assert [resource.getrlimit(kind) for kind in LIMITS] == before
+
+
+def test_memory_that_others_hold_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "small"
+    path.write_text("x")
+    (tmp_path / "meminfo").write_text("MemAvailable:   1024 kB")
+    monkeypatch.setattr(limits, "_MEMORY", tmp_path / "meminfo")
+    with pytest.raises(DataError, match="more memory than the 1,048,576 bytes that are free; end"), bounded(path, "x"):
+        allocate(path)
 
 
 def test_limits_hold_while_an_item_is_read(tmp_path: Path) -> None:
