@@ -137,6 +137,7 @@ class WarpedEvents:
 
     def __init__(self, runs: list[EventStream], trajectory: Trajectory, camera: CameraIntrinsics) -> None:
         self._trajectory = trajectory
+        self._meant = {GIVEN.poses: trajectory}
         self._width, self._height, self._binning = image_size(camera.width, camera.height)
         self._camera = camera
         directions, valid = camera.pixel_directions()
@@ -156,7 +157,7 @@ class WarpedEvents:
             for run in runs:
                 count = min(max(len(run) // size, 1), _SETTINGS.num_slices // len(runs))
                 length = len(run) if len(run) < 2 * size else size
-                for begin in (np.arange(count) + 0.5) / count * (len(run) - length):
+                for begin in np.linspace(0, len(run) - length, count) if count > 1 else [(len(run) - length) / 2]:
                     events = run[int(begin) : int(begin) + length]
                     if len(events) > _SETTINGS.max_events:
                         events = events[np.sort(rng.choice(len(events), _SETTINGS.max_events, replace=False))]
@@ -245,8 +246,9 @@ class WarpedEvents:
         if hypothesis.still:
             poses = torch.eye(4, dtype=torch.float64).expand(num_poses, 4, 4)
         else:
-            trajectory = self._trajectory.transform(hypothesis.poses)
-            poses = homogeneous(trajectory.interpolate(times + hypothesis.clock_offset))
+            if hypothesis.poses not in self._meant:
+                self._meant[hypothesis.poses] = self._trajectory.transform(hypothesis.poses)
+            poses = homogeneous(self._meant[hypothesis.poses].interpolate(times + hypothesis.clock_offset))
         reference = poses[num_poses // 2]
         duration = max(int(events.t[-1] - events.t[0]), 1)
         return _SliceGeometry(

@@ -172,7 +172,10 @@ def _count_events(
 
 
 def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> list[EventStream]:
-    """Read runs of consecutive events that have a pose, evenly spread over all events that have one."""
+    """Read runs of consecutive events that have a pose, evenly spread over all events that have one.
+
+    Of a run with gaps between the poses, the longest stretch without one is kept: its events are warped as one motion.
+    """
     file, camera = recording.event_file, recording.event_camera
     begins, length = choose_runs(num_covered, camera)
     parts: list[list[EventStream]] = [[] for _ in begins]
@@ -183,7 +186,8 @@ def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> li
             # Indices make a copy: a slice would keep the whole chunk in memory.
             part.append(covered[np.arange(len(covered))[max(begin, 0) : max(begin + length, 0)]])
         position += len(covered)
-    return [EventStream.concatenate(part) for part in parts]
+    runs = map(EventStream.concatenate, parts)
+    return [max((run.between(*piece) for piece in window.pieces()), key=len) for run in runs]
 
 
 def _check_events(result: CheckResult, noise: NoiseRate, bayer_pattern: str | None) -> None:
@@ -195,8 +199,8 @@ def _check_events(result: CheckResult, noise: NoiseRate, bayer_pattern: str | No
         f"{count / seconds:,.0f} a second, {count / statistics.counts.size:.1f} a pixel of {width} x {height}; "
         f"{(statistics.counts == 0).mean():.1%} of the pixels have none"
     )
-    rate = statistics.rate / seconds * _RATE_PARTS
-    figures.append(f"Rate over time, 0 to {rate.max():,.0f} events a second:\n  |{_histogram(statistics.rate)}|")
+    highest = max(result.events_per_second)
+    figures.append(f"Rate over time, 0 to {highest:,.0f} events a second:\n  |{_histogram(statistics.rate)}|")
     positive = statistics.num_positive / count
     figures.append(f"Polarity: {positive:.1%} positive")
     if not _LIMITS.min_polarity_share < positive < 1 - _LIMITS.min_polarity_share:

@@ -54,6 +54,8 @@ class EventFilters:
     def __post_init__(self) -> None:
         if not 0 < self.pixel_share <= 1:
             raise ValueError(f"the share of pixels must be above 0 and at most 1, not {self.pixel_share}")
+        if max(abs(self.start or 0), abs(self.end or 0)) > LAST_TIME:
+            raise ValueError(f"the time window from {self.start} to {self.end} ns is longer than any recording")
         if self.shortest_interval > LAST_TIME:
             raise ValueError(f"the shortest interval is {self.shortest_interval} ns, longer than any recording")
         if self.shortest_interval < 0:

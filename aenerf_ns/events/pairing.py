@@ -397,7 +397,9 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
             continue
         own &= (1 << SPAN_SHIFT) - 1
         interval = rows[i, 0] - rows[i - 1, 0]
-        block_ends[block + 1] += interval
+        # A sum that has overflowed once stays negative, which tells of it.
+        if block_ends[block + 1] >= 0:
+            block_ends[block + 1] += interval
         if refractory_period > 0 and own == last_own and (own == 1 or own == 1 << NEGATIVE_SHIFT):
             # Rounding down leaves a rest, which is added at the next event.
             rest += min(COUNT_UNIT * refractory_period / (interval - refractory_period), COUNT_UNIT - 1)

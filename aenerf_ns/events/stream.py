@@ -107,8 +107,7 @@ class EventStream:
 
     def between(self, start: int, end: int) -> EventStream:
         """Return the events with start <= t <= end, in nanoseconds."""
-        first, last = np.searchsorted(self.t, [start, end + 1])
-        return self[first:last]
+        return self[np.searchsorted(self.t, start) : np.searchsorted(self.t, end, "right")]
 
     def nearest(self, time: int, count: int) -> EventStream:
         """Return about ``count`` events around a time in nanoseconds, half of them before it.
@@ -177,7 +176,7 @@ class EventFile(ABC):
 
     @abstractmethod
     def time_span(self) -> tuple[int, int]:
-        """Return the times of the first and the last event in nanoseconds, without reading all events.
+        """Return the times of the first and the last event in nanoseconds. Some formats tell them when all is read.
 
         Raises:
             DataError: the file is missing or empty.

@@ -19,7 +19,7 @@ def spread_times(window: TimeWindow, count: int) -> Tensor:
     starts, ends = torch.tensor(window.pieces()).T
     elapsed = (ends - starts).cumsum(0)
     # The times are in the middles of equal parts.
-    middles = ((torch.arange(count) + 0.5) * (int(elapsed[-1]) / count)).long()
+    middles = ((torch.arange(count, dtype=torch.float64) + 0.5) * (int(elapsed[-1]) / count)).long()
     piece = torch.searchsorted(elapsed, middles, right=True)
     return ends[piece] - (elapsed[piece] - middles)
 
@@ -37,9 +37,16 @@ def regular_times(start: int, end: int, rate: float) -> Tensor:
 
 
 def times_at_rate(window: TimeWindow, rate: float) -> Tensor:
-    """Return times in nanoseconds, at a rate per second, in a time window but not in its gaps."""
+    """Return times in nanoseconds, at a rate per second, in a time window but not in its gaps.
+
+    Raises:
+        DataError: the rate gives no time, or too many.
+    """
     times = regular_times(window.start, window.end, rate)
-    return times[torch.from_numpy(window.contains(times))]
+    times = times[torch.from_numpy(window.contains(times))]
+    if len(times) == 0:
+        raise DataError("--rate", f"{rate:g} gives no time at which poses are known", "give a higher one")
+    return times
 
 
 def times_from_seconds(window: TimeWindow, seconds: Sequence[str]) -> Tensor:

@@ -55,8 +55,8 @@ def estimate_poses_from_events(
         features, pairs = workspace.count_features_and_pairs()
         held_out = workspace.hold_out_matches(_HELD_OUT)
         # Not side by side: the global mapper then gives other poses each time.
-        found = {"incremental": workspace.reconstruct(), "global": workspace.reconstruct_globally()}
-        models: dict[str, Any] = {mapper: models[0] for mapper, models in found.items() if models and camera}
+        found = {"incremental": workspace.reconstruct(), "global": workspace.reconstruct_globally()} if camera else {}
+        models: dict[str, Any] = {mapper: models[0] for mapper, models in found.items() if models}
         for limits in _ROUNDS:
             adjusted = {mapper: workspace.adjust(model, *limits) for mapper, model in models.items()}
             models = {mapper: model for mapper, model in adjusted.items() if is_placed(model)}

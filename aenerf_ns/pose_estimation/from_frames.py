@@ -33,6 +33,8 @@ from aenerf_ns.progress import progress_bar
 _FLIP_DEGREES = 90.0
 _MISPLACED_DEGREES = 5.0
 _MISPLACED_EXTENTS = 0.1
+# Frames whose orientation is tried for the world, of many: each is compared with all.
+_MAX_TRIED = 500
 
 _MAX_GAPS_SHOWN = 10
 
@@ -143,12 +145,12 @@ def estimate_poses(
         folder: see :func:`~aenerf_ns.pose_estimation.colmap_workspace.work_folder`.
 
     Raises:
-        DataError: there are fewer than two frames, a frame is of another size than the camera, the times do not
+        DataError: there are fewer than three frames, a frame is of another size than the camera, the times do not
             increase, or COLMAP places no frames.
     """
     times = np.asarray(times, np.int64)
-    if len(times) < 2:
-        raise DataError(source, f"{len(times)} frames", "poses can be estimated from two frames or more")
+    if len(times) < 3:
+        raise DataError(source, f"{len(times)} frames", "poses can be estimated from three frames or more")
     if (np.diff(times) <= 0).any():
         index = int(np.argmax(np.diff(times) <= 0)) + 1
         raise DataError(source, f"frame {index} is not after the frame before it", "sort the frames by time")
@@ -226,7 +228,8 @@ def _align_majority(poses: Tensor, truth: Tensor) -> Similarity:
     """Align the frames that agree on the world's orientation if they are the majority, else all frames."""
     # Each frame alone gives an orientation of the world.
     turns = truth[..., :3] @ poses[..., :3].mT
-    degrees = torch.rad2deg(torch.stack([rotation_angle(turns, turn.expand_as(turns)) for turn in turns]))
+    tried = turns[:: -(-len(turns) // _MAX_TRIED)]
+    degrees = torch.rad2deg(torch.stack([rotation_angle(turns, turn.expand_as(turns)) for turn in tried]))
     agree = degrees[degrees.median(1).values.argmin()] <= _MISPLACED_DEGREES
     if 2 * agree.sum() <= len(poses):
         return align(poses, truth)

@@ -14,6 +14,7 @@ _MIN_LENGTH, _MIN_TRACKS = 4, 50
 # Share of the features that may lie beyond each side of the box. It then gets a margin, in its longest sides, because
 # plain surfaces have no features.
 _MAX_BEYOND, _MARGIN = 0.01, 0.1
+_MAX_COMPARED = 2000
 
 
 def box_of(model: Any) -> NDArray[np.float64] | None:
@@ -34,6 +35,7 @@ def box_of(model: Any) -> NDArray[np.float64] | None:
     margin = _MARGIN * (high - low).max()
     low, high = low - margin, high + margin
     cameras = np.stack(list(poses.values()))[:, :, 3]
-    directions = cameras - (low + high) / 2
+    # Of many cameras, some are looked at: each is compared with each.
+    directions = cameras[:: -(-len(cameras) // _MAX_COMPARED)] - (low + high) / 2
     is_inside = ((low < cameras) & (cameras < high)).all(1).any()
     return None if is_inside or (directions @ directions.T).min() > 0 else np.stack([low, high])

@@ -229,6 +229,8 @@ class EventDataParser(DataParser):
         if start is None or end is None:
             first, last = self.event_span(recording)
             start, end = first if start is None else start, last if end is None else end
+        if start == end and config.start_time_ns is None and config.end_time_ns is None:
+            raise DataError(str(config.data), f"all its events are at {start} ns", "check the unit of the times")
         if start >= end:
             raise DataError(
                 str(config.data),
@@ -283,10 +285,14 @@ class EventDataParser(DataParser):
             transform = torch.cat([torch.eye(3, dtype=torch.float64), -center[:, None]], -1)
             scale = self.config.scale_factor / float(half.max())
             return transform, scale, torch.stack([-half, half]) * scale
+        # The framework takes float32, which rounds positions far from the origin, such as those of a map.
+        center = poses[:, :3, 3].mean(0) * (self.config.center_method != "none")
+        poses[:, :3, 3] -= center
         oriented, transform = auto_orient_and_center_poses(
             poses.float(), method=self.config.orientation_method, center_method=self.config.center_method
         )
         transform = transform.double()
+        transform[:, 3] -= transform[:, :3] @ center
         scale = self.config.scale_factor
         if self.config.auto_scale_poses:
             extent = float(oriented[:, :3, 3].abs().max())

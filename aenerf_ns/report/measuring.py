@@ -188,7 +188,7 @@ def _measure_data(report: RunReport, run: TrainedRun) -> None:
     from aenerf_ns.checking.report import check
 
     scene = run.scene
-    if not scene.event_file.path.is_file():
+    if not scene.event_file.path.exists():
         report.missing.append(
             f"Rate, polarity, pairs and the check: the events are no longer at {scene.event_file.path}."
         )

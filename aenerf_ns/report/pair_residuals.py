@@ -14,7 +14,7 @@ from aenerf_ns.supervision.event_pairs import PairSupervision
 
 _NUM_PAIRS = 20_000
 # Upper ends of the classes of pairs by their number of events.
-_LENGTHS = (1, 2, 4, 8, 16, 32, 64, 255)
+_LENGTHS = (1, 2, 4, 8, 16, 32, 64, np.inf)
 # Tiles along the longer side of the sensor, and bins of the histogram along each axis.
 _TILES, _BINS = 12, 60
 # Share of pairs that may lie beyond either end of the histogram.
@@ -103,7 +103,7 @@ def average_by_length(length: NDArray[np.floating], residual: NDArray[np.float64
     for high in _LENGTHS:
         chosen = residual[(length >= low) & (length <= high)]
         if len(chosen) >= _MIN_PAIRS:
-            name = str(low) if low == high else f"{low} to {high}"
+            name = str(low) if low == high else f"{low} to {high}" if high < np.inf else f"{low} or more"
             classes.append({"events": name, "num_pairs": len(chosen), "mean_residual": float(chosen.mean())})
         low = high + 1
     return classes

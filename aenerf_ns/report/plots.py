@@ -96,7 +96,7 @@ def trajectory(reports: Sequence[RunReport]) -> go.Figure:
     figure = make_subplots(1, 2, subplot_titles=("from above", "from the side"))
     for column, (across, up) in enumerate(((0, 1), (0, 2)), start=1):
         for run, report in enumerate(reports):
-            for name, points in _paths(report, first=run == 0):
+            for name, points in _paths(report, reports[:run]):
                 x, y = ([point[axis] for point in points] for axis in (across, up))
                 shown = name if len(reports) == 1 or name == "true" else f"{name}, {report.name}"
                 _add_line(figure, x, y, shown, _line(name, run), column == 1, 1, column)
@@ -105,10 +105,11 @@ def trajectory(reports: Sequence[RunReport]) -> go.Figure:
     return _style(figure, 460)
 
 
-def _paths(report: RunReport, first: bool) -> list[tuple[str, Any]]:
+def _paths(report: RunReport, drawn: Sequence[RunReport]) -> list[tuple[str, Any]]:
     positions = report.poses.positions
     # All runs of a comparison may have the same true poses.
-    shown = [(name, points) for name, points in positions.items() if first or name != "true"]
+    is_drawn = positions.get("true") in [other.poses.positions.get("true") for other in drawn]
+    shown = [(name, points) for name, points in positions.items() if name != "true" or not is_drawn]
     # Below the others.
     return sorted(shown, key=lambda path: path[0] != "true")
 
@@ -190,17 +191,19 @@ def changes(pairs: PairResiduals) -> go.Figure:
 def residual_by_length(reports: Sequence[RunReport]) -> go.Figure:
     """Plot the mean absolute residual by the number of events of a pair."""
     figure = go.Figure()
+    names: set[str] = set()
     for run, report in enumerate(reports):
         if report.pairs is not None:
             rows = report.pairs.by_length
+            names |= {row["events"] for row in rows}
             figure.add_bar(
                 x=[row["events"] for row in rows], y=[row["mean_residual"] for row in rows], name=report.name,
                 marker_color=color(run), customdata=[row["num_pairs"] for row in rows],
                 hovertemplate="%{x} events: %{y:.3f} thresholds, %{customdata} pairs<extra></extra>",
             )  # fmt: skip
     figure.update_layout(
-        xaxis={"title": "events of a pair", "type": "category"}, yaxis_title="mean |rendered − measured| (thresholds)",
-        showlegend=len(reports) > 1,
+        xaxis={"title": "events of a pair", "categoryarray": sorted(names, key=lambda name: int(name.split()[0]))},
+        xaxis_type="category", yaxis_title="mean |rendered − measured| (thresholds)", showlegend=len(reports) > 1,
     )  # fmt: skip
     return _style(figure, 440)
 

@@ -49,7 +49,7 @@ def choose_views(psnr: Sequence[float]) -> dict[int, str]:
     chosen.setdefault(int(order[len(order) // 2]), "median")
     chosen.setdefault(int(order[-1]), "best")
     every = -(-len(order) // (_MAX_CHOSEN - len(chosen)))
-    ordinal = f"every {every}th" if every > 3 else {1: "all", 2: "every second", 3: "every third"}[every]
+    ordinal = f"one of {every}" if every > 3 else {1: "all", 2: "every second", 3: "every third"}[every]
     for index in range(0, len(order), every):
         chosen.setdefault(index, ordinal)
     return chosen

@@ -21,10 +21,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.hypotheses import clock_hypothesis
-from aenerf_ns.checking.report import _check_contrast
+from aenerf_ns.checking.report import _check_contrast, check
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
@@ -126,6 +127,14 @@ def test_name_nothing_where_nothing_is_wrong(simulated: tuple[Recording, EventSt
     comparisons = warped.compare_alternatives()
     assert not [c.hypothesis.name for c in comparisons if c.is_clearly_better]
     assert {c.hypothesis.name for c in comparisons if c.contrast < 0.9 * c.given} >= MISTAKES.keys()
+
+
+def test_no_slice_spans_a_gap_of_the_poses(simulated: tuple[Recording, EventStream]) -> None:
+    recording, _ = simulated
+    gaps = ((PART // 4, PART // 2), (3 * PART // 5, 3 * PART // 4))
+    warped = check(recording, TimeWindow(0, PART, gaps), 1.0).warped
+    assert warped is not None
+    assert not any(first < end and last > start for first, last in warped.spans for start, end in gaps)
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

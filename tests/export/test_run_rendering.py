@@ -101,6 +101,8 @@ def test_times_leave_gaps_out() -> None:
     unix = TimeWindow(1_700_000_000 * SECOND + 1, 1_700_000_001 * SECOND - 1)
     ends = ["1700000000.000000001", "1700000000.999999999"]
     assert times_from_seconds(unix, ends).tolist() == [unix.start, unix.end]
+    with pytest.raises(DataError, match=r"0\.1 gives no time at which poses are known; give a higher one"):
+        times_at_rate(TimeWindow(1, SECOND, ((0, SECOND // 2),)), 0.1)
     with pytest.raises(DataError, match="1e\\+09 gives 1e\\+09 times"):
         times_at_rate(window, 1e9)
     # Less than one time in the run.

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from helpers.dataset_faults import set_in
 from helpers.published_datasets import DURATION, EPOCH, config_of, seconds, write_images, write_own
 from helpers.small_datasets import END, START, make_trajectory, parse, write_ecd, write_native
@@ -19,7 +20,7 @@ from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
-from aenerf_ns.files.tum_trajectory import write_tum_trajectory
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.scene import SCENE_KEY
@@ -37,6 +38,19 @@ def test_all_splits_share_the_reported_world(tmp_path: Path) -> None:
     assert train.metadata[SCENE_KEY].trajectory.camera_to_worlds[:, :, 3].abs().max().item() == pytest.approx(
         1.0, rel=1e-2
     )
+
+
+def test_a_world_far_from_its_origin_is_the_same_scene(tmp_path: Path) -> None:
+    near, far = write_native(tmp_path / "near"), write_native(tmp_path / "far")
+    offset = torch.tensor([4e5, 5e6, 100.0], dtype=torch.float64)
+    path = far / "trajectory_estimated.txt"
+    write_tum_trajectory(
+        path, read_tum_trajectory(path).transform(lambda poses: poses + F.pad(offset[:, None], (3, 0, 0, 1)))
+    )
+    first, second = (parse(NativeDataParserConfig(data=data)).metadata[SCENE_KEY] for data in (near, far))
+    assert second.scale == pytest.approx(first.scale, rel=1e-6)
+    poses = [scene.trajectory.camera_to_worlds for scene in (first, second)]
+    torch.testing.assert_close(poses[1], poses[0], rtol=0, atol=1e-6)
 
 
 def test_scene_box_sets_scale_and_bounds(tmp_path: Path) -> None:
@@ -76,6 +90,10 @@ def test_time_window_leaves_out_the_rest(tmp_path: Path) -> None:
     assert parse(config).metadata[SCENE_KEY].window == TimeWindow(START, END)
     with pytest.raises(DataError, match="nothing is left from 9 to 9 ns"):
         parse(NativeDataParserConfig(data=folder, start_time_ns=9, end_time_ns=9))
+    with h5py.File(folder / "events.h5", "a") as file:
+        file["events/t"][:] = START
+    with pytest.raises(DataError, match=f"all its events are at {START} ns; check the unit of the times"):
+        parse(NativeDataParserConfig(data=folder))
 
 
 def test_refuse_reference_views_far_away(tmp_path: Path) -> None:

@@ -65,13 +65,14 @@ def test_correction_components(random_poses: torch.Tensor) -> None:
 
 
 def test_average_residuals_by_length_and_tile() -> None:
-    length = np.array([1] * 20 + [3] * 20 + [100] * 5)
-    residual = np.arange(45.0)
+    length = np.array([1] * 20 + [3] * 20 + [20] * 5 + [400] * 10)
+    residual = np.arange(55.0)
     rows = average_by_length(length, residual)
     # Five pairs say too little.
     assert rows == [
         {"events": "1", "num_pairs": 20, "mean_residual": 9.5},
         {"events": "3 to 4", "num_pairs": 20, "mean_residual": 29.5},
+        {"events": "65 or more", "num_pairs": 10, "mean_residual": 49.5},
     ]
 
     # Tiles of two pixels: the last one on the sensor, and one beside the first.
@@ -88,7 +89,7 @@ def test_choose_worst_median_and_best_view() -> None:
     assert [chosen[index] for index in (0, 27)] == ["worst", "best"]
     assert list(chosen.values()).count("median") == 1
     assert len(chosen) <= 9
-    assert set(chosen.values()) == {"worst", "median", "best", "every 5th"}
+    assert set(chosen.values()) == {"worst", "median", "best", "one of 5"}
     assert choose_views([20.0]) == {0: "worst"}
 
 
