@@ -11,10 +11,9 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.files.event_hdf5 import COLUMNS_AT_TOP, Hdf5TableFile
-from aenerf_ns.files.kalibr import motion_between, read_camchain
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
@@ -81,10 +80,8 @@ class EdsDataParser(EventDataParser):
         path = self.config.calibration
         if path is None:
             return _EVENT_CAMERA, _FRAME_CAMERA, torch.tensor(_EVENT_FROM_FRAME, dtype=torch.float64)
-        cameras = read_camchain(path)
-        if not {"cam0", "cam1"} <= set(cameras):
-            raise DataError(path, f"its cameras are {', '.join(cameras)}", "it must hold cam0 and cam1")
-        return cameras["cam1"].lens(), cameras["cam0"].lens(), motion_between(path, cameras, "cam0", "cam1")
+        read = read_calibration(path, "cam1", "cam0")
+        return read.event_camera, read.frame_camera, torch.linalg.inv(read.frame_from_event)
 
 
 eds_dataparser = DataParserSpecification(

@@ -23,6 +23,7 @@ from aenerf_ns.files.transforms import (
     read_transforms,
     rigid_motion,
     sensor_values,
+    states_thresholds,
 )
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
@@ -95,6 +96,7 @@ class NativeDataParser(EventDataParser):
             frame_camera=frame_camera,
             image_encoding=meta.image_encoding,
             intrinsics_origin=meta.event_camera.intrinsics_origin,
+            has_assumed_thresholds=meta.event_camera.has_assumed_thresholds and not states_thresholds(self.config),
         )
         return path, meta, capture
 

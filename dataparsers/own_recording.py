@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -96,6 +97,8 @@ class OwnRecordingDataParser(EventDataParser):
 
     def poses_path(self) -> Path:
         folder, config = Path(self.config.data), self.config
+        if config.colmap and config.poses:
+            raise DataError("event-recording-data", "--poses and --colmap are both given", "leave out one of them")
         stated = config.colmap or config.poses
         if stated is not None and not stated.exists():
             option = "--colmap" if config.colmap else "--poses"
@@ -173,9 +176,15 @@ def _read_colmap(
                 "move this folder away and estimate the poses again (aenerf convert --poses colmap), or correct the "
                 "calibration",
             )
+    if frame_from_event[:3, 3].norm() > 0:
+        CONSOLE.print("The COLMAP model must have the unit of T_frame_event: the two are combined as they are.")
+    times_of: dict[str, list[int]] = defaultdict(list)
+    for time, file in timed:
+        for first in range(1, len(file.parts)):
+            times_of["/".join(file.parts[first:])].append(time)
     placed: list[tuple[int, Tensor]] = []
     for name, pose in poses.items():
-        times = [time for time, file in timed if file.as_posix().endswith(f"/{name}")]
+        times = times_of[name]
         if len(times) != 1:
             raise DataError(images, f"it lists {name} {len(times)} times", "list every image of the COLMAP model once")
         placed.append((times[0], pose))

@@ -54,7 +54,9 @@ def perturb(
         shape = (_NUM_WAVES, 6)
         frequency = torch.randn(shape, generator=generator, dtype=torch.float64) / correlation_time
         phase = torch.rand(shape, generator=generator, dtype=torch.float64) * (2 * math.pi)
-        error = torch.cos(seconds[:, None, None] * frequency + phase).sum(1)
+        # In parts, because all waves of many poses would fill the memory.
+        parts = seconds[:, None, None].split(10_000)
+        error = torch.cat([torch.cos(part * frequency + phase).sum(1) for part in parts])
     else:
         error = torch.randn((len(seconds), 6), generator=generator, dtype=torch.float64)
         kept = torch.exp(-seconds.diff() / correlation_time)

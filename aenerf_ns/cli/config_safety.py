@@ -54,7 +54,7 @@ def require_known_names(config: Path) -> None:
         line = event.start_mark.line + 1
         if kind in ("python/object", "python/name") and name.startswith("aenerf_ns.") and _find(name) is None:
             problem = f"line {line} names {name}, which this version does not have"
-            raise DataError(config, problem, "open it with the version that trained it (0.1), or train again")
+            raise DataError(config, problem, "open it with the version that trained it, or train again")
         raise DataError(config, f"line {line} names {kind}:{name}, and opening the file could run it", _REMEDY)
     if not tagged or _split(tagged[0][1])[0] != "python/object":
         raise DataError(config, "not the config.yml of a run", _REMEDY)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from aenerf_ns.cli.console import say
-from aenerf_ns.cli.dataset import DatasetCommand, copy_images, open_writer, training_command
+from aenerf_ns.cli.dataset import DatasetCommand, copy_images, open_writer, say_scene_box, training_command
 from aenerf_ns.cli.ranges import require_seed
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, value_errors_as_data_error
@@ -149,7 +149,7 @@ class Convert(DatasetCommand):
         else:
             recording, report, picture = self._with_estimated_poses(capture, images, filters.window)
             # The dataset's own longest gap is about its own poses, but one that was given is about these.
-            if any(option.startswith("max_pose_gap_ns=") for option in self.format_options):
+            if any(option.replace("-", "_").startswith("max_pose_gap_ns=") for option in self.format_options):
                 recording = replace(recording, max_pose_gap=parser.config.max_pose_gap_ns)
         trajectory = _cut(recording, events, filters.window)
         views = {
@@ -288,13 +288,8 @@ def _scene_box(found: NDArray[np.float64] | None) -> Tensor | None:
     """Return a box that was found as a tensor, and say that the dataset gets it."""
     import torch
 
-    if found is None:
-        return None
-    say(
-        f"The camera goes around what it sees, so the dataset gets a scene box, {found.round(3).tolist()}. Where more "
-        "is to be seen, delete scene_box from transforms.json."
-    )
-    return torch.from_numpy(found)
+    say_scene_box(found)
+    return None if found is None else torch.from_numpy(found)
 
 
 def _with_poses(

@@ -8,14 +8,18 @@ from copy import copy
 from dataclasses import dataclass, field, fields
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
+from aenerf_ns.cli.console import say
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import require_dataset
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.recording.dataparser import EventDataParser
     from aenerf_ns.recording.options import EventDataParserConfig
@@ -42,6 +46,9 @@ class DatasetCommand:
     format_options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = field(default=(), kw_only=True)
     """Options of the format (docs/options.md), such as width=346 height=260."""
 
+    placing_options: ClassVar[tuple[str, ...]] = ()
+    """Options of all formats, which place the recording in a scene, that the command takes too."""
+
     def open_dataset(self) -> EventDataParser:
         """Make the parser of the dataset, which reads nothing yet.
 
@@ -53,20 +60,23 @@ class DatasetCommand:
 
         guessed = recognize(self.data) if self.format == "auto" else None
         name = guessed or self.format
-        config = _with_options(FORMATS[name], name, self.format_options)
+        config = _with_options(FORMATS[name], name, self.format_options, self.placing_options)
         config.data = self.data
         parser = config.setup()
         parser.guessed_format = guessed
         return parser
 
 
-def _with_options(config: EventDataParserConfig, name: str, options: Sequence[str]) -> EventDataParserConfig:
+def _with_options(
+    config: EventDataParserConfig, name: str, options: Sequence[str], placing: Sequence[str]
+) -> EventDataParserConfig:
     """Copy the configuration of a format, with options set by ``key=value``."""
     from aenerf_ns.recording.options import EventDataParserConfig
 
-    # Commands keep the world of the recording, so options that place it in a scene have no effect. The longest gap
-    # between poses and malformed events belong to the recording.
-    without_effect = {option.name for option in fields(EventDataParserConfig)} - {"max_pose_gap_ns", "drop_malformed"}
+    # Most commands keep the world of the recording, so options that place it in a scene have no effect. The longest
+    # gap between poses and malformed events belong to the recording.
+    without_effect = {option.name for option in fields(EventDataParserConfig)}
+    without_effect -= {"max_pose_gap_ns", "drop_malformed", *placing}
     known = [option.name for option in fields(config) if option.name not in without_effect]
     config = copy(config)
     for option in options:
@@ -114,6 +124,7 @@ def open_writer(
         # Near and far planes keep their units.
         auto_scale_poses=parser.scales_poses(recording) or not has_metric_poses,
         has_estimated_intrinsics=recording.intrinsics_origin == "estimated",
+        has_assumed_thresholds=recording.has_assumed_thresholds,
     )
 
 
@@ -140,3 +151,12 @@ def training_command(
     for name, value in (options or {}).items():
         words += [f"--{name}", str(value)]
     return shlex.join([*words, *format_words, "--data", str(data)])
+
+
+def say_scene_box(box: NDArray[np.float64] | None) -> None:
+    """Say that a dataset gets the box that its camera was found to go around, if there is one."""
+    if box is not None:
+        say(
+            f"The camera goes around what it sees, so the dataset gets a scene box, {box.round(3).tolist()}. Where "
+            "more is to be seen, delete scene_box from transforms.json."
+        )

@@ -155,7 +155,7 @@ class ExportMesh(RunCommand):
 
     def main(self) -> None:
         """Load the run, extract the mesh and write it."""
-        if self.output.suffix not in _MESH_SUFFIXES:
+        if self.output.suffix.lower() not in _MESH_SUFFIXES:
             raise DataError(self.output, "not a mesh file", "choose another --output, ending with .ply, .glb or .obj")
         require_writable(self.output)
         require_range("resolution", self.resolution, 8, 2048)

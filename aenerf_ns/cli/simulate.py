@@ -66,7 +66,9 @@ class Simulate(SimulationCommand):
 
     def _require_poses(self, duration: float) -> None:
         """Raise a DataError if the trajectories of a duration in seconds have one pose, or more than readers take."""
-        num_poses = self.pose_rate * duration
+        from aenerf_ns.simulator.paths import SpeedProfile
+
+        num_poses = self.pose_rate * SpeedProfile(self.speed, duration).duration
         # The last pose is at the end, and one that is closer to it than half an interval is left out.
         if num_poses <= 0.5:
             raise DataError("--pose-rate", f"{self.pose_rate:g} a second gives one pose", "give a higher rate")
@@ -110,6 +112,9 @@ class Simulate(SimulationCommand):
             for events in simulation.events():
                 writer.events.append(events)
                 num_events += len(events)
+            if num_events == 0:
+                remedy = "give lower thresholds, or a scene with more contrast"
+                raise DataError(self.scene, "no pixel changes by a contrast threshold", remedy)
             for time in np.linspace(estimated.start, estimated.end, self.train_images, dtype=np.int64).tolist():
                 # The picture is taken from the true pose. The dataset stores the estimated pose beside it.
                 pose = homogeneous(estimated.interpolate(time))

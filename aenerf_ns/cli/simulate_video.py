@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from aenerf_ns.cli.console import say
-from aenerf_ns.cli.dataset import training_command
+from aenerf_ns.cli.dataset import say_scene_box, training_command
 from aenerf_ns.cli.simulation import SimulationCommand
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, reading, require_file, value_errors_as_data_error
@@ -76,6 +76,11 @@ class SimulateVideo(SimulationCommand):
         """Raise a DataError for options that contradict each other."""
         if self.calibration is not None and self.intrinsics is not None:
             raise DataError(_COMMAND, "--calibration and --intrinsics are both given", "leave out one of them")
+        if self.event_camera is not None and self.calibration is None:
+            raise DataError(_COMMAND, "--event-camera without --calibration", "give the camchain that has the camera")
+        if any(self.pose_noise) and self.poses == "colmap":
+            remedy = "leave the pose noise out, because COLMAP makes errors of its own"
+            raise DataError(_COMMAND, f"pose noise {self.pose_noise} with --poses colmap", remedy)
         if any(self.pose_noise) and self.trajectory is None:
             raise DataError(_COMMAND, f"pose noise {self.pose_noise} without poses to add it to", "give --trajectory")
         if self.trajectory is not None:
@@ -147,12 +152,12 @@ class SimulateVideo(SimulationCommand):
             lens = (video.width, video.height) if camera is None else camera
             found = estimate_poses(video, video.times, lens, video.source, self.seed)
             say(found.summary())
+            report = found.report()
             if camera is None:
-                say(
-                    f"COLMAP estimates the lens: focal length {found.camera.fx:.1f} pixels, radial distortion "
-                    f"{found.camera.distortion[0]:.3g}."
-                )
-            return _VideoPoses(found.camera, found.trajectory, report=found.report())
+                report["intrinsics"] = found.camera.to_transforms()
+                say(f"The intrinsics were estimated with the poses: {found.camera.summary()}.")
+            say_scene_box(found.scene_box)
+            return _VideoPoses(found.camera, found.trajectory, None, report, found.scene_box, camera is None)
         return None
 
     def _write_dataset(self, lock: OutputLock, video: Video, simulator: EventSimulator, poses: _VideoPoses) -> str:
@@ -170,7 +175,14 @@ class SimulateVideo(SimulationCommand):
             "val": spread_evenly(taken[::2], self.validation_views),
             "test": spread_evenly(taken[1::2], self.test_views),
         }
-        with NativeDatasetWriter(lock, poses.camera, simulator.sensor, "srgb") as writer:
+        with NativeDatasetWriter(
+            lock,
+            poses.camera,
+            simulator.sensor,
+            "srgb",
+            poses.scene_box,
+            has_estimated_intrinsics=poses.has_estimated_lens,
+        ) as writer:
             writer.add_trajectories(poses.estimated, poses.truth)
             if poses.report is not None:
                 writer.add_poses_report(poses.report)
@@ -231,9 +243,11 @@ class SimulateVideo(SimulationCommand):
 
 @dataclass(frozen=True)
 class _VideoPoses:
-    """The lens and the poses of a video's camera, the true poses if others are estimated, and COLMAP's report."""
+    """The lens and the poses of a video's camera, the true poses if others are estimated, and what COLMAP found."""
 
     camera: CameraIntrinsics
     estimated: Trajectory
     truth: Trajectory | None = None
     report: dict[str, Any] | None = None
+    scene_box: NDArray[np.float64] | None = None
+    has_estimated_lens: bool = False

@@ -109,6 +109,8 @@ class SimulationCommand:
 
     def add_pose_noise(self, poses: Trajectory) -> Trajectory:
         """Add errors to true poses."""
+        if not any(self.pose_noise):
+            return poses
         from aenerf_ns.camera.noise import perturb
 
         return perturb(poses, *self.pose_noise, self.pose_noise_correlation_time, self.seed, self.pose_noise_kind)

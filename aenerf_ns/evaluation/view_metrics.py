@@ -69,7 +69,8 @@ def average_metrics(metrics: Sequence[dict[str, float]], with_deviations: bool) 
     """Compute the mean of each metric of views, and its standard deviation if asked for and if there are two views."""
     averages = {}
     for name in metrics[0]:
-        deviation, mean = torch.std_mean(torch.tensor([view[name] for view in metrics]))
+        values = torch.tensor([view[name] for view in metrics])
+        deviation, mean = torch.std_mean(values, correction=min(1, len(values) - 1))
         averages[name] = float(mean)
         if with_deviations and len(metrics) > 1:
             averages[f"{name}_std"] = float(deviation)

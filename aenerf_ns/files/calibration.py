@@ -66,7 +66,7 @@ def read_calibration(
     """
     if path.suffix == ".json":
         _require_no_names(path, event_camera, frame_camera)
-        meta, lens = read_transforms(path)
+        meta, lens = read_transforms(path, image_encoding="linear")
         with value_errors_as_data_error(path):
             sensor = SensorModel(**sensor_values(meta.event_camera))
         camera = meta.event_camera

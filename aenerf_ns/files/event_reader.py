@@ -33,16 +33,21 @@ class EventReader(EventFile):
 
     kind = "event file"
     extra = ""
+    _span: tuple[bool, tuple[int, int]] | None = None
 
     def read_chunks(self) -> Iterator[EventStream]:
         yield from bounded_items(self._chunks(), self.path, self.kind, self.extra)
 
     def time_span(self) -> tuple[int, int]:
+        # Kept, because some formats are read through to find it, and commands ask for it several times.
+        if self._span is not None and self._span[0] == self.drop_malformed:
+            return self._span[1]
         with bounded(self.path, self.kind, self.extra):
             # Only what is read as a whole tells which events are well-formed, and whether the others are few.
             span = EventReader._time_span(self) if self.drop_malformed else self._time_span()
         if span is None:
             raise self.empty_error()
+        self._span = self.drop_malformed, span
         return span
 
     def count(self) -> int | None:

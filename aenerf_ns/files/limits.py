@@ -48,19 +48,20 @@ _lock = threading.RLock()
 
 
 @contextmanager
-def bounded(path: Path, kind: str, extra: str = "") -> Iterator[None]:
+def bounded(path: Path, kind: str, extra: str = "", size: int | None = None) -> Iterator[None]:
     """Read from a file or the folder of a bag within the context, in little memory.
 
     Args:
         path: the file or folder.
         kind: what it should be, such as "HDF5 file".
         extra: the optional dependencies that reading it may need.
+        size: its bytes, where they are known.
 
     Raises:
         DataError: anything went wrong.
     """
     try:
-        with _little_memory(path):
+        with _little_memory(path, size_on_disk(path) if size is None else size):
             yield
     except DataError:
         raise
@@ -80,8 +81,11 @@ def bounded(path: Path, kind: str, extra: str = "") -> Iterator[None]:
 
 def bounded_items(items: Iterator[Item], path: Path, kind: str, extra: str = "") -> Iterator[Item]:
     """Yield items, each of which is read from a file within :func:`bounded`."""
+    size = None
     while True:
-        with bounded(path, kind, extra):
+        with bounded(path, kind, extra, size):
+            # Once, because a folder may hold thousands of files.
+            size = size_on_disk(path) if size is None else size
             item = next(items, None)
         if item is None:
             return
@@ -89,10 +93,10 @@ def bounded_items(items: Iterator[Item], path: Path, kind: str, extra: str = "")
 
 
 @contextmanager
-def _little_memory(path: Path) -> Iterator[None]:
+def _little_memory(path: Path, size: int) -> Iterator[None]:
     """Within the context, let the process take only as much more memory, and write only files as large, as the size
     of a file explains."""
-    allowed = _max_unpacked(size_on_disk(path))
+    allowed = _max_unpacked(size)
     reason, remedy = "far more memory than its size explains", "it is damaged, or made to fill the memory"
     available = re.search(r"MemAvailable:\s*(\d+)", _MEMORY.read_text())
     if available and (free := int(available[1]) << 10) < allowed:

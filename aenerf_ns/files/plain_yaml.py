@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import yaml
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.limits import read_text
 
-# Calibrations and the metadata of bags have 1 kB a camera or topic. PyYAML reads 0.1 MB in a second.
+# Calibrations have 1 kB a camera. PyYAML reads 0.1 MB in a second.
 _MAX_BYTES = 1 << 17
 
 # PyYAML takes time at every token for each bracket that is open.
@@ -29,6 +30,8 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
+# YAML 1.1 takes 1e-05, as Python prints it, for a text.
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?\d+[eE][-+]?\d+$"), list("-+0123456789"))
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)
 
 
@@ -45,7 +48,7 @@ def read_yaml_text(path: Path, max_bytes: int) -> str:
     return text
 
 
-def read_plain_yaml(path: Path) -> Any:
+def read_plain_yaml(path: Path, max_bytes: int = _MAX_BYTES) -> Any:
     """Return the value of a YAML file.
 
     Raises:
@@ -53,7 +56,7 @@ def read_plain_yaml(path: Path) -> Any:
     """
     try:
         # OpenCV's first line is no YAML, and rostopic's last line ends a message.
-        text = read_yaml_text(path, _MAX_BYTES).removeprefix("%YAML:1.0").rstrip().removesuffix("\n---")
+        text = read_yaml_text(path, max_bytes).removeprefix("%YAML:1.0").rstrip().removesuffix("\n---")
         return yaml.load(text, _Loader)
     except DataError:
         raise

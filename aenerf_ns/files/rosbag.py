@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import Columns, EventReader, batches, resolve_sensor_size
-from aenerf_ns.files.limits import bounded, require_unpacked_size, size_on_disk
+from aenerf_ns.files.limits import MAX_HEADER, bounded, require_unpacked_size, size_on_disk
 from aenerf_ns.files.plain_yaml import read_plain_yaml
 
 if TYPE_CHECKING:
@@ -233,7 +233,8 @@ def _begins(path: Path, magic: bytes) -> bool:
 
 def _require_distinct_files(metadata: Path) -> None:
     """Raise a DataError for a bag of ROS 2 that lists a file twice: it would be read as often as it is listed."""
-    names = read_plain_yaml(metadata)["rosbag2_bagfile_information"]["relative_file_paths"]
+    # It has some kilobytes for each topic that many nodes publish.
+    names = read_plain_yaml(metadata, MAX_HEADER)["rosbag2_bagfile_information"]["relative_file_paths"]
     if len(set(names)) < len(names):
         raise DataError(metadata, f"it lists {len(names)} files, {len(set(names))} of them distinct", "list each once")
 

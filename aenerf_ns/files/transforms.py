@@ -68,6 +68,7 @@ class EventCamera(_Camera, kw_only=True):
 
     file: str | None = None
     intrinsics_origin: Origin = "given"
+    has_assumed_thresholds: bool = False
     positive_contrast_threshold: float | None = None
     negative_contrast_threshold: float | None = None
     refractory_period_ns: int = 0
@@ -114,8 +115,8 @@ class Transforms(msgspec.Struct, kw_only=True):
             raise ValueError(f"scene_box has corners {self.scene_box}, the first not below the second")
 
 
-def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
-    """Read transforms.json or calibration.json.
+def read_transforms(path: Path, image_encoding: ImageEncoding = "srgb") -> tuple[Transforms, CameraIntrinsics]:
+    """Read transforms.json or calibration.json, with the encoding of the images where the file states none.
 
     Returns:
         The file, and the lens of the camera that took the images: the event camera's where the file states no other. An
@@ -124,7 +125,7 @@ def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
     Raises:
         DataError: the file is missing or malformed, or a value is impossible.
     """
-    values = read_json(path, dict)
+    values = {"image_encoding": image_encoding, **read_json(path, dict)}
     camera = values.get("event_camera")
     parts = [part for part in (values, camera) if isinstance(part, dict)]
     stated = [name for part in parts for name in part if re.match("T_.*event", name) and name != _MOUNT]
@@ -132,6 +133,9 @@ def read_transforms(path: Path) -> tuple[Transforms, CameraIntrinsics]:
         remedy = f"state {_MOUNT} in event_camera, which takes points from its coordinates to the frame camera's"
         raise DataError(path, f"it states {stated[0]}, which is not read", remedy)
     if isinstance(camera, dict) and camera.keys().isdisjoint(("fl_x", "fl_y", "cx", "cy")):
+        if lens := sorted(camera.keys() & {"camera_model", "k1", "k2", "k3", "k4", "p1", "p2"}):
+            problem = f"event_camera: it states {lens[0]}, but no focal lengths and principal point"
+            raise DataError(path, problem, f"state these too, or leave {lens[0]} out: all is then estimated")
         size = convert(path, camera, _Size, name="event_camera")
         with value_errors_as_data_error(path):
             guess = CameraIntrinsics.guess(size.width, size.height)

@@ -63,6 +63,7 @@ def _finish(
         if backward is None:
             backward = _Filter(batch.width, batch.height, sensor, decay)
         mean = (weight * state + backward.weight * backward.state()) / (weight + backward.weight)
+        # An image of a batch shorter than the lag is dated to the batch's start.
         lag = round(_LAG * batch.width * batch.height)
         both.append((int(batch.t[max(len(batch) - 1 - lag, 0)]), mean))
         backward.add(batch, -1)

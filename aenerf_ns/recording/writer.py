@@ -101,6 +101,7 @@ class NativeDatasetWriter(_FolderWriter):
         frame_camera: the lens of the camera that took the images; by default the event camera's.
         auto_scale_poses: whether training scales the poses by default.
         has_estimated_intrinsics: whether the event camera's lens was estimated together with the poses.
+        has_assumed_thresholds: whether nobody states the contrast thresholds.
     """
 
     def __init__(
@@ -114,6 +115,7 @@ class NativeDatasetWriter(_FolderWriter):
         frame_camera: CameraIntrinsics | None = None,
         auto_scale_poses: bool = True,
         has_estimated_intrinsics: bool = False,
+        has_assumed_thresholds: bool = False,
     ) -> None:
         super().__init__(folder)
         frame_camera = event_camera if frame_camera is None else frame_camera
@@ -129,6 +131,8 @@ class NativeDatasetWriter(_FolderWriter):
         }
         if has_estimated_intrinsics:
             self._meta["event_camera"]["intrinsics_origin"] = "estimated"
+        if has_assumed_thresholds:
+            self._meta["event_camera"]["has_assumed_thresholds"] = True
         if not auto_scale_poses:
             self._meta["auto_scale_poses"] = False
         if scene_box is not None:

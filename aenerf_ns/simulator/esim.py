@@ -204,8 +204,8 @@ class EventSimulator:
 
     Args:
         width, height: pixel columns and rows, at most 65536.
-        sensor: contrast thresholds, refractory period and Bayer pattern. Initial reference times are random, uniform in
-            [0, refractory period) after the first frame.
+        sensor: contrast thresholds, of 0.01 or more, refractory period and Bayer pattern. Initial reference times are
+            random, uniform in [0, refractory period) after the first frame.
         noise: thresholds of single pixels are drawn once from N(C, contrast_threshold_spread) and clipped at 0.01. A
             low-pass filter of first order follows the logarithm; its cutoff frequency is bandwidth · (I + ε) / (1 + ε),
             ε = 20 / 255. The leak makes the filtered signal rise by leak_rate · C+ a second. Shot noise falls with the
@@ -377,5 +377,4 @@ class EventSimulator:
         if image.ndim == 2:
             return image
         # Not a matrix product, which may round equal pixels differently.
-        red, green, blue = np.moveaxis(image * self._channel_weights, -1, 0)
-        return red + green + blue
+        return (image * self._channel_weights).sum(-1)

@@ -344,9 +344,10 @@ class SpeedProfile:
         advance = np.asarray(parameter, np.float64) * self.easy_duration
         if self.name == "easy":
             return advance
-        # The advance stays within half a second of its mean. Newton's method starts from an interpolation.
-        grid = np.arange(advance.min() / HARD_MEAN_SPEED - 1, advance.max() / HARD_MEAN_SPEED + 1, 1e-3)
-        time = np.interp(advance, _hard_advance(grid), grid)
+        # The speed repeats every second. Newton's method starts from an interpolation.
+        whole, rest = np.divmod(advance, HARD_MEAN_SPEED)
+        grid = np.linspace(0, 1, 1001)
+        time = whole + np.interp(rest, _hard_advance(grid), grid)
         for _ in range(4):
             time = time - (_hard_advance(time) - advance) / HARD_SPEED_RATIO ** np.sin(2 * np.pi * time)
         return time

@@ -132,8 +132,8 @@ class Simulation:
         steps = max(int(np.ceil(ends[1] - ends[0])), 1)
         seconds = middle + exposure * ((np.arange(steps) + 0.5) / steps - 0.5)
         parameters = self._profile.parameter(seconds).clip(0, 1)
-        radiance = [self._render(self._scene.path(float(s)), _RAYS_OF_EXPOSURES)[0] for s in parameters]
-        seen = to_channels(torch.from_numpy(np.mean(radiance, axis=0)), self._sensor.num_channels)
+        radiance = sum(self._render(self._scene.path(float(s)), _RAYS_OF_EXPOSURES)[0] for s in parameters) / steps
+        seen = to_channels(torch.from_numpy(radiance), self._sensor.num_channels)
         return _display(seen.squeeze(-1))
 
     def reference_picture(self, camera_to_world: NDArray[np.float64] | Tensor) -> ReferencePicture:

@@ -134,6 +134,7 @@ MISTAKES = [
     ("simulate --output O --duration 1e-300", 1, "Error: --duration: 1e-300 is out of range"),
     ("simulate --output O --duration 10000 --pose-rate 1e5", 1, "Error: --pose-rate: it gives 1e+09 poses"),
     ("simulate --output O --duration 0.05 --pose-rate 10", 1, "Error: --pose-rate: 10 a second gives one pose"),
+    ("simulate --output O --duration 4 --speed hard --pose-rate 0.2", 1, "Error: --pose-rate: 0.2 a second gives one"),
     ("simulate --output O --positive-contrast-threshold 0", 1, "Error: --positive-contrast-threshold: 0.0 is out"),
     ("simulate-video V --output O --refractory-period-ns -1", 1, "Error: --refractory-period-ns: -1 is out of range"),
     ("simulate --output O --poses colmap --pose-noise-degrees 1", 1, "COLMAP makes errors of its own"),
@@ -223,6 +224,11 @@ def test_wrong_option_of_a_format_is_one_line(option: str, part: str, folder: Pa
         DatasetCommand(folder / "F", format_options=(option,)).open_dataset()
     assert error.value.source == f"--format-options {option}"
     assert "\n" not in str(error.value)
+
+
+def test_a_check_takes_options_that_place_the_scene(folder: Path) -> None:
+    parser = Check(folder / "F", format_options=("scale-factor=2", "end-time-ns=5")).open_dataset()
+    assert (parser.config.scale_factor, parser.config.end_time_ns) == (2.0, 5)
 
 
 def test_training_command_is_quoted() -> None:

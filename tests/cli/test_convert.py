@@ -66,6 +66,7 @@ def assert_same(one: Recording, other: Recording) -> None:
     assert one.frame_camera == other.frame_camera
     assert one.sensor == other.sensor
     assert one.image_encoding == other.image_encoding
+    assert one.has_assumed_thresholds == other.has_assumed_thresholds
     for split, views in one.reference_views.items():
         assert len(views) == len(other.reference_views[split])
         for a, b in zip(views, other.reference_views[split], strict=True):
@@ -232,7 +233,7 @@ def test_given_poses_of_another_time_are_left_out(tmp_path: Path, monkeypatch: p
     given = read_tum_trajectory(data / "groundtruth.txt")
     write_tum_trajectory(data / "groundtruth.txt", Trajectory(given.times + 10**12, given.camera_to_worlds))
     with CONSOLE.capture() as output:
-        options = {"format": "ecd-data", "format_options": ("max_pose_gap_ns=150000000",)}
+        options = {"format": "ecd-data", "format_options": ("max-pose-gap-ns=150000000",)}
         found = convert(data, tmp_path / "found", poses="events", **options)
     assert found.max_pose_gap == 150_000_000
     assert "The given poses, from 1000000000000 to " in output.get()
@@ -283,7 +284,7 @@ def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
         ({"pixel_share": 1e-9}, "no event is left; widen"),
         ({"poses": "events", "region": (0, 0, 7, 4)}, "region of interest 0 0 7 4 .* beyond its 6 x 4 pixels"),
         ({"poses": "refined", "region": (1, 0, 4, 4)}, "from pixel 1 0 of a color sensor; begin it at an even"),
-        ({"poses": "colmap", "end_time_ns": START + 1}, "1 frames; poses can be estimated from two"),
+        ({"poses": "colmap", "end_time_ns": START + 1}, "1 frames; poses can be estimated from three"),
         ({"poses": "events", "seed": 2**31}, "--seed: 2147483648 is out of range"),
     ],
 )

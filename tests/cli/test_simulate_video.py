@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.colmap_stand_in import place_frames
+from helpers.colmap_stand_in import FOUND_BOX, place_frames
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
@@ -140,17 +140,23 @@ def test_colmap_gives_poses_and_lens(frames: Path, tmp_path: Path, monkeypatch: 
     place_frames(8, monkeypatch)
     printed = simulate(tmp_path / "dataset", video=frames, poses="colmap")
     assert "8 of 10 frames registered" in printed
-    assert "COLMAP estimates the lens: focal length 22.0 pixels, radial distortion 0.01" in printed
+    assert "The intrinsics were estimated with the poses: focal length 22.0 px" in printed
+    assert "the dataset gets a scene box, [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]" in printed
     recording = NativeDataParserConfig(data=tmp_path / "dataset").setup().recording
     assert (recording.event_camera.fx, recording.event_camera.distortion[0]) == (22.0, 0.01)
+    assert recording.intrinsics_origin == "estimated"
+    assert recording.scene_box is not None
+    np.testing.assert_array_equal(recording.scene_box, FOUND_BOX)
     assert recording.trajectory.times.tolist() == [FRAME * index for index in range(8)]
     # The last two frames have no pose, and the first one lies before all events.
     assert [view.time for view in recording.reference_views["train"]] == [FRAME * index for index in range(1, 8)]
     report = json.loads((tmp_path / "dataset" / "poses_report.json").read_text())
     assert report["registered_frames"] == 8
+    assert report["intrinsics"]["fl_x"] == 22.0
     printed = simulate(tmp_path / "given", video=frames, poses="colmap", intrinsics=(20.0, 21.0, 11.5, 7.5))
-    assert "estimates the lens" not in printed
-    assert NativeDataParserConfig(data=tmp_path / "given").setup().recording.event_camera.fy == 21.0
+    assert "intrinsics were estimated" not in printed
+    recording = NativeDataParserConfig(data=tmp_path / "given").setup().recording
+    assert (recording.event_camera.fy, recording.intrinsics_origin) == (21.0, "given")
 
 
 def test_video_without_poses_becomes_a_recording(frames: Path, camchain: Path, tmp_path: Path) -> None:
@@ -193,6 +199,8 @@ LENS = {"intrinsics": (20.0, 21.0, 11.5, 7.5)}
         (("calibration",), {"event_camera": "cam1"}, "its camera has 25 x 16 pixels, the frames of .* 24 x 16; give"),
         ((), {"intrinsics": (0.0, 21.0, 11.5, 7.5)}, "--intrinsics: fx must be from"),
         ((), {"pose_noise_degrees": 1.0}, "without poses to add it to; give --trajectory"),
+        ((), {"pose_noise_degrees": 1.0, "poses": "colmap"}, "with --poses colmap; leave the pose noise out"),
+        ((), {"event_camera": "cam1"}, "--event-camera without --calibration; give the camchain"),
         ((), {"positive_contrast_threshold": 0.0}, "--positive-contrast-threshold: 0.0 is out of range"),
         ((), {"positive_contrast_threshold": 9.0, "negative_contrast_threshold": 9.0}, "no pixel changes by a"),
     ],

@@ -68,6 +68,7 @@ def test_intrinsics_may_be_missing(tmp_path: Path) -> None:
     file = truth.data / "calibration.json"
     meta = json.loads(file.read_text())
     lens = {"fl_x", "fl_y", "cx", "cy", "k1", "p2"}
+    del meta["image_encoding"]
     meta["event_camera"] = {key: value for key, value in meta["event_camera"].items() if key not in lens}
     file.write_text(json.dumps(meta))
     with pytest.raises(DataError, match="it has no camera cam1; leave the name out"):
@@ -82,7 +83,11 @@ def test_intrinsics_may_be_missing(tmp_path: Path) -> None:
     assert (recording.event_camera.width, recording.event_camera.height) == (60, 40)
     assert recording.sensor == SensorModel(0.3, 0.2, 100)
     assert len(frames) == 3
+    assert recording.image_encoding == "linear"
     # A part of a lens is a mistake.
+    file.write_text(json.dumps({**meta, "event_camera": {**meta["event_camera"], "camera_model": "OPENCV_FISHEYE"}}))
+    with pytest.raises(DataError, match="it states camera_model, but no focal lengths and principal point; state"):
+        parser.read_recording()
     meta["event_camera"]["fl_x"] = 50.0
     file.write_text(json.dumps(meta))
     with pytest.raises(DataError, match="missing required field `fl_y`"):
@@ -186,6 +191,9 @@ def test_refuse_a_colmap_model_of_several_cameras(tmp_path: Path) -> None:
     truth = write_own(tmp_path / "made")
     (truth.data / "trajectory.txt").unlink()
     write_colmap(truth.data / "colmap", truth.poses[[0, 5, 10]], [f"{index:05d}.png" for index in range(3)])
+    both = {"poses": truth.data / "poses.txt", "colmap": truth.data / "colmap"}
+    with pytest.raises(DataError, match="--poses and --colmap are both given; leave out one of them"):
+        recording_of(OwnRecordingDataParserConfig(data=truth.data, **both))
     path = truth.data / "colmap" / "images.txt"
     path.write_text(path.read_text().replace("1 00002.png", "2 00002.png"))
     with pytest.raises(DataError, match="its images are of 2 cameras, and how these are mounted"):
@@ -241,7 +249,7 @@ CAMERA_INFO = (
     "image_width: 96\nimage_height: 72\ncamera_name: dvs\n"
     "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [90.0, 0.0, 47.5, 0.0, 91.0, 35.5, 0.0, 0.0, 1.0]\n"
     "distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n"
-    "  data: [-0.1, 0.01, 0.0, 0.0, 0.0]\n"
+    "  data: [-0.1, 1e-02, 0.0, 0.0, 0.0]\n"
 )
 
 

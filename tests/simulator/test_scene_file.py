@@ -164,6 +164,14 @@ def test_bare_mesh_is_in_view(tmp_path: Path) -> None:
         assert max(alpha[0].max(), alpha[-1].max(), alpha[:, 0].max(), alpha[:, -1].max()) == 0
 
 
+def test_a_scene_without_an_event_is_refused(box_file: Path) -> None:
+    name = scene_file(box_file, path={"kind": "around", "radius": 2.5, "turns": 0.2})
+    thresholds = {"positive_contrast_threshold": 900.0, "negative_contrast_threshold": 900.0}
+    with pytest.raises(DataError, match="no pixel changes by a contrast threshold; give lower thresholds, or a scene"):
+        Simulate(box_file.with_name("data"), scene=name, width=24, height=18, duration=0.1, **thresholds).main()
+    assert not box_file.with_name("data").exists()
+
+
 def test_command_events_are_thresholds_apart(box_file: Path) -> None:
     """The command, on a mesh: at every event, the log-radiance that the renderer gives has moved by one threshold."""
     name = scene_file(box_file, path={"kind": "around", "radius": 2.5, "turns": 0.2})

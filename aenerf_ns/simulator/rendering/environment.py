@@ -31,7 +31,9 @@ class Environment:
     radiance: NDArray[np.float32]
 
     def split(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Split the environment into an even part, at most 32 rows high, and a bright part, which add up to the whole.
+        """Split the environment into an even part and a bright part, which add up to the whole.
+
+        The even part is halved to at most 32 rows, as long as its sides are even.
 
         Sampling a light of a few texels like the sky gives noise, and sampling the sky like the sun takes many samples,
         so each part is sampled in its own way.

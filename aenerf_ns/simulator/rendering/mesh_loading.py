@@ -90,7 +90,8 @@ class _FilesBeside(trimesh.resolvers.FilePathResolver):
         file = file_inside(self._path.parent, name, self._path)
         content = _read(file)
         if name == self._library:
-            self.materials |= {found.decode(errors="replace").strip() for found in re.findall(rb"newmtl (.*)", content)}
+            names = re.findall(rb"^\s*newmtl\s+(.*)", content, re.MULTILINE)
+            self.materials |= {name.decode(errors="replace").strip() for name in names}
         elif self._library is not None:
             try:
                 Image.open(BytesIO(content)).close()
@@ -112,7 +113,8 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
         used = {name.strip() for name in re.findall("^usemtl(.*)", text, re.MULTILINE)}
         if len(libraries) > 1:
             raise DataError(path, f"{len(libraries)} material files", "join them into one")
-        content = _triangulate_obj(text).encode()
+        # trimesh takes a comment behind a face for a corner.
+        content = _triangulate_obj(re.sub(r"^(f[ \t][^#\n]*)#.*", r"\1", text, flags=re.MULTILINE)).encode()
     files = _FilesBeside(path, libraries[0] if libraries else None)
     scene = trimesh.load_scene(BytesIO(content), file_type=suffix[1:], resolver=files, process=False)
     if files.errors:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -40,31 +41,14 @@ def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
             start += rows * columns
             if rows == columns == 1:
                 break
-            picture = _halved(_halved(picture, 0), 1)
+            half = (max(1, columns // 2), max(1, rows // 2))
+            picture = cv2.resize(picture, half, interpolation=cv2.INTER_AREA).reshape(half[1], half[0], -1)
         first_level.append(len(level))
     return MipMaps(
         np.concatenate(texels) if texels else np.zeros((0, 3), np.uint16 if bits16 else np.float32),
         np.array(level, np.int64).reshape(-1, 3),
         np.array(first_level, np.int64),
     )
-
-
-def _halved(picture: NDArray[np.floating], axis: int) -> NDArray[np.floating]:
-    """Average pairs of texels along an axis; if their number is odd, average a little more than two."""
-    picture = np.moveaxis(picture, axis, 0)
-    size = len(picture)
-    half = max(1, size // 2)
-    if size == 1:
-        means = picture
-    elif size % 2 == 0:
-        means = 0.5 * (picture[0::2] + picture[1::2])
-    else:
-        total = np.concatenate([np.zeros_like(picture[:1], np.float64), np.cumsum(picture, axis=0, dtype=np.float64)])
-        edge = np.arange(half + 1) * (size / half)
-        i = np.minimum(edge.astype(np.int64), size - 1)
-        part = (edge - i).reshape(-1, *(1,) * (picture.ndim - 1))
-        means = np.diff((1 - part) * total[i] + part * total[i + 1], axis=0) * (half / size)
-    return np.moveaxis(means, 0, axis)
 
 
 @numba.njit(cache=True, error_model="numpy")
