@@ -87,6 +87,7 @@ class PoseCorrection(CameraOptimizer):
     _compared_seconds: Tensor
     _true_poses: Tensor | None
     _twist_units: Tensor
+    clock_start: Tensor
     _sampled_seconds: Tensor
     _sampled_poses: Tensor
     _penalties: Tensor
