@@ -27,7 +27,7 @@ from aenerf_ns.training.schedules import (
 from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
 
-def optimized_by(scheduler: SchedulerConfig | None = None, **adam: float) -> dict[str, Any]:
+def optimized_by(scheduler: SchedulerConfig | None = None, **adam: Any) -> dict[str, Any]:
     """Return how a group of parameters is optimized: Adam's options, and by default a rate that falls at milestones."""
     return {
         "optimizer": FusedAdamOptimizerConfig(**adam),

@@ -226,7 +226,7 @@ class ProposalNetwork(HashMLPDensityField):
         num_levels: levels of the hash grid.
         max_res: cells along an axis on the finest level.
         log2_hashmap_size: binary logarithm of the entries of a level.
-        grid_implementation: how the hash grid is computed, see :class:`.encoding.hash_grid.HashEncoding`.
+        grid_implementation: how the hash grid is computed, see :class:`.hash_grid.HashEncoding`.
         to_field_space: see :class:`DensityField`.
         options: the other options of the framework's network.
     """

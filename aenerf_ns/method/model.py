@@ -84,7 +84,7 @@ class AENeRFModelConfig(ModelConfig):
     """Density of field and proposal networks before training, per scene unit. A scene that starts nearly transparent
     sits in a fog for hundreds of steps, until matter grows out of it."""
     unbounded_init_density: float | None = None
-    """Density before training in a scene without a box, in place of average_init_density where it is given."""
+    """Density before training where space is contracted, in place of average_init_density where it is given."""
     loss_coefficients: LossCoefficients = dataclasses.field(default_factory=PairLossCoefficients)
     """Weights of the losses (paper, eq. 14)."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=PairSupervisionConfig)
@@ -118,7 +118,7 @@ class AENeRFModel(Model):
         """Build the networks, the samplers, the supervision and the color correction."""
         scene: SceneRecording = self.kwargs["metadata"][SCENE_KEY]
         config = self.config
-        _require_possible(config)
+        _require_possible(config, scene.trajectory.duration)
         self.sensor = scene.sensor
         self.image_encoding = scene.image_encoding
         contraction = config.scene_contraction
@@ -381,8 +381,13 @@ def _density(network: Field, samples: RaySamples) -> Tensor:
     return network.get_density(samples)[0]
 
 
-def _require_possible(config: AENeRFModelConfig) -> None:
-    """Raise a DataError for planes that no ray can meet, and for numbers that fit nothing."""
+def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
+    """Raise a DataError for planes that no ray can meet, and for numbers that fit nothing.
+
+    Args:
+        config: of the model.
+        duration: seconds of the trajectory.
+    """
     near, far = config.near_plane, config.far_plane
     if not 0 <= near < far < math.inf:
         raise DataError(
@@ -399,6 +404,16 @@ def _require_possible(config: AENeRFModelConfig) -> None:
         )
     if not config.camera_optimizer.knot_interval > 0:
         raise DataError("model", f"knot_interval {config.camera_optimizer.knot_interval:g}", "give seconds above 0")
+    offset = config.camera_optimizer.clock_offset
+    # Beyond it, all events would see the pose of one end.
+    if offset is not None and not abs(offset) < duration:
+        remedy = f"give seconds, fewer than the {duration:g} s of the trajectory"
+        raise DataError("model", f"camera_optimizer.clock_offset {offset:g}", remedy)
+    for name in ("average_init_density", "unbounded_init_density"):
+        density = getattr(config, name)
+        # Softplus turns larger ones into infinity.
+        if density is not None and not 0 < density < 700:
+            raise DataError("model", f"{name} {density:g}", "give a number above 0 and below 700")
 
 
 def _with_room(aabb: Tensor) -> Tensor:

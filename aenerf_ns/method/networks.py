@@ -96,7 +96,7 @@ def make_networks(
         average_init_density: density before training.
         warp: moves the field along with the corrections of the poses, or None where poses are not corrected.
     """
-    # The proposal networks only follow the field: poses are learned from the field alone.
+    # The proposal networks only follow the field: gradients reach the motion of space by the field alone.
     field_warp, proposal_warp = (None, None) if warp is None else (warp.forward, warp.without_gradient)
     if backbone == "hash":
         radiance_field = EventRadianceField(

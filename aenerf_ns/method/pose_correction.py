@@ -47,8 +47,6 @@ class PoseCorrectionConfig(CameraOptimizerConfig):
     """Weight of the mean squared rotation of the corrections, in radians."""
     knot_interval: float = 0.1
     """Seconds between the knots of the spline. It corrects errors that change more slowly than that."""
-    num_frequencies: int = 3
-    """Frequencies of the network's sinusoidal encoding."""
     rigid_offset: bool = False
     """Learn one rigid motion from the given poses to the camera's, the same at all times: the error of a hand-eye
     calibration. It works with every mode."""
@@ -87,8 +85,9 @@ class PoseCorrection(CameraOptimizer):
     config: PoseCorrectionConfig
     _camera_seconds: Tensor
     _compared_seconds: Tensor
-    _reference_poses: Tensor
+    _true_poses: Tensor | None
     _twist_units: Tensor
+    clock_start: Tensor
     _sampled_seconds: Tensor
     _sampled_poses: Tensor
     _penalties: Tensor
@@ -108,10 +107,10 @@ class PoseCorrection(CameraOptimizer):
         self.trajectory = trajectory
         self.register_buffer("_camera_seconds", trajectory.seconds(camera_times), persistent=False)
         times = _compared_times(trajectory, ground_truth)
-        reference = trajectory if ground_truth is None else ground_truth
         self.has_ground_truth = ground_truth is not None
         self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
-        self.register_buffer("_reference_poses", reference.interpolate(times), persistent=False)
+        true_poses = None if ground_truth is None else ground_truth.interpolate(times)
+        self.register_buffer("_true_poses", true_poses, persistent=False)
         # A camera that only turns gives translations no unit. The unit of the scene serves instead.
         self.translation_unit = extent = trajectory.extent if trajectory.extent > _MIN_EXTENT else 1.0
         # Times in every interval of the spline, at which the size of the corrections is taken.
@@ -130,6 +129,7 @@ class PoseCorrection(CameraOptimizer):
         self.clock_change: nn.Parameter | None = None
         if config.clock_offset is not None:
             self.clock_change = nn.Parameter(torch.zeros(()))
+            self.register_buffer("clock_start", torch.tensor(config.clock_offset, dtype=torch.float64))
             # The seconds in which the camera moves by a unit of the twists: a step of the optimizer then moves poses
             # about as far by the clock as by a twist.
             _, rate = trajectory.pose_and_rate(sampled)
@@ -137,7 +137,7 @@ class PoseCorrection(CameraOptimizer):
             self._clock_unit = 1 / max(float((turning + moving).mean().sqrt()), _MIN_SPEED)
         self.twists: TwistNetwork | TwistSpline | None = None
         if config.mode == "network":
-            self.twists = TwistNetwork(trajectory, config.num_frequencies)
+            self.twists = TwistNetwork(trajectory)
         elif config.mode == "spline":
             self.twists = TwistSpline(trajectory.duration, config.knot_interval)
 
@@ -161,7 +161,7 @@ class PoseCorrection(CameraOptimizer):
 
     def pose(self, seconds: Tensor) -> Tensor:
         """Return corrected (N, 3, 4) float64 poses at (N,) float64 seconds since the trajectory's start."""
-        base = self.trajectory.pose(self._on_clock_of_poses(seconds))
+        base = self.trajectory.pose(self.on_clock_of_poses(seconds))
         pose = base
         if self.twists is not None:
             pose = self._exponential(pose, self._twist_units * self.twists(seconds, base))
@@ -171,7 +171,7 @@ class PoseCorrection(CameraOptimizer):
 
     def pose_and_rate(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of :meth:`pose` and their derivatives with respect to time, per second."""
-        shifted = self._on_clock_of_poses(seconds)
+        shifted = self.on_clock_of_poses(seconds)
         base, base_rate = self.trajectory.pose_and_rate(shifted)
         if self.clock_change is not None:
             # Beyond its ends the trajectory stands still.
@@ -189,15 +189,20 @@ class PoseCorrection(CameraOptimizer):
             pose, rate = both.split(3, -2)
         return pose, rate
 
-    def at_first(self, seconds: Tensor) -> Tensor:
-        """Return the times on the trajectory at which training begins to look up poses, for times of events."""
-        return (seconds + (self.config.clock_offset or 0.0)).clamp(0, self.trajectory.duration)
-
-    def _on_clock_of_poses(self, seconds: Tensor) -> Tensor:
-        """Return the times on the trajectory at which base poses are looked up, for times of events."""
-        if self.clock_change is None:
+    def on_clock_of_poses(self, seconds: Tensor, at_first: bool = False) -> Tensor:
+        """Return the times on the trajectory at which base poses are looked up, now or at first, for events' times."""
+        if self.config.clock_offset is None:
             return seconds
-        return (seconds + self.clock_offset()).clamp(0, self.trajectory.duration)
+        offset = self.config.clock_offset if at_first else self.clock_offset()
+        return (seconds + offset).clamp(0, self.trajectory.duration)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # The learned change counts from the start value. Checkpoints of earlier versions hold no start value.
+        if self.clock_change is not None:
+            start = float(state_dict.setdefault(f"{prefix}clock_start", self.clock_start))
+            if start != self.config.clock_offset:
+                args[-1].append(f"it began with clock-offset {start:g}, not {self.config.clock_offset:g}")
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _rigid_twists(self, count: int) -> Tensor:
         """Return χ in scene units and radians, (count, 6) float64."""
@@ -266,7 +271,7 @@ class PoseCorrection(CameraOptimizer):
             twists = twists + self._rigid_twists(len(base))
         translation, rotation = (base[:, None, :, :3] @ twists.unflatten(-1, (2, 3, 1)))[..., 0].unbind(1)
         if self.clock_change is not None:
-            _, rate = self.trajectory.pose_and_rate(self.at_first(seconds))
+            _, rate = self.trajectory.pose_and_rate(self.on_clock_of_poses(seconds, at_first=True))
             # The derivative of a rotation R is [ω]ₓ R.
             turning = rate[..., :3] @ base[..., :3].mT
             omega = torch.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], -1)
@@ -279,14 +284,21 @@ class PoseCorrection(CameraOptimizer):
 
         Where the true trajectory is not known, the estimated one takes its place.
         """
-        with torch.no_grad():
-            return align(self.pose(self._compared_seconds), self._reference_poses)
+        _, corrected, reference = self.compared_poses()
+        return align(corrected, reference)
 
     def compared_poses(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return estimated, corrected and reference poses (N, 3, 4) at the same times, in scene units."""
+        """Return estimated, corrected and reference poses (N, 3, 4) at the same times, in scene units.
+
+        Where there are no true poses, the reference is the estimated trajectory at the times of the corrected clock: an
+        offset of the clock moves no place of the world.
+        """
+        seconds = self._compared_seconds
         with torch.no_grad():
-            estimated, corrected = (source.pose(self._compared_seconds) for source in (self.trajectory, self))
-        return estimated, corrected, self._reference_poses
+            estimated, corrected = self.trajectory.pose(seconds), self.pose(seconds)
+            if self._true_poses is not None:
+                return estimated, corrected, self._true_poses
+            return estimated, corrected, self.trajectory.pose(self.on_clock_of_poses(seconds))
 
     def ray_rates(self, raybundle: RayBundle) -> tuple[Tensor, Tensor]:
         """Return the derivatives of the corrected rays' origins and directions (N, 3) by time, per second."""
@@ -359,10 +371,9 @@ class TwistNetwork(nn.Module):
 
     Args:
         trajectory: estimated trajectory, whose span the times lie in.
-        num_frequencies: frequencies of the sinusoidal encoding.
     """
 
-    def __init__(self, trajectory: Trajectory, num_frequencies: int) -> None:
+    def __init__(self, trajectory: Trajectory) -> None:
         super().__init__()
         self._duration = trajectory.duration
         width = 256
@@ -370,9 +381,9 @@ class TwistNetwork(nn.Module):
         self.time_embedding = nn.Linear(1, width)
         self.encoding = NeRFEncoding(
             in_dim=width,
-            num_frequencies=num_frequencies,
+            num_frequencies=3,
             min_freq_exp=0.0,
-            max_freq_exp=num_frequencies - 1.0,
+            max_freq_exp=2.0,
             include_input=True,
             implementation="torch",
         )

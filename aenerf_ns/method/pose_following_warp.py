@@ -67,7 +67,8 @@ class PoseFollowingWarp(nn.Module):
         self._interval = duration / (count - 1)
         seconds = torch.linspace(0, duration, count, dtype=torch.float64)
         self.register_buffer("_seconds", seconds, persistent=False)
-        self.register_buffer("_base_poses", correction.trajectory.pose(correction.at_first(seconds)), persistent=False)
+        base = correction.trajectory.pose(correction.on_clock_of_poses(seconds, at_first=True))
+        self.register_buffer("_base_poses", base, persistent=False)
         self.register_buffer("_seen", torch.zeros(_RESOLUTION**3, count))
         self.register_buffer("_weights", torch.full((_RESOLUTION**3, count), 1 / count))
         self.register_buffer("_strides", torch.tensor([_RESOLUTION**2, _RESOLUTION, 1]), persistent=False)
@@ -86,7 +87,7 @@ class PoseFollowingWarp(nn.Module):
         return self._moved(positions, self._twists)
 
     def without_gradient(self, positions: Tensor) -> Tensor:
-        """Return the places of :meth:`forward`, through which nothing of the corrections is learned."""
+        """Return the places of :meth:`forward`, with a motion that gradients do not reach. They reach the positions."""
         assert self._twists is not None
         return self._moved(positions, self._twists.detach())
 

@@ -143,9 +143,14 @@ class Supervision(nn.Module, ABC):
 class ChangeSupervision(Supervision):
     """Compares rendered changes of log-radiance with the events of a pixel between two times."""
 
-    @abstractmethod
+    @property
+    def sensor_thresholds(self) -> tuple[float, float]:
+        """The sensor's C₊ and C₋."""
+        return self.sensor.positive_contrast_threshold, self.sensor.negative_contrast_threshold
+
     def thresholds(self, outputs: Mapping[str, Any]) -> tuple[Tensor | float, Tensor | float]:
         """Return the changes of log-radiance that a positive and a negative event stand for, both positive."""
+        return self.sensor_thresholds
 
     def changes(self, outputs: Mapping[str, Any], batch: Any) -> tuple[Tensor, Tensor]:
         """Return the (N,) changes between the two times: as rendered in the pixel's channel, and as the events say."""

@@ -98,8 +98,3 @@ def dead_zone_excess(
     """
     error = predicted - change
     return F.relu(error - positive_threshold) + F.relu(-negative_threshold - error)
-
-
-def threshold_bound_loss(thresholds: Tensor, least: Tensor) -> Tensor:
-    """Return by how much thresholds are below the least that they may be, summed. Both have the same shape."""
-    return F.relu(least - thresholds).sum()

@@ -78,13 +78,16 @@ class ScalarWriter(writer.Writer):
 
     Args:
         folder: of the run. It exists.
+        resumes: whether the run goes on from a checkpoint. What a run in the same folder wrote before is kept.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, resumes: bool) -> None:
         # Line by line on the disk, so that the file of a run that is killed is whole.
-        self._file = (folder / SCALARS_FILE).open("w", encoding="utf-8", newline="", buffering=1)
+        mode = "a" if resumes else "w"
+        self._file = (folder / SCALARS_FILE).open(mode, encoding="utf-8", newline="", buffering=1)
         self._rows = csv.writer(self._file, lineterminator="\n")
-        self._rows.writerow(("step", "name", "value"))
+        if self._file.tell() == 0:
+            self._rows.writerow(("step", "name", "value"))
 
     def write_scalar(self, name: str, scalar: float | Tensor, step: int) -> None:
         """Write one scalar, unless it is a time, or a rate at a step that is not logged otherwise."""

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import tyro
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
-from torch.nn import Parameter
-from torch.optim import Adam, Optimizer
+from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
 
@@ -17,9 +16,8 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """Adam that updates all parameters in one operation, on CPU and GPU faster than one by one."""
 
-    def setup(self, params: list[Parameter]) -> Adam:
-        """Return the optimizer of parameters."""
-        return Adam(params, lr=self.lr, eps=self.eps, weight_decay=self.weight_decay, fused=True)
+    fused: tyro.conf.Suppress[bool] = True
+    """For torch's Adam, which gets all fields."""
 
 
 class _StepsFactor:

@@ -81,6 +81,8 @@ class AENeRFTrainerConfig(TrainerConfig):
             "max-num-iterations": self.max_num_iterations,
             "pipeline.datamanager.train-num-rays-per-batch": self.pipeline.datamanager.train_num_rays_per_batch,
         }
+        for group, steps in self.gradient_accumulation_steps.items():
+            numbers[f"gradient-accumulation-steps.{group.replace('_', '-')}"] = steps
         with errors_as_one_line():
             require_device(self.machine.device_type)
             for name, value in numbers.items():
@@ -133,7 +135,7 @@ class AENeRFTrainer(Trainer):
             if not comms.is_main_process():
                 return
             framework.set_end(self._steps.stop)
-            framework.add_writer(ScalarWriter(self.base_dir))
+            framework.add_writer(ScalarWriter(self.base_dir, resumes=self._steps.start > 0))
             self._record = RunRecord(self.base_dir, self.config.machine.seed, self._steps)
             # After the last checkpoint, and before the viewer waits for the user to end it.
             places = TrainingCallbackLocation
@@ -170,7 +172,8 @@ class AENeRFTrainer(Trainer):
     @contextmanager
     def _stopping_after_a_step(self) -> Iterator[None]:
         """Let the first interrupt, by the keyboard or by SIGTERM, take effect when a step is complete."""
-        if threading.current_thread() is not threading.main_thread():
+        # Of several processes, Nerfstudio's launcher terminates all at once.
+        if self.world_size > 1 or threading.current_thread() is not threading.main_thread():
             yield
             return
         numbers = (signal.SIGINT, signal.SIGTERM)

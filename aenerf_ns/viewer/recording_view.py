@@ -174,12 +174,8 @@ class RecordingView:
     def _threshold_figures(self) -> str:
         sensor, learned = self._model.sensor, self._model.supervision.learned_values()
         positive, negative = sensor.positive_contrast_threshold, sensor.negative_contrast_threshold
-        ratio = learned.get("contrast_threshold_ratio")
-        if ratio is not None:
-            positive = ratio * negative
-        text = f"**Thresholds** C⁺ {positive:.4g}{' (learned)' if ratio is not None else ''}, C⁻ {negative:.4g}"
-        period = learned.get("refractory_period_ns")
-        return text if period is None else f"{text}; refractory period {period / 1e3:.4g} µs (learned)"
+        words = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in learned.items())
+        return f"**Thresholds** C⁺ {positive:.4g}, C⁻ {negative:.4g}" + (f"; learned: {words}" if words else "")
 
     @torch.no_grad()
     def trajectory_file(self) -> bytes:

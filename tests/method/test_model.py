@@ -264,6 +264,10 @@ def test_pictures_are_also_rendered_without_color_correction() -> None:
     [
         ({"proposal": {"num_samples_per_ray": (8, 8), "max_resolutions": (32,)}}, "2 values, .*_resolutions 1"),
         ({"camera_optimizer": PoseCorrectionConfig(knot_interval=0.0)}, "knot_interval 0; give seconds above 0"),
+        ({"camera_optimizer": PoseCorrectionConfig(clock_offset=-20.0)}, "clock_offset -20; give seconds, fewer than"),
+        ({"camera_optimizer": PoseCorrectionConfig(clock_offset=math.nan)}, "clock_offset nan; give seconds"),
+        ({"average_init_density": 0.0}, "average_init_density 0; give a number above 0"),
+        ({"unbounded_init_density": 1000.0}, "unbounded_init_density 1000; .* below 700"),
     ],
 )
 def test_impossible_options_are_one_line(options: dict, message: str) -> None:

@@ -107,7 +107,7 @@ def test_positions_that_move_have_rates(correction: PoseCorrection) -> None:
     torch.testing.assert_close(tangent, difference, rtol=1e-2, atol=1e-2)
 
 
-def test_the_proposals_teach_the_poses_nothing(correction: PoseCorrection) -> None:
+def test_gradients_of_the_proposals_do_not_reach_the_motion(correction: PoseCorrection) -> None:
     warp = PoseFollowingWarp(correction, None, BOX)
     warp.update(correction)
     assert warp(torch.rand(4, 3)).requires_grad

@@ -83,6 +83,37 @@ def test_offsets_begin_as_the_identity_with_gradients(mode: str) -> None:
         assert parameter.grad.abs().max() > 1e-3
 
 
+def test_a_clock_offset_moves_no_reference_view() -> None:
+    correction = _correction(clock_offset=0.02)
+    alignment = correction.alignment()
+    torch.testing.assert_close(alignment.rotation, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-9)
+    assert alignment.scale == pytest.approx(1, abs=1e-9)
+    assert alignment.translation.abs().max() < 1e-9
+
+
+def test_a_learned_clock_offset_belongs_to_its_start() -> None:
+    first = _correction(clock_offset=0.02)
+    _set(first, 0.1)
+    again, other = _correction(clock_offset=0.02), _correction(clock_offset=0.03)
+    state = first.state_dict()
+    with pytest.raises(RuntimeError, match=r"it began with clock-offset 0.02, not 0.03"):
+        other.load_state_dict(state)
+    # Checkpoints of earlier versions do not have it.
+    for loaded in (state, {"clock_change": state["clock_change"]}):
+        again.load_state_dict(loaded)
+        assert again.offsets() == first.offsets()
+
+
+@torch.no_grad()
+def test_many_poses_are_those_of_few() -> None:
+    correction = _correction(mode="network")
+    _set(correction, 0.1)
+    seconds = torch.linspace(0, 2, 4500, dtype=torch.float64)
+    for many, few in zip(correction.pose_and_rate(seconds), correction.pose_and_rate(seconds[3000:3100]), strict=True):
+        torch.testing.assert_close(many[3000:3100], few, rtol=0, atol=1e-4)
+    torch.testing.assert_close(correction.pose(seconds)[3000:3100], correction.pose(seconds[3000:3100]))
+
+
 def test_the_clock_offset_is_bounded() -> None:
     correction = _correction(clock_offset=0.01)
     for raw, expected in ((1e6, 0.06), (-1e6, -0.04)):
@@ -105,7 +136,7 @@ def test_world_twists_are_the_corrections_to_first_order(offsets: dict[str, Any]
     for size in (1e-2, 1e-3):
         correction = _correction(mode="spline", **offsets)
         _set(correction, size)
-        base = correction.trajectory.pose(correction.at_first(seconds))
+        base = correction.trajectory.pose(correction.on_clock_of_poses(seconds, at_first=True))
         twists = correction.world_twists(seconds, base)
         moved = homogeneous(correction.pose(seconds))
         expected = motion_from_twist(twists) @ homogeneous(base)

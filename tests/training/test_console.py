@@ -62,12 +62,21 @@ def test_console_shows_losses_and_pose_errors(
     assert (values["Step time"], values["ETA"], values["Pairs/s"]) == ("0.25 s", "0:00:00", "128.00")
 
 
-@pytest.mark.parametrize("option", ["--max-num-iterations", "--pipeline.datamanager.train-num-rays-per-batch"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--max-num-iterations",
+        "--pipeline.datamanager.train-num-rays-per-batch",
+        "--gradient-accumulation-steps.camera-opt",
+    ],
+)
 def test_no_steps_or_rays_is_one_line(option: str) -> None:
     config = deepcopy(aenerf.config)
     config.machine.device_type = "cpu"
     if option == "--max-num-iterations":
         config.max_num_iterations = 0
+    elif option == "--gradient-accumulation-steps.camera-opt":
+        config.gradient_accumulation_steps["camera_opt"] = 0
     else:
         config.pipeline.datamanager.train_num_rays_per_batch = 0
     # What ns-train calls first.

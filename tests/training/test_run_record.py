@@ -15,6 +15,7 @@ import pytest
 from helpers.small_trainings import train_small_model
 
 from aenerf_ns.training import provenance
+from aenerf_ns.training.run_record import SCALARS_FILE, ScalarWriter
 from aenerf_ns.training.trainer import AENeRFTrainer
 
 
@@ -60,6 +61,20 @@ def test_a_training_records_its_end_and_its_scalars(tmp_path: Path) -> None:
     names = {row["name"] for row in rows}
     assert "Train Loss Dict/reconstruction_loss" in names
     assert not any("time" in name for name in names)
+
+
+def test_a_run_that_goes_on_in_its_folder_keeps_its_scalars(tmp_path: Path) -> None:
+    for step, resumes in ((0, False), (10, True)):
+        ScalarWriter(tmp_path, resumes).write_scalar("loss", 0.5, step)
+    assert (tmp_path / SCALARS_FILE).read_text() == "step,name,value\n0,loss,0.5\n10,loss,0.5\n"
+
+
+def test_one_of_several_processes_does_not_wait_for_a_checkpoint() -> None:
+    trainer = object.__new__(AENeRFTrainer)
+    trainer.world_size = 2
+    before = signal.getsignal(signal.SIGTERM)
+    with trainer._stopping_after_a_step():
+        assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_a_training_that_breaks_off_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -184,7 +184,7 @@ def test_figures_of_errors_thresholds_and_colors(viewer: Viewer, pipeline: AENeR
     given, corrected = (errors[name]["rotation_error_degrees"] for name in ("estimated", "corrected"))
     assert given > 1
     assert f"| rotation (°) | {given:.3f} | {corrected:.3f} |" in text
-    assert "C⁺ 0.2, C⁻ 0.3" in text
+    assert "C⁺ 0.2, C⁻ 0.3\n" in text
     assert "affine, fitted on 2 validation views" in text
 
 
@@ -193,7 +193,7 @@ def test_figures_without_true_poses(tmp_path: Path) -> None:
     pipeline = make_pipeline_of(data, learn_contrast_threshold_ratio=True)
     text = pipeline.recording.view.figures()
     assert "the true ones are not known. pose correction translation 0, pose correction degrees 0." in text
-    assert "C⁺ 0.2 (learned), C⁻ 0.3" in text
+    assert "C⁺ 0.2, C⁻ 0.3; learned: contrast threshold ratio 0.6667" in text
     assert pipeline.recording.view.lines().keys() == {"estimated", "corrected"}
     off = make_pipeline_of(data, pose_correction="off")
     assert "as given" in off.recording.view.figures()

@@ -49,6 +49,5 @@ def _pool(num_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_threads, "kernels")
 
 
-# A forked process inherits the pool, but not its threads. There is no fork on Windows.
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)
+# A forked process inherits the pool, but not its threads.
+os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from functools import lru_cache
 from importlib import import_module
 from types import ModuleType
@@ -29,7 +30,11 @@ def load(module: str, device: torch.device) -> ModuleType:
     """
     # Imported lazily: every ns-* command imports the model, and numba is slow to import.
     loaded = import_module(module)
-    loaded.self_test(device)
+    try:
+        loaded.self_test(device)
+    except (OSError, subprocess.SubprocessError) as error:
+        # Triton's, where there is no compiler or no header of Python.
+        raise RuntimeError(f"{module} cannot be compiled ({error})") from error
     return loaded
 
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -196,6 +195,8 @@ class FlowPatchSampler(WindowSampler):
         self, config: WindowSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
     ) -> None:
         super().__init__(config, dataset, supervision, device)
+        # Velocities of the tiles and side of a tile, by the index of the first event of a stretch.
+        self._flows: dict[int, tuple[NDArray[np.float64], int]] = {}
         usable = self.pixel_rays.usable
         height, width = usable.shape
         pixels = np.arange(height * width).reshape(height, width)[: height // 2 * 2, : width // 2 * 2]
@@ -214,11 +215,6 @@ class FlowPatchSampler(WindowSampler):
             candidates = np.flatnonzero(num_active == number)
             drawn.append(draw(candidates if len(candidates) else np.arange(len(self._patches)), share))
         return self._patches[np.concatenate(drawn)].ravel()
-
-    @cached_property
-    def _flows(self) -> dict[int, tuple[NDArray[np.float64], int]]:
-        """Velocities of the tiles and side of a tile, by the index of the first event of a stretch."""
-        return {}
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, PatchBatch]:
         """Draw a batch of patches in windows.

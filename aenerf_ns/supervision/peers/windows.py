@@ -27,7 +27,7 @@ from aenerf_ns.supervision.base import (
     Supervision,
     SupervisionConfig,
 )
-from aenerf_ns.supervision.losses import dead_zone_excess, reconstruction_loss, threshold_bound_loss
+from aenerf_ns.supervision.losses import dead_zone_excess, reconstruction_loss
 from aenerf_ns.supervision.pixel_rays import PixelRays
 
 # The inverse of softplus at 1.
@@ -45,15 +45,6 @@ class WindowSupervision(ChangeSupervision):
     A window begins and ends anywhere between two events of a pixel. So the events give the change only to within a
     contrast threshold at either end, which is why methods differ in how they compare the two.
     """
-
-    @property
-    def sensor_thresholds(self) -> tuple[float, float]:
-        """The sensor's C₊ and C₋."""
-        return self.sensor.positive_contrast_threshold, self.sensor.negative_contrast_threshold
-
-    def thresholds(self, outputs: Mapping[str, Any]) -> tuple[Tensor | float, Tensor | float]:
-        """Return the sensor's C₊ and C₋."""
-        return self.sensor_thresholds
 
     def loss_unit(self, outputs: Mapping[str, Any]) -> float:
         """Return C̄, the mean of the sensor's contrast thresholds, also where other thresholds are learned.
@@ -129,7 +120,7 @@ class EvNeRFSupervision(WindowSupervision):
         excess = dead_zone_excess(*self.changes(outputs, batch), *thresholds)
         return {
             "reconstruction_loss": excess.mean() / self.loss_unit(outputs),
-            "threshold_bound_loss": threshold_bound_loss(thresholds, self._minimum) / self.loss_unit(outputs),
+            "threshold_bound_loss": F.relu(self._minimum - thresholds).sum() / self.loss_unit(outputs),
         }
 
     def learned_values(self) -> dict[str, float]:
