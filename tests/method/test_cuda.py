@@ -29,6 +29,7 @@ from aenerf_ns.supervision.base import SupervisionConfig
 from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
 from aenerf_ns.supervision.peers.paev3d import PAEv3DSupervisionConfig, PatchBatch
 from aenerf_ns.supervision.peers.windows import EventNeRFSupervisionConfig, EvNeRFSupervisionConfig
+from benchmarks.step.worker import train_steps
 
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
@@ -140,15 +141,12 @@ def move_to_device(trainer: Trainer) -> None:
     pipeline = trainer.pipeline
     to_device(pipeline.model)
     trainer.optimizers = Optimizers(trainer.config.optimizers, pipeline.get_param_groups())
-    pipeline.get_training_callbacks(SimpleNamespace(trainer=trainer))
-    pipeline.train()
+    trainer.callbacks = pipeline.get_training_callbacks(SimpleNamespace(trainer=trainer))
 
 
 def train(trainer: Trainer, gpu: SimulatedCuda, step: int) -> Counts:
-    trainer.step = step
-    trainer.pipeline.model.proposal_sampler.step_cb(step)
-    gpu.counts = Counts()
-    trainer.train_iteration(step)
+    trainer.step, gpu.counts = step, Counts()
+    train_steps(trainer, 1)
     return gpu.counts
 
 
