@@ -73,7 +73,9 @@ def _with_placeholders(poses: Tensor) -> Tensor:
     return torch.where((torch.arange(len(poses)) % 20 == 7)[:, None, None], torch.eye(4, dtype=torch.float64), poses)
 
 
-def _times(offset: float = 0, factor: int = 1) -> Callable[..., Given]:
+def shift_clock(offset: float = 0, factor: int = 1) -> Callable[..., Given]:
+    """Add seconds to the times of the poses, multiplied by a factor."""
+
     def change(events: EventStream, recording: Recording) -> Given:
         given = recording.trajectory
         return events, replace(
@@ -115,10 +117,10 @@ MISTAKES: dict[str, Callable[..., Given]] = {
     "placeholders among the poses": _poses(_with_placeholders),
     "tracking lost for half the time": _poses(_held(40, 20)),
     "each pose repeated 8 times": _poses(_held(8, 0)),
-    "clock of the poses 0.2 s ahead": _times(0.2),
-    "clock of the poses 0.05 s behind": _times(-0.05),
-    "times of the poses in milliseconds": _times(factor=1000),
-    "times of the poses in microseconds": _times(factor=1_000_000),
+    "clock of the poses 0.2 s ahead": shift_clock(0.2),
+    "clock of the poses 0.05 s behind": shift_clock(-0.05),
+    "times of the poses in milliseconds": shift_clock(factor=1000),
+    "times of the poses in microseconds": shift_clock(factor=1_000_000),
     "focal lengths x 1.5": _focal_lengths(1.5),
     "focal lengths / 1.5": _focal_lengths(1 / 1.5),
     "principal point of twice the resolution": _lens(lambda camera: {"cx": 2 * camera.cx, "cy": 2 * camera.cy}),

@@ -97,17 +97,21 @@ def sampler(pairs: EventPairs) -> PairSampler:
 
 def sample(pairs: EventPairs) -> dict[str, float]:
     """Return figures of batches of 4096 pairs, one thread."""
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    begin = time.perf_counter()
-    source = sampler(pairs)
-    source.prepare()
-    prepared = time.perf_counter() - begin
-    wall, cpu = [], []
-    for _ in range(_BATCHES):
-        begin, begin_cpu = time.perf_counter(), time.thread_time()
-        source.sample(2 * _PAIRS)
-        wall.append(time.perf_counter() - begin)
-        cpu.append(time.thread_time() - begin_cpu)
+    try:
+        begin = time.perf_counter()
+        source = sampler(pairs)
+        source.prepare()
+        prepared = time.perf_counter() - begin
+        wall, cpu = [], []
+        for _ in range(_BATCHES):
+            begin, begin_cpu = time.perf_counter(), time.thread_time()
+            source.sample(2 * _PAIRS)
+            wall.append(time.perf_counter() - begin)
+            cpu.append(time.thread_time() - begin_cpu)
+    finally:
+        torch.set_num_threads(threads)
     return {
         "seconds_until_the_first": prepared,
         "batch_ms": 1e3 * float(np.median(wall)),

@@ -19,8 +19,11 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.runs import new_trainer, run_benchmark, write_result
+from benchmarks.step.worker import train_steps
 
 _STEPS_BEFORE = 20
+# So many kernels are listed, those that take longest.
+_KERNELS = 12
 
 
 @dataclass
@@ -40,8 +43,6 @@ class Profile:
     """Methods with options of ns-train."""
     steps: int = 200
     """Steps that are timed."""
-    kernels: int = 12
-    """How many kernels are listed, those that take longest."""
 
     def main(self) -> None:
         """Profile all trainings, and write what was found."""
@@ -55,26 +56,23 @@ class Profile:
         trainer = new_trainer(words, self.data, folder, steps=30000, seed=1)
         on_gpu = trainer.pipeline.device.type == "cuda"
 
-        def train(first: int, count: int) -> float:
+        def train(count: int) -> float:
             begin = time.perf_counter()
-            for step in range(first, first + count):
-                trainer.pipeline.train()
-                trainer.pipeline.model.proposal_sampler.step_cb(step)
-                trainer.train_iteration(step)
+            train_steps(trainer, count)
             if on_gpu:
                 torch.cuda.synchronize()
             return 1e3 * (time.perf_counter() - begin) / count
 
         # Compiles, and lets the proposal networks train in every second step only.
-        train(0, _STEPS_BEFORE)
+        train(_STEPS_BEFORE)
         if on_gpu:
             torch.cuda.reset_peak_memory_stats()
-        milliseconds = train(_STEPS_BEFORE, self.steps)
+        milliseconds = train(self.steps)
         memory = torch.cuda.max_memory_allocated() / 2**30 if on_gpu else None
         # The profiler keeps every call, so it watches few steps: two periods of the pose correction.
         watched = 16
         with profile(activities=[ProfilerActivity.CPU, *[ProfilerActivity.CUDA] * on_gpu]) as profiler:
-            train(_STEPS_BEFORE + self.steps, watched)
+            train(watched)
         device = DeviceType.CUDA if on_gpu else DeviceType.CPU
         # A step of an optimizer is listed as a whole, too, beside its kernels.
         kernels = [
@@ -95,7 +93,7 @@ class Profile:
                     "calls": event.count / watched,
                     "milliseconds": getattr(event, own_time) / 1e3 / watched,
                 }
-                for event in kernels[: self.kernels]
+                for event in kernels[:_KERNELS]
             ],
         }
 

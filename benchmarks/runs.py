@@ -161,13 +161,16 @@ def write_result(output: Path, result: dict[str, Any], show: bool = True) -> Non
         print(json.dumps(result, indent=2), flush=True)
 
 
-# Looked up once: a result that was just written into the checkout would count as a change to the commit.
+# Looked up once, before anything is written: a result in the checkout would count as a change to the commit.
 _provenance = functools.cache(provenance)
 
 
 def run_benchmark(kind: Callable[..., Any]) -> None:
     """Run the command of a benchmark: a dataclass of its options with a method ``main``."""
+    command = tyro.cli(kind)
+    # Code that is changed while the benchmark runs is not the code that runs.
+    _provenance()
     try:
-        tyro.cli(kind).main()
+        command.main()
     except DataError as error:
         sys.exit(f"Error: {error}")

@@ -24,6 +24,21 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts import train as ns_train
 
 
+def train_steps(trainer: Trainer, count: int) -> None:
+    """Train for some more steps as Nerfstudio does, with the callbacks, but without its evaluations and checkpoints."""
+
+    def call_back(location: TrainingCallbackLocation) -> None:
+        for callback in trainer.callbacks:
+            callback.run_callback_at_location(trainer.step, location=location)
+
+    for step in range(trainer.step, trainer.step + count):
+        trainer.pipeline.train()
+        call_back(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        trainer.train_iteration(step)
+        call_back(TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        trainer.step = step + 1
+
+
 class _Worker:
     """Answer requests about one training."""
 
@@ -48,25 +63,12 @@ class _Worker:
 
     def train(self, steps: int) -> dict[str, float]:
         """Train for some steps and return the seconds that they took."""
-        return self._seconds(lambda: self._train(steps))
+        return self._seconds(lambda: train_steps(self._trainer, steps))
 
     def render(self) -> dict[str, float]:
         """Render the first validation view and return the seconds that it took."""
         self._model.eval()
         return self._seconds(lambda: self._model.get_outputs_for_camera(self._camera))
-
-    def _train(self, steps: int) -> None:
-        trainer = self._trainer
-        for step in range(trainer.step, trainer.step + steps):
-            trainer.pipeline.train()
-            self._call_back(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-            trainer.train_iteration(step)
-            self._call_back(TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
-            trainer.step = step + 1
-
-    def _call_back(self, location: TrainingCallbackLocation) -> None:
-        for callback in self._trainer.callbacks:
-            callback.run_callback_at_location(self._trainer.step, location=location)
 
     def _seconds(self, work: Callable[[], Any]) -> dict[str, float]:
         self._wait()

@@ -62,8 +62,11 @@ def test_lens_in_other_terms_and_back(camera: CameraIntrinsics) -> None:
     pinhole = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     again = CameraIntrinsics.from_opencv((camera.width, camera.height), pinhole, camera.distortion, name)
     assert (again.cx, again.cy, again.distortion) == (camera.cx, camera.cy, camera.distortion)
+
+
+def test_refuse_a_lens_model_that_is_not_of_opencv() -> None:
     with pytest.raises(ValueError, match="the lens model is 'fov', not one of OPENCV"):
-        CameraIntrinsics.from_opencv((8, 6), pinhole, (), "fov")
+        CameraIntrinsics.from_opencv((8, 6), (5.0, 5.0, 4.0, 3.0), (), "fov")
 
 
 @pytest.mark.parametrize(

@@ -301,12 +301,3 @@ def test_no_pose_noise_changes_nothing(random_poses: torch.Tensor) -> None:
     assert torch.equal(perturb(truth, 0, 0, 0.25, 0).camera_to_worlds, truth.camera_to_worlds)
     with pytest.raises(ValueError, match="must not be negative"):
         perturb(truth, -1, 0, 0.25, 0)
-
-
-def test_opencv_axes_become_opengl_axes() -> None:
-    opencv = torch.eye(4, dtype=torch.float64)
-    opengl = opencv @ OPENCV_TO_OPENGL
-    forward_opencv, forward_opengl = opencv[:3, 2], -opengl[:3, 2]
-    down_opencv, up_opengl = opencv[:3, 1], opengl[:3, 1]
-    assert torch.equal(forward_opencv, forward_opengl)
-    assert torch.equal(down_opencv, -up_opengl)

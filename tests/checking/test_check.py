@@ -20,9 +20,8 @@ from PIL import Image
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.time_window import TimeWindow
-from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.hypotheses import clock_hypothesis
 from aenerf_ns.checking.report import _check_contrast, check
@@ -36,6 +35,8 @@ from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.recording.recording import Recording
+from benchmarks.check_windows import MISTAKES as PLANTED
+from benchmarks.check_windows import shift_clock
 
 # Part of the simulated recording that is looked at, in nanoseconds.
 PART = 2_600_000_000
@@ -66,57 +67,26 @@ def simulated(room: Path) -> tuple[Recording, EventStream]:
     return recording, all_events(recording).between(0, PART)
 
 
-def named(events: EventStream, trajectory: Trajectory, recording: Recording) -> list[str]:
+def named(events: EventStream, recording: Recording) -> list[str]:
     """Return the names of the alternatives that are clearly better, the best first."""
+    trajectory = recording.trajectory
     covered = events.between(trajectory.start, trajectory.end)
     warped = WarpedEvents([covered], trajectory, recording.event_camera)
     return [c.hypothesis.name for c in warped.compare_alternatives() if c.is_clearly_better]
 
 
-Change = Callable[[EventStream, Trajectory], tuple[EventStream, Trajectory]]
-
-
-def with_poses(function: Callable[[torch.Tensor], torch.Tensor]) -> Change:
-    return lambda events, trajectory: (events, trajectory.transform(function))
-
-
-def axes(*signs: float) -> torch.Tensor:
-    return torch.diag(torch.tensor([*signs, 1.0], dtype=torch.float64))
-
-
-def shifted(seconds: float) -> Change:
-    offset = round(seconds * 1e9)
-    return lambda events, trajectory: (events, Trajectory(trajectory.times + offset, trajectory.camera_to_worlds))
-
-
-def with_pixels(function: Callable[[EventStream], tuple[np.ndarray, np.ndarray]]) -> Change:
-    def change(events: EventStream, trajectory: Trajectory) -> tuple[EventStream, Trajectory]:
-        x, y = (values.astype(np.uint16) for values in function(events))
-        inside = (x < events.width) & (y < events.height)
-        t, p = events.t[inside], events.p[inside]
-        return EventStream(x[inside], y[inside], t, p, events.width, events.height), trajectory
-
-    return change
-
-
-def read_with_w_first(poses: torch.Tensor) -> torch.Tensor:
-    """Return the poses that are read if qw qx qy qz are taken for qx qy qz qw."""
-    wrong = quaternion_from_rotation(poses[:, :3, :3]).roll(1, -1)
-    return torch.cat([torch.cat([rotation_from_quaternion(wrong), poses[:, :3, 3:]], -1), poses[:, 3:]], 1)
-
-
 MISTAKES = {
-    "the poses have OpenGL camera axes (y up, z backward)": with_poses(lambda poses: poses @ axes(1, -1, -1)),
-    "the camera axes x and y are flipped (a camera upside down)": with_poses(lambda poses: poses @ axes(-1, -1, 1)),
-    "the camera axes x and z are flipped": with_poses(lambda poses: poses @ axes(-1, 1, -1)),
-    "the poses are world-to-camera": with_poses(torch.linalg.inv),
-    "the poses are world-to-camera with OpenGL camera axes": with_poses(
-        lambda poses: torch.linalg.inv(poses @ axes(1, -1, -1))
+    "the poses have OpenGL camera axes (y up, z backward)": PLANTED["OpenGL camera axes"],
+    "the camera axes x and y are flipped (a camera upside down)": PLANTED["camera axes x and y flipped"],
+    "the camera axes x and z are flipped": PLANTED["camera axes x and z flipped"],
+    "the poses are world-to-camera": PLANTED["world-to-camera"],
+    "the poses are world-to-camera with OpenGL camera axes": lambda *given: PLANTED["world-to-camera"](
+        *PLANTED["OpenGL camera axes"](*given)
     ),
-    "the quaternions have w first": with_poses(read_with_w_first),
-    "the pixels are mirrored in x": with_pixels(lambda events: (events.width - 1 - events.x, events.y)),
-    "the pixels are mirrored in y": with_pixels(lambda events: (events.x, events.height - 1 - events.y)),
-    "x and y of the events are swapped": with_pixels(lambda events: (events.y, events.x)),
+    "the quaternions have w first": PLANTED["quaternions with w first"],
+    "the pixels are mirrored in x": PLANTED["pixels mirrored in x"],
+    "the pixels are mirrored in y": PLANTED["pixels mirrored in y"],
+    "x and y of the events are swapped": PLANTED["x and y swapped"],
 }
 
 
@@ -140,14 +110,14 @@ def test_no_slice_spans_a_gap_of_the_poses(simulated: tuple[Recording, EventStre
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_name_a_planted_mistake(mistake: str, simulated: tuple[Recording, EventStream]) -> None:
     recording, events = simulated
-    found = named(*MISTAKES[mistake](events, recording.trajectory), recording)
+    found = named(*MISTAKES[mistake](events, recording))
     assert found[:1] == [mistake]
 
 
 @pytest.mark.parametrize(("side", "seconds"), [("ahead of", 0.2), ("behind", -0.2)])
 def test_name_and_measure_a_shifted_clock(side: str, seconds: float, simulated: tuple[Recording, EventStream]) -> None:
     recording, events = simulated
-    best, *_ = named(*shifted(seconds)(events, recording.trajectory), recording)
+    best, *_ = named(*shift_clock(seconds)(events, recording))
     found = best.removeprefix("the clock of the poses is ").removesuffix(f" s {side} that of the events")
     assert float(found) == pytest.approx(0.2, abs=0.05)
 
@@ -159,7 +129,7 @@ def test_name_focal_lengths_that_do_not_fit(
     recording, events = simulated
     camera = recording.event_camera
     lens = replace(recording, event_camera=replace(camera, fx=given * camera.fx, fy=given * camera.fy))
-    found = named(events, recording.trajectory, lens)
+    found = named(events, lens)
     assert found[0] == f"the focal lengths are about {factor} times the given ones"
 
 
@@ -192,9 +162,9 @@ def test_name_mistakes_in_the_real_recording(slider_depth: Path) -> None:
     recording = open_ecd(slider_depth)
     events = all_events(recording)
     for name in ("the poses are world-to-camera", "the camera axes x and z are flipped"):
-        assert name in named(*MISTAKES[name](events, recording.trajectory), recording)
+        assert name in named(*MISTAKES[name](events, recording))
     # The camera gathers speed at the first pose. Afterwards its speed is constant, and no clock offset shows.
-    (best, *_) = named(*shifted(-0.1)(events, recording.trajectory), recording)
+    (best, *_) = named(*shift_clock(-0.1)(events, recording))
     assert "behind that of the events" in best
 
 
@@ -512,7 +482,7 @@ def test_a_lens_of_another_size_is_no_wrong_axes(changes: dict, problems: list[s
 def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(room, tmp_path / "room")
     rewrite(folder, all_events(open_native(folder))[:3500])
-    change_poses(folder, lambda poses: poses @ axes(1, -1, -1))
+    change_poses(folder, lambda poses: poses @ OPENCV_TO_OPENGL)
     set_in("transforms.json", "scene_box", value=[[-0.5] * 3, [0.5] * 3])(folder)
     _, output = run(folder)
     assert "as if" not in output.split("problem")[-1]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.dataset_faults import set_in
-from helpers.small_datasets import START, parse, write_native
+from helpers.small_datasets import AS_RECORDED, START, parse, write_native
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
@@ -67,8 +67,7 @@ def test_images_have_poses_of_their_times(data: Path, tmp_path: Path) -> None:
 
 def test_nerfstudio_reads_the_folder(data: Path, tmp_path: Path) -> None:
     Reconstruct(data, tmp_path / "out").main()
-    as_is = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
-    config = NerfstudioDataParserConfig(data=tmp_path / "out", **as_is)
+    config = NerfstudioDataParserConfig(data=tmp_path / "out", **AS_RECORDED)
     views = opened(tmp_path / "out").reference_views
     for split, count in (("train", 25), ("val", 1), ("test", 2)):
         outputs = parse(config, split)

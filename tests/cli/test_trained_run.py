@@ -127,8 +127,6 @@ def test_other_files_are_one_line(contents: bytes, problem: str, tmp_path: Path)
     with pytest.raises(DataError, match=problem) as refused:
         require_known_names(tmp_path / "config.yml")
     assert "\n" not in str(refused.value)
-    with pytest.raises(DataError, match="there is no such file"):
-        Evaluate(load_config=tmp_path / "nothing.yml", output=tmp_path / "out").main()
 
 
 def damaged(run: Path, name: str, old: str, new: str) -> Path:

@@ -56,10 +56,7 @@ def test_frame_without_pose_gets_that_of_its_time(tmp_path: Path) -> None:
     meta["event_camera"]["T_frame_event"] = shift.tolist()
     # Every digit of the time counts, beyond what a JSON writer's float holds.
     (folder / "transforms.json").write_text(json.dumps(meta).replace('"STAMP"', format_seconds(time)))
-    config = NativeDataParserConfig(
-        data=folder, orientation_method="none", center_method="none", auto_scale_poses=False
-    )
-    pose = parse(config, "test").cameras.camera_to_worlds[0]
+    pose = parse(NativeDataParserConfig(data=folder, **AS_RECORDED), "test").cameras.camera_to_worlds[0]
     expected = homogeneous(make_trajectory().interpolate(time)) @ torch.linalg.inv(torch.from_numpy(shift))
     torch.testing.assert_close(pose, (expected @ OPENCV_TO_OPENGL)[:3].float(), rtol=0, atol=1e-6)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.streams import make_stream
+from helpers.streams import EventsInMemory, make_stream
 from helpers.unpacked_pairs import unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -55,13 +54,6 @@ def as_set(pairs: EventPairs) -> set[tuple[int, ...]]:
     return set(rows)
 
 
-def cut(stream: EventStream, sizes: list[int]) -> Iterator[EventStream]:
-    begin = 0
-    for size in [*sizes, len(stream)]:
-        yield stream[begin : begin + size]
-        begin += size
-
-
 @settings(max_examples=300, deadline=None)
 @given(
     EVENTS, st.lists(st.integers(0, 20), max_size=6), st.integers(0, 5), st.integers(1, 60), st.integers(0, 2**12 - 1)
@@ -78,7 +70,7 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
         with pytest.raises(DataError, match="no event lies on a pixel with a direction"):
             pair_events([make_stream(rows)], **options)
         return
-    pairs = pair_events(cut(make_stream(rows), sizes), **options)
+    pairs = pair_events(EventsInMemory(make_stream(rows), sizes).read_chunks(), **options)
     found = unpacked(pairs)
     assert as_set(pairs) == brute_force_pairs(used, refractory_period)
     # By pixel, then by time.
@@ -98,7 +90,7 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     # The same in a file.
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "rows").open("w+b") as file:
         in_file = pair_events(
-            cut(make_stream(rows), sizes),
+            EventsInMemory(make_stream(rows), sizes).read_chunks(),
             **options,
             open_file=lambda: (file, Path(folder)),
             events_in_memory=in_memory,
@@ -196,7 +188,7 @@ def test_no_pair_spans_a_gap_however_the_stream_is_cut() -> None:
     expected = [(0, 10), (20, 25), (25, 40)]
     for gaps in (((10, 20),), ((-9, -3), (10, 20), (50, 60))):
         for sizes in ([8], [1] * 8, [3, 5]):
-            pairs = pair_events(cut(make_stream(rows), sizes), window=TimeWindow(gaps=gaps))
+            pairs = pair_events(EventsInMemory(make_stream(rows), sizes).read_chunks(), window=TimeWindow(gaps=gaps))
             assert [pair[2:4] for pair in unpacked(pairs)] == expected
             assert (pairs.num_outside, pairs.num_first, pairs.num_merged) == (2, 2, 1)
             assert [pair[6] for pair in unpacked(pairs)] == [1, 1, 2]

@@ -6,25 +6,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.streams import make_stream
+from helpers.streams import random_stream
 
 from aenerf_ns.events.statistics import event_statistics
 from aenerf_ns.events.stream import EventStream
 
 
 def test_statistics_are_those_of_brute_force_however_the_stream_is_cut() -> None:
-    rng = np.random.default_rng(0)
-    t = np.sort(rng.integers(10, 200, 400))
-    rows = list(
-        zip(
-            rng.integers(0, 5, 400).tolist(),
-            rng.integers(0, 4, 400).tolist(),
-            t.tolist(),
-            rng.choice([-1, 1], 400).tolist(),
-            strict=True,
-        )
-    )
-    events = make_stream(rows, 5, 4)
+    events = random_stream(400, 5, 4, 200, start=10)
+    rows = list(zip(*(getattr(events, name).tolist() for name in "xytp"), strict=True))
     counts = np.zeros((4, 5), int)
     np.add.at(counts, (events.y, events.x), 1)
     previous: dict[tuple[int, int], int] = {}
@@ -38,7 +28,7 @@ def test_statistics_are_those_of_brute_force_however_the_stream_is_cut() -> None
     for cuts in ([], [1, 7, 100]):
         edges = [0, *cuts, 400]
         chunks = (events[a:b] for a, b in pairwise(edges))
-        found = event_statistics(chunks, 5, 4, (int(t[0]), int(t[-1])), 6)
+        found = event_statistics(chunks, 5, 4, (rows[0][2], rows[-1][2]), 6)
         np.testing.assert_array_equal(found.counts, counts)
         assert (found.num_events, found.num_repeated) == (400, repeated)
         assert found.num_positive == sum(row[3] > 0 for row in rows)

@@ -2,49 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
+from helpers.streams import EventsInMemory, random_stream
 
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.export.video import RenderedEvents, sum_recorded_events
-
-
-class Pieces(EventFile):
-    """Events that come in pieces of a given size."""
-
-    def __init__(self, events: EventStream, size: int) -> None:
-        super().__init__(Path("made"), events.width, events.height)
-        self._events, self._size = events, size
-
-    def read_chunks(self) -> Iterator[EventStream]:
-        for begin in range(0, len(self._events), self._size):
-            yield self._events[begin : begin + self._size]
-
-    def require(self) -> None:
-        pass
-
-    def time_span(self) -> tuple[int, int]:
-        return int(self._events.t[0]), int(self._events.t[-1])
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_sum_recorded_events(size: int) -> None:
-    generator = np.random.default_rng(0)
-    events = EventStream(
-        generator.integers(0, 5, 200).astype(np.uint16),
-        generator.integers(0, 4, 200).astype(np.uint16),
-        np.sort(generator.integers(0, 1000, 200)),
-        generator.choice([-1, 1], 200).astype(np.int8),
-        5,
-        4,
-    )
+    events = random_stream(200, 5, 4, 1000)
     # Before the first event, between events, at an event, and beyond the last.
     times = np.array([-50, 100, 101, int(events.t[120]), 900, 2000, 3000])
-    pictures = list(sum_recorded_events(Pieces(events, size), times))
+    pictures = list(sum_recorded_events(EventsInMemory(events, [size] * (200 // size)), times))
     assert len(pictures) == len(times) - 1
     for picture, first, last in zip(pictures, times[:-1], times[1:], strict=True):
         expected = np.zeros((4, 5), np.int64)

@@ -10,7 +10,18 @@ import pytest
 import tyro
 from helpers.bag_writers import ARRAY, array_message, write_bag
 from helpers.event_file_checks import read
-from helpers.event_file_writers import HEADER2, HEADER3, HEIGHT, WIDTH, Rows, aedat4_file, dat, evt2, evt3, words
+from helpers.event_file_writers import (
+    HEADER2,
+    HEIGHT,
+    WIDTH,
+    Rows,
+    aedat4_file,
+    dat,
+    evt2,
+    evt3,
+    evt3_of,
+    words,
+)
 from helpers.event_table_writers import Columns, write_csv, write_eds, write_text
 from helpers.own_recordings import random_events, write_calibration, write_poses
 
@@ -111,10 +122,6 @@ def test_leave_out_events_between_the_files_of_a_folder(tmp_path: Path, capsys: 
         assert file.time_span() == (ROWS[0][2], ROWS[-1][2])
         np.testing.assert_array_equal(read(file)[:, 2], [t for _, _, t, _ in ROWS])
     assert capsys.readouterr().out.count("1 out of order (the first at 100010 ns)") == 1
-
-
-def evt3_of(*values: int) -> bytes:
-    return HEADER3 + words("<u2", *values)
 
 
 def evt2_of(*values: int) -> bytes:

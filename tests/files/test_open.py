@@ -135,7 +135,7 @@ def test_size_is_stated_or_given(folder: Path) -> None:
 
 
 def test_missing_file_opens_with_its_size(folder: Path) -> None:
-    for suffix in ("raw", "dat", "aedat4", "bag", "h5", "npy", "txt"):
+    for suffix in ("raw", "dat", "aedat4", "bag", "h5", "npy", "npz", "txt", "csv"):
         file = open_event_file(folder / f"gone.{suffix}", WIDTH, HEIGHT)
         assert (file.width, file.height) == (WIDTH, HEIGHT)
         with pytest.raises(DataError, match="there is no such file"):

@@ -145,3 +145,7 @@ HEADER2, HEADER3 = b"% evt 2.0\n% geometry 64x48\n", b"% evt 3.0\n% geometry 64x
 
 def words(dtype: str, *values: int) -> bytes:
     return np.array(values, dtype).tobytes()
+
+
+def evt3_of(*values: int) -> bytes:
+    return HEADER3 + words("<u2", *values)

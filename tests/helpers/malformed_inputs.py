@@ -258,9 +258,8 @@ _JSON_VALUES: dict[tuple, list] = {
     ("frames",): [{"a": 1}],
     ("frames", 0): [["a.png"]],
     ("frames", 0, "file_path"): ["a" * 5000, "a\0b"],
-    ("frames", 0, "timestamp"): ["RAW:1e-999999999", [1]],
+    ("frames", 0, "timestamp"): [[1]],
     ("frames", 0, "transform_matrix"): ["RAW:" + "[" * 900 + "]" * 900, [[1], [1, 2]], [["1"] * 4] * 4],
-    ("frames", 0, "transform_matrix", 0, 3): ["RAW:1e300"],
     ("test_filenames",): [[["x.png"]]],
     ("scene_box",): ["wide", [{}, {}], [[-1e300] * 3, [1e300] * 3], [[0, 0, 0], [1, 1, 1e-320]]],
 }
@@ -399,7 +398,6 @@ _CHANGES: dict[str, dict[str, Change]] = {
     },
     _EDS: {
         "HDF5 columns of 10^12 rows": unallocated("events.h5", {**_COLUMNS, "p": "u1"}),
-        "eds enumeration": typed_polarities(h5py.enum_dtype({"A": 0, "B": 1}, "i1")),
         "eds lists": typed_polarities(h5py.vlen_dtype("i1")),
     },
     _PAEV3D: {

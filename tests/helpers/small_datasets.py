@@ -12,8 +12,8 @@ from PIL import Image
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.writer import NativeDatasetWriter
+from helpers.streams import random_stream
 
 CAMERA = CameraIntrinsics(6, 4, 5.0, 5.5, 3.0, 2.0, "radial_tangential", (0.01, 0.0, 0.001, 0.0, 0.0))
 SENSOR = SensorModel(0.3, 0.2, 1000, "RGGB")
@@ -34,13 +34,10 @@ def make_trajectory() -> Trajectory:
 
 def write_native(folder: Path, scene_box: np.ndarray | None = None) -> Path:
     trajectory = make_trajectory()
-    rng = np.random.default_rng(0)
+    events = random_stream(200, 6, 4, END + 1, start=START)
     with NativeDatasetWriter(folder, CAMERA, SENSOR, "srgb", scene_box) as writer:
-        t = np.sort(rng.integers(START, END + 1, 200))
-        x, y = rng.integers(0, 6, 200).astype(np.uint16), rng.integers(0, 4, 200).astype(np.uint16)
-        p = rng.choice(np.array([-1, 1], np.int8), 200)
-        for part in (slice(0, 90), slice(90, 200)):
-            writer.events.append(EventStream(x[part], y[part], t[part], p[part], 6, 4))
+        writer.events.append(events[:90])
+        writer.events.append(events[90:])
         writer.add_trajectories(trajectory, trajectory)
         picture = np.full((4, 6, 3), 77, np.uint8)
         for time in (START, START + 150_000_000, END):

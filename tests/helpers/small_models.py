@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +20,6 @@ from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.pairing import pair_events
 from aenerf_ns.events.polarity_drift import PolarityDrift, polarity_drift
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile, EventStream
 from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
@@ -34,7 +31,7 @@ from aenerf_ns.supervision.event_pairs import (
     PairSamplerConfig,
     PairSupervisionConfig,
 )
-from helpers.streams import make_stream
+from helpers.streams import EventsInMemory, make_stream
 
 CAMERA = CameraIntrinsics(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 0.0, 0.002, 0.0, 0.0))
 
@@ -53,7 +50,7 @@ def make_scene(
         trajectory=trajectory,
         ground_truth=None,
         event_camera=camera,
-        event_file=NoEvents(Path("none"), camera.width, camera.height),
+        event_file=EventsInMemory(make_stream([], camera.width, camera.height)),
         sensor=sensor,
         window=TimeWindow(),
         camera_times=torch.tensor([0]),
@@ -61,16 +58,6 @@ def make_scene(
         image_encoding="srgb",
         bounded=bounded,
     )
-
-
-class NoEvents(EventFile):
-    """Stands where a scene has an event file, in tests that do not read it."""
-
-    def read_chunks(self) -> Iterator[EventStream]:
-        raise AssertionError("no test reads it")
-
-    def time_span(self) -> tuple[int, int]:
-        raise AssertionError("no test reads it")
 
 
 def make_supervision(config: SupervisionConfig, sensor: SensorModel | None = None) -> Any:

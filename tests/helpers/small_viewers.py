@@ -25,23 +25,14 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.training.pipeline import AENeRFPipeline
 from helpers.small_pipelines import make_pipeline_config
-from helpers.streams import make_stream
+from helpers.streams import random_stream
 
 SIZE, DURATION, NUM_EVENTS = (24, 16), 2.0, 1000
 
 
 def make_recording(folder: Path, true_poses: bool = True) -> Path:
     """Write a dataset of 1000 random events in 2 s, whose true poses, where there are any, are turned by degrees."""
-    generator = np.random.default_rng(0)
     width, height = SIZE
-    times = np.sort(generator.choice(int(DURATION * 1e9), NUM_EVENTS, replace=False))
-    rows = zip(
-        generator.integers(width, size=NUM_EVENTS),
-        generator.integers(height, size=NUM_EVENTS),
-        times,
-        generator.choice([-1, 1], NUM_EVENTS),
-        strict=True,
-    )
     knots = np.linspace(0, DURATION * 1e9, 9).astype(np.int64)
     poses = torch.eye(4, dtype=torch.float64).repeat(9, 1, 1)
     poses[:, 0, 3] = torch.linspace(-0.5, 0.5, 9)
@@ -50,7 +41,7 @@ def make_recording(folder: Path, true_poses: bool = True) -> Path:
     turned[:, :3, :3] = rotation_from_vector(0.1 * torch.sin(torch.arange(27.0).reshape(9, 3)).double())
     camera = CameraIntrinsics(width, height, 20.0, 20.0, 12.0, 8.0)
     with NativeDatasetWriter(folder, camera, SensorModel(0.2, 0.3), "srgb") as made:
-        made.events.append(make_stream(list(rows), width, height))
+        made.events.append(random_stream(NUM_EVENTS, width, height, int(DURATION * 1e9)))
         made.add_trajectories(Trajectory(knots, poses), Trajectory(knots, turned) if true_poses else None)
         for _ in range(2):
             made.add_image("val", np.full((height, width, 3), 102, np.uint8), poses[0])

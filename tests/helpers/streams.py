@@ -1,12 +1,14 @@
-"""Small event streams, and how many examples random tests draw."""
+"""Small event streams, a file that holds one, and how many examples random tests draw."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from aenerf_ns.events.stream import EventStream
+from aenerf_ns.events.stream import EventFile, EventStream
 
 FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 """Examples of each test that feeds readers with damaged and random input; many more when they are set to."""
@@ -18,3 +20,31 @@ def make_stream(rows: list[tuple[int, int, int, int]], width: int = 4, height: i
     return EventStream(
         x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), p.astype(np.int8), width, height, "made"
     )
+
+
+def random_stream(count: int, width: int, height: int, end: int, start: int = 0, seed: int = 0) -> EventStream:
+    """Events at random pixels, of random polarities, at random times from ``start`` on and before ``end``."""
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(start, end, count))
+    x, y = rng.integers(0, width, count).astype(np.uint16), rng.integers(0, height, count).astype(np.uint16)
+    return EventStream(x, y, t, rng.choice(np.array([-1, 1], np.int8), count), width, height, "made")
+
+
+class EventsInMemory(EventFile):
+    """Stands for a file. Its events come in pieces of the given sizes, and the others in a last one."""
+
+    def __init__(self, events: EventStream, sizes: Sequence[int] = ()) -> None:
+        super().__init__(Path("made"), events.width, events.height)
+        self._events, self._sizes = events, sizes
+
+    def read_chunks(self) -> Iterator[EventStream]:
+        begin = 0
+        for size in [*self._sizes, len(self._events)]:
+            yield self._events[begin : begin + size]
+            begin += size
+
+    def time_span(self) -> tuple[int, int]:
+        return int(self._events.t[0]), int(self._events.t[-1])
+
+    def require(self) -> None:
+        pass

@@ -16,7 +16,7 @@ import numpy as np
 
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.recording.options import EventDataParserConfig
-from helpers.bag_writers import ARRAY, PACKET, array_message, packet_message, write_bag, write_bag2
+from helpers.bag_writers import ARRAY, PACKET, array_message, packet_messages, write_bag, write_bag2
 from helpers.dataset_faults import Change, all_of, edit_bytes, read_everything, sparse
 from helpers.event_file_writers import (
     HEIGHT,
@@ -27,7 +27,6 @@ from helpers.event_file_writers import (
     dat,
     evt2,
     evt3,
-    evt3_words,
     flat_table,
 )
 from helpers.malformed_inputs import FORMAT_WRITERS
@@ -65,12 +64,8 @@ def _bag(path: Path, compress: str = "") -> None:
 
 
 def _packets(path: Path) -> None:
-    stream = evt3_words(ROWS).tobytes()
-    cuts = range(0, len(stream), 200)
-    packets = [
-        (10**8 + 10**7 * i, packet_message(i, 10**8 + 10**7 * i, stream[c : c + 200])) for i, c in enumerate(cuts)
-    ]
-    write_bag(path, {"/events": (PACKET, packets)})
+    times = [10**8 + 10**7 * i for i in range(len(ROWS))]
+    write_bag(path, {"/events": (PACKET, packet_messages(ROWS, times, 100))})
 
 
 def _bag2(path: Path, storage: str) -> None:

@@ -256,16 +256,3 @@ def test_the_rate_of_a_moving_exponential_is_exact_and_smooth(size: float, rando
     few = [argument[:2].clone().requires_grad_() for argument in arguments]
     assert torch.autograd.gradcheck(exponential.with_rate, few, atol=1e-6)
     assert torch.autograd.gradgradcheck(exponential.with_rate, few, atol=1e-5)
-
-
-@pytest.mark.parametrize("mode", ["off", "network", "spline"])
-def test_the_rate_of_the_corrected_pose_is_its_derivative(mode: str) -> None:
-    correction = make_correction(mode)
-    for parameter in correction.parameters():
-        torch.nn.init.normal_(parameter, std=0.1)
-    # Neither at the ends, nor on a knot.
-    seconds = torch.linspace(0.013, 1.987, 40, dtype=torch.float64)
-    pose, rate = correction.pose_and_rate(seconds)
-    torch.testing.assert_close(pose, correction.pose(seconds), rtol=0, atol=1e-7)
-    _, expected = torch.func.jvp(correction.pose, (seconds,), (torch.ones_like(seconds),))
-    torch.testing.assert_close(rate, expected, rtol=0, atol=1e-4 if mode == "network" else 1e-12)

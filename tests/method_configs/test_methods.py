@@ -27,7 +27,6 @@ from aenerf_ns.training.pipeline import AENeRFPipeline
 
 NAMES = ("robust_enerf", "eventnerf", "evnerf", "paev3d", "e2vid_nerf")
 SMALL = [getattr(peers, f"{name}_small") for name in NAMES]
-PEERS = SMALL + [getattr(peers, name) for name in NAMES]
 
 
 @pytest.fixture
@@ -82,11 +81,6 @@ def train(
     return history, {name: value.clone() for name, value in pipeline.model.state_dict().items()}
 
 
-def same(first: Any, second: Any) -> bool:
-    """Whether two trainings gave the same losses and weights, to the bit."""
-    return first[0] == second[0] and all(torch.equal(value, second[1][name]) for name, value in first[1].items())
-
-
 def test_aenerf_mlp_trains_by_the_papers_losses_alone(data: Path) -> None:
     config, seen = shrunk(deepcopy(aenerf_mlp.config)), []
     history, _ = train(config, data, 3, lambda pipeline: seen.append(pipeline.model.warp))
@@ -111,14 +105,8 @@ def test_robust_enerf_is_aenerf_with_options(robust: Any, ours: Any) -> None:
     assert asdict(as_robust) == asdict(robust.config)
 
 
-def test_robust_enerf_trains_as_aenerf_to_the_bit(data: Path) -> None:
-    robust = train(shrunk(deepcopy(robust_enerf_small.config)), data, 5)
-    assert same(robust, train(shrunk(with_options(aenerf_small.config, *AS_ROBUST)), data, 5))
-    assert not same(robust, train(shrunk(with_options(aenerf_small.config, *AS_ROBUST[2:])), data, 5))
-
-
 @pytest.mark.parametrize("mode", ["off", "spline"])
-@pytest.mark.parametrize("method", PEERS, ids=lambda method: method.config.method_name)
+@pytest.mark.parametrize("method", SMALL, ids=lambda method: method.config.method_name)
 def test_peers_train_with_and_without_correction(method: Any, mode: str, data: Path) -> None:
     config = with_options(method.config, "--pipeline.model.camera-optimizer.mode", mode)
     history, weights = train(shrunk(config), data, 3)

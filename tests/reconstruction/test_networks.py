@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.streams import make_stream
+from helpers.streams import make_stream, random_stream
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.reconstruction.batches import batches_of
 from aenerf_ns.reconstruction.images import NetworkImages, demosaic
 from aenerf_ns.reconstruction.layers import ConvGRU, ConvLSTM
@@ -80,19 +79,6 @@ ENTRIES = {"e2vid": e2vid_entries(), "firenet": firenet_entries()}
 def save(path: Path, name: str, **changes: object) -> Path:
     torch.save({"arch": name, "epoch": 3, "state_dict": made(ENTRIES[name]), **changes}, path)
     return path
-
-
-def events_of(height: int, width: int, count: int, seed: int = 0) -> EventStream:
-    rng = np.random.default_rng(seed)
-    columns = zip(*(rng.integers(0, size, count) for size in (width, height)), strict=True)
-    return make_stream(
-        [
-            (x, y, 10 * index, p)
-            for index, ((x, y), p) in enumerate(zip(columns, rng.choice([-1, 1], count), strict=True))
-        ],
-        width,
-        height,
-    )
 
 
 @pytest.mark.parametrize(("name", "number", "weights"), [("e2vid", 74, 10_715_503), ("firenet", 24, 37_777)])
@@ -181,9 +167,9 @@ def test_network_keeps_size_and_state(kind: type[E2VID] | type[FireNet]) -> None
 def test_images_of_a_sensor(name: str, pattern: str, tmp_path: Path) -> None:
     network = load_network(save(tmp_path / "weights.pth.tar", name))
     sensor = SensorModel(bayer_pattern="RGGB" if pattern else "")
-    events = events_of(10, 13, 400)
+    events = random_stream(400, 13, 10, 4000)
     found = list(NetworkImages(network, sensor, "cpu")(batches_of([events[:150], events[150:]], 130)))
-    assert [time for time, _ in found] == [1290, 2590, 3890]
+    assert [time for time, _ in found] == events.t[[129, 259, 389]].tolist()
     assert all(image.shape == (10, 13, 3) and image.dtype == np.uint8 for _, image in found)
     ((_, fresh),) = NetworkImages(network, sensor, "cpu")([events[130:260]])
     assert (fresh != found[1][1]).any()

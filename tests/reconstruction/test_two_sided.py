@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.streams import make_stream
+from helpers.streams import make_stream, random_stream
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
@@ -20,11 +21,10 @@ SENSOR = SensorModel(0.2, 0.2)
 @pytest.fixture
 def events() -> EventStream:
     """100 batches of random events, of polarities that differ from region to region."""
-    generator = np.random.default_rng(0)
     count = 100 * BATCH
-    x, y = generator.integers(0, WIDTH, count), generator.integers(0, HEIGHT, count)
-    polarity = np.where(generator.random(count) < x / WIDTH, 1, -1)
-    return make_stream(list(zip(x, y, np.arange(count), polarity, strict=True)), WIDTH, HEIGHT)
+    events = random_stream(count, WIDTH, HEIGHT, count)
+    polarity = np.where(np.random.default_rng(1).random(count) < events.x / WIDTH, 1, -1).astype(np.int8)
+    return replace(events, t=np.arange(count), p=polarity)
 
 
 def states_of(events: EventStream) -> Iterator[tuple[int, np.ndarray]]:

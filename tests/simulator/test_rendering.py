@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from functools import partial
 
 import numba
 import numpy as np
@@ -111,7 +112,8 @@ def test_edge_is_blurred_by_the_point_spread() -> None:
     np.testing.assert_allclose(alpha, norm.cdf(shifts, scale=0.5), atol=0.02)
 
 
-def test_threads_do_not_change_pictures() -> None:
+def test_threads_do_not_change_pictures(request: pytest.FixtureRequest) -> None:
+    request.addfinalizer(partial(numba.set_num_threads, numba.get_num_threads()))
     mesh, _ = repair(mesh_of(trimesh.creation.icosphere(3)), 0.2)
     lamp = AreaLight((0.5, 0, 2.0), (0.3, 0, 0), (0, -0.3, 0), (1.0, 2.0, 3.0))
     pose = paths.look_at((3, 1, 1), (0, 0, 0))
@@ -120,7 +122,6 @@ def test_threads_do_not_change_pictures() -> None:
         numba.set_num_threads(threads)
         scene = light_mesh(mesh, sky((0.1,) * 3, (1.0,) * 3), [lamp], BLACK)
         pictures.append(b"".join(part.tobytes() for part in scene.render(pose, (50, 50, 20, 15), 40, 30, 4)))
-    numba.set_num_threads(1)
     assert pictures[0] == pictures[1]
 
 

@@ -51,12 +51,7 @@ def events_of(
 ) -> EventStream:
     video = cast(Video, StoredVideo(frames))
     simulator = video_simulator(video, sensor, noise, seed)
-    return joined([interval.events for interval in video_events(video, simulator, interpolation)])
-
-
-def joined(pieces: list[EventStream]) -> EventStream:
-    columns = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in "xytp")
-    return EventStream(*columns, pieces[0].width, pieces[0].height)
+    return EventStream.concatenate([interval.events for interval in video_events(video, simulator, interpolation)])
 
 
 def gray(levels: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -77,7 +72,9 @@ def test_events_cross_thresholds(rising: bool, tmp_path: Path) -> None:
     (tmp_path / "images.txt").write_text("".join(lines))
     sensor = SensorModel(0.21, 0.17)
     video = open_video(tmp_path)
-    events = joined([interval.events for interval in video_events(video, video_simulator(video, sensor), "linear")])
+    events = EventStream.concatenate(
+        [interval.events for interval in video_events(video, video_simulator(video, sensor), "linear")]
+    )
     # As stated in the docs: the step from gray level 0 to 2 is the smaller threshold.
     epsilon = 2 / 255 / 12.92 / (math.exp(0.17) - 1)
     log_radiance = np.log(LEVELS[levels] + epsilon)
@@ -152,7 +149,7 @@ def test_flow_is_nearer_to_truth() -> None:
     def seen(frame: float) -> NDArray[np.float64]:
         return moving(3.3 * frame, 1.2 * frame)
 
-    truth = joined(
+    truth = EventStream.concatenate(
         [
             EventStream(*exact(seen(step / steps), round(step * FRAME / steps)), 96, 72)
             for step in range(intervals * steps + 1)

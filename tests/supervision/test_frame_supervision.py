@@ -19,7 +19,6 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
-from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervisionConfig
 from aenerf_ns.supervision.peers.frames import (
     FrameBatch,
     FrameSampler,
@@ -83,13 +82,6 @@ def test_the_loss_is_the_squared_error_of_display_values() -> None:
     loss.backward()
     assert log_radiance.grad is not None
     torch.testing.assert_close(log_radiance.grad[:, 0], torch.tensor([0.06, 0.0, 0.02]) / 3)
-
-
-def test_pairs_and_images_do_not_mix(random_poses: torch.Tensor, tmp_path: Path) -> None:
-    scene = make_sampler(tmp_path, random_poses).dataset.scene
-    supervision = PairSupervisionConfig().setup(sensor=scene.sensor, loss_coefficients=PairLossCoefficients())
-    with pytest.raises(DataError, match="its sampler draws a FrameBatch, and its supervision compares a PairBatch"):
-        FrameSamplerConfig().setup(dataset=Dataset(scene), supervision=supervision, device="cpu")
 
 
 def test_images_that_cannot_be_trained_on_end_with_one_line(random_poses: torch.Tensor, tmp_path: Path) -> None:

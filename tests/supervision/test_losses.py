@@ -30,18 +30,6 @@ def test_reconstruction_loss_by_hand() -> None:
     assert reconstruction_loss(torch.zeros(2), torch.tensor([0.3, -0.3]), 0.3).item() == pytest.approx(1.0)
 
 
-def test_the_losses_of_robust_enerf_by_hand() -> None:
-    def loss(predicted: list[float], positive: float, negative: float) -> float:
-        change = log_radiance_change(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 1.0]), positive, negative)
-        return reconstruction_loss(torch.tensor(predicted), change, (positive + negative) / 2).item()
-
-    assert loss([0.30, -0.20], 0.25, 0.25) == pytest.approx(0.04)
-    # A constant field.
-    assert loss([0.0, 0.0], 0.3, 0.2) == pytest.approx(1.04)
-    rates, changes, intervals = torch.tensor([20.0, -30.0]), torch.tensor([0.25, -0.25]), torch.tensor([0.01, 0.005])
-    assert temporal_loss(rates, changes, intervals).item() == pytest.approx(0.30)
-
-
 def test_a_silent_pixel_is_within_a_threshold_of_its_events() -> None:
     predicted = torch.tensor([0.9, 0.5, 0.2, -0.4], requires_grad=True)
     nearest = silent_change(predicted, torch.tensor([0.4, 0.4, 0.4, 0.4]), torch.tensor(0.2, requires_grad=True), 0.3)

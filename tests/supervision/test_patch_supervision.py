@@ -235,15 +235,7 @@ def test_displacements_are_those_of_the_flow_and_are_zero_where_nothing_happens(
         assert batch.displacement[index].numpy() == pytest.approx(expected, rel=1e-5), index
 
 
-def test_a_batch_of_another_kind_is_refused(random_poses: torch.Tensor) -> None:
-    from aenerf_ns.supervision.peers.windows import EventNeRFSupervisionConfig
-
-    with pytest.raises(DataError, match="its sampler draws a PatchBatch, and its supervision compares a WindowBatch"):
-        FlowPatchSamplerConfig().setup(
-            dataset=make_sampler(random_poses).dataset,
-            supervision=make_supervision(EventNeRFSupervisionConfig(), SensorModel()),
-            device="cpu",
-        )
+def test_a_camera_without_patches_is_refused(random_poses: torch.Tensor) -> None:
     blind = CameraIntrinsics(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (-9.0, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(DataError, match="it gives no patch of 2 x 2 pixels a direction"):
         make_sampler(random_poses, camera=blind)

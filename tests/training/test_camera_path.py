@@ -46,9 +46,17 @@ def test_a_camera_path_that_cannot_be_rendered_is_one_line(
     assert error.value.source == path
     assert problem in error.value.problem
     assert "Render tab" in error.value.remedy
-    # Panoramas need no field of view, and other commands no camera path.
+
+
+def test_panoramas_need_no_field_of_view_and_other_commands_no_camera_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     panorama = CAMERA_PATH | {"camera_type": "equirectangular", "camera_path": [{**CAMERA, "fov": None}]}
+    path = tmp_path / "path.json"
     path.write_text(json.dumps(panorama))
+    monkeypatch.setattr(
+        sys, "argv", ["ns-render", "camera-path", "--load-config", "x", f"--camera_path_filename={path}"]
+    )
     require_camera_path()
     monkeypatch.setattr(sys, "argv", ["ns-render", "interpolate"])
     require_camera_path()

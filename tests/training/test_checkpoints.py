@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers.dataset_faults import rewrite_zip, zip_members
 from helpers.small_trainings import train_small_model
 from nerfstudio.utils.eval_utils import eval_setup
 
@@ -67,11 +68,7 @@ def _replace_by_folder(path: Path) -> None:
 
 
 def _compress(path: Path) -> None:
-    with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
+    rewrite_zip(path, zip_members(path), zipfile.ZIP_DEFLATED)
 
 
 def _with(**entries: object) -> Callable[[Path], None]:
@@ -199,11 +196,13 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def test_a_checkpoint_that_cannot_be_written_leaves_the_older_one(trained: AENeRFTrainer, run: Path) -> None:
+def test_a_checkpoint_that_cannot_be_written_leaves_the_older_one(
+    trained: AENeRFTrainer, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = run / "nerfstudio_models"
-    trained.checkpoint_dir, kept = folder, trained.checkpoint_dir
+    monkeypatch.setattr(trained, "checkpoint_dir", folder)
+    monkeypatch.setattr(trained, "base_dir", run)
     files = sorted(run.rglob("*"))
-    trained.base_dir, base_dir = run, trained.base_dir
     size = (folder / "step-000000003.ckpt").stat().st_size
     # From the first bytes to the last ones of the archive's directory.
     for limit in (0, 100, size // 3, size - 10_000, size - 1):
@@ -212,7 +211,6 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_older_one(trained: AENeR
         assert sorted(run.rglob("*")) == files
     trained.save_checkpoint(9)
     assert checkpoint_to_load(folder).name == "step-000000009.ckpt"
-    trained.base_dir, trained.checkpoint_dir = base_dir, kept
 
 
 def test_failed_write_leaves_the_older_file(tmp_path: Path) -> None:

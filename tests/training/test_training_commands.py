@@ -168,12 +168,7 @@ def test_two_processes_equal_one_with_twice_the_batch(
     assert one["weights"]["camera_optimizer.twists.control_twists"].any()
 
 
-def test_the_framework_lists_the_methods_and_its_own_still_work(workspace: Path) -> None:
-    output = run("ns-train", "--help", cwd=workspace)
-    assert "aenerf " in output
-    assert "aenerf-mlp" in output
-    assert "aenerf-small" in output
-    assert "nerfacto" in output
+def test_methods_of_the_framework_still_work(workspace: Path) -> None:
     assert "ecd-data" in run("ns-train", "nerfacto", "--help", cwd=workspace)
 
 
