@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, Protocol
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -10,13 +10,12 @@ from nerfstudio.field_components.encodings import HashEncoding as FrameworkHashE
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from aenerf_ns.errors import DataError
-from aenerf_ns.method.kernels.loader import is_float_in_memory, load, try_load
+from aenerf_ns.method.kernels.loader import is_float_in_memory, try_load
 
 # https://arxiv.org/abs/2201.05989, eq. 4; the second is 2654435761 in 32 bits, where products wrap as they should.
 _PRIMES = (1, 2654435761 - 2**32, 805459861)
 
-Implementation = Literal["auto", "torch", "numba", "triton"]
+Implementation = Literal["auto", "torch"]
 
 _BY_DEVICE = {"cpu": "numba", "cuda": "triton"}
 
@@ -64,12 +63,9 @@ class HashEncoding(FrameworkHashEncoding):
     that move (``forward_ad.make_dual``) with the first derivatives of the rates.
 
     Args:
-        implementation: "torch" is the plain one, "numba" runs on the CPU and "triton" on NVIDIA GPUs. "auto" takes
-            numba or Triton for float32 tensors outside ``torch.func``, and the plain one for everything else.
+        implementation: "torch" is the plain one. "auto" takes numba on the CPU and Triton on NVIDIA GPUs for float32
+            tensors outside ``torch.func``, and the plain one for everything else.
         options: the other options of the framework's encoding.
-
-    Raises:
-        DataError: if numba or Triton is asked for by name and is not installed or cannot compute with the tensors.
     """
 
     _scales: Tensor
@@ -107,16 +103,7 @@ class HashEncoding(FrameworkHashEncoding):
             and is_float_in_memory(self.hash_table)
             and forward_ad.unpack_dual(self.hash_table).tangent is None
         )
-        if self._implementation == "auto":
-            return try_load(_module(by_device), positions.device) if by_device is not None and fits else None
-        source = f"hash grid implementation {self._implementation}"
-        if self._implementation != by_device or not fits:
-            problem = f"cannot compute with these {positions.dtype} tensors on {positions.device}"
-            raise DataError(source, problem, "choose auto")
-        try:
-            return cast(Kernels, load(_module(self._implementation), positions.device))
-        except (ImportError, RuntimeError) as error:
-            raise DataError(source, str(error), "install it or choose auto") from error
+        return try_load(_module(by_device), positions.device) if by_device is not None and fits else None
 
     def _plain(self, positions: Tensor) -> Tensor:
         scaled = positions.mT[:, None] * self._scales

@@ -38,8 +38,8 @@ class FieldConfig:
     log2_hashmap_size: int = 19
     """hash: binary logarithm of the entries of a level."""
     grid_implementation: Implementation = "auto"
-    """hash: how the grids of field and proposal networks are computed. "numba": on the CPU. "triton": on NVIDIA GPUs.
-    "torch": anywhere, more slowly. "auto": by numba or Triton where they are installed, else by torch."""
+    """hash: how the grids of field and proposal networks are computed. "auto": by numba on the CPU and by Triton on
+    NVIDIA GPUs where they are installed, else by torch. "torch": by torch, more slowly."""
     num_frequencies: int = 10
     """mlp: frequencies of the position's encoding, in octaves from one period across the box or contracted space."""
     num_hidden_layers: int = 1

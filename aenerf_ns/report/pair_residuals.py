@@ -99,7 +99,8 @@ def _histogram(measured: NDArray[np.float64], rendered: NDArray[np.float64]) -> 
 
 def average_by_length(length: NDArray[np.floating], residual: NDArray[np.float64]) -> list[dict[str, Any]]:
     """Average the (N,) residuals of pairs in classes by the (N,) numbers of their events."""
-    classes, low = [], 1
+    classes: list[dict[str, Any]] = []
+    low: float = 1
     for high in _LENGTHS:
         chosen = residual[(length >= low) & (length <= high)]
         if len(chosen) >= _MIN_PAIRS:

@@ -345,9 +345,8 @@ class SpeedProfile:
         if self.name == "easy":
             return advance
         # The speed repeats every second. Newton's method starts from an interpolation.
-        whole, rest = np.divmod(advance, HARD_MEAN_SPEED)
-        grid = np.linspace(0, 1, 1001)
-        time = whole + np.interp(rest, _hard_advance(grid), grid)
+        whole, grid = np.floor(advance / HARD_MEAN_SPEED), np.linspace(0, 1, 1001)
+        time = whole + np.interp(advance - HARD_MEAN_SPEED * whole, _hard_advance(grid), grid)
         for _ in range(4):
             time = time - (_hard_advance(time) - advance) / HARD_SPEED_RATIO ** np.sin(2 * np.pi * time)
         return time

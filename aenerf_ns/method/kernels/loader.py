@@ -21,29 +21,15 @@ def is_float_in_memory(tensor: Tensor) -> bool:
 
 
 @lru_cache
-def load(module: str, device: torch.device) -> ModuleType:
-    """Return a module whose function ``self_test`` has computed something on a device.
-
-    Raises:
-        ImportError: the library that compiles the module is not installed.
-        RuntimeError: the module cannot be compiled, such as Triton's without a C compiler.
-    """
-    # Imported lazily: every ns-* command imports the model, and numba is slow to import.
-    loaded = import_module(module)
-    try:
-        loaded.self_test(device)
-    except (OSError, subprocess.SubprocessError) as error:
-        # Triton's, where there is no compiler or no header of Python.
-        raise RuntimeError(f"{module} cannot be compiled ({error})") from error
-    return loaded
-
-
-@lru_cache
 def try_load(module: str, device: torch.device) -> ModuleType | None:
-    """Return a module as :func:`load` does. If it does not work, say why and return None."""
+    """Return a module whose function ``self_test`` computes something on a device, or say why it does not work."""
     try:
-        return load(module, device)
-    except (ImportError, RuntimeError) as error:
+        # Imported lazily: every ns-* command imports the model, and numba is slow to import.
+        loaded = import_module(module)
+        loaded.self_test(device)
+        return loaded
+    # Triton raises the last two where there is no compiler or no header of Python.
+    except (ImportError, RuntimeError, OSError, subprocess.SubprocessError) as error:
         _warn_once(f"[yellow]Plain torch computes what compiled kernels compute faster: {error}.")
         return None
 

@@ -42,7 +42,8 @@ def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
             if rows == columns == 1:
                 break
             half = (max(1, columns // 2), max(1, rows // 2))
-            picture = cv2.resize(picture, half, interpolation=cv2.INTER_AREA).reshape(half[1], half[0], -1)
+            halved = cv2.resize(picture, half, interpolation=cv2.INTER_AREA)
+            picture = np.asarray(halved, np.float32).reshape(half[1], half[0], -1)
         first_level.append(len(level))
     return MipMaps(
         np.concatenate(texels) if texels else np.zeros((0, 3), np.uint16 if bits16 else np.float32),
