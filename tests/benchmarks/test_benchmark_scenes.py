@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from trimesh.triangles import area
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
@@ -29,10 +30,6 @@ class StandIns:
     def model(self, name, detail="plain", dress=None):
         self.names.add(name)
         return shapes.box((-0.1, -0.1, 0), (0.1, 0.1, 0.2), PLAIN)
-
-
-def area(triangles):
-    return 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -16,13 +16,8 @@ import torch
 from helpers.colmap_stand_in import FOUND_BOX, place_frames
 from helpers.commands import run
 from helpers.dataset_faults import put, remove, set_in
-from helpers.small_datasets import (
-    END,
-    START,
-    make_trajectory,
-    write_ecd,
-    write_native,
-)
+from helpers.small_datasets import END, START, make_trajectory, write_ecd, write_native
+from helpers.streams import random_stream
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
@@ -176,20 +171,16 @@ def test_filters_cut_everything(tmp_path: Path) -> None:
 
 def test_hot_pixels_are_named(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
-    rng = np.random.default_rng(1)
-    n = 3000
-    t = np.sort(rng.integers(START, END, n))
-    x, y = rng.integers(0, 6, n).astype(np.uint16), rng.integers(0, 4, n).astype(np.uint16)
-    x[::2], y[::2] = 3, 1
+    events = random_stream(3000, 6, 4, END, start=START, seed=1)
+    events.x[::2], events.y[::2] = 3, 1
     with Hdf5EventWriter(data / "events.h5") as writer:
-        writer.append(EventStream(x, y, t, np.ones(n, np.int8), 6, 4))
+        writer.append(events)
     with CONSOLE.capture() as output:
         after = convert(data, tmp_path / "converted", drop_hot_pixels=True)
     assert "Hot pixels: 1, with 5" in output.get()
     assert "(3, 1) 1,5" in output.get()
-    kept = columns(after)
-    hot = (x == 3) & (y == 1)
-    np.testing.assert_array_equal(kept["t"], t[~hot])
+    hot = (events.x == 3) & (events.y == 1)
+    np.testing.assert_array_equal(columns(after)["t"], events.t[~hot])
 
 
 def test_poses_from_frames_replace_the_given_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
