@@ -123,6 +123,17 @@ def choose_runs(num_events: int, camera: CameraIntrinsics) -> tuple[NDArray[np.i
     return np.linspace(0, num_events - length, _SETTINGS.num_slices).astype(np.int64), length
 
 
+def longest_stretches(runs: list[EventStream], window: TimeWindow, min_events: int) -> list[EventStream]:
+    """Return the stretches of runs between the gaps of a time window, as many as there are slices at most.
+
+    The events of a slice are warped as one motion, which a gap between the poses would be in. Stretches of fewer than
+    ``min_events`` are left out.
+    """
+    stretches = [run.between(*piece) for run in runs for piece in window.pieces()]
+    longest = sorted((part for part in stretches if len(part) >= min_events), key=len)[-_SETTINGS.num_slices :]
+    return sorted(longest, key=lambda part: part.t[0])
+
+
 class WarpedEvents:
     """Warp slices of a recording under hypotheses about its poses, clock and pixels.
 

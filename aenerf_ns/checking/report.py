@@ -14,7 +14,7 @@ from aenerf_ns.camera.alignment import rotation_angle
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.checking.contrast import WarpedEvents, choose_runs, contrast_of
+from aenerf_ns.checking.contrast import WarpedEvents, choose_runs, contrast_of, longest_stretches
 from aenerf_ns.checking.frames import FrameChanges
 from aenerf_ns.checking.noise import NoiseRate
 from aenerf_ns.checking.thresholds import PolarityBalance
@@ -136,12 +136,12 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     _check_thresholds(result, recording, changes, balance, correlation or 0.0)
     _check_poses(result, recording, window, num_covered)
     is_simple = _check_lens(result, recording.event_camera) | _check_steps(result, recording.trajectory, window)
-    if num_covered < _LIMITS.min_events:
+    runs = longest_stretches(_read_runs(recording, window, num_covered), window, _LIMITS.min_events)
+    if not runs:
         result.figures.append(
-            f"Contrast of warped events: not computed, because only {num_covered} events have a pose."
+            f"Contrast of warped events: not computed, because no {_LIMITS.min_events} events have poses without a gap."
         )
         return result
-    runs = _read_runs(recording, window, num_covered)
     with progress_bar() as progress:
         progress.add_task("Warping events", total=None)
         result.warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
@@ -172,10 +172,7 @@ def _count_events(
 
 
 def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> list[EventStream]:
-    """Read runs of consecutive events that have a pose, evenly spread over all events that have one.
-
-    Of a run with gaps between the poses, the longest stretch without one is kept: its events are warped as one motion.
-    """
+    """Read runs of consecutive events that have a pose, evenly spread over all events that have one."""
     file, camera = recording.event_file, recording.event_camera
     begins, length = choose_runs(num_covered, camera)
     parts: list[list[EventStream]] = [[] for _ in begins]
@@ -186,8 +183,7 @@ def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> li
             # Indices make a copy: a slice would keep the whole chunk in memory.
             part.append(covered[np.arange(len(covered))[max(begin, 0) : max(begin + length, 0)]])
         position += len(covered)
-    runs = map(EventStream.concatenate, parts)
-    return [max((run.between(*piece) for piece in window.pieces()), key=len) for run in runs]
+    return [EventStream.concatenate(part) for part in parts if part]
 
 
 def _check_events(result: CheckResult, noise: NoiseRate, bayer_pattern: str | None) -> None:

@@ -23,7 +23,9 @@ class Check(DatasetCommand):
     picture: Path | None = None
     """PNG file to write: events as they came, and warped to one view by the poses."""
 
-    placing_options: ClassVar[tuple[str, ...]] = ("scale_factor", "auto_scale_poses", "start_time_ns", "end_time_ns")
+    placing_options: ClassVar[tuple[str, ...]] = (
+        "orientation_method", "center_method", "scale_factor", "auto_scale_poses", "start_time_ns", "end_time_ns",
+    )  # fmt: skip
     error_status: ClassVar[int] = 2
     """Exit status for a dataset that cannot be read."""
 

@@ -47,7 +47,7 @@ class DatasetCommand:
     """Options of the format (docs/options.md), such as width=346 height=260."""
 
     placing_options: ClassVar[tuple[str, ...]] = ()
-    """Options of all formats, which place the recording in a scene, that the command takes too."""
+    """Options of all formats that the command takes, too: they place the recording in a scene, or cut it."""
 
     def open_dataset(self) -> EventDataParser:
         """Make the parser of the dataset, which reads nothing yet.

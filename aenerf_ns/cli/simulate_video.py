@@ -122,7 +122,11 @@ class SimulateVideo(SimulationCommand):
         from aenerf_ns.files.calibration import read_calibration
 
         if self.calibration is not None:
-            camera = read_calibration(self.calibration, self.event_camera).event_camera
+            calibration = read_calibration(self.calibration, self.event_camera)
+            if calibration.intrinsics_origin == "guessed":
+                remedy = "state them, or leave --calibration out and estimate them with --poses colmap"
+                raise DataError(self.calibration, "it states no focal lengths and no principal point", remedy)
+            camera = calibration.event_camera
             if (camera.width, camera.height) != (video.width, video.height):
                 raise DataError(
                     self.calibration,

@@ -70,7 +70,7 @@ def summarize(figures: dict[str, Any]) -> str:
     if figures["contrast_is_clearly_lower"]:
         signs.append(
             "turned too far: the events fit the estimated poses better (train with "
-            "--pipeline.model.camera-optimizer.mode off, and without an offset that is learned)"
+            "--pipeline.model.camera-optimizer.mode off, and without its rigid-offset and clock-offset)"
         )
     if figures["clock_change_share_of_limit"] > _MAX_CLOCK_SHARE:
         signs.append(

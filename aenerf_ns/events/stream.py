@@ -176,7 +176,7 @@ class EventFile(ABC):
 
     @abstractmethod
     def time_span(self) -> tuple[int, int]:
-        """Return the times of the first and the last event in nanoseconds. Some formats tell them when all is read.
+        """Return the times of the first and the last event in nanoseconds. Some formats must be read through.
 
         Raises:
             DataError: the file is missing or empty.

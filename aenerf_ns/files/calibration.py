@@ -71,7 +71,8 @@ def read_calibration(
             sensor = SensorModel(**sensor_values(meta.event_camera))
         camera = meta.event_camera
         motion = frame_from_event(path, camera, lens)
-        origin, is_assumed = camera.intrinsics_origin, not states_thresholds(camera)
+        origin = camera.intrinsics_origin
+        is_assumed = camera.has_assumed_thresholds or not states_thresholds(camera)
         return Calibration(camera.intrinsics(), lens, motion, sensor, meta.image_encoding, origin, is_assumed)
     content = read_plain_yaml(path)
     if isinstance(content, dict) and not content.keys().isdisjoint("Kk"):
@@ -99,7 +100,8 @@ def _require_no_names(path: Path, *names: str | None) -> None:
     """Raise a DataError if a camera is named for a file in which cameras have no names."""
     for name in names:
         if name is not None:
-            raise DataError(path, f"it has no camera {name}", "leave the name out; only Kalibr's camchain has names")
+            remedy = "give Kalibr's camchain, whose cameras have names, or name no camera"
+            raise DataError(path, f"it has no camera {name}", remedy)
 
 
 def _as_file(message: dict[str, Any]) -> dict[str, Any]:

@@ -81,11 +81,11 @@ def bounded(path: Path, kind: str, extra: str = "", size: int | None = None) -> 
 
 def bounded_items(items: Iterator[Item], path: Path, kind: str, extra: str = "") -> Iterator[Item]:
     """Yield items, each of which is read from a file within :func:`bounded`."""
-    size = None
+    # Once, because a folder may hold thousands of files.
+    with bounded(path, kind, extra):
+        size = size_on_disk(path)
     while True:
         with bounded(path, kind, extra, size):
-            # Once, because a folder may hold thousands of files.
-            size = size_on_disk(path) if size is None else size
             item = next(items, None)
         if item is None:
             return

@@ -411,7 +411,7 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
         raise DataError("model", f"camera_optimizer.clock_offset {offset:g}", remedy)
     for name in ("average_init_density", "unbounded_init_density"):
         density = getattr(config, name)
-        # Softplus turns larger ones into infinity.
+        # The start of the softplus overflows for larger ones.
         if density is not None and not 0 < density < 700:
             raise DataError("model", f"{name} {density:g}", "give a number above 0 and below 700")
 

@@ -107,8 +107,8 @@ def trajectory(reports: Sequence[RunReport]) -> go.Figure:
 
 def _paths(report: RunReport, drawn: Sequence[RunReport]) -> list[tuple[str, Any]]:
     positions = report.poses.positions
-    # All runs of a comparison may have the same true poses.
-    is_drawn = positions.get("true") in [other.poses.positions.get("true") for other in drawn]
+    # All runs of a comparison have the same true poses, as far as they have any.
+    is_drawn = any("true" in other.poses.positions for other in drawn)
     shown = [(name, points) for name, points in positions.items() if name != "true" or not is_drawn]
     # Below the others.
     return sorted(shown, key=lambda path: path[0] != "true")

@@ -55,7 +55,11 @@ def measure_poses(run: TrainedRun) -> RunPoses:
     seconds = given.seconds(times)
     poses = {"estimated": given.interpolate(times), "corrected": psi.pose(seconds.to(run.device)).cpu()}
     reference = poses["estimated"] if true is None else true.interpolate(times)
-    positions = {name: align(part, reference)(part.double()) for name, part in poses.items()}
+    references = dict.fromkeys(poses, reference)
+    if true is None:
+        # A learned clock does not turn the world.
+        references["corrected"] = given.pose(psi.on_clock_of_poses(seconds.to(run.device)).cpu())
+    positions = {name: align(part, references[name])(part.double()) for name, part in poses.items()}
     if true is not None:
         positions["true"] = reference
     every = -(-len(times) // _MAX_DRAWN)

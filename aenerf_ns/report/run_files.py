@@ -81,12 +81,15 @@ def read_scalars(folder: Path) -> dict[str, tuple[list[int], list[float]]] | Non
         try:
             with path.open(encoding="utf8", newline="") as file:
                 for row in csv.DictReader(file):
-                    steps, values = curves[row["name"]]
-                    steps.append(int(row["step"]))
+                    (steps, values), step = curves[row["name"]], int(row["step"])
+                    # A run that was killed goes on from its last checkpoint, and logs some steps again.
+                    while steps and steps[-1] >= step:
+                        steps.pop(), values.pop()
+                    steps.append(step)
                     values.append(float(row["value"]))
         except (ValueError, KeyError, TypeError, csv.Error) as error:
             # The last line of a run that was killed may be incomplete.
-            raise DataError(path, f"it cannot be read ({error!r})", "remove its last line, or the file") from None
+            raise DataError(path, f"it cannot be read ({error!r})", "remove the incomplete line, or the file") from None
     return {name: _thin(*curve) for name, curve in curves.items()}
 
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from benchmarks.pairing import in_memory, with_numpy
+import torch
+
+from aenerf_ns.events.pairing import pair_events
+from benchmarks.pairing import sample, stream
 
 
-def test_pairs_are_as_many_as_by_numpy() -> None:
-    # Of so few events no two are of one pixel and time.
-    assert in_memory(20_000)["pairs"] == with_numpy(20_000) > 100
+def test_batches_are_timed_on_one_thread_that_is_given_back() -> None:
+    threads = torch.get_num_threads()
+    figures = sample(pair_events(stream(20_000)))
+    assert min(figures.values()) > 0
+    assert torch.get_num_threads() == threads

@@ -105,6 +105,9 @@ def test_no_slice_spans_a_gap_of_the_poses(simulated: tuple[Recording, EventStre
     warped = check(recording, TimeWindow(0, PART, gaps), 1.0).warped
     assert warped is not None
     assert not any(first < end and last > start for first, last in warped.spans for start, end in gaps)
+    # From all three stretches.
+    assert warped.spans[0][0] < gaps[0][0]
+    assert warped.spans[-1][1] > gaps[1][1]
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -381,7 +384,7 @@ def test_scene_box_must_hold_what_is_seen(shorter: Path) -> None:
 def test_few_events_are_not_warped(tmp_path: Path) -> None:
     picture = tmp_path / "warped.png"
     _, output = run(write_native(tmp_path / "few"), picture=picture)
-    assert "Contrast of warped events: not computed, because only" in output
+    assert "Contrast of warped events: not computed, because no 2000 events have poses without" in output
     assert f"{picture}: not written" in output
     assert not picture.exists()
 

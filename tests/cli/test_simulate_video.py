@@ -216,6 +216,13 @@ def test_contradicting_options_are_refused(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_calibration_without_a_lens_is_refused(frames: Path, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text('{"event_camera": {"width": 24, "height": 16}}')
+    with pytest.raises(DataError, match="it states no focal lengths and no principal point; state them, or leave"):
+        simulate(tmp_path / "out", video=frames, poses="colmap", calibration=path)
+
+
 def test_poses_of_another_clock_are_refused(frames: Path, tmp_path: Path) -> None:
     late = make_poses()
     write_tum_trajectory(tmp_path / "late.txt", Trajectory(late.times + 10**9, late.camera_to_worlds))

@@ -71,7 +71,7 @@ def test_intrinsics_may_be_missing(tmp_path: Path) -> None:
     del meta["image_encoding"]
     meta["event_camera"] = {key: value for key, value in meta["event_camera"].items() if key not in lens}
     file.write_text(json.dumps(meta))
-    with pytest.raises(DataError, match="it has no camera cam1; leave the name out"):
+    with pytest.raises(DataError, match="it has no camera cam1; give Kalibr's camchain"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1"))
     parser = OwnRecordingDataParserConfig(data=truth.data).setup()
     with pytest.raises(DataError, match=r"intrinsics .* are not known; calibrate it, or .* --poses events"):

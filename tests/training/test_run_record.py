@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 from helpers.small_trainings import train_small_model
 
+from aenerf_ns.report.run_files import read_scalars
 from aenerf_ns.training import provenance
-from aenerf_ns.training.run_record import SCALARS_FILE, ScalarWriter
+from aenerf_ns.training.run_record import ScalarWriter
 from aenerf_ns.training.trainer import AENeRFTrainer
 
 
@@ -64,9 +65,12 @@ def test_a_training_records_its_end_and_its_scalars(tmp_path: Path) -> None:
 
 
 def test_a_run_that_goes_on_in_its_folder_keeps_its_scalars(tmp_path: Path) -> None:
-    for step, resumes in ((0, False), (10, True)):
-        ScalarWriter(tmp_path, resumes).write_scalar("loss", 0.5, step)
-    assert (tmp_path / SCALARS_FILE).read_text() == "step,name,value\n0,loss,0.5\n10,loss,0.5\n"
+    for steps, resumes in (((0, 10, 20), False), ((10, 30), True)):
+        scalars = ScalarWriter(tmp_path, resumes)
+        for step in steps:
+            scalars.write_scalar("loss", 0.5 + resumes, step)
+    # The first part was killed after its checkpoint at step 10.
+    assert read_scalars(tmp_path) == {"loss": ([0, 10, 30], [0.5, 1.5, 1.5])}
 
 
 def test_one_of_several_processes_does_not_wait_for_a_checkpoint() -> None:

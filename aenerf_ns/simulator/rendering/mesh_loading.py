@@ -90,7 +90,7 @@ class _FilesBeside(trimesh.resolvers.FilePathResolver):
         file = file_inside(self._path.parent, name, self._path)
         content = _read(file)
         if name == self._library:
-            names = re.findall(rb"^\s*newmtl\s+(.*)", content, re.MULTILINE)
+            names = re.findall(rb"^[ \t]*newmtl[ \t]+(.*)", content, re.MULTILINE)
             self.materials |= {name.decode(errors="replace").strip() for name in names}
         elif self._library is not None:
             try:
@@ -109,8 +109,8 @@ def _build_mesh(path: Path, content: bytes, y_up: bool, gloss: Mapping[str, Glos
         _require_plain_glb(path, content)
     elif suffix == ".obj":
         text = content.decode("utf-8", errors="replace")
-        libraries = [name.strip() for name in re.findall("^mtllib(.*)", text, re.MULTILINE)]
-        used = {name.strip() for name in re.findall("^usemtl(.*)", text, re.MULTILINE)}
+        libraries = [name.strip() for name in re.findall(r"^[ \t]*mtllib(.*)", text, re.MULTILINE)]
+        used = {name.strip() for name in re.findall(r"^[ \t]*usemtl(.*)", text, re.MULTILINE)}
         if len(libraries) > 1:
             raise DataError(path, f"{len(libraries)} material files", "join them into one")
         # trimesh takes a comment behind a face for a corner.

@@ -27,7 +27,7 @@ class MipMaps(NamedTuple):
 
 
 def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
-    """Build mip maps of pictures (rows, columns, 3). Every level keeps the mean of its picture.
+    """Build mip maps of pictures (rows, columns, 3). Every level keeps the mean of its picture, to a thousandth.
 
     With ``bits16``, values are stored as 16-bit integers, clipped to [0, 1], which halves the memory.
     """
