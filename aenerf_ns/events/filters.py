@@ -54,8 +54,9 @@ class EventFilters:
     def __post_init__(self) -> None:
         if not 0 < self.pixel_share <= 1:
             raise ValueError(f"the share of pixels must be above 0 and at most 1, not {self.pixel_share}")
-        if max(abs(self.start or 0), abs(self.end or 0)) > LAST_TIME:
-            raise ValueError(f"the time window from {self.start} to {self.end} ns is longer than any recording")
+        for time in (self.start, self.end):
+            if time is not None and not FIRST_TIME <= time <= LAST_TIME:
+                raise ValueError(f"the time window ends at {time} ns, which must fit in 64 bits")
         if self.shortest_interval > LAST_TIME:
             raise ValueError(f"the shortest interval is {self.shortest_interval} ns, longer than any recording")
         if self.shortest_interval < 0:

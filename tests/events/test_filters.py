@@ -172,7 +172,7 @@ def test_a_cropped_camera_sees_the_same_directions() -> None:
     ],
 )
 def test_impossible_filters_are_refused(values: dict) -> None:
-    with pytest.raises(ValueError, match=r"must|before|longer"):
+    with pytest.raises(ValueError, match=r"must|before"):
         EventFilters(**values)
 
 

@@ -338,20 +338,20 @@ def test_refuse_frames_without_texture() -> None:
 
 def test_refuse_unusable_frames(tmp_path: Path) -> None:
     camera = CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
-    frames = np.full((2, 60, 80), 128, np.uint8)
-    for times, text in (([0], "1 frames"), ([5, 5], "frame 1 is not after")):
+    frames = np.full((3, 60, 80), 128, np.uint8)
+    for times, text in (([0, 1], "2 frames"), ([5, 5, 6], "frame 1 is not after")):
         with pytest.raises(DataError, match=text):
             estimate_poses(frames, times, camera, "video")
     with pytest.raises(DataError, match="video, frame 0: the frame has 60 x 80 pixels"):
-        estimate_poses(frames.transpose(0, 2, 1), [0, 1], camera, "video")
+        estimate_poses(frames.transpose(0, 2, 1), [0, 1, 2], camera, "video")
     Image.fromarray(frames[0].astype(np.uint16)).save(tmp_path / "deep.png")
     with pytest.raises(DataError, match=r"deep\.png: .*mode I;16"):
-        estimate_poses([tmp_path / "deep.png"] * 2, [0, 1], camera, "video")
+        estimate_poses([tmp_path / "deep.png"] * 3, [0, 1, 2], camera, "video")
     whole, cut = tmp_path / "whole.png", tmp_path / "cut.png"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (60, 80), np.uint8)).save(whole)
     cut.write_bytes(whole.read_bytes()[:-100])
     with pytest.raises(DataError, match=r"cut\.png: not a PNG or JPEG image"):
-        estimate_poses([whole, cut], [0, 1], camera, "video")
+        estimate_poses([whole, cut, whole], [0, 1, 2], camera, "video")
 
 
 @pytest.mark.parametrize("pattern", ["", "RGGB"])

