@@ -160,8 +160,8 @@ def test_a_run_is_evaluated_under_other_protocols(
     assert 0 < abs(results["psnr"] - of_run["psnr"]) < 3
     assert len(list(pictures.glob("eval_img_*.png"))) == 3
     assert (trained.read_bytes(), checkpoint.read_bytes()) == before
-    # nerfbaselines measures the written pictures. It finds our metrics, except for the rounding to 8 bits: it lowers the
-    # PSNR of so few pixels at 32 dB by 0.01 dB, +/- 0.01 dB, and by no more than 0.05 dB in 2000 random pictures.
+    # nerfbaselines measures the written pictures. It finds our metrics, except for the rounding to 8 bits. That lowers
+    # the PSNR of so few pixels at 32 dB by 0.01 dB, +/- 0.01 dB, and by at most 0.05 dB in 2000 random pictures.
     for index, view in enumerate(results["views"]):
         rendering, truth = (
             np.asarray(Image.open(predictions / "predictions" / kind / f"{index:05d}.png")) / 255
