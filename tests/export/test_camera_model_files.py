@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.export.camera_model_files import ObservedPoints, PlacedImage, write_cameras
+from aenerf_ns.open3d_import import load_open3d
 
 LENSES = {
     "pinhole": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5),
@@ -105,6 +106,8 @@ def test_framework_reads_the_model(name: str, tmp_path: Path, random_poses: torc
 
 @pytest.mark.parametrize("name", LENSES)
 def test_framework_reads_transforms_json(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
+    # The dataparser reads the points by Open3D, which needs a libusb that the system may lack.
+    load_open3d()
     images, points = write(tmp_path, LENSES[name], random_poses)
     config = NerfstudioDataParserConfig(data=tmp_path, downscale_factor=1, load_3D_points=True)
     for split in ("train", "val", "test"):
