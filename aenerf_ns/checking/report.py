@@ -136,7 +136,9 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     _check_thresholds(result, recording, changes, balance, correlation or 0.0)
     _check_poses(result, recording, window, num_covered)
     is_simple = _check_lens(result, recording.event_camera) | _check_steps(result, recording.trajectory, window)
-    runs = longest_stretches(_read_runs(recording, window, num_covered), window, _LIMITS.min_events)
+    # The events are read once more only where there can be enough.
+    runs = _read_runs(recording, window, num_covered) if num_covered >= _LIMITS.min_events else []
+    runs = longest_stretches(runs, window, _LIMITS.min_events)
     if not runs:
         result.figures.append(
             f"Contrast of warped events: not computed, because no {_LIMITS.min_events} events have poses without a gap."
