@@ -30,6 +30,8 @@ _EVENT_FILE = re.compile(r"(?P<sequence>.+)-events_(?P<side>left|right)\.h5")
 _SET_A = {"loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"}
 # Indices of the event camera and of the frame camera in the lists of the calibration.
 _INDICES = {"left": (2, 0), "right": (3, 1)}
+# Nanoseconds between poses of the motion capture that make a gap.
+_MAX_MOCAP_GAP = 50_000_000
 # The ratio C+ / C- and the refractory period (ns) are the estimates of Robust e-NeRF.
 _SENSOR = SensorModel(1.458 * 0.25, 0.25, 1375)
 
@@ -89,9 +91,9 @@ class TumVieDataParserConfig(PublishedDataParserConfig):
 
     markers = ("SEQUENCE-events_left.h5", "SEQUENCE-vi_gt_data")
     _target: type = field(default_factory=lambda: TumVieDataParser)
-    max_pose_gap_ns: int | None = 50_000_000
-    """Leave out everything between consecutive poses that are further apart than this, in nanoseconds. The motion
-    capture at 120 Hz covers only the start and the end of long sequences."""
+    max_pose_gap_ns: int | None = None
+    """Leave out everything between consecutive poses that are further apart than this, in nanoseconds. By default 50 ms
+    for the motion capture at 120 Hz, which covers only the start and the end of long sequences."""
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:
@@ -121,11 +123,12 @@ class TumVieDataParser(EventDataParser):
         return self.config.make_recording(
             reference,
             capture,
+            max_pose_gap=_MAX_MOCAP_GAP if self.config.trajectory is None else None,
             reference_views=views_on_trajectory(
                 images,
                 reference,
                 torch.linalg.inv(imu_from_event) @ imu_from_frame,
-                max_pose_gap=self.config.max_pose_gap_ns,
+                max_pose_gap=self.config.max_pose_gap_ns or _MAX_MOCAP_GAP,
             ),
         )
 

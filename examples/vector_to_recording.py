@@ -41,5 +41,4 @@ fx, _, cx, _, fy, cy, *_ = lens["camera_matrix"]["data"]
 distortion = dict(zip(("k1", "k2", "p1", "p2", "k3"), lens["distortion_coefficients"]["data"], strict=True))
 # The principal point counts from the first pixel's center there, and from its edge here.
 camera = {"width": 640, "height": 480, "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, **distortion}
-thresholds = {"positive_contrast_threshold": 0.25, "negative_contrast_threshold": 0.25}
-(folder / "calibration.json").write_text(json.dumps({"event_camera": {**camera, **thresholds}}))
+(folder / "calibration.json").write_text(json.dumps({"event_camera": camera}))

@@ -39,15 +39,7 @@ def perturb(
 
     Returns:
         The trajectory whose pose at each knot is the true one composed with the error, in the camera's frame.
-
-    Raises:
-        ValueError: a size is negative or the correlation time is not positive.
     """
-    if rotation_degrees < 0 or translation < 0 or not correlation_time > 0:
-        raise ValueError(
-            f"pose noise of {rotation_degrees} degrees, {translation} units and {correlation_time} s: "
-            "sizes must not be negative and the correlation time must be positive"
-        )
     generator = torch.Generator().manual_seed(seed)
     seconds = trajectory.seconds(trajectory.times)
     if kind == "smooth":

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 # Below this squared angle the series are exact to the last bit of float64. Above it the closed forms lose a few bits at
@@ -149,35 +150,10 @@ def cross_matrix(vector: Tensor) -> Tensor:
 
 
 def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Return the (..., 3, 3) rotation matrices of unit quaternions (..., 4) in the order x, y, z, w."""
-    x, y, z, w = quaternion.unbind(-1)
-    return torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-        ],
-        -1,
-    ).unflatten(-1, (3, 3))  # fmt: skip
+    """Return the (N, 3, 3) rotation matrices of quaternions (N, 4) in the order x, y, z, w. It has no gradient."""
+    return torch.from_numpy(Rotation.from_quat(quaternion.cpu().numpy()).as_matrix()).to(quaternion)
 
 
 def quaternion_from_rotation(rotation: Tensor) -> Tensor:
-    """Return the unit quaternions (..., 4), x, y, z, w with w >= 0, of rotation matrices (..., 3, 3).
-
-    All four classical formulas are evaluated, and the best-conditioned one is used (Shepperd 1978).
-    """
-    m = rotation.flatten(-2).unbind(-1)
-    xx, yy, zz = m[0], m[4], m[8]
-    candidates = torch.stack(
-        [
-            torch.stack([1 + xx - yy - zz, m[1] + m[3], m[2] + m[6], m[7] - m[5]], -1),
-            torch.stack([m[1] + m[3], 1 - xx + yy - zz, m[5] + m[7], m[2] - m[6]], -1),
-            torch.stack([m[2] + m[6], m[5] + m[7], 1 - xx - yy + zz, m[3] - m[1]], -1),
-            torch.stack([m[7] - m[5], m[2] - m[6], m[3] - m[1], 1 + xx + yy + zz], -1),
-        ],
-        -2,
-    )
-    best = candidates.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    quaternion = torch.take_along_dim(candidates, best[..., None, None], -2).squeeze(-2)
-    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
-    return torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+    """Return the unit quaternions (N, 4), x, y, z, w with w >= 0, of rotation matrices (N, 3, 3). No gradient."""
+    return torch.from_numpy(Rotation.from_matrix(rotation.cpu().numpy()).as_quat(canonical=True)).to(rotation)

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from aenerf_ns.camera.pose_spline import pose_polynomials, rotation_from_products
+from aenerf_ns.camera.pose_spline import MAX_SEGMENT_RATIO, pose_polynomials, rotation_from_products
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 
@@ -239,13 +239,22 @@ class Trajectory(nn.Module):
         """Return the times in nanoseconds of the knots from ``start`` to ``end``, both included."""
         return self.times[(self.times >= start) & (self.times <= end)]
 
+    def knots_known_to(self, reference: Trajectory) -> Tensor:
+        """Return the times in nanoseconds of the knots at which a reference trajectory is known: not in its gaps.
+
+        A gap is a segment more than 5.5 times as long as the median one.
+        """
+        longest = MAX_SEGMENT_RATIO * reference.times.diff().double().median()
+        known = reference.known_time(int(longest)).contains(self.times.cpu().numpy())
+        return self.times[torch.from_numpy(known)]
+
     def knots_covered_by(self, reference: Trajectory) -> Tensor:
-        """Return the times in nanoseconds of the knots within the span of a reference trajectory.
+        """Return :meth:`knots_known_to` a reference trajectory.
 
         Raises:
             DataError: there are fewer than two such knots.
         """
-        times = self.knots_between(reference.start, reference.end)
+        times = self.knots_known_to(reference)
         if len(times) < 2:
             raise DataError(
                 reference.source,

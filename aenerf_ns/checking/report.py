@@ -263,7 +263,9 @@ def _check_thresholds(
         if recording.has_assumed_thresholds:
             result.sensor_options = {"positive-contrast-threshold": value}
         else:
-            figure += f". If the given ones were a guess, train with --positive-contrast-threshold {value}"
+            figure += (
+                f". If the given ones were a guess, add --positive-contrast-threshold {value} after the format's name"
+            )
     result.figures.append(figure)
 
 

@@ -317,7 +317,7 @@ def _with_poses(
     box = _scene_box(found.scene_box)
     if isinstance(capture, Recording):
         truth = capture.reference_trajectory
-        knots = trajectory.knots_between(truth.start, truth.end)
+        knots = trajectory.knots_known_to(truth)
         if len(knots) > 1:
             covered = Trajectory(knots, trajectory.interpolate(knots))
             aligned, errors = compare_with_truth(covered, truth.interpolate(knots))

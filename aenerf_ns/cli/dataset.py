@@ -150,7 +150,8 @@ def training_command(
     words = ["ns-train", method]
     for name, value in (options or {}).items():
         words += [f"--{name}", str(value)]
-    return shlex.join([*words, *format_words, "--data", str(data)])
+    # After the format's words the framework would not name the run by its data.
+    return shlex.join([*words, "--data", str(data), *format_words])
 
 
 def say_scene_box(box: NDArray[np.float64] | None) -> None:

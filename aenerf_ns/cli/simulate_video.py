@@ -218,10 +218,12 @@ class SimulateVideo(SimulationCommand):
                     writer.add_image(frame, time)
 
             num_events = self._write_events(writer, video, simulator, add_image)
-        missing = "trajectory.txt" if camera is not None else "calibration.json and trajectory.txt"
+        missing = (
+            "" if camera else 'calibration.json (with "image_encoding": "srgb" and the thresholds of this command) and '
+        )
         return (
             f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(kept)} images, no poses.\n"
-            f"To train on them, add {missing} (docs/your_data.md)."
+            f"To train on them, add {missing}trajectory.txt (docs/your_data.md)."
         )
 
     def _write_events(

@@ -56,6 +56,7 @@ def open_run(
     require_known_names(config)
     from nerfstudio.utils.eval_utils import eval_setup
 
+    from aenerf_ns.training.checkpoints import step_of
     from aenerf_ns.training.pipeline import AENeRFPipeline
 
     try:
@@ -76,6 +77,8 @@ def open_run(
             raise DataError(
                 checkpoint, f"its {name} is not finite", "move it away if there is an earlier one, or train again"
             )
+    # A run that was stopped, or that goes on, has made other steps than it planned.
+    opened.max_num_iterations = step_of(checkpoint) + 1
     return opened, pipeline.trained_run(), checkpoint
 
 

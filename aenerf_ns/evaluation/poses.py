@@ -28,12 +28,14 @@ def camera_speeds(correction: PoseCorrection, scene: SceneRecording, seconds: Te
     """Compute how fast the corrected camera moves and turns at (N,) float64 seconds since the trajectory's start.
 
     Returns:
-        (N,) units of the recording per second, and (N,) degrees per second.
+        (N,) units of the recording's true poses, or where they are not known of its poses, per second, and (N,) degrees
+        per second.
     """
     pose, rate = correction.pose_and_rate(seconds.to(correction.trajectory.times.device))
     # The derivative of a rotation R is R [ω]ₓ, whose norm is √2 |ω|.
     turning = (pose[..., :3].mT @ rate[..., :3]).flatten(1).norm(dim=-1) / math.sqrt(2)
-    return rate[..., 3].norm(dim=-1).cpu() / scene.scale, torch.rad2deg(turning).cpu()
+    speed = correction.alignment().scale * rate[..., 3].norm(dim=-1) / scene.scale
+    return speed.cpu(), torch.rad2deg(turning).cpu()
 
 
 def describe_test_poses(correction: PoseCorrection) -> str:

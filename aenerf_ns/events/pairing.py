@@ -32,7 +32,6 @@ from aenerf_ns.events.pair_store import (
 from aenerf_ns.events.stream import EventStream
 
 _MAX_MERGED = 255
-_MAX_PIXELS = 1 << 23
 
 # A pair spans an event only where the intervals on both sides of it are so many refractory periods long. At a steady
 # rate, at most a third of a contrast threshold then goes unseen. Shorter pairs would cost more (benchmarks/LOG.md).
@@ -136,8 +135,6 @@ class _Table:
         self, usable: NDArray[np.bool_], refractory_period: int, expected_events: int, source: str | Path
     ) -> None:
         height, width = usable.shape
-        if usable.size > _MAX_PIXELS:
-            raise DataError(source, f"its sensor has {width} x {height} pixels", f"use at most {_MAX_PIXELS} of them")
         self._usable = usable.ravel()
         self._shape = (width, height)
         self._refractory_period = refractory_period

@@ -29,8 +29,8 @@ _MIN_VIEWS = 1.0
 def extract_mesh(run: TrainedRun, num_views: int, resolution: int) -> trimesh.Trimesh:
     """Fuse the depths of views along the corrected trajectory in a truncated signed distance field, and mesh it.
 
-    The framework's own exporter takes the cameras as the dataset gives them, while its renderings are from the
-    corrected poses. Its field also forgets: a voxel holds the mean of its last two views or so, and the mesh is rough.
+    The field of the framework's own exporter forgets: a voxel holds the mean of its last two views or so, and the mesh
+    is rough.
 
     Args:
         run: in evaluation mode.

@@ -311,7 +311,10 @@ class AENeRFModel(Model):
         losses = self.supervision.losses(outputs, batch)
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
-            losses["interlevel_loss"] = interlevel_loss(weights, samples) / self.supervision.loss_unit(outputs) ** 2
+            with torch.no_grad():
+                # The proposals' loss must not drive thresholds that are learned.
+                unit = self.supervision.loss_unit(outputs)
+            losses["interlevel_loss"] = interlevel_loss(weights, samples) / unit**2
             losses["distortion_loss"] = distortion_loss(weights[-1], samples[-1])
             self.camera_optimizer.get_loss_dict(losses)
         return scale_dict(losses, vars(self.config.loss_coefficients))
@@ -395,6 +398,8 @@ def _require_possible(config: AENeRFModelConfig, duration: float) -> None:
         )
     if config.eval_num_rays_per_chunk < 1:
         raise DataError("model", f"eval_num_rays_per_chunk {config.eval_num_rays_per_chunk}", "give one or more rays")
+    if config.color_correction_num_rays < 1:
+        raise DataError("model", f"color_correction_num_rays {config.color_correction_num_rays}", "give thousands")
     rounds, networks = len(config.proposal.num_samples_per_ray), len(config.proposal.max_resolutions)
     if rounds == 0 or (config.backbone == "hash" and rounds != networks):
         raise DataError(

@@ -104,6 +104,7 @@ class PoseCorrection(CameraOptimizer):
         # The framework's corrections, one for each camera, are off.
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
+        self._has_penalty = bool(config.trans_l2_penalty or config.rot_l2_penalty)
         self.trajectory = trajectory
         self.register_buffer("_camera_seconds", trajectory.seconds(camera_times), persistent=False)
         times = _compared_times(trajectory, ground_truth)
@@ -171,12 +172,9 @@ class PoseCorrection(CameraOptimizer):
 
     def pose_and_rate(self, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """Return the poses of :meth:`pose` and their derivatives with respect to time, per second."""
-        shifted = self.on_clock_of_poses(seconds)
-        base, base_rate = self.trajectory.pose_and_rate(shifted)
+        base, base_rate = self.trajectory.pose_and_rate(self.on_clock_of_poses(seconds))
         if self.clock_change is not None:
-            # Beyond its ends the trajectory stands still.
-            moves = shifted == seconds + self.clock_offset()
-            base_rate = torch.where(moves[:, None, None], base_rate, 0.0)
+            base_rate = torch.where(self._moves(seconds), base_rate, 0.0)
         pose, rate = base, base_rate
         if self.twists is not None:
             twist, twist_rate = self.twists.with_rate(seconds, base, base_rate)
@@ -195,6 +193,10 @@ class PoseCorrection(CameraOptimizer):
             return seconds
         offset = self.config.clock_offset if at_first else self.clock_offset()
         return (seconds + offset).clamp(0, self.trajectory.duration)
+
+    def _moves(self, seconds: Tensor) -> Tensor:
+        """Return which (N, 1, 1) cameras move with the clock: beyond its ends the trajectory stands still."""
+        return (self.on_clock_of_poses(seconds) == seconds + self.clock_offset())[:, None, None]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         # The learned change counts from the start value. Checkpoints of earlier versions hold no start value.
@@ -272,6 +274,7 @@ class PoseCorrection(CameraOptimizer):
         translation, rotation = (base[:, None, :, :3] @ twists.unflatten(-1, (2, 3, 1)))[..., 0].unbind(1)
         if self.clock_change is not None:
             _, rate = self.trajectory.pose_and_rate(self.on_clock_of_poses(seconds, at_first=True))
+            rate = torch.where(self._moves(seconds), rate, 0.0)
             # The derivative of a rotation R is [ω]ₓ R.
             turning = rate[..., :3] @ base[..., :3].mT
             omega = torch.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], -1)
@@ -310,7 +313,7 @@ class PoseCorrection(CameraOptimizer):
 
     def get_loss_dict(self, loss_dict: dict[str, Tensor]) -> None:
         """Add the mean squared size of the corrections over the recording, so that good poses stay as they are."""
-        if self.twists is None:
+        if self.twists is None or not self._has_penalty:
             return
         penalty = (self._penalties * self._sampled_twists().square().mean(0)).sum()
         loss_dict["pose_correction_penalty"] = penalty.float()

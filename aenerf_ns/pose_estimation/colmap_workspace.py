@@ -61,19 +61,14 @@ class HeldOutMatches:
 
         A match fits if its epipolar error (Sampson's distance) is less than a pixel.
         """
-        poses = {image.image_id: image.cam_from_world().matrix() for image in _placed(model)}
+        poses = {image.image_id: image.cam_from_world() for image in _placed(model)}
         fitting = total = 0
         for (first, second), rays in self.pairs:
             total += len(rays[0])
             if first not in poses or second not in poses:
                 continue
-            rotation = poses[second][:, :3] @ poses[first][:, :3].T
-            translation = poses[second][:, 3] - rotation @ poses[first][:, 3]
-            essential = np.cross(translation, rotation.T).T
-            x, y = (np.pad(points, ((0, 0), (0, 1)), constant_values=1.0) for points in rays)
-            lines_in_second, lines_in_first = x @ essential.T, y @ essential
-            slopes = np.square(lines_in_second[:, :2]).sum(1) + np.square(lines_in_first[:, :2]).sum(1)
-            errors = np.abs((y * lines_in_second).sum(1)) / np.sqrt(slopes + 1e-30)
+            essential = pycolmap.essential_matrix_from_pose(poses[second] * poses[first].inverse())
+            errors = np.sqrt(pycolmap.compute_squared_sampson_error(*rays, essential))
             fitting += int((errors * self.focal_length < _MAX_EPIPOLAR_ERROR).sum())
         return fitting / total if total else None
 

@@ -33,7 +33,8 @@ class PairResiduals:
         histogram: number of pairs by bin of the rendered change, then of the measured change.
         correlation: of rendered and measured changes.
         mean_residual: mean absolute difference.
-        by_length: ``mean_residual`` and ``num_pairs`` of classes of pairs by their number of ``events``.
+        by_length: ``mean_residual`` and ``num_pairs`` of classes of pairs by their number of ``events``,
+            with those that a blind pixel missed.
         by_tile: rows of the mean absolute differences in tiles of the sensor, None where there are too few pairs.
     """
 

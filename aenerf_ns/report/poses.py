@@ -10,7 +10,6 @@ from torch import Tensor
 
 from aenerf_ns.camera.alignment import align, rotation_angle
 from aenerf_ns.camera.trajectory import homogeneous
-from aenerf_ns.evaluation.poses import camera_speeds
 from aenerf_ns.evaluation.run import TrainedRun
 
 # Poses that are drawn. More are not seen, and make the page large.
@@ -27,8 +26,6 @@ class RunPoses:
         positions: (N, 3) of the ``estimated``, the ``corrected`` and, where they are known, the ``true`` poses in
             units of the recording, with z up as far as the cameras tell. Aligned to the true trajectory where it is
             known.
-        speed: (N,) units of the recording per second.
-        turn_rate_degrees: (N,) per second.
         evo: :func:`evo_errors` of the ``estimated`` and the ``corrected`` poses,
             over all of them. None without true poses.
         errors: :func:`errors_over_time` of both. None without true poses.
@@ -39,8 +36,6 @@ class RunPoses:
     num_poses: int
     seconds: list[float]
     positions: dict[str, list[list[float]]]
-    speed: list[float]
-    turn_rate_degrees: list[float]
     evo: dict[str, dict[str, dict[str, float]]] | None
     errors: dict[str, dict[str, list[float]]] | None
     correction: dict[str, list[float]] | None
@@ -64,7 +59,6 @@ def measure_poses(run: TrainedRun) -> RunPoses:
         positions["true"] = reference
     every = -(-len(times) // _MAX_DRAWN)
     drawn = seconds[::every].contiguous()
-    speeds, turn_rates = camera_speeds(psi, scene, drawn)
     in_recording = {name: scene.to_recording(part) for name, part in poses.items()}
     evo = errors = correction = None
     if true is not None:
@@ -80,8 +74,6 @@ def measure_poses(run: TrainedRun) -> RunPoses:
         num_poses=len(times),
         seconds=drawn.tolist(),
         positions={name: (part[::every, :, 3] / scene.scale).tolist() for name, part in positions.items()},
-        speed=speeds.tolist(),
-        turn_rate_degrees=turn_rates.tolist(),
         evo=evo,
         errors=errors,
         correction=correction,

@@ -9,7 +9,7 @@ from typing import Literal
 
 import msgspec
 
-from aenerf_ns.errors import DataError, reading, require_file
+from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.json_file import read_json
 from aenerf_ns.files.limits import require_at_most
 from aenerf_ns.training.run_record import RUN_FILE, SCALARS_FILE
@@ -74,7 +74,6 @@ def read_scalars(folder: Path) -> dict[str, tuple[list[int], list[float]]] | Non
     path = folder / SCALARS_FILE
     if not path.exists():
         return None
-    require_file(path)
     curves: dict[str, tuple[list[int], list[float]]] = defaultdict(lambda: ([], []))
     with reading(path):
         require_at_most(path, _MAX_BYTES)

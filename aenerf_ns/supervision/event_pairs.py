@@ -178,8 +178,11 @@ class PairSupervision(ChangeSupervision):
         rendered, change = self.changes(outputs, batch)
         silent = silent_change(rendered, change, *self.thresholds(outputs))
         target = torch.where(batch.ends_between_events, silent, change)
-        unit = self.loss_unit(outputs)
-        losses = {"reconstruction_loss": reconstruction_loss(rendered, target, unit, batch.weight)}
+        unit, weight = self.loss_unit(outputs), batch.weight
+        if isinstance(unit, Tensor):
+            # Silent pairs tell nothing of a learned threshold, but it would rise because their loss is divided by it.
+            weight = torch.where(batch.ends_between_events, weight * (unit / unit.detach()).square(), weight)
+        losses = {"reconstruction_loss": reconstruction_loss(rendered, target, unit, weight)}
         if self.training and "log_radiance_rate" in outputs:
             rate = outputs["log_radiance_rate"].gather(1, batch.channel[:, None])[:, 0]
             interval = batch.last_interval + outputs.get("interval_change", 0.0)

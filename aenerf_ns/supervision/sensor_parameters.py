@@ -70,8 +70,7 @@ class SensorParameters(nn.Module):
             shortest_interval: nanoseconds between two consecutive events of a pixel. It is longer than the sensor's
                 refractory period.
         """
-        if self.raw_refractory_period is None:
-            return
+        assert self.raw_refractory_period is not None
         self._longest_refractory_period.fill_(shortest_interval * 1e-9)
         part = self._sensor.refractory_period / shortest_interval
         self.raw_refractory_period.data.fill_(math.log(part / (1 - part)) if part > 0 else 0.0)

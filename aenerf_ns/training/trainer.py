@@ -110,8 +110,11 @@ class AENeRFTrainer(Trainer):
     checkpoint_dir: Path
 
     def __init__(self, config: AENeRFTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        changes: dict[str, Any] = {"schedule_length": config.schedule_length or config.max_num_iterations}
+        length = config.max_num_iterations if config.schedule_length is None else config.schedule_length
+        changes: dict[str, Any] = {"schedule_length": length}
         with errors_as_one_line():
+            if length < 1:
+                raise DataError("ns-train", f"the schedules' length is {length} steps", "give one or more")
             if config.load_dir is not None:
                 # As one path: commands that open this run would look for a load_step among its own checkpoints.
                 checkpoint = checkpoint_to_load(config.load_dir, config.load_step)

@@ -160,7 +160,7 @@ class Plan:
     """Scenes x speeds x methods x seeds."""
 
     scale: Scale = "full"
-    """full: 346 x 260 pixels with aenerf. tiny, for a CPU: 96 x 72 pixels with aenerf-small."""
+    """full: 346 x 260 pixels with aenerf. medium: the same with aenerf-small. tiny, for a CPU: 96 x 72 pixels."""
     scenes: tuple[str, ...] = ("room", "object")
     """Scenes as aenerf simulate takes them: built-in ones and files."""
     speeds: tuple[Literal["easy", "hard"], ...] = ("easy", "hard")

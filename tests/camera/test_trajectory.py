@@ -299,5 +299,3 @@ def test_gauss_markov_noise_keeps_the_same_share_from_pose_to_pose(random_poses:
 def test_no_pose_noise_changes_nothing(random_poses: torch.Tensor) -> None:
     truth = Trajectory(10**9 * np.arange(8), random_poses)
     assert torch.equal(perturb(truth, 0, 0, 0.25, 0).camera_to_worlds, truth.camera_to_worlds)
-    with pytest.raises(ValueError, match="must not be negative"):
-        perturb(truth, -1, 0, 0.25, 0)

@@ -234,8 +234,8 @@ def test_a_check_takes_options_that_place_the_scene(folder: Path) -> None:
 def test_training_command_is_quoted() -> None:
     planes = {"pipeline.model.near-plane": "0.3", "pipeline.model.far-plane": "20"}
     assert training_command(Path("my data"), options=planes, format_words=["ecd-data", "--width", "346"]) == (
-        "ns-train aenerf --pipeline.model.near-plane 0.3 --pipeline.model.far-plane 20 ecd-data --width 346 "
-        "--data 'my data'"
+        "ns-train aenerf --pipeline.model.near-plane 0.3 --pipeline.model.far-plane 20 --data 'my data' "
+        "ecd-data --width 346"
     )
     assert training_command(Path("data"), "e2vid-nerf") == "ns-train e2vid-nerf --data data"
 

@@ -174,7 +174,7 @@ def test_video_without_poses_becomes_a_recording(frames: Path, camchain: Path, t
     np.testing.assert_array_equal(times_of(recording), np.concatenate([interval.events.t for interval in intervals]))
     printed = simulate(tmp_path / "no_lens", video=frames, validation_views=0, test_views=0, train_images=4)
     assert "4 images, no poses" in printed
-    assert "add calibration.json and trajectory.txt" in printed
+    assert "add calibration.json (with " in printed
     written = ["events.h5", "images", "images.txt", "thresholds_ground_truth.npz"]
     assert sorted(path.name for path in (tmp_path / "no_lens").iterdir()) == written
 

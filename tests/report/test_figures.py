@@ -118,7 +118,7 @@ def test_errors_match_evo(random_poses: torch.Tensor, tmp_path: Path) -> None:
 
 def report_of(name: str, psnr: list[float]) -> RunReport:
     views = [{"file": f"{index}.png", "placed": {"psnr": value}} for index, value in enumerate(psnr)]
-    poses = RunPoses(0, [], {}, [], [], None, None, None)
+    poses = RunPoses(0, [], {}, None, None, None)
     return RunReport(name, Path(name), {}, None, None, [], poses, evaluation={"views": views})
 
 
