@@ -87,11 +87,13 @@ class IntegratedEncoding(NeRFEncoding):
         # Checkpoints of fields with a plain encoding fit otherwise, and would show other pictures.
         self.register_buffer("is_integrated", torch.tensor(True))
 
-    def pytorch_fwd(self, in_tensor: Tensor, covs: Tensor) -> Tensor:
+    def pytorch_fwd(self, in_tensor: Tensor, covs: Tensor | None = None) -> Tensor:
         """Return features (N, 6 num_frequencies) of positions (N, 3), for Gaussians with variances (N, 3) by axis."""
         frequencies = 2 * math.pi * 2.0 ** torch.arange(self.num_frequencies, device=in_tensor.device)
         phases = (in_tensor[..., None] * frequencies).flatten(-2)
         values = torch.sin(torch.cat([phases, phases + math.pi / 2], -1))
+        if covs is None:
+            return values
         # Smaller exponents give denormal numbers, which slow a CPU down.
         exponents = (-0.5 * covs[..., None] * frequencies.square()).clamp_min(-40).flatten(-2)
         return values * exponents.exp().repeat(1, 2)

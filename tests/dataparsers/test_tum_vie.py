@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers.published_datasets import (
     EPOCH,
     assert_same_poses,
@@ -21,10 +22,12 @@ from helpers.published_datasets import (
 from helpers.small_datasets import parse
 from helpers.unpacked_pairs import unpacked
 
+from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
 
@@ -90,6 +93,11 @@ def test_gap_of_poses_is_left_out_after_conversion_too(
     stamps.write_text(f"{EPOCH + 100_000}\n{EPOCH + 900_000}\n{EPOCH + 1_900_000}\n")
     views = recording_of(config).reference_views["train"]
     assert [view.file.name for view in views] == ["00000.jpg", "00002.jpg"]
+    # Poses that are given in place of the motion capture have gaps of their own.
+    write_tum_trajectory(tmp_path / "slow.txt", Trajectory(truth.times[::30], torch.from_numpy(truth.poses[::30])))
+    given = replace(config, trajectory=tmp_path / "slow.txt")
+    assert parse(given).metadata[SCENE_KEY].window.gaps == ()
+    assert recording_of(given).ground_truth is not None
     # Another limit may be given.
     assert parse(replace(config, max_pose_gap_ns=2 * 10**9)).metadata[SCENE_KEY].window.gaps == ()
 

@@ -267,6 +267,7 @@ def test_pictures_are_also_rendered_without_color_correction() -> None:
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=-20.0)}, "clock_offset -20; give seconds, fewer than"),
         ({"camera_optimizer": PoseCorrectionConfig(clock_offset=math.nan)}, "clock_offset nan; give seconds"),
         ({"average_init_density": 0.0}, "average_init_density 0; give a number above 0"),
+        ({"color_correction_num_rays": 0}, "color_correction_num_rays 0; give thousands"),
         ({"unbounded_init_density": 1000.0}, "unbounded_init_density 1000; .* below 700"),
     ],
 )

@@ -114,6 +114,15 @@ def test_many_poses_are_those_of_few() -> None:
     torch.testing.assert_close(correction.pose(seconds)[3000:3100], correction.pose(seconds[3000:3100]))
 
 
+def test_the_field_stands_where_the_camera_stands_still() -> None:
+    correction = _correction(mode="off", clock_offset=0.1)
+    correction.clock_change.data.fill_(0.01)
+    seconds = torch.tensor([1.0, 1.95, 2.0], dtype=torch.float64)
+    twists = correction.world_twists(seconds, correction.trajectory.pose(seconds + 0.1 * (seconds < 1.5)))
+    assert twists[0].abs().max() > 1e-4
+    assert not twists[1:].any()
+
+
 def test_the_clock_offset_is_bounded() -> None:
     correction = _correction(clock_offset=0.01)
     for raw, expected in ((1e6, 0.06), (-1e6, -0.04)):

@@ -81,6 +81,18 @@ def test_their_gradients_are_those_of_finite_differences() -> None:
         assert abs(gradient.item()) > 1e-6, name
 
 
+def test_proposals_and_silent_pixels_tell_nothing_of_thresholds() -> None:
+    model = make_learning_model().train()
+    ratio = model.supervision.sensor_parameters.raw_ratio
+    batch = replace(make_batch(5), ends_between_events=torch.ones(5, dtype=torch.bool))
+    losses = model.get_loss_dict(model(make_rays(15, with_times=True)), batch)
+    for name in ("interlevel_loss", "reconstruction_loss"):
+        (gradient,) = torch.autograd.grad(losses[name], ratio, retain_graph=True, allow_unused=True)
+        assert losses[name] > 0
+        # All but rounding.
+        assert gradient is None or abs(gradient) < 1e-5 * losses[name]
+
+
 def test_the_starts_of_the_intervals_move_and_what_lies_within_keeps_its_place() -> None:
     model = make_learning_model().train()
     rays = make_rays(15, with_times=True)

@@ -8,6 +8,7 @@ import math
 from dataclasses import replace
 from operator import sub
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -233,6 +234,12 @@ def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tenso
     half = truth.crop(0, 3 * SECOND)
     estimated, corrected, reference = make_correction(truth, half).compared_poses()
     assert len(estimated) == len(corrected) == len(reference) == len(half)
+    # Between true poses that are far apart nothing is known.
+    times = torch.arange(40) * (SECOND // 10)
+    estimate = Trajectory(times, motion_from_twist(torch.sin(torch.outer(times / SECOND, torch.arange(1.0, 7.0)))))
+    known = (times <= SECOND) | (times >= 3 * SECOND)
+    gappy = Trajectory(times[known], estimate.camera_to_worlds[known])
+    assert torch.equal(estimate.knots_covered_by(gappy), times[known])
     torch.testing.assert_close(estimated, reference, rtol=0, atol=1e-12)
 
 
@@ -327,6 +334,19 @@ def test_views_on_the_trajectory_have_their_times_and_the_camera_s_speed(
     run = pipeline.trained_run()
     _, turn_rates = camera_speeds(run.model.camera_optimizer, run.scene, torch.tensor([0.5], dtype=torch.float64))
     assert float(turn_rates) == pytest.approx(math.degrees(1), rel=1e-4)
+
+
+def test_speeds_are_in_the_units_of_the_true_poses(random_poses: torch.Tensor) -> None:
+    truth = make_truth(random_poses)
+    tenfold = truth.camera_to_worlds.clone()
+    tenfold[:, :, 3] *= 10
+    scene = SimpleNamespace(scale=1.0)
+    middle = torch.tensor([truth.duration / 2], dtype=torch.float64)
+    speeds = [
+        camera_speeds(make_correction(estimated, truth), scene, middle)[0]
+        for estimated in (truth, Trajectory(truth.times, tenfold))
+    ]
+    torch.testing.assert_close(speeds[0], speeds[1])
 
 
 def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor) -> None:
