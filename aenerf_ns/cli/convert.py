@@ -187,6 +187,7 @@ class Convert(DatasetCommand):
         """Estimate poses with COLMAP, and return the recording with them, COLMAP's report and its picture."""
         from aenerf_ns.pose_estimation.from_events import estimate_poses_from_events
         from aenerf_ns.pose_estimation.from_frames import estimate_poses
+        from aenerf_ns.recording.views import require_seconds
 
         has_own_frames = capture.frame_camera == capture.event_camera
         if self.poses == "events":
@@ -201,6 +202,15 @@ class Convert(DatasetCommand):
             )
         kept = [(time, file) for time, file in images if window.contains(time)]
         times, files = [time for time, _ in kept], [file for _, file in kept]
+        first, last = span = capture.event_file.ordered_time_span()
+        # Before COLMAP's work, which may take hours.
+        if len(times) > 2 and sum(first <= time <= last for time in times) <= len(times) // 10:
+            require_seconds(times, self.data, "events", span)
+            raise DataError(
+                self.data,
+                f"of {len(times)} frames hardly any was taken during the events, from {first} to {last} ns",
+                "give the times of the frames in seconds on the clock of the events",
+            )
         lens = capture.event_camera
         camera = (lens.width, lens.height) if capture.intrinsics_origin == "guessed" else lens
         return _with_poses(

@@ -116,7 +116,7 @@ def views_on_trajectory(
     known = trajectory.known_time(max_pose_gap)
     kept = [(time, file) for time, file in images if known.contains(time)]
     if len(kept) <= max(1, len(images) // 10):
-        _require_seconds(times, images[0][1].parent if images else Path(), trajectory)
+        require_seconds(times, images[0][1].parent if images else Path(), "poses", (trajectory.start, trajectory.end))
     if len(kept) < len(images):
         CONSOLE.print(
             f"{len(images) - len(kept)} of {len(images)} images are left out: they were taken outside the poses."
@@ -134,9 +134,9 @@ def require_distinct_times(times: Sequence[int], source: Path) -> None:
         raise DataError(source, problem, "give each image its own time, with all digits")
 
 
-def _require_seconds(times: list[int], source: Path, trajectory: Trajectory) -> None:
-    """Raise a DataError if images were taken on a trajectory only if their times have another unit than seconds."""
-    power = unit_steps((min(times), max(times)), (trajectory.start, trajectory.end)) if len(times) > 1 else None
+def require_seconds(times: list[int], source: Path, name: str, span: tuple[int, int]) -> None:
+    """Raise a DataError if images fit a span of time, of the poses or events, only if their times are not seconds."""
+    power = unit_steps((min(times), max(times)), span) if len(times) > 1 else None
     if power is not None:
         seconds = (max(times) - min(times)) * 1e-9
         unit, remedy = f"{1000 ** max(power, 0):,} times too small", "correct their unit"
@@ -144,8 +144,8 @@ def _require_seconds(times: list[int], source: Path, trajectory: Trajectory) -> 
             unit, remedy = f"in {list(UNIT_NAMES.values())[power - 1]}", "write the times of the images in seconds"
         raise DataError(
             source,
-            f"the poses last {trajectory.duration:g} s and the images {seconds:g} s, as if the times of the images "
-            f"were {unit}",
+            f"the {name} last {(span[1] - span[0]) * 1e-9:g} s and the images {seconds:g} s, as if the times of the "
+            f"images were {unit}",
             remedy,
         )
 

@@ -247,6 +247,26 @@ def test_broken_images_are_refused_before_poses_are_found(
         convert(data, tmp_path / "converted", poses=poses)
 
 
+@pytest.mark.parametrize(
+    ("factor", "shift", "message"),
+    [
+        (1000, 0, "as if the times of the images were in ms"),
+        (1, 1000, "of 4 frames hardly any was taken during the ev"),
+    ],
+)
+def test_frames_on_another_clock_are_refused_before_poses_are_found(
+    factor: int, shift: int, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aenerf_ns.pose_estimation.from_frames.estimate_poses", lambda *_: pytest.fail("it searched"))
+    data = write_ecd(tmp_path / "made")
+    (data / "groundtruth.txt").unlink()
+    rows = [row.split() for row in (data / "images.txt").read_text().splitlines()]
+    moved = [f"{factor * float(time) + shift:.9f} {name}" for time, name in rows]
+    (data / "images.txt").write_text("\n".join(moved))
+    with pytest.raises(DataError, match=message):
+        convert(data, tmp_path / "converted", poses="colmap", format="ecd-data")
+
+
 def test_the_report_on_poses_stays_with_them(tmp_path: Path) -> None:
     data = write_native(tmp_path / "made")
     (data / "poses_report.json").write_text('{"summary": "Found by hand."}')
