@@ -60,7 +60,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def trained(workspace: Path) -> Path:
     """config.yml of a run on a tiny simulated room, whose events are gone since."""
     data = workspace / "room"
-    Simulate(output=data, width=48, height=36, train_images=4, validation_views=4, test_views=3).main()
+    noise = {"pose_noise_degrees": 1.5, "pose_noise_translation": 0.04}
+    Simulate(output=data, width=48, height=36, train_images=4, validation_views=4, test_views=3, **noise).main()
     run(
         "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", str(STEPS),
         "--steps-per-save", "200", "--data", data,
@@ -117,8 +118,9 @@ def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, un
     assert results["num_views"] == 3
     assert results["lpips"] is None
     assert results["lpips_absent"]
-    # The given poses are the true ones.
-    assert results["pose_errors"]["estimated"]["rotation_error_degrees"] < 1e-5
+    given, corrected = (results["pose_errors"][name]["rotation_error_degrees"] for name in ("estimated", "corrected"))
+    assert given > 1
+    assert corrected < 0.85 * given
     assert results["test_poses"] == "Sim(3) of the corrected to the true trajectory"
     refined = results["refined_test_poses"]
     assert refined.keys() == {"psnr", "psnr_std", "ssim", "ssim_std", "lpips", "test_poses"}
@@ -174,29 +176,27 @@ def test_a_run_is_evaluated_under_other_protocols(
 
 
 def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspace: Path) -> None:
-    given = read_tum_trajectory(workspace / "room" / "trajectory_estimated.txt")
-    for poses, rate, times in (
-        ("estimated", None, given.times),
-        ("corrected", None, given.times),
-        ("ground-truth", 100.0, torch.arange(0, given.end + 1, 10_000_000)),
+    given, truth = (
+        read_tum_trajectory(workspace / "room" / f"trajectory_{n}.txt") for n in ("estimated", "ground_truth")
+    )
+    for poses, rate, times, expected in (
+        ("estimated", None, given.times, given),
+        ("corrected", None, given.times, truth),
+        ("ground-truth", 100.0, torch.arange(0, given.end + 1, 10_000_000), truth),
     ):
         output = workspace / "exported" / "poses.txt"
         ExportTrajectory(trained, output, poses, rate).main()
         exported = read_tum_trajectory(output)
         assert torch.equal(exported.times, times)
-        difference = (exported.camera_to_worlds - given.interpolate(times)).abs().max()
-        if poses == "corrected":
-            # Corrected for some steps, of poses that are the true ones.
-            assert 1e-4 < difference < 0.2
-        else:
-            # The given ones, but for the framework's float32 transform.
-            assert difference < 1e-6
+        difference = (exported.camera_to_worlds - expected.interpolate(times)).abs().max()
+        # What correction leaves, or the framework's float32 transform.
+        assert difference < (0.2 if poses == "corrected" else 1e-6)
 
 
 def test_cameras_frames_and_a_mesh_go_on_to_other_tools(trained: Path, workspace: Path) -> None:
     ExportCameras(trained.parent, workspace / "cameras", num_points=500).main()
     model = pycolmap.Reconstruction(str(workspace / "cameras" / "sparse" / "0"))
-    # All images but those outside the events, at the corrected poses, where the given ones are the true ones.
+    # All images but those outside the events, at the corrected poses, which are near the true ones.
     names = {image.name: image for image in model.images.values()}
     assert {name.split("/")[0] for name in names} == {"train", "val", "test"}
     assert model.num_points3D() > 400
@@ -269,7 +269,8 @@ def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
     assert figures["record"]["state"] == "finished"
     assert figures["record"]["steps"] == STEPS
     assert figures["pairs"]["correlation"] > 0.3
-    assert figures["poses"]["evo"]["estimated"]["ate"]["rmse"] < 1e-5
+    evo = figures["poses"]["evo"]
+    assert evo["corrected"]["ate"]["rmse"] < evo["estimated"]["ate"]["rmse"] < 0.05
     with (workspace / "report" / "views.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["file"] for row in rows] == [f"images/test/{view:05d}.png" for view in range(3)]
