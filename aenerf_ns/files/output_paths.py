@@ -36,7 +36,8 @@ def require_run(run: Path) -> Path:
 def require_absent(output: Path, option: str = "--output") -> None:
     """Raise a DataError if the folder that a command will write, and an option names, exists or cannot be created."""
     try:
-        exists = output.exists()
+        # A link to nothing is in the way, too.
+        exists = output.exists() or output.is_symlink()
     except (OSError, ValueError) as error:
         raise output_error(output, error, option) from None
     if exists:

@@ -25,13 +25,15 @@ LONG = "a" * 290
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with what the command lines name: a dataset F, a run's config.yml C and a text file W."""
+    """The current folder, with what the command lines name: a dataset F, a run's config.yml C, a text file W and a link
+    to nothing L."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "F").mkdir()
     for file in ("events.txt", "calib.txt", "groundtruth.txt"):
         (tmp_path / "F" / file).touch()
     (tmp_path / "C").write_text("!!python/object:nerfstudio.engine.trainer.TrainerConfig {}")
     (tmp_path / "W").touch()
+    (tmp_path / "L").symlink_to("nothing")
     return tmp_path
 
 
@@ -108,6 +110,7 @@ MISTAKES = [
     ("check F --picture C/a.png", 2, "Error: C/a.png: it cannot be created (Not a directory); choose"),
     ("convert nothing --output O", 1, "Error: nothing: there is no such folder"),
     ("convert F --output F", 1, "Error: F: the folder exists already"),
+    ("convert F --output L", 1, "Error: L: the folder exists already"),
     ("convert F --output O --pixel-share 2", 1, "Error: aenerf convert: the share of pixels must be above 0"),
     ("convert F --output O --seed -1", 1, "Error: --seed: -1 is out of range"),
     ("convert F --output O --shortest-interval-ns 10000000000000000000", 1, "Error: aenerf convert: the shortest"),
