@@ -67,7 +67,7 @@ class PairFile:
 
     def _print_once(self, line: str) -> None:
         if line not in self._printed:
-            CONSOLE.print(f"[yellow]{line}")
+            CONSOLE.print(line, style="yellow", markup=False)
         self._printed.add(line)
 
     def _read(self, file: BinaryIO) -> tuple[EventPairs, NDArray[np.int16]] | None:
@@ -111,8 +111,10 @@ class PairFile:
         except OSError as error:
             folder = Path(tempfile.gettempdir())
             CONSOLE.print(
-                f"[yellow]{self.path.parent} cannot be written to ({error.strerror}): the pairs are in {folder} until "
-                "this process ends, and are made again by the next."
+                f"{self.path.parent} cannot be written to ({error.strerror}): the pairs are in {folder} until "
+                "this process ends, and are made again by the next.",
+                style="yellow",
+                markup=False,
             )
             # The file has no name, and is gone when the process ends.
             self._new = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
@@ -150,7 +152,7 @@ class PairFile:
         # Another host may have made it meanwhile: what that one maps would be gone from a network folder.
         if self.find() is None:
             self._part.rename(self.path)
-        CONSOLE.print(f"The pairs are in {self.path}, for the next run. It may be deleted.")
+        CONSOLE.print(f"The pairs are in {self.path}, for the next run. It may be deleted.", markup=False)
 
     @contextmanager
     def making(self, alone: bool) -> Iterator[None]:

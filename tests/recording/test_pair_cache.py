@@ -30,7 +30,7 @@ PART = f"{KEPT}.{socket.gethostname()}.part"
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    return write_native(tmp_path / "made")
+    return write_native(tmp_path / "made[/i]")
 
 
 @pytest.fixture
