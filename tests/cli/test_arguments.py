@@ -148,6 +148,7 @@ MISTAKES = [
     (f"evaluate {LONG} --output O", 1, f"Error: {LONG}: it cannot be read (File name too long)"),
     ("evaluate W --output O", 1, "Error: W: not the config.yml of a run"),
     ("evaluate C --output F", 1, "Error: F: it cannot be created (Is a directory); choose another --output"),
+    ("evaluate C --output /dev/null", 1, "Error: /dev/null: it cannot be created (File exists); choose"),
     ("evaluate C --output O --render-output W", 1, "Error: W/0000.png: it cannot be created (Not a directory)"),
     ("evaluate C --output O --nerfbaselines F", 1, "Error: F: the folder exists already"),
     ("report W nothing --output O", 1, "Error: nothing: there is no such file"),
