@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -27,7 +27,9 @@ def atomic_write(path: Path, partial: Path | None = None) -> Iterator[Path]:
         yield partial
         _sync(partial)
         partial.replace(path)
-        _sync(path.parent)
+        # Some file systems cannot, and the file is whole.
+        with suppress(OSError):
+            _sync(path.parent)
     finally:
         partial.unlink(missing_ok=True)
 

@@ -14,7 +14,7 @@ Chunk = TypeVar("Chunk", bound=Sized)
 def progress_bar() -> Progress:
     """Return a progress bar with counts, elapsed and remaining time, which is cleared when it is done."""
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

@@ -61,7 +61,7 @@ class AutomaticDataParserConfig(DataParserConfig):
         name = recognize(Path(self.data))
         config = deepcopy(FORMATS[name])
         config.data = self.data
-        CONSOLE.print(f"{self.data} is in the format {name}.")
+        CONSOLE.print(f"{self.data} is in the format {name}.", markup=False)
         parser = config.setup(**kwargs)
         parser.guessed_format = name
         return parser

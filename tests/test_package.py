@@ -114,6 +114,22 @@ def test_importing_costs_nothing() -> None:
     assert done.stdout.strip() == "set()"
 
 
+def test_the_cache_in_the_temporary_folder_is_the_users_own(tmp_path: Path) -> None:
+    code = "import os; os.access = lambda *_: False; import aenerf_ns; print(os.environ['NUMBA_CACHE_DIR'])"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+
+    def cache() -> Path:
+        done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment)
+        return Path(done.stdout.strip())
+
+    own = tmp_path / f"aenerf-ns-numba-{os.getuid()}"
+    assert cache() == cache() == own
+    # As another user could have made it.
+    own.chmod(0o777)
+    assert cache() != own
+
+
 def test_registered_modules_defer_heavy_imports() -> None:
     # What the framework itself imports at every command is no cost of ours.
     code = (

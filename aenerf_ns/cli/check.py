@@ -67,8 +67,8 @@ class Check(DatasetCommand):
         remark = " (near and far plane for a camera that stays that close)" if result.planes else ""
         say(f"Train with{remark}: {command}")
         if self.picture is not None and result.warped is not None:
-            with creating(self.picture, "--picture"):
-                Image.fromarray(result.warped.picture()).save(self.picture)
+            with creating(self.picture, "--picture") as file:
+                Image.fromarray(result.warped.picture()).save(file)
             say(f"{self.picture}: events as they came, and warped")
         elif self.picture is not None:
             say(f"{self.picture}: not written, because too few events have a pose")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -177,7 +178,7 @@ class Convert(DatasetCommand):
         counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
         say(
             f"{self.output}: {num_written:,} of {num_read:,} events, {len(trajectory)} poses, images: {counts}.\n"
-            f"Look it over with: aenerf check {self.output}\n"
+            f"Look it over with: aenerf check {shlex.quote(str(self.output))}\n"
             f"Train with: {training_command(self.output)}"
         )
 

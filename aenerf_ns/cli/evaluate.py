@@ -8,7 +8,7 @@ from pathlib import Path
 
 from aenerf_ns.cli.console import say
 from aenerf_ns.cli.trained_run import RunCommand, open_run
-from aenerf_ns.files.output_paths import creating, require_absent, require_writable
+from aenerf_ns.files.output_paths import creating, output_error, require_absent, require_writable
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 
 
@@ -43,8 +43,10 @@ class Evaluate(RunCommand):
         if self.color_correction is not None:
             replace_color_correction(run, used)
         if self.render_output is not None:
-            with creating(self.render_output, "--render-output"):
-                self.render_output.mkdir(exist_ok=True)
+            try:
+                self.render_output.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise output_error(self.render_output, error, "--render-output") from None
         results = evaluate(run, self.render_output)
         evaluation = {
             "experiment_name": config.experiment_name,
@@ -56,16 +58,16 @@ class Evaluate(RunCommand):
             },
             "results": results,
         }
-        with creating(self.output):
-            self.output.write_text(json.dumps(evaluation, indent=2) + "\n", "utf8")
+        with creating(self.output) as file:
+            file.write_text(json.dumps(evaluation, indent=2) + "\n", "utf8")
         if results["num_views"] == 0:
             say(f"{self.output}: errors of the poses; there are no views to evaluate on.")
             return
         if self.nerfbaselines is not None:
             from aenerf_ns.export.nerfbaselines import export_predictions
 
-            with creating(self.nerfbaselines, "--nerfbaselines"):
-                export_predictions(run, self.nerfbaselines, config, results["views"])
+            with creating(self.nerfbaselines, "--nerfbaselines") as folder:
+                export_predictions(run, folder, config, results["views"])
         refined = results.get("refined_test_poses")
         metrics = {"placed": results} | ({"refined": refined} if refined else {})
         shown = "; ".join(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -60,8 +62,8 @@ class ExportTrajectory(RunCommand):
         with torch.no_grad():
             poses = source.pose(trajectory.seconds(times))
         written = Trajectory(times.cpu(), run.scene.to_recording(poses))
-        with creating(self.output):
-            write_tum_trajectory(self.output, written)
+        with creating(self.output) as file:
+            write_tum_trajectory(file, written)
         say(f"{self.output}: {len(written)} {self.poses} poses.")
 
 
@@ -89,19 +91,22 @@ class ExportCameras(RunCommand):
         placed = place_views(run)
         images = [image for image, _ in placed]
         points = observe_points(run, images, self.num_points)
-        with creating(self.output):
+        with creating(self.output) as folder:
             for image, file in placed:
-                target = self.output / IMAGE_FOLDER / image.name
+                target = folder / IMAGE_FOLDER / image.name
                 target.parent.mkdir(parents=True, exist_ok=True)
-                if self.copy:
-                    shutil.copyfile(file, target)
-                else:
-                    target.symlink_to(file.resolve())
-            write_cameras(self.output, images, points)
+                # Some disks hold no links.
+                with suppress(OSError):
+                    if not self.copy:
+                        target.symlink_to(file.resolve())
+                        continue
+                shutil.copyfile(file, target)
+            write_cameras(folder, images, points)
+        data = shlex.quote(str(self.output))
         say(
             f"{self.output}: {len(images)} images with cameras, {len(points.positions)} points. Train on them with:\n"
-            f"  ns-train splatfacto --data {self.output} nerfstudio-data --load-3D-points True\n"
-            f"  ns-train nerfacto --data {self.output} colmap --colmap-path sparse/0"
+            f"  ns-train splatfacto --data {data} nerfstudio-data --load-3D-points True\n"
+            f"  ns-train nerfacto --data {data} colmap --colmap-path sparse/0"
         )
 
 
@@ -135,8 +140,8 @@ class ExportFrames(RunCommand):
             times = times_from_seconds(run.scene.window, self.times)
         else:
             times = times_at_rate(run.scene.window, 10.0 if self.rate is None else self.rate)
-        with creating(self.output):
-            export_frames(run, self.output, times, self.num_points)
+        with creating(self.output) as folder:
+            export_frames(run, folder, times, self.num_points)
         say(f"{self.output}: {len(times)} frames with depths, times and cameras.")
 
 
@@ -164,8 +169,8 @@ class ExportMesh(RunCommand):
         from aenerf_ns.export.mesh import extract_mesh
 
         mesh = extract_mesh(run, self.num_views, self.resolution)
-        with creating(self.output):
-            mesh.export(self.output)
+        with creating(self.output) as file:
+            mesh.export(file)
         sides = " x ".join(f"{side:.3g}" for side in mesh.extents)
         say(f"{self.output}: {len(mesh.faces)} triangles, {sides} units of the recording.")
 
@@ -199,6 +204,6 @@ class ExportVideo(RunCommand):
         times = times_at_rate(run.scene.window, self.rate)
         if len(times) < 2:
             raise DataError("--rate", f"{self.rate:g} frames a second give no two frames", "give a higher one")
-        with creating(self.output):
-            num_frames = write_video(self.output, render_panels(run, times), self.frame_rate)
+        with creating(self.output) as file:
+            num_frames = write_video(file, render_panels(run, times), self.frame_rate)
         say(f"{self.output}: {num_frames} frames.")

@@ -84,8 +84,8 @@ class ReportCommand:
         paired = comparison.paired_differences(reports, shared)
         left_out = comparison.views_left_out(reports, shared)
         page = make_page(reports, paired, left_out, mixed, shared)
-        with creating(self.output / "report.html"):
-            (self.output / "report.html").write_text(page, "utf8")
+        with creating(self.output / "report.html") as page_file:
+            page_file.write_text(page, "utf8")
             with (self.output / "views.csv").open("w", encoding="utf8", newline="") as file:
                 table = csv.DictWriter(file, ("run", "file", *VIEW_COLUMNS), lineterminator="\n")
                 table.writeheader()

@@ -192,7 +192,8 @@ class _Table:
         run, begins = self._by_pixel(count)
         # It has no name, so it is gone when the process ends, however the process ends.
         file = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115
-        run.tofile(file)
+        # The errors of NumPy's tofile do not say that the disk is full.
+        file.write(run.data)
         self._runs.append((file, begins))
         left = self._entries[count : self.size].copy()
         self.size = len(left)
@@ -267,9 +268,9 @@ class _Table:
                 run.seek(16 * begin)
                 _sort_into(np.fromfile(run, np.int64, 2 * (end - begin)).reshape(-1, 2), first, next_rows, rows)
             ends.finish(rows)
-            rows.tofile(file)
+            file.write(rows.data)
             first = last
-        np.zeros((ends.num_padded - ends.num_rows, 2), np.int64).tofile(file)
+        file.write(bytes(16 * (ends.num_padded - ends.num_rows)))
         file.flush()
         for run, _ in self._runs:
             run.close()

@@ -36,7 +36,8 @@ def require_run(run: Path) -> Path:
 def require_absent(output: Path, option: str = "--output") -> None:
     """Raise a DataError if the folder that a command will write, and an option names, exists or cannot be created."""
     try:
-        exists = output.exists()
+        # A link to nothing is in the way, too.
+        exists = output.exists() or output.is_symlink()
     except (OSError, ValueError) as error:
         raise output_error(output, error, option) from None
     if exists:
@@ -46,39 +47,45 @@ def require_absent(output: Path, option: str = "--output") -> None:
 def require_writable(output: Path, option: str = "--output") -> None:
     """Raise a DataError if a file that a command will write, and an option names, cannot be created.
 
-    A file that exists is overwritten, and folders that are missing are made.
+    A file that exists is replaced, and folders that are missing are made.
     """
     try:
         if output.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        parent = next(folder for folder in output.absolute().parents if folder.exists())
+        # A device would be replaced by a file.
+        if output.exists() and not output.is_file():
+            raise OSError(errno.EEXIST, os.strerror(errno.EEXIST))
+        parent = next(folder for folder in Path(os.path.realpath(output)).parents if folder.exists())
         if not parent.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
-        if not os.access(output if output.exists() else parent, os.W_OK):
+        if not all(os.access(path, os.W_OK) for path in (parent, output) if path.exists()):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:
         raise output_error(output, error, option) from None
 
 
 @contextmanager
-def creating(output: Path, option: str = "--output") -> Iterator[None]:
-    """Make the folder of what is written within the context, and turn errors of the system into a DataError.
+def creating(output: Path, option: str = "--output") -> Iterator[Path]:
+    """Yield where to write a file or a new folder, which gets its name when the context ends without an error.
 
-    If an error or Ctrl-C ends the context, a new output is removed, because it is unfinished. An older output stays.
+    Its folder is made, and errors of the system become a DataError. If an error or Ctrl-C ends the context, an older
+    file stays, and nothing new.
     """
-    is_new = not output.exists()
+    # A link stays one. Writers choose the format by the suffix.
+    final = Path(os.path.realpath(output))
+    partial = final.with_name(f".{final.stem}.partial{final.suffix}")
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    except BaseException as error:
-        if is_new and output.is_dir():
-            shutil.rmtree(output, ignore_errors=True)
-        elif is_new:
-            with suppress(OSError):
-                output.unlink()
-        if isinstance(error, OSError):
-            raise output_error(output, error, option) from None
-        raise
+        final.parent.mkdir(parents=True, exist_ok=True)
+        # Of a command that was killed.
+        shutil.rmtree(partial, ignore_errors=True)
+        yield partial
+        partial.replace(final)
+    except OSError as error:
+        raise output_error(output, error, option) from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):
+            partial.unlink()
 
 
 def output_error(output: Path, error: OSError | ValueError, option: str = "--output") -> DataError:

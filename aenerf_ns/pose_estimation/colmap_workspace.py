@@ -79,7 +79,7 @@ def work_folder(kept: Path | None) -> Iterator[Path]:
 
     Args:
         kept: where the features and matches are kept if the command is interrupted, and where they are then found. The
-            folder is removed in the end.
+            folder is removed when the work ends or the data are bad. Another error, such as a full disk, leaves it.
     """
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -92,10 +92,15 @@ def work_folder(kept: Path | None) -> Iterator[Path]:
             if kept is not None and (folder / _DATABASE).exists():
                 is_kept = True
                 kept.mkdir(exist_ok=True)
+                # It comes last: a database without it, cut short by another interrupt, is not taken.
+                (kept / _INPUTS).unlink(missing_ok=True)
                 for file in (_DATABASE, _INPUTS):
                     shutil.copyfile(folder / file, kept / file)
                 words = f"{kept} keeps the features and matches that were found: repeat the command to go on."
                 CONSOLE.print(words, markup=False, highlight=False, soft_wrap=True)
+            raise
+        except Exception as error:
+            is_kept = not isinstance(error, DataError)
             raise
         finally:
             if kept is not None and not is_kept:

@@ -128,9 +128,8 @@ def _open_file(source: Path, needs_times: bool) -> Video:
     stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     if len(milliseconds) < stated:
         # No error, because some containers only state a guess.
-        CONSOLE.print(
-            f"{source}: {len(milliseconds)} of the {stated} frames that it states can be decoded.", soft_wrap=True
-        )
+        line = f"{source}: {len(milliseconds)} of the {stated} frames that it states can be decoded."
+        CONSOLE.print(line, markup=False, soft_wrap=True)
     # Some containers state no times, or the largest number there is.
     known = np.abs(milliseconds) < MAX_TIME * 1e-6
     if needs_times and len(known) > 1 and not known.all():
@@ -142,9 +141,10 @@ def _open_file(source: Path, needs_times: bool) -> Video:
 def _open_capture(source: Path) -> cv2.VideoCapture:
     with reading(source):
         source.open("rb").close()
-    # The other backends take the numbers in a file's name for a pattern of many files.
+    # The other backends take the numbers in a file's name for a pattern of many files, and ffmpeg takes a relative name
+    # with a colon for a protocol.
     with _silent_opencv():
-        capture = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
+        capture = cv2.VideoCapture(str(source.absolute()), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise DataError(source, "not a video that can be read", "convert it to MP4, or give a folder of images")
     return capture

@@ -99,7 +99,7 @@ class EventDataset(InputDataset):
                 # Another process may have made the file meanwhile.
                 found = file.find() or self._read_events(file, usable, count)
         else:
-            CONSOLE.print(f"{file.path.name}: {found[0].summary()}.")
+            CONSOLE.print(f"{file.path.name}: {found[0].summary()}.", markup=False)
         self._require_covered(found[0].num_events, found[0].num_outside)
         return found
 
@@ -120,7 +120,7 @@ class EventDataset(InputDataset):
             expected_events=count,
             open_file=file.open,
         )
-        CONSOLE.print(f"{events.path.name}: {pairs.summary()}.")
+        CONSOLE.print(f"{events.path.name}: {pairs.summary()}.", markup=False)
         if len(pairs) == 0:
             self._require_covered(pairs.num_events, pairs.num_outside)
             raise DataError(events.path, "no pixel has two events", "record longer, or widen the time window")
@@ -137,7 +137,7 @@ class EventDataset(InputDataset):
         pictures = self._new_pictures()
         chunks = pictures.watch(self._chunks(scene.event_file.count()))
         windows = sort_events(chunks, window=scene.window, usable=usable)
-        CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.")
+        CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.", markup=False)
         self._require_covered(len(windows.times) + windows.num_outside + windows.num_unusable, windows.num_outside)
         return windows, pictures.sums(*usable.shape)
 

@@ -62,8 +62,10 @@ class OutputLock:
             if error.errno not in _NO_LOCKS:
                 raise
             CONSOLE.print(
-                f"[yellow]{self.output}: its file system has no locks ({error.strerror}): start no second command "
+                f"{self.output}: its file system has no locks ({error.strerror}): start no second command "
                 "with this output",
+                style="yellow",
+                markup=False,
                 soft_wrap=True,
             )
 

@@ -7,6 +7,7 @@ import fcntl
 import json
 import math
 import os
+import socket
 import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -66,7 +67,7 @@ class PairFile:
 
     def _print_once(self, line: str) -> None:
         if line not in self._printed:
-            CONSOLE.print(f"[yellow]{line}")
+            CONSOLE.print(line, style="yellow", markup=False)
         self._printed.add(line)
 
     def _read(self, file: BinaryIO) -> tuple[EventPairs, NDArray[np.int16]] | None:
@@ -110,8 +111,10 @@ class PairFile:
         except OSError as error:
             folder = Path(tempfile.gettempdir())
             CONSOLE.print(
-                f"[yellow]{self.path.parent} cannot be written to ({error.strerror}): the pairs are in {folder} until "
-                "this process ends, and are made again by the next."
+                f"{self.path.parent} cannot be written to ({error.strerror}): the pairs are in {folder} until "
+                "this process ends, and are made again by the next.",
+                style="yellow",
+                markup=False,
             )
             # The file has no name, and is gone when the process ends.
             self._new = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
@@ -119,7 +122,8 @@ class PairFile:
 
     @property
     def _part(self) -> Path:
-        return self.path.with_name(self.path.name + ".part")
+        # The lock keeps apart the processes of one host only. The next one there overwrites what a killed one left.
+        return self.path.with_name(f"{self.path.name}.{socket.gethostname()}.part")
 
     def keep(self, pairs: EventPairs, pictures: NDArray[np.int16]) -> None:
         """Keep pairs and pictures if their rows went to a file. Otherwise delete an older file of pairs."""
@@ -131,7 +135,7 @@ class PairFile:
             return
         checksum, arrays = 0, []
         for array in (pairs.replacement_rows, pairs.block_ends, pictures):
-            array.tofile(self._new)
+            self._new.write(array.data)
             checksum = zlib.crc32(array.data, checksum)
             arrays.append((array.dtype.str, array.shape))
         about = {
@@ -145,8 +149,10 @@ class PairFile:
         self._new.write(text + len(text).to_bytes(8, "little") + _WORD)
         self._new.flush()
         os.fsync(self._new.fileno())
-        self._part.rename(self.path)
-        CONSOLE.print(f"The pairs are in {self.path}, for the next run. It may be deleted.")
+        # Another host may have made it meanwhile: what that one maps would be gone from a network folder.
+        if self.find() is None:
+            self._part.rename(self.path)
+        CONSOLE.print(f"The pairs are in {self.path}, for the next run. It may be deleted.", markup=False)
 
     @contextmanager
     def making(self, alone: bool) -> Iterator[None]:
@@ -169,7 +175,9 @@ class PairFile:
             ) from None
         finally:
             if self._new is not None:
-                self._new.close()
+                # Fails once more on a full disk.
+                with suppress(OSError):
+                    self._new.close()
                 if self._is_kept:
                     self._part.unlink(missing_ok=True)
 

@@ -44,9 +44,8 @@ def checkpoint_to_load(path: Path, step: int | None = None) -> Path:
         fault = _fault(path)
         if fault is None:
             if broken:
-                CONSOLE.print(
-                    f"[yellow]{folder}: broken checkpoints: {'; '.join(broken)}. {path.name} is loaded", soft_wrap=True
-                )
+                line = f"{folder}: broken checkpoints: {'; '.join(broken)}. {path.name} is loaded"
+                CONSOLE.print(line, style="yellow", markup=False, soft_wrap=True)
             return path
         broken.append(f"{path.name} ({fault})")
     problem = f"none of its checkpoints is whole: {'; '.join(broken)}" if broken else "it holds no checkpoint"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import json
 import resource
 import time
@@ -17,6 +18,7 @@ from nerfstudio.utils.decorators import check_main_thread, decorate_all
 from torch import Tensor
 
 from aenerf_ns.atomic_write import atomic_write
+from aenerf_ns.errors import DataError
 from aenerf_ns.training.framework import is_logged
 from aenerf_ns.training.provenance import provenance
 
@@ -79,12 +81,26 @@ class ScalarWriter(writer.Writer):
     Args:
         folder: of the run. It exists.
         resumes: whether the run goes on from a checkpoint. What a run in the same folder wrote before is kept.
+
+    Raises:
+        DataError: another process writes there.
     """
 
     def __init__(self, folder: Path, resumes: bool) -> None:
         # Line by line on the disk, so that the file of a run that is killed is whole.
-        mode = "a" if resumes else "w"
-        self._file = (folder / SCALARS_FILE).open(mode, encoding="utf-8", newline="", buffering=1)
+        self._file = (folder / SCALARS_FILE).open("a", encoding="utf-8", newline="", buffering=1)
+        try:
+            # Trainings that start in one second take one folder. This lock is of a process, and holds between hosts.
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            remedy = "give another --experiment-name or --timestamp"
+            raise DataError(folder, "another training writes there", remedy) from None
+        except OSError:
+            # Some network folders have no locks.
+            pass
+        if not resumes:
+            self._file.seek(0)
+            self._file.truncate()
         self._rows = csv.writer(self._file, lineterminator="\n")
         if self._file.tell() == 0:
             self._rows.writerow(("step", "name", "value"))

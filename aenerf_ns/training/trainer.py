@@ -94,7 +94,7 @@ def _folder_of_opened_run() -> Path | None:
     """Return the folder of the config.yml that a command of Nerfstudio opens: it tells the configuration no path."""
     if Path(sys.argv[0]).name not in ("ns-eval", "ns-render", "ns-export", "ns-viewer"):
         return None
-    words = [word.rpartition("=")[2] for word in sys.argv[1:]]
+    words = [part for word in sys.argv[1:] for part in (word, word.partition("=")[2])]
     configs = [Path(word).absolute() for word in words if word.endswith("config.yml") and Path(word).is_file()]
     return configs[0].parent if configs else None
 

@@ -25,13 +25,15 @@ LONG = "a" * 290
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with what the command lines name: a dataset F, a run's config.yml C and a text file W."""
+    """The current folder, with what the command lines name: a dataset F, a run's config.yml C, a text file W and a link
+    to nothing L."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "F").mkdir()
     for file in ("events.txt", "calib.txt", "groundtruth.txt"):
         (tmp_path / "F" / file).touch()
     (tmp_path / "C").write_text("!!python/object:nerfstudio.engine.trainer.TrainerConfig {}")
     (tmp_path / "W").touch()
+    (tmp_path / "L").symlink_to("nothing")
     return tmp_path
 
 
@@ -108,6 +110,7 @@ MISTAKES = [
     ("check F --picture C/a.png", 2, "Error: C/a.png: it cannot be created (Not a directory); choose"),
     ("convert nothing --output O", 1, "Error: nothing: there is no such folder"),
     ("convert F --output F", 1, "Error: F: the folder exists already"),
+    ("convert F --output L", 1, "Error: L: the folder exists already"),
     ("convert F --output O --pixel-share 2", 1, "Error: aenerf convert: the share of pixels must be above 0"),
     ("convert F --output O --seed -1", 1, "Error: --seed: -1 is out of range"),
     ("convert F --output O --shortest-interval-ns 10000000000000000000", 1, "Error: aenerf convert: the shortest"),
@@ -145,6 +148,7 @@ MISTAKES = [
     (f"evaluate {LONG} --output O", 1, f"Error: {LONG}: it cannot be read (File name too long)"),
     ("evaluate W --output O", 1, "Error: W: not the config.yml of a run"),
     ("evaluate C --output F", 1, "Error: F: it cannot be created (Is a directory); choose another --output"),
+    ("evaluate C --output /dev/null", 1, "Error: /dev/null: it cannot be created (File exists); choose"),
     ("evaluate C --output O --render-output W", 1, "Error: W/0000.png: it cannot be created (Not a directory)"),
     ("evaluate C --output O --nerfbaselines F", 1, "Error: F: the folder exists already"),
     ("report W nothing --output O", 1, "Error: nothing: there is no such file"),

@@ -34,7 +34,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
-from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, poses_of, stand_upright
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, poses_of, stand_upright, work_folder
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses, compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
 from aenerf_ns.recording.recording import ReferenceView
@@ -199,6 +199,36 @@ def test_an_interrupted_search_goes_on(
     assert not kept.exists()
     for name in ("trajectory_estimated.txt", "transforms.json"):
         assert (tmp_path / "data" / name).read_bytes() == (found[0] / "data" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("error", "left"),
+    [
+        (OSError(28, "No space left on device"), ["database.db", "inputs.txt"]),
+        (DataError("frames", "too few", "give more"), None),
+        # Once more while the database is copied, after which the next command would take the half of it.
+        (KeyboardInterrupt(), ["database.db"]),
+    ],
+)
+def test_errors_leave_what_was_kept(
+    error: BaseException, left: list[str] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    for name in ("database.db", "inputs.txt"):
+        (kept / name).touch()
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def fail() -> None:
+        with work_folder(kept):
+            monkeypatch.setattr(shutil, "copyfile", interrupt)
+            raise error
+
+    with pytest.raises(type(error)):
+        fail()
+    assert (sorted(path.name for path in kept.iterdir()) if kept.exists() else None) == left
 
 
 @pytest.mark.parametrize(("typical", "placed"), [(20, 15), (100, 25), (400, 30)])

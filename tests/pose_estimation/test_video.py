@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from aenerf_ns.cli import video_file
 from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.video import open_video
 
@@ -56,6 +57,18 @@ def test_read_a_video_file(tmp_path: Path) -> None:
         np.testing.assert_array_equal(list(video), frames)
 
 
+def test_a_colon_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("run1:2.mp4")
+    assert video_file.write_video(path, make_frames(3), 30.0) == len(open_video(path).times) == 3
+
+
+def test_ffmpeg_on_a_full_disk_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "full.mp4").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="ffmpeg wrote 0 of 3 frames"):
+        video_file.write_video(tmp_path / "full.mp4", make_frames(3), 30.0)
+
+
 def test_read_a_folder(tmp_path: Path) -> None:
     frames = make_frames(3)
     frames[1][...] = frames[1][..., :1]
@@ -89,13 +102,13 @@ def test_frames_are_read_lazily(tmp_path: Path) -> None:
 
 
 def test_name_lost_frames_of_a_cut_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_video(tmp_path / "video.avi", make_frames(20))
+    path = write_video(tmp_path / "[a].avi", make_frames(20))
     open_video(path)
     assert "can be decoded" not in capsys.readouterr().out
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     found = len(open_video(path).times)
     assert 2 <= found < 20
-    assert f"video.avi: {found} of the 20 frames that it states can be decoded" in capsys.readouterr().out
+    assert f"[a].avi: {found} of the 20 frames that it states can be decoded" in capsys.readouterr().out
 
 
 def folder_with(times: list[str], change: Callable[[Path], object] = lambda folder: None) -> Callable[[Path], Path]:

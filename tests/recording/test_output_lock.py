@@ -103,9 +103,11 @@ def test_file_system_without_locks_is_used(
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(FileLock, "acquire", none)
-    write_native(tmp_path / "made")
-    assert "its file system has no locks (No locks available): start no second command" in capsys.readouterr().out
-    assert list(tmp_path.iterdir()) == [tmp_path / "made"]
+    write_native(tmp_path / "[made]")
+    assert (
+        "[made]: its file system has no locks (No locks available): start no second command" in capsys.readouterr().out
+    )
+    assert list(tmp_path.iterdir()) == [tmp_path / "[made]"]
 
 
 def test_uncreatable_output_is_one_line(tmp_path: Path) -> None:

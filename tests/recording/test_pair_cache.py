@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import socket
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from itertools import islice
@@ -23,11 +25,12 @@ from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSamplerConfig, PairSupervisionConfig
 
 KEPT = "events.h5.pairs"
+PART = f"{KEPT}.{socket.gethostname()}.part"
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    return write_native(tmp_path / "made")
+    return write_native(tmp_path / "made[/i]")
 
 
 @pytest.fixture
@@ -144,36 +147,50 @@ def test_broken_file_is_made_again(
     assert (data / KEPT).read_bytes() == content
 
 
-@pytest.mark.parametrize(
-    ("error", "raised", "message"),
-    [
-        (KeyboardInterrupt(), KeyboardInterrupt, ""),
-        (OSError(28, "No space left on device"), DataError, "events.h5.pairs: the disk is full; free some of it"),
-    ],
-)
-def test_failure_leaves_no_file(
-    error: BaseException,
-    raised: type[BaseException],
-    message: str,
-    data: Path,
-    long_recording: list[Path],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_interrupt_leaves_no_file(data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     # As if an earlier process had been killed.
-    (data / (KEPT + ".part")).write_bytes(b"half")
+    (data / PART).write_bytes(b"half")
     read = Hdf5EventFile.read_chunks
 
     def fail(self: Hdf5EventFile) -> Iterator[EventStream]:
         yield from islice(read(self), 5)
-        raise error
+        raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(Hdf5EventFile, "read_chunks", fail)
-        with pytest.raises(raised) as caught:
+        with pytest.raises(KeyboardInterrupt):
             _ = opened(data).pairs
-    assert message in str(caught.value)
     assert [path.name for path in data.glob("events*")] == ["events.h5"]
     assert len(opened(data).pairs) > 100
+    assert sorted(path.name for path in data.glob("events*")) == ["events.h5", KEPT]
+
+
+def test_full_disk_is_one_line(data: Path, long_recording: list[Path]) -> None:
+    (data / PART).symlink_to("/dev/full")
+    with pytest.raises(DataError, match=r"events\.h5\.pairs: the disk is full; free some of it"):
+        _ = opened(data).pairs
+    assert [path.name for path in data.glob("events*")] == ["events.h5"]
+
+
+def test_hosts_do_not_share_a_file(data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    # As on a network folder.
+    monkeypatch.setattr(fcntl, "flock", lambda *_: None)
+    read, others = Hdf5EventFile.read_chunks, []
+
+    def met(self: Hdf5EventFile) -> Iterator[EventStream]:
+        chunks = read(self)
+        yield from islice(chunks, 5)
+        with monkeypatch.context() as patch:
+            patch.setattr(Hdf5EventFile, "read_chunks", read)
+            patch.setattr(socket, "gethostname", lambda: "other")
+            others.append((opened(data).pairs, (data / KEPT).stat().st_ino))
+        yield from chunks
+
+    monkeypatch.setattr(Hdf5EventFile, "read_chunks", met)
+    pairs = opened(data).pairs
+    ((other, inode),) = others
+    assert_same(pairs, other)
+    assert (data / KEPT).stat().st_ino == inode
     assert sorted(path.name for path in data.glob("events*")) == ["events.h5", KEPT]
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import resource
 import shutil
 import signal
+import stat
+import sys
 import time
 import warnings
 import zipfile
@@ -108,7 +111,7 @@ def test_a_broken_newest_checkpoint_is_named_and_passed_over(
     run: Path, fault: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(run)
-    folder = run / "nerfstudio_models"
+    folder = (run / "nerfstudio_models").rename(run / "[models]")
     newest = folder / "step-000000003.ckpt"
     assert checkpoint_to_load(folder) == newest
     assert capsys.readouterr().out == ""
@@ -169,6 +172,15 @@ def test_a_run_is_opened_with_its_newest_whole_checkpoint(run: Path, capsys: pyt
         eval_setup(run / "config.yml")
 
 
+@pytest.mark.parametrize("words", ["--load-config {}", "--load-config={}"])
+def test_a_command_of_nerfstudio_finds_the_folder_of_its_run(
+    words: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = run.rename(tmp_path / "lr=0.01")
+    monkeypatch.setattr(sys, "argv", ["ns-eval", *words.format(moved / "config.yml").split()])
+    assert eval_setup(moved / "config.yml")[2] == moved / "nerfstudio_models" / "step-000000003.ckpt"
+
+
 def test_a_run_goes_on_from_the_newest_whole_checkpoint(
     run: Path, tmp_path: Path, trained: AENeRFTrainer, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -220,6 +232,20 @@ def test_failed_write_leaves_the_older_file(tmp_path: Path) -> None:
         partial.write_text("newer")
     assert path.read_text() == "older"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_system_that_cannot_sync_a_folder_takes_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sync = os.fsync
+
+    def of_files_only(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", of_files_only)
+    with atomic_write(tmp_path / "config.yml") as partial:
+        partial.write_text("newer")
+    assert (tmp_path / "config.yml").read_text() == "newer"
 
 
 @pytest.mark.slow

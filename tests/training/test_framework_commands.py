@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import re
@@ -33,6 +34,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.scripts import train
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, SpiralRender
+from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
 from aenerf_ns.cli.evaluate import Evaluate
@@ -193,7 +195,9 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
         assert difference < (0.2 if poses == "corrected" else 1e-6)
 
 
-def test_cameras_frames_and_a_mesh_go_on_to_other_tools(trained: Path, workspace: Path) -> None:
+def test_cameras_frames_and_a_mesh_go_on_to_other_tools(
+    trained: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ExportCameras(trained.parent, workspace / "cameras", num_points=500).main()
     model = pycolmap.Reconstruction(str(workspace / "cameras" / "sparse" / "0"))
     # All images but those outside the events, at the corrected poses, which are near the true ones.
@@ -210,6 +214,18 @@ def test_cameras_frames_and_a_mesh_go_on_to_other_tools(trained: Path, workspace
     assert len(outputs.image_filenames) == 3
     with pytest.raises(DataError, match="cameras: the folder exists already"):
         ExportCameras(trained, workspace / "cameras").main()
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    # A disk without links.
+    with monkeypatch.context() as patch, CONSOLE.capture() as output:
+        patch.setattr(Path, "symlink_to", refuse)
+        ExportCameras(trained, workspace / "my cameras", num_points=1).main()
+    assert f"--data '{workspace / 'my cameras'}' colmap" in output.get()
+    copied = workspace / "my cameras" / "images" / next(iter(names))
+    assert copied.is_file()
+    assert not copied.is_symlink()
 
     ExportFrames(trained, workspace / "frames", times=("1.0", "2.5"), num_points=100).main()
     lines = (workspace / "frames" / "images.txt").read_text().splitlines()

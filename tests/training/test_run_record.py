@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from helpers.small_trainings import train_small_model
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.report.run_files import read_scalars
 from aenerf_ns.training import provenance
 from aenerf_ns.training.run_record import ScalarWriter
@@ -71,6 +72,21 @@ def test_a_run_that_goes_on_in_its_folder_keeps_its_scalars(tmp_path: Path) -> N
             scalars.write_scalar("loss", 0.5 + resumes, step)
     # The first part was killed after its checkpoint at step 10.
     assert read_scalars(tmp_path) == {"loss": ([0, 10, 30], [0.5, 1.5, 1.5])}
+
+
+def test_another_training_in_the_folder_is_refused(tmp_path: Path) -> None:
+    ScalarWriter(tmp_path, resumes=False).write_scalar("loss", 0.5, 0)
+    owner = "import fcntl, sys; f = open(sys.argv[1], 'a'); fcntl.lockf(f, fcntl.LOCK_EX); print(flush=True); input()"
+    command = [sys.executable, "-c", owner, tmp_path / "scalars.csv"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(DataError, match="another training writes there; give another --experiment-name"):
+            ScalarWriter(tmp_path, resumes=False)
+        other.kill()
+    assert read_scalars(tmp_path) == {"loss": ([0], [0.5])}
+    ScalarWriter(tmp_path, resumes=False).write_scalar("loss", 0.25, 0)
+    assert read_scalars(tmp_path) == {"loss": ([0], [0.25])}
 
 
 def test_one_of_several_processes_does_not_wait_for_a_checkpoint() -> None:

@@ -101,7 +101,8 @@ class FrameSampler(Sampler):
             check_image(file, scene.event_camera)
             with Image.open(file) as image:
                 values.append(np.asarray(image.convert(mode)).reshape(-1, scene.sensor.num_channels))
-        CONSOLE.print(f"Training on {len(values)} images, the first of them {scene.frames[0][1]}.", soft_wrap=True)
+        line = f"Training on {len(values)} images, the first of them {scene.frames[0][1]}."
+        CONSOLE.print(line, markup=False, soft_wrap=True)
         times = torch.tensor([time for time, _ in scene.frames], device=self.device)
         return self._pixel_rays.trajectory.seconds(times), torch.from_numpy(np.stack(values)).to(self.device)
 
