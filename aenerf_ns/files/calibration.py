@@ -29,7 +29,8 @@ class _CameraInfo(msgspec.Struct):
     image_height: int
     camera_matrix: _Values
     distortion_coefficients: _Values
-    distortion_model: str = "plumb_bob"
+    distortion_model: str | None = None
+    fisheye_model: int = 0
 
 
 @dataclass(frozen=True)
@@ -123,4 +124,6 @@ def _camera_info(path: Path, content: dict[str, Any]) -> CameraIntrinsics:
             raise ValueError(f"its camera_matrix has {len(matrix)} numbers, not 9")
         pinhole = (matrix[0], matrix[4], matrix[2], matrix[5])
         size = (info.image_width, info.image_height)
-        return CameraIntrinsics.from_opencv(size, pinhole, info.distortion_coefficients.data, info.distortion_model)
+        # OpenCV's own file names no model.
+        model = info.distortion_model or ("equidistant" if info.fisheye_model else "plumb_bob")
+        return CameraIntrinsics.from_opencv(size, pinhole, info.distortion_coefficients.data, model)
