@@ -99,9 +99,9 @@ def _line_name(line: int, num_before: int | None) -> str:
 class TextEventFile(EventReader):
     """Read lines of t, x, y and p, with polarity 0 or 1, or -1 or 1 (Mueggler et al. 2017).
 
-    The first line may hold the width and the height of the sensor, as E2VID's has. It, or a comment ahead of the events,
-    may name the columns, which may then have any order, and state the unit of the times: t[ns] or time_us. Without
-    names, x, y, p, t or x, y, t, p are read where nothing else fits.
+    The first line may hold the width and the height of the sensor, as E2VID's has. It, or a comment ahead of the
+    events, may name the columns, which may then have any order, and state the unit of the times: t[ns] or time_us.
+    Without names, x, y, p, t or x, y, t, p are read where nothing else fits.
 
     Args:
         path, width, height: see :class:`EventFile`.

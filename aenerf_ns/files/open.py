@@ -96,7 +96,8 @@ def _read_beginning(path: Path) -> bytes:
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return b""
-        raise DataError(path, "it is a folder without the metadata.yaml of a bag of ROS 2", "name the event file in it")
+        remedy = "name the event file in it, or ros2 bag reindex it"
+        raise DataError(path, "it is a folder without the metadata.yaml of a bag of ROS 2", remedy)
     with path.open("rb") as file:
         beginning = file.read(HEADER_BYTES)
     if not beginning:
