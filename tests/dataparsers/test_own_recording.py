@@ -30,6 +30,7 @@ from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import views_on_trajectory
 
@@ -280,10 +281,11 @@ OPENCV = "%YAML:1.0\n---\n" + CAMERA_INFO.replace("_matrix:", "_matrix: !!opencv
         CAMERA_INFO,
         OPENCV,
         OPENCV.replace("distortion_model: plumb_bob", "fisheye_model: 1").replace(", 0.0, 0.0, 0.0]", ", 0.03, 0.04]"),
+        CAMERA_INFO.replace("plumb_bob", "rational_polynomial").replace("0.0]", "0.0, 0.0, 0.0, 0.0]"),
         "header: {seq: 0}\nheight: 72\nwidth: 96\ndistortion_model: plumb_bob\nD: [-0.1, 0.01, 0.0, 0.0, 0.0]\n"
         "K: [90.0, 0.0, 47.5, 0.0, 91.0, 35.5, 0.0, 0.0, 1.0]\n---\n",
     ],
-    ids=["file", "file of OpenCV", "fisheye of OpenCV", "message"],
+    ids=["file", "file of OpenCV", "fisheye of OpenCV", "rational", "message"],
 )
 def test_read_the_camera_info_of_ros(text: str, tmp_path: Path) -> None:
     (tmp_path / "camera_info.yaml").write_text(text)
@@ -292,3 +294,10 @@ def test_read_the_camera_info_of_ros(text: str, tmp_path: Path) -> None:
     recording = recording_of(OwnRecordingDataParserConfig(data=tmp_path))
     lens = ("fisheye", (-0.1, 0.01, 0.03, 0.04)) if "fisheye" in text else ("radial_tangential", (-0.1, 0.01, 0, 0, 0))
     assert recording.event_camera == CameraIntrinsics(96, 72, 90.0, 91.0, 48.0, 36.0, *lens)
+
+
+def test_refuse_a_rational_lens(tmp_path: Path) -> None:
+    text = CAMERA_INFO.replace("plumb_bob", "rational_polynomial").replace("0.0]", "0.0, 0.1, 0.0, 0.0]")
+    (tmp_path / "camera_info.yaml").write_text(text)
+    with pytest.raises(DataError, match=r"is 'rational_polynomial', .* calibrate again with plumb_bob or equidistant"):
+        read_calibration(tmp_path / "camera_info.yaml")
