@@ -83,9 +83,9 @@ def open_event_file(
             header = PropheseeHeader.parse(path, beginning)
             is_raw = path.suffix.lower() == ".raw" or header.is_raw
             return (PropheseeRawFile if is_raw else PropheseeDatFile)(path, header, width, height)
-        size = resolve_sensor_size(path, None, width, height)
         if name == "HDF5":
-            return open_hdf5_events(path, *size, time_unit)
+            return open_hdf5_events(path, width, height, time_unit)
+        size = resolve_sensor_size(path, None, width, height)
         if name == "NumPy":
             return open_array_events(path, *size, time_unit)
         return (CsvEventFile if has_commas(beginning) else TextEventFile)(path, *size, time_unit)
