@@ -59,7 +59,8 @@ class PropheseeHeader:
         fields: dict[str, str] = {}
         end = 0
         # The keyword "end" is optional. Without it, the header ends at the first line that does not begin with "% ".
-        while beginning.startswith(b"% ", end):
+        # Empty ones have no blank.
+        while beginning.startswith((b"% ", b"%\n", b"%\r\n"), end):
             line_end = beginning.find(b"\n", end) + 1
             if line_end == 0:
                 raise DataError(path, f"line {len(fields) + 1} of its header does not end", "record or copy it again")

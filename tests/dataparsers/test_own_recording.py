@@ -123,7 +123,9 @@ def test_camchain_places_both_cameras(tmp_path: Path) -> None:
     # They are not taken for images of the event camera.
     with pytest.raises(DataError, match="its cameras are cam0, cam1; name that of the images as --frame-camera"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1"))
-    recording = recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1", frame_camera="cam0"))
+    options = {"event_camera": "cam1", "frame_camera": "cam0", "image_encoding": "srgb"}
+    recording = recording_of(OwnRecordingDataParserConfig(data=truth.data, **options))
+    assert recording.image_encoding == "srgb"
     assert recording.event_camera == CameraIntrinsics(60, 40, 50.0, 51.0, 30.0, 20.5, distortion=(-0.1, 0, 0, 0.01, 0))
     assert recording.frame_camera == CameraIntrinsics(
         80, 60, 70.0, 71.0, 40.5, 30.5, "fisheye", (0.01, 0.02, 0.03, 0.04)
