@@ -79,7 +79,7 @@ def _is_row(line: bytes) -> bool:
 
 def _parse_names(line: bytes) -> tuple[list[str], TimeUnit | None] | None:
     """Return the names of the columns and the unit of the times that a line states, or None if it does not name all."""
-    text = re.sub(r"\s*\[", "[", line.decode("utf-8", "replace").lower().lstrip("#% "))
+    text = line.decode("utf-8", "replace").lower().lstrip("#% ").replace(" [", "[")
     names = [name.strip().strip('"') for name in (text.split(",") if "," in text else text.split())]
     units = [time[1] for time in map(TIME_NAME.fullmatch, names) if time]
     names = ["t" if TIME_NAME.fullmatch(name) else _ALIASES.get(name, name) for name in names]

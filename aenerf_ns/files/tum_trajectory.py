@@ -57,7 +57,7 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
 
 def _quaternion_order(line: str) -> str:
     """Return how the names of a quaternion's four columns end in a line that names all columns, such as wxyz."""
-    names = re.sub(r"\[.*?\]|[#\"',]", " ", line).split()
+    names = re.sub(r"\[[^][]*\]|[#\"',]", " ", line).split()
     if len(names) == len(POSE_COLUMNS.split()):
         names = names[4:]
     else:
