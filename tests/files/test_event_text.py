@@ -139,7 +139,6 @@ SPELLINGS = {
     "remark.txt": "".join(f"{t} {x} {y} {p} # first, or later\n" for x, y, t, p in PLAIN),
     "named.txt": "timestamp x y polarity\n" + "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "xytp.txt": "".join(f"{x} {y} {t} {p}\n" for x, y, t, p in PLAIN),
-    "savetxt.txt": "# x y t p\n# x and y in pixels\n" + "".join(f"{x} {y} {t} {p}\n" for x, y, t, p in PLAIN),
     "comment.txt": "# t y x p\n" + "".join(f"{t} {y} {x} {p}\n" for x, y, t, p in PLAIN),
     "unit_in_comment.txt": "% t [ns] x y p\n" + "".join(f"{t}000 {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "unit_in_comment.csv": "# t[ns],x,y,p\n" + "".join(f"{t}000,{x},{y},{p}\n" for x, y, t, p in PLAIN),
