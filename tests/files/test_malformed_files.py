@@ -127,7 +127,7 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object], str]] = {
         lambda path: path.write_bytes(
             re.sub(rb"index_pos=.{8}", b"index_pos=" + bytes(8), array_bag(path, ROWS).read_bytes(), flags=re.DOTALL)
         ),
-        "it has no index: .*; rosbag reindex ",
+        "it has no index, .*; rosbag reindex ",
     ),
     "bag: no events": (bag(array_message([])), "holds no events"),
     "bag: cut": (bag(ARRAYS[:-1]), "does not have the parts"),
