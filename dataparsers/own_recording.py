@@ -11,6 +11,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
@@ -65,6 +66,8 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     images: Path | None = None
     """List of the images: on each line the time in seconds and the file. By default images.txt in the folder, if it is
     there."""
+    image_encoding: ImageEncoding | None = None
+    """Whether the images' values are sRGB or linear, in place of the calibration's."""
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:
@@ -125,7 +128,7 @@ class OwnRecordingDataParser(EventDataParser):
             event_file=self._event_file(folder, calibration.event_camera.width, calibration.event_camera.height),
             event_camera=calibration.event_camera,
             frame_camera=calibration.frame_camera,
-            image_encoding=calibration.image_encoding,
+            image_encoding=config.image_encoding or calibration.image_encoding,
             intrinsics_origin=calibration.intrinsics_origin,
         )
         return capture, calibration.frame_from_event, timed

@@ -97,10 +97,14 @@ class Aedat4File(EventReader):
         while position < self._end:
             file.seek(position)
             head = file.read(8)
-            stream, length = struct.unpack("<2i", head) if len(head) == 8 else (0, -1)
+            stream, length = struct.unpack("<2i", head) if len(head) == 8 else (0, MAX_PIECE)
+            is_cut = position + 8 + length > self._end
             # No packet is empty, because its content names its kind. A file of zeros would have no end.
-            if not 0 < length <= MAX_PIECE or position + 8 + length > self._end:
-                self._fail(f"it ends within the packet at byte {position}, or is damaged there")
+            if not 0 < length <= MAX_PIECE or (is_cut and self._table is not None):
+                self._fail(f"the packet at byte {position} is damaged")
+            if is_cut:
+                self._leave_out_end("a packet", position)
+                return
             if stream == self._number:
                 yield position + 8, length
             position += 8 + length

@@ -29,7 +29,8 @@ class _CameraInfo(msgspec.Struct):
     image_height: int
     camera_matrix: _Values
     distortion_coefficients: _Values
-    distortion_model: str = "plumb_bob"
+    distortion_model: str | None = None
+    fisheye_model: int = 0
 
 
 @dataclass(frozen=True)
@@ -118,9 +119,15 @@ def _camera_info(path: Path, content: dict[str, Any]) -> CameraIntrinsics:
     """Return the lens of ROS's camera_info, with the names of camera_calibration_parsers."""
     info = convert(path, content, _CameraInfo, "give the file that ROS's camera calibration wrote")
     matrix = info.camera_matrix.data
-    with value_errors_as_data_error(path):
+    with value_errors_as_data_error(path, "correct it there, or calibrate again with plumb_bob or equidistant"):
         if len(matrix) != 9:
             raise ValueError(f"its camera_matrix has {len(matrix)} numbers, not 9")
         pinhole = (matrix[0], matrix[4], matrix[2], matrix[5])
         size = (info.image_width, info.image_height)
-        return CameraIntrinsics.from_opencv(size, pinhole, info.distortion_coefficients.data, info.distortion_model)
+        # OpenCV's own file names no model.
+        model = info.distortion_model or ("equidistant" if info.fisheye_model else "plumb_bob")
+        distortion = info.distortion_coefficients.data
+        if model == "rational_polynomial" and not any(distortion[5:]):
+            # Its denominator is 1.
+            model, distortion = "plumb_bob", distortion[:5]
+        return CameraIntrinsics.from_opencv(size, pinhole, distortion, model)

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.files.event_reader import resolve_sensor_size
 from aenerf_ns.files.event_table import FORMATS_REMEDY, EventLayout, EventTableFile
 from aenerf_ns.files.limits import bounded, require_unpacked_size
+from aenerf_ns.files.prophesee import PropheseeHeader
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
 if TYPE_CHECKING:
@@ -65,7 +67,9 @@ class Hdf5TableFile(EventTableFile):
             packed = sum(array.id.get_storage_size() for array in arrays.values())
             require_unpacked_size(self.path, "its events", size, packed)
             offset = _scalar(self._time_offset(file))
-            if not isinstance(offset, (int, np.integer)):
+            # NumPy and MATLAB make a float64 of it, which is exact up to there.
+            is_whole = isinstance(offset, float) and abs(offset) < 1 << 53 and offset.is_integer()
+            if not is_whole and not isinstance(offset, (int, np.integer)):
                 name = self._layout.time_offset or "time_offset"
                 raise DataError(self.path, f"its {name} is {offset!r}", "store an integer")
             yield {**arrays, "time_offset": int(offset)}
@@ -82,7 +86,6 @@ class Hdf5TableFile(EventTableFile):
 
     def _stated_unit(self, arrays: Mapping[str, Any]) -> TimeUnit | None:
         unit = _scalar(self._attributes(arrays).get("time_unit", super()._stated_unit(arrays)))
-        unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
         if unit is not None and not (isinstance(unit, str) and unit in NANOSECONDS):
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(NANOSECONDS)}")
         if self._given_unit not in (None, unit):
@@ -117,21 +120,23 @@ class Hdf5EventFile(Hdf5TableFile):
         return columns
 
 
-def open_hdf5_events(path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> EventFile:
+def open_hdf5_events(path: Path, width: int | None, height: int | None, time_unit: TimeUnit | None = None) -> EventFile:
     """Open an HDF5 file of events. Its content tells the format: native, DSEC, TUM-VIE, EDS, Prophesee or PAEv3D.
 
     Args:
-        path, width, height: see :class:`EventFile`.
+        path: the file.
+        width, height: size of the sensor in pixels; needed where the file has no ``geometry``, as Metavision's have.
         time_unit: of the times, where the file states none. By default whole numbers are microseconds and decimals
             seconds.
 
     Raises:
-        DataError: the file is missing or not HDF5, or holds no events in a known layout.
+        DataError: the file is missing or not HDF5, or holds no events in a known layout, or a size is not known.
     """
     with bounded(path, "HDF5 file"), _open(path) as file:
+        stated = PropheseeHeader({"geometry": str(_scalar(file.attrs.get("geometry")))}, 0).size
         for layout in _LAYOUTS:
             if all(_dataset(path, file, name) is not None for name in layout.arrays):
-                return Hdf5TableFile(path, width, height, layout, time_unit)
+                return Hdf5TableFile(path, *resolve_sensor_size(path, stated, width, height), layout, time_unit)
         raise DataError(
             path,
             f"it holds {', '.join(sorted(file)) or 'nothing'}",
@@ -196,7 +201,8 @@ def _require_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
 
 def _scalar(value: Any) -> Any:
     """Return a number or text. Some writers store it as an array of one value."""
-    return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
 class Hdf5EventWriter:

@@ -86,6 +86,13 @@ class EventReader(EventFile):
             columns = tuple(column[inside] for column in columns)  # type: ignore[assignment]
         return EventStream(*columns, self.width, self.height, self.path)
 
+    def _leave_out_end(self, piece: str, position: int) -> None:
+        """Count a piece that an interrupted recording ends within, or raise a DataError unless it is to be left out."""
+        if not self.drop_malformed:
+            remedy = "copy it again, or leave the end of an interrupted recording out (--drop-malformed)"
+            raise DataError(self.path, f"it ends within {piece} at byte {position:,}", remedy)
+        self.left_out.add_number("cut off at its end", 1, f"{piece} at byte {position:,}")
+
 
 def resolve_sensor_size(
     path: Path, stated: tuple[int, int] | None, width: int | None, height: int | None

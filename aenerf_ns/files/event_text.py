@@ -23,10 +23,10 @@ from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventReader
 from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.files.limits import MAX_LINE
-from aenerf_ns.files.text import NANOSECONDS, TimeUnit, require_utf8
+from aenerf_ns.files.text import NANOSECONDS, TIME_NAME, TimeUnit, require_utf8
 
 _COLUMNS = "xytp"
-_ALIASES = {"timestamp": "t", "ts": "t", "time": "t", "polarity": "p", "pol": "p"}
+_ALIASES = {"polarity": "p", "pol": "p"}
 # Of lines without names: the order of the Event Camera Dataset, that of Metavision's CSV, and that of arrays.
 _ORDERS = ("txyp", "xypt", "xytp")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -77,6 +77,15 @@ def _is_row(line: bytes) -> bool:
     return bool(line.split(b"#", 1)[0].strip()) and not line.startswith(b"%")
 
 
+def _parse_names(line: bytes) -> tuple[list[str], TimeUnit | None] | None:
+    """Return the names of the columns and the unit of the times that a line states, or None if it does not name all."""
+    text = line.decode("utf-8", "replace").lower().lstrip("#% ").replace(" [", "[")
+    names = [name.strip().strip('"') for name in (text.split(",") if "," in text else text.split())]
+    units = [time[1] for time in map(TIME_NAME.fullmatch, names) if time]
+    names = ["t" if TIME_NAME.fullmatch(name) else _ALIASES.get(name, name) for name in names]
+    return (names, units[0]) if set(_COLUMNS) <= set(names) else None  # type: ignore[return-value]
+
+
 def has_commas(beginning: bytes) -> bool:
     """Tell from the beginning of a file of text whether commas separate its numbers."""
     row = next((line for line in beginning.split(b"\n") if _is_row(line)), b"")
@@ -90,15 +99,18 @@ def _line_name(line: int, num_before: int | None) -> str:
 class TextEventFile(EventReader):
     """Read lines of t, x, y and p, with polarity 0 or 1, or -1 or 1 (Mueggler et al. 2017).
 
-    The first line may hold the width and the height of the sensor, as E2VID's has, or names of the columns, which may
-    then have any order. Without names, x, y, p, t or x, y, t, p are read where nothing else fits.
+    The first line may hold the width and the height of the sensor, as E2VID's has. It, or a comment ahead of the
+    events, may name the columns, which may then have any order, and state the unit of the times: t[ns] or time_us.
+    Without names, x, y, p, t or x, y, t, p are read where nothing else fits.
 
     Args:
         path, width, height: see :class:`EventFile`.
-        time_unit: of the times. By default whole numbers are microseconds and decimals seconds.
+        time_unit: of the times, where the file states none. By default whole numbers are microseconds and decimals
+            seconds.
     """
 
     with_commas = False
+    _stated_unit: TimeUnit | None = None
 
     def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
         super().__init__(path, width, height)
@@ -110,19 +122,31 @@ class TextEventFile(EventReader):
         require_utf8(self.path, beginning)
         begin = len(_BYTE_ORDER_MARK) if beginning.startswith(_BYTE_ORDER_MARK) else 0
         file.seek(begin)
+        named = None
         while line := self._line(file):
             size = _SIZE.match(line)
             if size:
                 self._require_size(size[1] or size[3], size[2] or size[4])
             elif _is_row(line):
                 break
+            else:
+                named = _parse_names(line) or named
             begin = file.tell()
         if re.match(rb"[\s,]*[A-Za-z_\"]", line):
-            return self._named(line.decode("utf-8", "replace"))
+            named = _parse_names(line)
+            if named is None:
+                raise self._unnamed(line)
+            begin = file.tell()
+        # Other comments may hold the same words.
+        elif named is not None and len(named[0]) != len(self._fields(line)):
+            named = None
         file.seek(begin)
-        order = self._order(file)
+        names, self._stated_unit = named or (self._order(file), None)
+        if self._stated_unit and self._time_unit not in (None, self._stated_unit):
+            problem = f"it states its time unit, {self._stated_unit!r}, but {self._time_unit} was given"
+            raise DataError(self.path, problem, "leave it out")
         file.seek(begin)
-        return order
+        return names
 
     def _require_size(self, width: bytes, height: bytes) -> None:
         if (int(width), int(height)) != (self.width, self.height):
@@ -132,13 +156,6 @@ class TextEventFile(EventReader):
                 f"its header says {stated}, the calibration {self.width} x {self.height}",
                 "give the calibration of this sensor",
             )
-
-    def _named(self, header: str) -> list[str]:
-        names = [name.strip().strip('"').lower() for name in (header.split(",") if "," in header else header.split())]
-        names = [_ALIASES.get(name, name) for name in names]
-        if not set(_COLUMNS) <= set(names):
-            raise self._unnamed(header)
-        return names
 
     def _order(self, file: BinaryIO) -> list[str]:
         """Return the columns of lines without names, the order of the Event Camera Dataset unless another one fits."""
@@ -158,18 +175,19 @@ class TextEventFile(EventReader):
             if good.sum() >= (_LEFT_OUT_FITS if self.drop_malformed else 1) * len(good):
                 fitting.append(order)
         if self.with_commas and whole.shape[1] > 0 and len(fitting) != 1:
-            raise self._unnamed(text.split(b"\n")[0].decode("utf-8", "replace"))
+            raise self._unnamed(text.split(b"\n")[0])
         return list((fitting or _ORDERS)[0])
 
-    def _unnamed(self, line: str) -> DataError:
+    def _unnamed(self, line: bytes) -> DataError:
         return DataError(
             self.path,
-            f"its first line is {line.strip()[:60]!r}",
+            f"its first line is {line.decode('utf-8', 'replace').strip()[:60]!r}",
             "it must name the columns, x, y, t and p among them, separated by commas or blanks",
         )
 
     def _assumed_unit(self) -> TimeUnit | None:
-        return self._time_unit or self._unit_of(self._ends())
+        unit = self._unit_of(self._ends())
+        return None if self._stated_unit else unit
 
     def _ends(self) -> list[_Lines]:
         """Parse the beginning of the file and its last line; none of them without events."""
@@ -179,11 +197,11 @@ class TextEventFile(EventReader):
             return [] if beginning is None else [beginning, self._last_line(file, names)]
 
     def _unit_of(self, ends: list[_Lines]) -> TimeUnit:
-        """Return the unit that is assumed of the times at the ends of the file."""
-        return "s" if any(lines.fraction[2].any() for lines in ends) else "us"
+        """Return the unit that is stated or given, or assumed of the times at the ends of the file."""
+        return self._stated_unit or self._time_unit or ("s" if any(lines.fraction[2].any() for lines in ends) else "us")
 
     def _chunks(self) -> Iterator[EventStream]:
-        tick = NANOSECONDS[self._time_unit or self._unit_of(self._ends())]
+        tick = NANOSECONDS[self._unit_of(self._ends())]
         with self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
                 yield self._events(lines, tick)
@@ -193,7 +211,7 @@ class TextEventFile(EventReader):
         if not ends:
             return None
         beginning, last = ends
-        tick = NANOSECONDS[self._time_unit or self._unit_of(ends)]
+        tick = NANOSECONDS[self._unit_of(ends)]
         first = replace(beginning, whole=beginning.whole[:, :1], fraction=beginning.fraction[:, :1])
         start, end = (int(self._events(lines, tick).t[0]) for lines in (first, last))
         return start, end
@@ -234,8 +252,11 @@ class TextEventFile(EventReader):
             raise self._malformed(line, text[fault : text.index(b"\n", fault)], names)
         return _Lines(text, num_before, whole, fraction)
 
+    def _fields(self, line: bytes) -> list[bytes]:
+        return [field.strip() for field in line.split(b"#")[0].split(b"," if self.with_commas else None)]
+
     def _malformed(self, line_name: str, line: bytes, names: list[str]) -> DataError:
-        fields = [field.strip() for field in line.split(b"#")[0].split(b"," if self.with_commas else None)]
+        fields = self._fields(line)
         if len(fields) != len(names):
             remedy = f"each line must hold the {len(names)}, between commas or blanks: {' '.join(names)}"
             beginning = line[:60].decode("utf-8", "replace")

@@ -15,7 +15,7 @@ from aenerf_ns.files.json_file import convert
 from aenerf_ns.files.plain_yaml import read_plain_yaml
 from aenerf_ns.files.transforms import Matrix, Row, rigid_motion
 
-_REMEDY = "give the camchain that Kalibr wrote"
+_REMEDY, _OTHER_MODEL = "give the camchain that Kalibr wrote", "calibrate again with pinhole-radtan or pinhole-equi"
 
 
 class ChainCamera(msgspec.Struct, kw_only=True):
@@ -29,9 +29,10 @@ class ChainCamera(msgspec.Struct, kw_only=True):
     T_cn_cnm1: Matrix | None = None
 
     def __post_init__(self) -> None:
+        # The number of coefficients depends on the model, which is looked at first.
+        self.lens()
         if self.distortion_model != "none" and len(self.distortion_coeffs) != 4:
             raise ValueError(f"it has {len(self.distortion_coeffs)} distortion_coeffs, not 4")
-        self.lens()
 
     def lens(self) -> CameraIntrinsics:
         """Return the camera's lens."""
@@ -53,7 +54,9 @@ def read_camchain(path: Path) -> dict[str, ChainCamera]:
     cameras: dict[str, ChainCamera] = {}
     # cam10 follows cam9.
     for name in sorted(chain, key=lambda name: (len(name), name)):
-        cameras[name] = convert(path, chain[name], ChainCamera, _REMEDY, name)
+        models = chain[name].get("camera_model", "pinhole"), chain[name].get("distortion_model", "none")
+        is_read = models in (("pinhole", "radtan"), ("pinhole", "equidistant"), ("pinhole", "none"))
+        cameras[name] = convert(path, chain[name], ChainCamera, _REMEDY if is_read else _OTHER_MODEL, name)
         if cameras[name].T_cn_cnm1 is not None:
             _motion_from_previous(path, cameras, name)
     return cameras

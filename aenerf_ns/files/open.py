@@ -83,9 +83,9 @@ def open_event_file(
             header = PropheseeHeader.parse(path, beginning)
             is_raw = path.suffix.lower() == ".raw" or header.is_raw
             return (PropheseeRawFile if is_raw else PropheseeDatFile)(path, header, width, height)
-        size = resolve_sensor_size(path, None, width, height)
         if name == "HDF5":
-            return open_hdf5_events(path, *size, time_unit)
+            return open_hdf5_events(path, width, height, time_unit)
+        size = resolve_sensor_size(path, None, width, height)
         if name == "NumPy":
             return open_array_events(path, *size, time_unit)
         return (CsvEventFile if has_commas(beginning) else TextEventFile)(path, *size, time_unit)
@@ -96,7 +96,8 @@ def _read_beginning(path: Path) -> bytes:
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return b""
-        raise DataError(path, "it is a folder without the metadata.yaml of a bag of ROS 2", "name the event file in it")
+        remedy = "name the event file in it, or ros2 bag reindex it"
+        raise DataError(path, "it is a folder without the metadata.yaml of a bag of ROS 2", remedy)
     with path.open("rb") as file:
         beginning = file.read(HEADER_BYTES)
     if not beginning:

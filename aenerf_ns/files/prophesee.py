@@ -59,7 +59,8 @@ class PropheseeHeader:
         fields: dict[str, str] = {}
         end = 0
         # The keyword "end" is optional. Without it, the header ends at the first line that does not begin with "% ".
-        while beginning.startswith(b"% ", end):
+        # Empty ones have no blank.
+        while beginning.startswith((b"% ", b"%\n", b"%\r\n"), end):
             line_end = beginning.find(b"\n", end) + 1
             if line_end == 0:
                 raise DataError(path, f"line {len(fields) + 1} of its header does not end", "record or copy it again")
@@ -123,8 +124,9 @@ class PropheseeRawFile(EventReader):
         from aenerf_ns.files.evt_words import TIME_HIGH
 
         dtype = encoding.dtype
-        if (self.path.stat().st_size - self._begin) % dtype.itemsize:
-            raise DataError(self.path, f"it ends within a word of {dtype.itemsize} bytes", "copy it again")
+        size = self.path.stat().st_size
+        if rest := (size - self._begin) % dtype.itemsize:
+            self._leave_out_end(f"a word of {dtype.itemsize} bytes", size - rest)
         with self.path.open("rb") as file:
             file.seek(self._begin)
             while len(block := np.fromfile(file, dtype, BLOCK)):
@@ -181,14 +183,15 @@ class PropheseeDatFile(EventReader):
                 path, f"its records are of type and size {kind.hex(' ') or 'none'}, not events", "record it again"
             )
         self._begin = header.end + len(kind)
-        self._num_events, rest = divmod(path.stat().st_size - self._begin, _RECORD.itemsize)
-        if rest:
-            raise DataError(path, f"it ends within a record of {_RECORD.itemsize} bytes", "copy it again")
+        self._num_events, self._rest = divmod(path.stat().st_size - self._begin, _RECORD.itemsize)
 
     def _count(self) -> int:
         return self._num_events
 
     def _chunks(self) -> Iterator[EventStream]:
+        if self._rest:
+            end = self._begin + self._num_events * _RECORD.itemsize
+            self._leave_out_end(f"a record of {_RECORD.itemsize} bytes", end)
         previous = None
         with self.path.open("rb") as file:
             file.seek(self._begin)

@@ -2,7 +2,7 @@
 
 * ``dvs_msgs/EventArray``, and those of ``dv_ros_msgs`` and ``prophesee_event_msgs`` with the same fields:
   https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
-* ``event_camera_msgs/EventPacket``: https://github.com/ros-event-camera/event_camera_msgs
+* ``event_camera_msgs/EventPacket``, formerly ``event_array_msgs/EventArray``: https://github.com/ros-event-camera/event_camera_msgs
 
 The package rosbags reads the bags. The messages are taken apart here, because rosbags makes a Python object of each
 event. Its AnyReader is not used: it refuses bags whose definitions of other messages are missing or do not match.
@@ -34,9 +34,11 @@ if TYPE_CHECKING:
 _ROS1_MAGIC = b"#ROSBAG"
 BAG_MAGIC = (_ROS1_MAGIC, b"SQLite format 3\0", b"\x89MCAP0\r\n")
 """The beginnings of bags: of ROS 1, and of the two storages of ROS 2."""
+_ROS1_HEADER_BYTES = 4096
 _MCAP_MAGIC, _MCAP_FOOTER = BAG_MAGIC[2], 0x02
 
-_PACKET_TYPE = "event_camera_msgs/msg/EventPacket"
+# The second is its former name.
+_PACKET_TYPES = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 _ARRAY_TYPES = tuple(f"{name}/msg/EventArray" for name in ("dvs_msgs", "dv_ros_msgs", "prophesee_event_msgs"))
 # ROS 1 serializes an event without padding. ROS 2 aligns each number to its size; see `_aligned_events`.
 _EVENT_FIELDS = {"x": "<u2", "y": "<u2", "seconds": "<u4", "nanoseconds": "<u4", "polarity": "?"}
@@ -128,6 +130,10 @@ class RosbagEventFile(EventReader):
             _require_distinct_files(self.path / "metadata.yaml")
         elif _begins(self.path, _MCAP_MAGIC):
             _require_records(self.path)
+        elif not self._is_ros2:
+            with self.path.open("rb") as file:
+                if b"index_pos=" + bytes(8) in file.read(_ROS1_HEADER_BYTES):
+                    raise DataError(self.path, "it has no index, as if interrupted", f"rosbag reindex {self.path}")
         with Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path) as reader:
             yield reader
 
@@ -142,7 +148,7 @@ class RosbagEventFile(EventReader):
                 total += len(data)
                 require_unpacked_size(self.path, f"the topic {topic}", total, packed)
                 try:
-                    message = _parse(data, connection.msgtype == _PACKET_TYPE, self._is_ros2)
+                    message = _parse(data, connection.msgtype in _PACKET_TYPES, self._is_ros2)
                 except struct.error:
                     raise DataError(
                         self.path, f"a message of {topic} does not have the parts of its type", "copy it again"
@@ -257,7 +263,7 @@ def _require_records(path: Path) -> None:
 
 def _choose(path: Path, types: dict[str, str], topic: str | None) -> str:
     """Return the topic with the events, from the type of each topic."""
-    known = sorted(name for name, kind in types.items() if kind in (_PACKET_TYPE, *_ARRAY_TYPES))
+    known = sorted(name for name, kind in types.items() if kind in _PACKET_TYPES + _ARRAY_TYPES)
     if topic is None and len(known) == 1:
         return known[0]
     if topic in known:

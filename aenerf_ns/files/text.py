@@ -6,6 +6,7 @@ import codecs
 import re
 from collections.abc import Sequence
 from decimal import Decimal
+from itertools import takewhile
 from pathlib import Path
 from typing import Literal
 
@@ -13,14 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.limits import MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
+from aenerf_ns.files.limits import MAX_LINE, MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
 
-# The name of the first column in a first line of names.
-_NAME = re.compile(r"[\"']?(t|ts|time\w*|stamp)\b", re.IGNORECASE)
+TIME_NAME = re.compile(
+    r"\W*(?:t|ts|time\w*?|stamp\w*?|secs?|seconds)(?:(?:\s*\[|_)(ns|us|ms|s)\b\]?)?(?!\w)", re.IGNORECASE
+)
+"""What names the times, and may state their unit: timestamp [ns], t[us] or time_us."""
+# The beginning of a row.
+_NUMBER = re.compile(r"\s*[-+.\d]")
 
 POSE_COLUMNS = "t tx ty tz qx qy qz qw"
 """The columns of a trajectory in the format of the TUM RGB-D benchmark."""
@@ -51,7 +56,7 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
             fields = line.split()
             if "," in line and (len(fields) != expected or fields[0].endswith(",")):
                 fields = [field.strip() for field in line.rstrip().split(",")]
-            if not fields or (not rows and len(fields) == expected and _NAME.match(fields[0])):
+            if not fields or (not rows and len(fields) == expected and TIME_NAME.match(fields[0])):
                 continue
             if len(fields) != expected:
                 remedy = f"each line must hold the {expected}, between blanks or commas: {columns}"
@@ -60,6 +65,14 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
                 raise DataError(path, f"it has more than {MAX_ROWS:,} rows", "cut the recording, or leave rows out")
             rows.append(fields)
     return rows
+
+
+def read_header(path: Path) -> tuple[list[str], TimeUnit | None]:
+    """Return the lines ahead of the rows in lower case, and the unit that they state of the times."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        lines = takewhile(lambda line: not _NUMBER.match(line), iter(lambda: file.readline(MAX_LINE), ""))
+        header = [line.lower() for line in lines]
+    return header, next((name[1] for name in map(TIME_NAME.match, header) if name and name[1]), None)  # type: ignore
 
 
 def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:

@@ -42,7 +42,10 @@ class _Camera(msgspec.Struct, kw_only=True):
     p2: float = 0.0
 
     def __post_init__(self) -> None:
-        self.intrinsics()
+        parameters = self.intrinsics().to_transforms()
+        for name in ("k3", "k4", "p1", "p2"):
+            if (value := getattr(self, name)) and name not in parameters:
+                raise ValueError(f"{name} is {value:g}, which camera_model {self.camera_model} does not have")
 
     def intrinsics(self) -> CameraIntrinsics:
         """Return the camera's lens."""
@@ -128,6 +131,9 @@ def read_transforms(path: Path, image_encoding: ImageEncoding = "srgb") -> tuple
     values = {"image_encoding": image_encoding, **read_json(path, dict)}
     camera = values.get("event_camera")
     parts = [part for part in (values, camera) if isinstance(part, dict)]
+    for name in (name for part in parts for name in part if "dist" in name):
+        remedy = "state camera_model, and k1, k2, p1, p2, k3 or for a fisheye k1 to k4"
+        raise DataError(path, f"it states {name}, which is not read", remedy)
     stated = [name for part in parts for name in part if re.match("T_.*event", name) and name != _MOUNT]
     if stated and not (isinstance(camera, dict) and camera.get(_MOUNT) is not None):
         remedy = f"state {_MOUNT} in event_camera, which takes points from its coordinates to the frame camera's"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -14,22 +13,26 @@ from torch import Tensor
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError, require_file
-from aenerf_ns.files.limits import MAX_LINE
-from aenerf_ns.files.text import POSE_COLUMNS, TimeUnit, format_seconds, parse_numbers, parse_times, read_rows
+from aenerf_ns.files.text import (
+    POSE_COLUMNS,
+    TIME_NAME,
+    TimeUnit,
+    format_seconds,
+    parse_numbers,
+    parse_times,
+    read_header,
+    read_rows,
+)
 
 # Trajectories are commonly printed with six or more digits, so quaternions have rounding errors.
 _MAX_NORM_ERROR = 1e-3
-# A line of names, which begins with that of the times.
-_NAMES = re.compile(r"\W*(t|ts|time\w*|stamp)\b")
-# The beginning of a line that holds a pose.
-_POSE = re.compile(r"\s*[-+.\d]")
 
 
 def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     """Read camera-to-world poses, with the axes of the file, from lines of t tx ty tz qx qy qz qw.
 
     Some datasets have the same rows with other units of the times. # starts a comment. A line ahead of the poses may
-    name the columns, and then counts: EuRoC's has nanoseconds and qw first.
+    name the columns, and then counts: EuRoC's has nanoseconds and qw first. q0 is w.
 
     Raises:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
@@ -39,16 +42,27 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
     rows = read_rows(path, POSE_COLUMNS)
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        lines = takewhile(lambda line: not _POSE.match(line), iter(lambda: file.readline(MAX_LINE), ""))
-        header = [line.lower() for line in lines if _NAMES.match(line.lower())]
-    stated = next(filter(None, (re.match(r"\W*\w+ *\[(ns|us|ms|s)\]", line) for line in header)), None)
-    times = parse_times(path, [row[0] for row in rows], stated[1] if stated else unit)  # type: ignore[arg-type]
+    header, stated = read_header(path)
+    times = parse_times(path, [row[0] for row in rows], stated or unit)
     values = parse_numbers(path, [row[1:] for row in rows])
-    orders = [re.findall(r"\bq\w*?([wxyz])\b", line)[:4] for line in header]
-    if "".join(next((order for order in reversed(orders) if len(order) == 4), [])) == "wxyz":
+    orders = [order for order in map(_quaternion_order, header) if sorted(order) in (sorted("wxyz"), sorted("0123"))]
+    order = orders[-1] if orders else "xyzw"
+    if order in ("wxyz", "0123"):
         values = values[:, [0, 1, 2, 4, 5, 6, 3]]
+    elif order != "xyzw":
+        problem = f"its names put the quaternion's columns in the order {' '.join(order)}"
+        raise DataError(path, problem, "write them in the order qx qy qz qw, or w first")
     return Trajectory(times, poses_from_quaternions(path, values[:, :3], values[:, 3:]), path)
+
+
+def _quaternion_order(line: str) -> str:
+    """Return how the names of a quaternion's four columns end in a line that names all columns, such as wxyz."""
+    names = re.sub(r"\[[^][]*\]|[#\"',]", " ", line).split()
+    if len(names) == len(POSE_COLUMNS.split()):
+        names = names[4:]
+    else:
+        names = re.findall(r"\bq\w*?[wxyz]\b", line)[:4] if TIME_NAME.match(line) else []
+    return "".join(name[-1] for name in names)
 
 
 def poses_from_quaternions(source: Path, positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> Tensor:

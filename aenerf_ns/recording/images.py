@@ -63,4 +63,5 @@ def open_image(file: Path) -> Iterator[Image.Image]:
         raise
     # PIL's readers raise whatever they stumble over.
     except Exception as error:
-        raise DataError(file, f"not a PNG or JPEG image that can be read ({error})", "copy it again") from None
+        remedy = "save it as PNG or JPEG, or copy it again if it is one"
+        raise DataError(file, f"not a PNG or JPEG image that can be read ({error})", remedy) from None

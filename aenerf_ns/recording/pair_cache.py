@@ -28,8 +28,8 @@ from aenerf_ns.events.stream import EventFile
 _VERSION = 2
 # The end of the file: length of the description as JSON in front of it, and this word.
 _WORD = b"aenerf-pairs"
-# Attributes of a reader of events that are no options. The last two are read from the file when they are asked for.
-_NOT_OPTIONS = ("path", "left_out", "_span", "_clock_offset")
+# Attributes of a reader of events that are no options. The last three are read from the file when they are asked for.
+_NOT_OPTIONS = ("path", "left_out", "_span", "_clock_offset", "_stated_unit")
 _NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "int")
 
 

@@ -16,7 +16,7 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.limits import file_inside
-from aenerf_ns.files.text import UNIT_NAMES, TimeUnit, parse_times, read_rows
+from aenerf_ns.files.text import UNIT_NAMES, TimeUnit, parse_times, read_header, read_rows
 from aenerf_ns.recording.recording import ReferenceView, Split
 from aenerf_ns.recording.time_units import unit_steps
 
@@ -57,6 +57,8 @@ def image_files_of_poses(folder: Path, num_poses: int) -> list[Path]:
 def read_image_list(path: Path) -> list[tuple[int, Path]]:
     """Read times in nanoseconds and files from a list: on each line seconds, and the file relative to its folder.
 
+    A line ahead of them may state another unit: timestamp [us],filename.
+
     Raises:
         DataError: the list or an image is missing, or a line does not hold the two.
     """
@@ -66,7 +68,7 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
         with reading(file):
             if not file.is_file():
                 raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
-    times = parse_times(path, [row[0] for row in rows]).tolist()
+    times = parse_times(path, [row[0] for row in rows], read_header(path)[1] or "s").tolist()
     return list(zip(times, files, strict=True))
 
 

@@ -64,7 +64,12 @@ NATIVE: dict[str, Fault] = {
     "negative threshold": (camera(negative_contrast_threshold=-1), "transforms.json", "negative_contrast"),
     "unknown Bayer pattern": (camera(bayer_pattern="RGBG"), "transforms.json", '"RGBG"'),
     "unknown lens": (camera(camera_model="KB4"), "transforms.json", "event_camera: the lens model is 'KB4'"),
+    "p1 of a fisheye": (camera(camera_model="OPENCV_FISHEYE", p1=0.1), "transforms.json", "event_camera: p1 is 0.1"),
+    "k4 without a fisheye": (top(k4=-0.1), "transforms.json", "k4 is -0.1, which camera_model OPENCV does not have"),
+    "Kalibr's distortion": (camera(distortion_coeffs=[0.1]), "transforms.json", "distortion_coeffs, which is not read"),
+    "model of distortion": (top(distortion_model="kb4"), "transforms.json", "distortion_model, which is not read"),
     "image of another size": (saved_as("PNG", "images/val/00000.png", (3, 2)), "val/00000.png", "3 x 2 pixels"),
+    "BMP": (saved_as("BMP", "images/val/00000.png"), "val/00000.png", "save it as PNG or JPEG, or copy it again if"),
     "mirrored pose": (frame(transform_matrix=MIRRORED), "frames[0].transform_matrix", "not a rigid motion"),
     "scaled mount": (camera(T_frame_event=SCALED), "event_camera.T_frame_event", "not a rigid motion"),
     "frame twice": (native(lambda m: m["frames"].append(m["frames"][0])), "transforms.json", "train/00000.png again"),
@@ -299,7 +304,8 @@ OWN: dict[str, Fault] = {
     "empty COLMAP": (colmap(), "colmap", "no COLMAP model"),
     "COLMAP of other images": (colmap(other_images), "images.txt", "it lists other.png 0 times"),
     "broken COLMAP": (colmap(write_bytes("colmap/images.bin", b"\1")), "images.bin", "not a COLMAP model"),
-    "unknown distortion": (kalibr("cam0", distortion_model="fov"), "camchain.yaml", "cam0: the lens model is 'fov'"),
+    "unknown distortion": (kalibr("cam0", distortion_model="fov", distortion_coeffs=[1]), "camchain.yaml", "is 'fov'"),
+    "unknown camera": (kalibr("cam0", camera_model="omni"), "camchain.yaml", "calibrate again with pinhole-radtan or"),
     "three distortions": (kalibr("cam0", distortion_coeffs=[0.1, 0, 0]), "camchain.yaml", "3 distortion_coeffs"),
     "infinite mount": (kalibr("cam1", T_cn_cnm1=INFINITE), "cam1.T_cn_cnm1", "not a rigid motion"),
     "camchain of numbers": (camchain("cam0: 3"), "camchain.yaml", "no camera"),
@@ -346,5 +352,5 @@ def test_faults_are_one_clear_line(name: str, fault: str, whole: Callable[[str],
         read_everything(config_of(name, folder, **options))
     assert str(folder) in str(error.value.source)
     assert str(error.value.source).endswith(source)
-    assert problem in error.value.problem
+    assert problem in f"{error.value.problem}; {error.value.remedy}"
     assert "\n" not in str(error.value)

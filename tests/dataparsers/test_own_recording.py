@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from aenerf_ns.dataparsers.formats import recognize
 from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.files.calibration import read_calibration
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.views import views_on_trajectory
 
@@ -39,7 +41,16 @@ def test_own_recordings_have_views_at_their_times(tmp_path: Path) -> None:
     assert recording.sensor == SensorModel(0.3, 0.2, 100)
     assert recording.image_encoding == "linear"
     # The fourth image is after the last pose.
-    assert [view.time - EPOCH * 1_000 for view in recording.reference_views["train"]] == [0, 5 * 10**8, 10**9]
+    times = [view.time for view in recording.reference_views["train"]]
+    assert [time - EPOCH * 1_000 for time in times] == [0, 5 * 10**8, 10**9]
+    # The list may state its unit.
+    rows = [line.split() for line in (truth.data / "images.txt").read_text().splitlines()]
+    rows = [(int(Decimal(time) * 10**6), name) for time, name in rows]
+    for names, separator in (("#timestamp [us],filename", " "), ("timestamp [us],filename", ","), ("t_us file", " ")):
+        text = "".join(f"{time}{separator}{name}\n" for time, name in rows)
+        (truth.data / "images.txt").write_text(f"{names}\n{text}")
+        views = recording_of(OwnRecordingDataParserConfig(data=truth.data)).reference_views["train"]
+        assert [view.time for view in views] == times
     view = recording.reference_views["test"][0]
     np.testing.assert_allclose(view.camera_to_world.numpy(), truth.poses[5], rtol=0, atol=1e-9)
 
@@ -112,7 +123,9 @@ def test_camchain_places_both_cameras(tmp_path: Path) -> None:
     # They are not taken for images of the event camera.
     with pytest.raises(DataError, match="its cameras are cam0, cam1; name that of the images as --frame-camera"):
         recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1"))
-    recording = recording_of(OwnRecordingDataParserConfig(data=truth.data, event_camera="cam1", frame_camera="cam0"))
+    options = {"event_camera": "cam1", "frame_camera": "cam0", "image_encoding": "srgb"}
+    recording = recording_of(OwnRecordingDataParserConfig(data=truth.data, **options))
+    assert recording.image_encoding == "srgb"
     assert recording.event_camera == CameraIntrinsics(60, 40, 50.0, 51.0, 30.0, 20.5, distortion=(-0.1, 0, 0, 0.01, 0))
     assert recording.frame_camera == CameraIntrinsics(
         80, 60, 70.0, 71.0, 40.5, 30.5, "fisheye", (0.01, 0.02, 0.03, 0.04)
@@ -259,20 +272,34 @@ CAMERA_INFO = (
 )
 
 
+OPENCV = "%YAML:1.0\n---\n" + CAMERA_INFO.replace("_matrix:", "_matrix: !!opencv-matrix").replace(
+    "data:", "dt: d\n  data:"
+)
+
+
 @pytest.mark.parametrize(
     "text",
     [
         CAMERA_INFO,
-        "%YAML:1.0\n---\n"
-        + CAMERA_INFO.replace("_matrix:", "_matrix: !!opencv-matrix").replace("data:", "dt: d\n  data:"),
+        OPENCV,
+        OPENCV.replace("distortion_model: plumb_bob", "fisheye_model: 1").replace(", 0.0, 0.0, 0.0]", ", 0.03, 0.04]"),
+        CAMERA_INFO.replace("plumb_bob", "rational_polynomial").replace("0.0]", "0.0, 0.0, 0.0, 0.0]"),
         "header: {seq: 0}\nheight: 72\nwidth: 96\ndistortion_model: plumb_bob\nD: [-0.1, 0.01, 0.0, 0.0, 0.0]\n"
         "K: [90.0, 0.0, 47.5, 0.0, 91.0, 35.5, 0.0, 0.0, 1.0]\n---\n",
     ],
-    ids=["file", "file of OpenCV", "message"],
+    ids=["file", "file of OpenCV", "fisheye of OpenCV", "rational", "message"],
 )
 def test_read_the_camera_info_of_ros(text: str, tmp_path: Path) -> None:
     (tmp_path / "camera_info.yaml").write_text(text)
     write_poses(tmp_path / "trajectory.txt")
     np.savez(tmp_path / "events.npz", **random_events())
     recording = recording_of(OwnRecordingDataParserConfig(data=tmp_path))
-    assert recording.event_camera == CameraIntrinsics(96, 72, 90.0, 91.0, 48.0, 36.0, distortion=(-0.1, 0.01, 0, 0, 0))
+    lens = ("fisheye", (-0.1, 0.01, 0.03, 0.04)) if "fisheye" in text else ("radial_tangential", (-0.1, 0.01, 0, 0, 0))
+    assert recording.event_camera == CameraIntrinsics(96, 72, 90.0, 91.0, 48.0, 36.0, *lens)
+
+
+def test_refuse_a_rational_lens(tmp_path: Path) -> None:
+    text = CAMERA_INFO.replace("plumb_bob", "rational_polynomial").replace("0.0]", "0.0, 0.1, 0.0, 0.0]")
+    (tmp_path / "camera_info.yaml").write_text(text)
+    with pytest.raises(DataError, match=r"is 'rational_polynomial', .* calibrate again with plumb_bob or equidistant"):
+        read_calibration(tmp_path / "camera_info.yaml")

@@ -131,21 +131,24 @@ def test_vector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert recording.event_camera == expected
 
 
-def test_frames_of_a_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("encoding", ["mono8", "rgb8", "bgr8"])
+def test_frames_of_a_bag(encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rosbag1, typesys = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
     monkeypatch.chdir(tmp_path)
     Path("recording").mkdir()
-    # Two frames of 3 x 2 pixels, whose rows are padded to 4 bytes.
+    # Two frames of 3 x 2 gray pixels or 1 x 2 colors, whose rows are padded to 4 bytes. images/ is there already.
+    Path("recording/images").mkdir()
     frames = np.arange(16, dtype=np.uint8).reshape(2, 2, 4)
     stamps = [EPOCH * 1_000 + 7, EPOCH * 1_000 + 40_000_007]
     with rosbag1.Writer(Path("recording/events.bag")) as writer:
         pictures = writer.add_connection("/dvs/image_raw", "sensor_msgs/msg/Image", typestore=store)
         for stamp, frame in zip(stamps, frames, strict=True):
-            end = string("mono8") + b"\0" + struct.pack("<2I", 4, frame.size) + frame.tobytes()
-            writer.write(pictures, stamp, message_header(stamp, (3, 2)) + end)
+            end = string(encoding) + b"\0" + struct.pack("<2I", 4, frame.size) + frame.tobytes()
+            writer.write(pictures, stamp, message_header(stamp, (3 if encoding == "mono8" else 1, 2)) + end)
     run_example("frames_of_a_bag")
     lines = Path("recording/images.txt").read_text().splitlines()
     assert lines == ["1600000000.000000007 images/000000.png", "1600000000.040000007 images/000001.png"]
     for index, frame in enumerate(frames):
-        np.testing.assert_array_equal(Image.open(f"recording/images/{index:06d}.png"), frame[:, :3])
+        values = frame[:, :3] if encoding == "mono8" else frame[:, None, :3][..., :: -1 if encoding == "bgr8" else 1]
+        np.testing.assert_array_equal(Image.open(f"recording/images/{index:06d}.png"), values)

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.event_table_writers import HEIGHT, WIDTH, made_columns, signed, write_tum_vie
+from helpers.event_table_writers import HEIGHT, WIDTH, made_columns, signed, write_prophesee, write_tum_vie
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventFile, EventStream
@@ -37,12 +37,12 @@ def test_native_file_is_recognized(tmp_path: Path) -> None:
     assert Hdf5EventFile(tmp_path / "events.h5", WIDTH, HEIGHT).time_span()[0] == columns["t"][0]
 
 
-@pytest.mark.parametrize("dtype", [np.int8, np.uint8])
-def test_stated_unit_and_offset_count_whatever_the_types(dtype: type, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("dtype", "offset"), [(np.int8, 10), (np.uint8, 10.0)])
+def test_stated_unit_and_offset_count_whatever_the_types(dtype: type, offset: float, tmp_path: Path) -> None:
     with h5py.File(tmp_path / "events.h5", "w") as file:
         for name in "xytp":
             file[f"events/{name}"] = np.array([5, 7] if name == "t" else [1, 1], dtype)
-        file["events"].attrs.update(time_unit="ms", time_offset=10)
+        file["events"].attrs.update(time_unit="ms", time_offset=offset)
     assert open_events(tmp_path / "events.h5").time_span() == (15_000_000, 17_000_000)
 
 
@@ -61,6 +61,19 @@ def test_given_unit_counts_where_none_is_stated(tmp_path: Path) -> None:
     (tmp_path / "events.raw").write_text("% evt 2.0\n")
     with pytest.raises(DataError, match="its format has a time unit, but us was given"):
         open_event_file(tmp_path / "events.raw", WIDTH, HEIGHT, time_unit="us")
+
+
+@pytest.mark.parametrize("geometry", [f"{WIDTH}x{HEIGHT}", np.bytes_(f"{WIDTH}x{HEIGHT}")])
+def test_metavision_states_the_size(geometry: str | bytes, tmp_path: Path) -> None:
+    write_prophesee(tmp_path / "events.h5", made_columns())
+    with pytest.raises(DataError, match="does not state the size of its sensor"):
+        open_event_file(tmp_path / "events.h5")
+    with h5py.File(tmp_path / "events.h5", "a") as file:
+        file.attrs["geometry"] = geometry
+    events = open_event_file(tmp_path / "events.h5")
+    assert (events.width, events.height) == (WIDTH, HEIGHT)
+    with pytest.raises(DataError, match="its sensor has 60 x 40 pixels, but 346 x 260 were given"):
+        open_event_file(tmp_path / "events.h5", 346, 260)
 
 
 def test_missing_filter_names_the_extra(tmp_path: Path) -> None:

@@ -139,6 +139,11 @@ SPELLINGS = {
     "remark.txt": "".join(f"{t} {x} {y} {p} # first, or later\n" for x, y, t, p in PLAIN),
     "named.txt": "timestamp x y polarity\n" + "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for x, y, t, p in PLAIN),
     "xytp.txt": "".join(f"{x} {y} {t} {p}\n" for x, y, t, p in PLAIN),
+    "comment.txt": "# t y x p\n" + "".join(f"{t} {y} {x} {p}\n" for x, y, t, p in PLAIN),
+    "unit_in_comment.txt": "% t [ns] x y p\n" + "".join(f"{t}000 {x} {y} {p}\n" for x, y, t, p in PLAIN),
+    "unit_in_comment.csv": "# t[ns],x,y,p\n" + "".join(f"{t}000,{x},{y},{p}\n" for x, y, t, p in PLAIN),
+    "unit.csv": "timestamp [ms],x,y,polarity\n" + "".join(f"{t / 1e3},{x},{y},{p}\n" for x, y, t, p in PLAIN),
+    "unit_in_name.csv": "time_us,x,y,p\n" + "".join(f"{t}.0,{x},{y},{p}\n" for x, y, t, p in PLAIN),
     "aliases.csv": "polarity,x,y,ts\n" + "".join(f"{p},{x},{y},{t}\n" for x, y, t, p in PLAIN),
 }
 
@@ -150,6 +155,13 @@ def test_read_the_spellings_that_are_unambiguous(name: str, tmp_path: Path) -> N
     expected = [(x, y, 1000 * t, 2 * p - 1) for x, y, t, p in PLAIN]
     assert list(zip(events.x, events.y, events.t, events.p, strict=True)) == expected
     assert file.time_span() == (expected[0][2], expected[-1][2])
+
+
+def test_refuse_another_unit_than_that_in_the_names(tmp_path: Path) -> None:
+    path = written(tmp_path / "events.txt", SPELLINGS["unit_in_comment.txt"])
+    assert open_event_file(path, 96, 72, time_unit="ns").assumed_unit() is None
+    with pytest.raises(DataError, match="it states its time unit, 'ns', but us was given; leave it out"):
+        next(open_event_file(path, 96, 72, time_unit="us").chunks())
 
 
 def test_refuse_the_size_of_another_sensor(tmp_path: Path) -> None:

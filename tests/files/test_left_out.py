@@ -85,6 +85,22 @@ def test_leave_out_a_few_malformed_events(suffix: str, folder: Path, capsys: pyt
     assert f"y = {HEIGHT + 3}" in said or "impossible y (the first " in said
 
 
+@pytest.mark.parametrize("suffix", [".dat", ".aedat4", ".evt2.raw", ".evt3.raw"])
+def test_leave_out_the_end_of_an_interrupted_recording(
+    suffix: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / f"cut{suffix}"
+    WRITERS[suffix](path, ROWS)
+    # A packet of AEDAT4 without events is the last one.
+    path.write_bytes(path.read_bytes()[: -20 if suffix == ".aedat4" else -1])
+    file = opened(path)
+    file.drop_malformed = True
+    times = read(file)[:, 2].tolist()
+    assert times == [t * 1000 for _, _, t, _ in ROWS[: len(times)]]
+    assert len(times) >= len(ROWS) - 3
+    assert "1 cut off at its end (the first a " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("suffix", [".npz", ".dat"])
 @pytest.mark.parametrize("kind", ["shuffled", "outside"])
 def test_refuse_many_malformed_events(kind: str, suffix: str, folder: Path) -> None:

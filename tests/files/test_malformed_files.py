@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from helpers.bag_writers import ARRAY, PACKET, START, array_message, packet_message, write_bag
+from helpers.bag_writers import ARRAY, PACKET, START, array_bag, array_message, packet_message, write_bag
 from helpers.event_file_checks import assert_one_line, attempt
 from helpers.event_file_writers import (
     HEADER2,
@@ -84,13 +85,13 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object], str]] = {
     "aedat4: of no number": (aedat4_file(ROWS).replace(b'e="0"', b'e="?"'), "not a readable AEDAT4 file"),
     "aedat4: of an unknown compression": (aedat4_file(ROWS, compression=9), "compression is number 9"),
     "aedat4: of another compression": (aedat4_file(ROWS, compression=1), ""),
-    "aedat4: cut in a packet": (aedat4_file(ROWS)[:-20], "ends within the packet"),
-    "aedat4: cut in a packet's head": (aedat4_file(ROWS)[:-10], "ends within the packet"),
+    "aedat4: cut in a packet": (aedat4_file(ROWS)[:-20], r"ends within a packet at byte .* \(--drop-malformed\)"),
+    "aedat4: cut in a packet's head": (aedat4_file(ROWS)[:-10], "ends within a packet at byte"),
     "aedat4: that ends before its table": (aedat4_file(ROWS, with_table=True)[:-300], "ends before its table"),
     "aedat4: of other packets": (aedat4_file(ROWS).replace(b"EVTS\x06", b"FRME\x06"), "does not hold events"),
     "aedat4: beside the sensor": (aedat4_file([(64, 1, 0, 1)]), "x = 64 on a sensor of width 64"),
     "aedat4: at an absurd time": (aedat4_file([(1, 1, 1 << 62, 1)]), "more than 292 years"),
-    "dat: cut": (dat(ROWS)[:-1], "ends within a record of 8 bytes"),
+    "dat: cut": (dat(ROWS)[:-1], r"ends within a record of 8 bytes at .* \(--drop-malformed\)"),
     "dat: without records": (dat([]), "holds no events"),
     "dat: without a type": (dat([])[:-2], "type and size none"),
     "dat: of triggers": (dat(ROWS).replace(b"\x0c\x08", b"\x0e\x08"), "type and size 0e 08"),
@@ -122,6 +123,12 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object], str]] = {
     "raw: unknown": (b"RIFF....WAVE", "its format is not known"),
     "bag: with its magic alone": (b"#ROSBAG V2.0\n", "not a readable bag"),
     "bag: of version 1": (b"#ROSBAG V1.2\n", "not a readable bag"),
+    "bag: without an index": (
+        lambda path: path.write_bytes(
+            re.sub(rb"index_pos=.{8}", b"index_pos=" + bytes(8), array_bag(path, ROWS).read_bytes(), flags=re.DOTALL)
+        ),
+        "it has no index, .*; rosbag reindex ",
+    ),
     "bag: no events": (bag(array_message([])), "holds no events"),
     "bag: cut": (bag(ARRAYS[:-1]), "does not have the parts"),
     "bag: cut in its header": (bag(ARRAYS[:10]), "does not have the parts"),

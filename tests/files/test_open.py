@@ -152,7 +152,10 @@ def test_content_tells_the_format(folder: Path) -> None:
 
 
 def test_refuse_paths_that_are_no_files(folder: Path) -> None:
-    for path, message in ((folder, "it is a folder without"), (folder / "none.raw", "there is no such file")):
+    for path, message in (
+        (folder, "without .* ros2 bag reindex it"),
+        (folder / "none.raw", "there is no such file"),
+    ):
         with pytest.raises(DataError, match=message):
             open_event_file(path)
 

@@ -49,7 +49,8 @@ def test_arrays_that_state_no_size_take_the_given_one(folder: Path) -> None:
         open_event_file(path)
 
 
-def test_packets_have_the_times_of_ros(folder: Path) -> None:
+@pytest.mark.parametrize("kind", [PACKET, "event_array_msgs/msg/EventArray"])
+def test_packets_have_the_times_of_ros(kind: str, folder: Path) -> None:
     # Ten seconds, which wrap once; two packets an event.
     rows = [(x, 5, 12_000_000 + 200_000 * x, 1 - 2 * (x % 2)) for x in range(50)]
     words = len(evt3_words(rows[:1]))
@@ -57,7 +58,7 @@ def test_packets_have_the_times_of_ros(folder: Path) -> None:
     # Received with a delay that is shortest, 2 ms, for the fourth event.
     arrivals = [START + 1000 * row[2] + (2_000_000 if row[0] == 3 else 5_000_000) for row in rows]
     messages = packet_messages(rows, arrivals, words)
-    path = write_bag(folder / "packets.bag", {"/events": (PACKET, messages)})
+    path = write_bag(folder / "packets.bag", {"/events": (kind, messages)})
     file = open_event_file(path)
     expected = table(rows)
     expected[:, 2] += START + 2_000_000
@@ -68,7 +69,7 @@ def test_packets_have_the_times_of_ros(folder: Path) -> None:
     arrivals = [START + 1000 * row[2] for row in rows]
     messages = packet_messages(rows, arrivals, words)
     kept = [*range(5), 8, 9, *range(20, 50)]
-    path = write_bag(path, {"/events": (PACKET, [messages[i] for i in kept])})
+    path = write_bag(path, {"/events": (kind, [messages[i] for i in kept])})
     expected = table(rows)[kept]
     expected[:, 2] += START
     np.testing.assert_array_equal(read(open_event_file(path)), expected)

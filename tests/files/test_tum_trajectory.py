@@ -29,6 +29,7 @@ def test_seconds_are_exact() -> None:
 
 
 POSE = "3.5 -0.25 1.5 -0.5 0.5 0.5 0.5"
+W_FIRST = "0.492 3.5 -0.25 1.5 0.5 -0.5 0.5 0.5\n0.496 3.5 -0.25 1.5 0.5 -0.5 0.5 0.5\n"
 POSES = {
     "byte-order mark": f"\ufeff0.492 {POSE}\n0.496 {POSE}\n",
     "commas": f"0.492 {POSE}\n0.496 {POSE}\n".replace(" ", ","),
@@ -37,11 +38,18 @@ POSES = {
     "EuRoC": "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n"
     "492000000,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n496000000,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
     "another order in a remark": f"# t x y z qx qy qz qw (not qw qx qy qz)\n0.492 {POSE}\n0.496 {POSE}\n",
-    "w first, below another remark": "# mine\n# T TX TY TZ QW QX QY QZ\n0.492 3.5 -0.25 1.5 0.5 -0.5 0.5 0.5\n"
-    "0.496 3.5 -0.25 1.5 0.5 -0.5 0.5 0.5\n",
+    "w first, below another remark": f"# mine\n# T TX TY TZ QW QX QY QZ\n{W_FIRST}",
     "two orders in remarks": f"# made of qw qx qy qz\n# t tx ty tz qx qy qz qw\n0.492 {POSE}\n0.496 {POSE}\n",
     "names first": f"# t tx ty tz qx qy qz qw\n# qw qx qy qz\n# exposure [ms]: 5\n0.492 {POSE}\n0.496 {POSE}\n",
-    "w first": "t,tx,ty,tz,qw,qx,qy,qz\n0.492,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n0.496,3.5,-0.25,1.5,0.5,-0.5,0.5,0.5\n",
+    "w first, and a remark": f"# t tx ty tz qw qx qy qz (w first)\n{W_FIRST}",
+    "w first in ROS": f"timestamp,p.x,p.y,p.z,orientation.w,orientation.x,orientation.y,orientation.z\n{W_FIRST}",
+    "w first as r": f"time,x,y,z,rw,rx,ry,rz\n{W_FIRST}",
+    "w first by numbers": f"t,x,y,z,q0,q1,q2,q3\n{W_FIRST}",
+    "w first with dots": f"# t x y z q.w q.x q.y q.z\n{W_FIRST}",
+    "w first behind secs": f"# secs, tx, ty, tz, qw, qx, qy, qz\n{W_FIRST}",
+    "w first behind utime": f"#utime tx ty tz qw qx qy qz\n# eight words of a remark that names nothing\n{W_FIRST}",
+    "names that state the unit": f"stamp_ms, tx, ty, tz, qx, qy, qz, qw\n492 {POSE}\n496 {POSE}\n",
+    "w first": f"t,tx,ty,tz,qw,qx,qy,qz\n{W_FIRST}".replace(" ", ","),
 }
 
 
@@ -52,6 +60,12 @@ def test_read_the_spellings_that_are_unambiguous(spelling: str, tmp_path: Path) 
     plain, read = (read_tum_trajectory(tmp_path / name) for name in ("plain.txt", "poses.txt"))
     assert read.times.tolist() == plain.times.tolist() == [492_000_000, 496_000_000]
     assert (read.camera_to_worlds == plain.camera_to_worlds).all()
+
+
+def test_refuse_another_order_of_the_quaternion(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text(f"t,x,y,z,qz,qy,qx,qw\n0.492 {POSE}\n0.496 {POSE}\n")
+    with pytest.raises(DataError, match="the quaternion's columns in the order z y x w; write them in the order qx qy"):
+        read_tum_trajectory(tmp_path / "poses.txt")
 
 
 def test_refuse_poses_in_utf16(tmp_path: Path) -> None:

@@ -54,10 +54,11 @@ def test_evt3_keeps_time_over_many_wraps(folder: Path) -> None:
     np.testing.assert_array_equal(read(open_event_file(path)), lapless(rows, 1 << 24))
 
 
-def test_skip_words_before_the_first_time(folder: Path) -> None:
+@pytest.mark.parametrize("line", [b"", b"%\n", b"%\r\n"])
+def test_skip_empty_lines_of_the_header_and_words_before_the_first_time(line: bytes, folder: Path) -> None:
     path = folder / "late.raw"
     words = [0x2005, 0x0007, 0x2006, 0x8001, 0x2007, 0x3008, 0x4FFF, 0x6002, 0x2009]
-    path.write_bytes(b"% evt 3.0\n% geometry 64x48\n" + np.array(words, "<u2").tobytes())
+    path.write_bytes(b"% evt 3.0\n" + line + b"% geometry 64x48\n" + np.array(words, "<u2").tobytes())
     np.testing.assert_array_equal(read(open_event_file(path)), [[9, 7, (0x1002) * 1000, -1]])
 
 

@@ -76,7 +76,7 @@ def write_bag(path: Path, topics: dict[str, tuple[str, list[tuple[int, bytes]]]]
         writer.set_compression(rosbag1.Writer.CompressionFormat[compress])
     with writer:
         for topic, (kind, messages) in topics.items():
-            definition = _PACKET_DEFINITION if kind.endswith("EventPacket") else _ARRAY_DEFINITION
+            definition = _PACKET_DEFINITION if kind.startswith("event_") else _ARRAY_DEFINITION
             connection = writer.add_connection(topic, kind, msgdef=definition, md5sum="0" * 32)
             for time, data in messages:
                 writer.write(connection, time, data)
