@@ -68,7 +68,7 @@ class HeldOutMatches:
             if first not in poses or second not in poses:
                 continue
             essential = pycolmap.essential_matrix_from_pose(poses[second] * poses[first].inverse())
-            errors = np.sqrt(pycolmap.compute_squared_sampson_error(*rays, essential))
+            errors = np.sqrt(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
             fitting += int((errors * self.focal_length < _MAX_EPIPOLAR_ERROR).sum())
         return fitting / total if total else None
 
