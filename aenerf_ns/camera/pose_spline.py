@@ -14,7 +14,7 @@ from aenerf_ns.camera.time_window import runs_of
 
 # Four lost frames in a row make a segment five times as long as its neighbors. The errors of the poses at its ends
 # grow with its length, but the spline is still closer to the path than a straight line (benchmarks/LOG.md).
-MAX_SEGMENT_RATIO = 5.5
+_MAX_SEGMENT_RATIO = 5.5
 # Closer to half a turn, the shorter way round is hardly known.
 _MAX_TURN = math.radians(150)
 
@@ -86,12 +86,17 @@ def _quadratic_rotation(quaternion: Tensor) -> Tensor:
     )  # fmt: skip
 
 
+def is_gap(steps: Tensor) -> Tensor:
+    """Return which of segments of (N,) lengths are more than 5.5 times as long as one of their neighbors."""
+    longest = torch.full_like(steps, math.inf)
+    longest[1:] = _MAX_SEGMENT_RATIO * steps[:-1]
+    longest[:-1] = torch.minimum(longest[:-1], _MAX_SEGMENT_RATIO * steps[1:])
+    return steps > longest
+
+
 def _in_spline(steps: Tensor, turns: Tensor) -> Tensor:
     """Return which of the (N,) segments, of given lengths and angles, belong to a spline of at least two segments."""
-    longest = torch.full_like(steps, math.inf)
-    longest[1:] = MAX_SEGMENT_RATIO * steps[:-1]
-    longest[:-1] = torch.minimum(longest[:-1], MAX_SEGMENT_RATIO * steps[1:])
-    known = (steps <= longest) & (turns <= _MAX_TURN)
+    known = ~is_gap(steps) & (turns <= _MAX_TURN)
     beside = torch.zeros_like(known)
     beside[1:] |= known[:-1]
     beside[:-1] |= known[1:]

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from aenerf_ns.camera.pose_spline import MAX_SEGMENT_RATIO, pose_polynomials, rotation_from_products
+from aenerf_ns.camera.pose_spline import is_gap, pose_polynomials, rotation_from_products
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 
@@ -229,11 +229,12 @@ class Trajectory(nn.Module):
             longest_gap: nanoseconds. Between two knots that are further apart the poses are not known. None: they are
                 known everywhere.
         """
-        gaps = []
-        if longest_gap is not None:
-            wide = (self.times[1:] - self.times[:-1] > longest_gap).nonzero()[:, 0]
-            gaps = [(int(self.times[i]), int(self.times[i + 1])) for i in wide]
-        return TimeWindow(self.start, self.end, tuple(gaps))
+        return self._time_without(self.times.diff() > longest_gap if longest_gap is not None else None)
+
+    def _time_without(self, gaps: Tensor | None) -> TimeWindow:
+        """Return the span of the knots without some of the (N - 1,) segments."""
+        found = [] if gaps is None else gaps.nonzero()[:, 0].tolist()
+        return TimeWindow(self.start, self.end, tuple((int(self.times[i]), int(self.times[i + 1])) for i in found))
 
     def knots_between(self, start: int, end: int) -> Tensor:
         """Return the times in nanoseconds of the knots from ``start`` to ``end``, both included."""
@@ -242,11 +243,11 @@ class Trajectory(nn.Module):
     def knots_known_to(self, reference: Trajectory) -> Tensor:
         """Return the times in nanoseconds of the knots at which a reference trajectory is known: not in its gaps.
 
-        A gap is a segment more than 5.5 times as long as the median one.
+        A gap is one of a spline that is also longer than most segments, because times may tremble.
         """
-        longest = MAX_SEGMENT_RATIO * reference.times.diff().double().median()
-        known = reference.known_time(int(longest)).contains(self.times.cpu().numpy())
-        return self.times[torch.from_numpy(known)]
+        steps = reference.times.diff().double()
+        known = reference._time_without(is_gap(steps) & (steps > 2 * steps.median()))
+        return self.times[torch.from_numpy(known.contains(self.times.cpu().numpy()))]
 
     def knots_covered_by(self, reference: Trajectory) -> Tensor:
         """Return :meth:`knots_known_to` a reference trajectory.
@@ -258,8 +259,8 @@ class Trajectory(nn.Module):
         if len(times) < 2:
             raise DataError(
                 reference.source,
-                f"its poses from {reference.start} to {reference.end} ns do not cover two of the estimated ones, from "
-                f"{self.start} to {self.end} ns",
+                f"its poses from {reference.start} to {reference.end} ns, and their gaps, do not cover two of the "
+                f"estimated ones, from {self.start} to {self.end} ns",
                 "give ground truth on the clock of the estimated poses, or remove the file",
             )
         return times

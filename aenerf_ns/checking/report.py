@@ -263,9 +263,7 @@ def _check_thresholds(
         if recording.has_assumed_thresholds:
             result.sensor_options = {"positive-contrast-threshold": value}
         else:
-            figure += (
-                f". If the given ones were a guess, add --positive-contrast-threshold {value} after the format's name"
-            )
+            figure += f". If the given ones were a guess, give the format --positive-contrast-threshold {value}"
     result.figures.append(figure)
 
 

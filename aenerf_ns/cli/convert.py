@@ -205,11 +205,13 @@ class Convert(DatasetCommand):
         times, files = [time for time, _ in kept], [file for _, file in kept]
         first, last = span = capture.event_file.ordered_time_span()
         # Before COLMAP's work, which may take hours.
-        if len(times) > 2 and sum(first <= time <= last for time in times) <= len(times) // 10:
+        num_inside = sum(first <= time <= last for time in times)
+        if num_inside <= len(times) // 10:
             require_seconds(times, self.data, "events", span)
+        if len(times) > 2 and num_inside < 2:
             raise DataError(
                 self.data,
-                f"of {len(times)} frames hardly any was taken during the events, from {first} to {last} ns",
+                f"of {len(times)} frames {num_inside} were taken during the events, from {first} to {last} ns",
                 "give the times of the frames in seconds on the clock of the events",
             )
         lens = capture.event_camera

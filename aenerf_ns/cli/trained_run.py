@@ -46,7 +46,8 @@ def open_run(
         test_mode: see :class:`~aenerf_ns.training.pipeline.AENeRFPipeline`.
 
     Returns:
-        The run's configuration, the run, and the checkpoint that was loaded.
+        The run's configuration, with the steps that were made as its number of iterations, the run, and the checkpoint
+        that was loaded.
 
     Raises:
         DataError: there is no such file, opening it could run foreign code, the run is of another method, it has no

@@ -110,7 +110,7 @@ def describe_views(
 
     Returns:
         Of each view its ``file`` (:func:`view_files`), and its image metrics. Of a view on the trajectory ``time_ns``,
-        on the clock of the events, and of the corrected trajectory then ``camera_speed``, in units of the recording per
+        on the clock of the events, and of the corrected trajectory then ``camera_speed``, in units of the true poses a
         second, and ``camera_turn_rate_degrees``, per second; else they are None.
     """
     assert run.views is not None

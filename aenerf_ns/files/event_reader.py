@@ -91,7 +91,8 @@ class EventReader(EventFile):
         if not self.drop_malformed:
             remedy = "copy it again, or leave the end of an interrupted recording out (--drop-malformed)"
             raise DataError(self.path, f"it ends within {piece} at byte {position:,}", remedy)
-        self.left_out.add_number("cut off at its end", 1, f"{piece} at byte {position:,}")
+        size = self.path.stat().st_size
+        self.left_out.add_number("cut off at its end", 1, f"{piece} at byte {position:,} of {size:,}")
 
 
 def resolve_sensor_size(

@@ -81,9 +81,12 @@ def _parse_names(line: bytes) -> tuple[list[str], TimeUnit | None] | None:
     """Return the names of the columns and the unit of the times that a line states, or None if it does not name all."""
     text = line.decode("utf-8", "replace").lower().lstrip("#% ").replace(" [", "[")
     names = [name.strip().strip('"') for name in (text.split(",") if "," in text else text.split())]
-    units = [time[1] for time in map(TIME_NAME.fullmatch, names) if time]
-    names = ["t" if TIME_NAME.fullmatch(name) else _ALIASES.get(name, name) for name in names]
-    return (names, units[0]) if set(_COLUMNS) <= set(names) else None  # type: ignore[return-value]
+    # Seconds may have their nanoseconds in another column.
+    times = [name for name in names if TIME_NAME.fullmatch(name) and "sec" not in name]
+    time = "t" if "t" in times else times[0] if len(times) == 1 else None
+    match = time and TIME_NAME.fullmatch(time)
+    names = ["t" if name == time else _ALIASES.get(name, name) for name in names]
+    return (names, match[1]) if match and set(_COLUMNS) <= set(names) else None  # type: ignore[return-value]
 
 
 def has_commas(beginning: bytes) -> bool:

@@ -73,7 +73,7 @@ def creating(output: Path, option: str = "--output") -> Iterator[Path]:
     """
     # A link stays one. Writers choose the format by the suffix.
     final = Path(os.path.realpath(output))
-    partial = final.with_name(f".{final.stem}.partial{final.suffix}")
+    partial = final.with_name(f".{final.stem[:99]}.partial{final.suffix}")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         # Of a command that was killed.

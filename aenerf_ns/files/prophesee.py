@@ -188,10 +188,13 @@ class PropheseeDatFile(EventReader):
     def _count(self) -> int:
         return self._num_events
 
-    def _chunks(self) -> Iterator[EventStream]:
+    def _require_end(self) -> None:
         if self._rest:
             end = self._begin + self._num_events * _RECORD.itemsize
             self._leave_out_end(f"a record of {_RECORD.itemsize} bytes", end)
+
+    def _chunks(self) -> Iterator[EventStream]:
+        self._require_end()
         previous = None
         with self.path.open("rb") as file:
             file.seek(self._begin)
@@ -203,6 +206,7 @@ class PropheseeDatFile(EventReader):
                 yield self._stream((x, y, time * 1000, 2 * (address >> 28).astype(np.int8) - 1))
 
     def _time_span(self) -> tuple[int, int] | None:
+        self._require_end()
         count = self._num_events
         if count == 0:
             return None

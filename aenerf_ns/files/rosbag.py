@@ -10,6 +10,7 @@ event. Its AnyReader is not used: it refuses bags whose definitions of other mes
 
 from __future__ import annotations
 
+import shlex
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -133,7 +134,9 @@ class RosbagEventFile(EventReader):
         elif not self._is_ros2:
             with self.path.open("rb") as file:
                 if b"index_pos=" + bytes(8) in file.read(_ROS1_HEADER_BYTES):
-                    raise DataError(self.path, "it has no index, as if interrupted", f"rosbag reindex {self.path}")
+                    raise DataError(
+                        self.path, "it has no index, as if interrupted", f"rosbag reindex {shlex.quote(str(self.path))}"
+                    )
         with Ros2Reader(self.path) if self._is_ros2 else Ros1Reader(self.path) as reader:
             yield reader
 

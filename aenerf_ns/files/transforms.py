@@ -131,7 +131,7 @@ def read_transforms(path: Path, image_encoding: ImageEncoding = "srgb") -> tuple
     values = {"image_encoding": image_encoding, **read_json(path, dict)}
     camera = values.get("event_camera")
     parts = [part for part in (values, camera) if isinstance(part, dict)]
-    for name in (name for part in parts for name in part if "dist" in name):
+    for name in (name for part in parts for name in part if re.match("dist(_|$)|.*distort", name)):
         remedy = "state camera_model, and k1, k2, p1, p2, k3 or for a fisheye k1 to k4"
         raise DataError(path, f"it states {name}, which is not read", remedy)
     stated = [name for part in parts for name in part if re.match("T_.*event", name) and name != _MOUNT]

@@ -19,7 +19,7 @@ from aenerf_ns.recording.recording import Capture
 _HELD_OUT = 0.05
 # Share of these matches by which the incremental mapper must be better: where both agree alike, the global one's poses
 # come out better (benchmarks/LOG.md).
-_GLOBAL_LEAD = 0.01
+_GLOBAL_LEAD = 0.03
 # Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, iterations, and pixels beyond
 # which an observation counts less. At first, most are off by more.
 _ROUNDS = ((12.0, 8.0, 30, 1.0), (8.0, 5.0, 30, 1.0), (5.0, 3.0, 30, 1.0), (4.0, 2.0, 60, 0.5), (4.0, 2.0, 60, 0.5))
@@ -66,10 +66,13 @@ def estimate_poses_from_events(
             is_near = models[mapper].compute_mean_reprojection_error() < _ROUNDS[-1][0]
             return is_near, (held_out.agreement(models[mapper]) or 0.0) + _GLOBAL_LEAD * (mapper == "global")
 
-        mapper = max(models, key=fit, default="")
-        model = models.get(mapper)
-        for limits in _ROUNDS:
-            model = workspace.adjust(model, *limits) if model and is_placed(model) else None
+        model = None
+        for mapper in sorted(models, key=fit, reverse=True):
+            model = models[mapper]
+            for limits in _ROUNDS:
+                model = workspace.adjust(model, *limits) if is_placed(model) else model
+            if is_placed(model):
+                break
         if camera is None or model is None or not is_placed(model):
             raise DataError(
                 source,

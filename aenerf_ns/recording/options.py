@@ -44,8 +44,8 @@ class EventDataParserConfig(DataParserConfig):
     """Leave out everything between consecutive poses that are further apart than this, in nanoseconds. By default the
     value that the dataset states; where it states none, poses are interpolated however far apart they are."""
     drop_malformed: bool = False
-    """Leave out events outside the sensor or out of order, as long as they are at most a thousandth, and say how many
-    and where."""
+    """Leave out events outside the sensor or out of order, as long as they are at most a thousandth, and the piece in
+    which an interrupted file ends, and say how many and where."""
 
     @classmethod
     def recognizes(cls, data: Path) -> bool:

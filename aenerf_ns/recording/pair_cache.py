@@ -25,7 +25,7 @@ from aenerf_ns.events.pair_store import EventPairs, map_rows
 from aenerf_ns.events.stream import EventFile
 
 # Counted up when the layout of the file, of the rows or of what is kept with them changes.
-_VERSION = 2
+_VERSION = 3
 # The end of the file: length of the description as JSON in front of it, and this word.
 _WORD = b"aenerf-pairs"
 # Attributes of a reader of events that are no options. The last three are read from the file when they are asked for.
