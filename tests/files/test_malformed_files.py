@@ -172,6 +172,10 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object], str]] = {
     "h5: ECF": (lambda path: write_with_filter(path, 0x8ECF), "ECF filter: .* set HDF5_PLUGIN_PATH to its folder"),
     "h5: another filter": (lambda path: write_with_filter(path, 40_000), r"pip install 'aenerf-ns\[hdf5-"),
     "csv: empty": (b"", "the file holds no events"),
+    "csv: seconds and nanoseconds": (
+        b"secs,nsecs,x,y,p\n1,5,2,3,1\n",
+        "first line is 'secs,nsecs,x,y,p'; it must name",
+    ),
     "csv: without header": (b"1,2,3,1\n", "first line is '1,2,3,1'; it must name"),
     "csv: with a word": (b"x,y,t,p\n1,2,now,1\n", "line 2 has t = now; write"),
     "csv: with five": (

@@ -240,6 +240,10 @@ def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tenso
     known = (times <= SECOND) | (times >= 3 * SECOND)
     gappy = Trajectory(times[known], estimate.camera_to_worlds[known])
     assert torch.equal(estimate.knots_covered_by(gappy), times[known])
+    # A rate that changes is no gap.
+    slower = (times <= SECOND) | (times % (SECOND // 2) == 0)
+    rare = Trajectory(times[slower], estimate.camera_to_worlds[slower])
+    assert torch.equal(estimate.knots_covered_by(rare), times[times <= rare.end])
     torch.testing.assert_close(estimated, reference, rtol=0, atol=1e-12)
 
 
