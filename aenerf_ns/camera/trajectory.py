@@ -259,7 +259,7 @@ class Trajectory(nn.Module):
         if len(times) < 2:
             raise DataError(
                 reference.source,
-                f"its poses from {reference.start} to {reference.end} ns, and their gaps, do not cover two of the "
+                f"its poses from {reference.start} to {reference.end} ns, without their gaps, do not cover two of the "
                 f"estimated ones, from {self.start} to {self.end} ns",
                 "give ground truth on the clock of the estimated poses, or remove the file",
             )

@@ -211,7 +211,7 @@ class Convert(DatasetCommand):
         if len(times) > 2 and num_inside < 2:
             raise DataError(
                 self.data,
-                f"of {len(times)} frames {num_inside} were taken during the events, from {first} to {last} ns",
+                f"{num_inside} of {len(times)} frames were taken during the events, from {first} to {last} ns",
                 "give the times of the frames in seconds on the clock of the events",
             )
         lens = capture.event_camera
