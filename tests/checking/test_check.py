@@ -406,7 +406,7 @@ def test_polarities_are_compared_with_the_frames(sign: int, shorter: Path) -> No
     set_in("transforms.json", "event_camera", "positive_contrast_threshold", value=0.4)(shorter)
     status, output = run(shorter)
     assert "(given: 1.60)" in output
-    option = "guess, train with --positive-contrast-threshold "
+    option = "guess, give the format --positive-contrast-threshold "
     # Reversed polarities reverse the ratio.
     assert (option in output) == (sign > 0)
     assert sign < 0 or number_after(option, output) == pytest.approx(0.25, abs=0.02)
