@@ -23,7 +23,7 @@ UNIT_NAMES = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "
 TIME_NAME = re.compile(
     r"\W*(?:t|ts|time\w*?|stamp\w*?|secs?|seconds)(?:(?:\s*\[|_)(ns|us|ms|s)\b\]?)?(?!\w)", re.IGNORECASE
 )
-"""What names the times, and may state their unit: timestamp [ns], t[us] or time_us."""
+"""The name of the column of times. It may state their unit, as timestamp [ns], t[us] and time_us do."""
 # The beginning of a row.
 _NUMBER = re.compile(r"\s*[-+.\d]")
 

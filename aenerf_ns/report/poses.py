@@ -58,7 +58,6 @@ def measure_poses(run: TrainedRun) -> RunPoses:
     if true is not None:
         positions["true"] = reference
     every = -(-len(times) // _MAX_DRAWN)
-    drawn = seconds[::every].contiguous()
     in_recording = {name: scene.to_recording(part) for name, part in poses.items()}
     evo = errors = correction = None
     if true is not None:
@@ -72,7 +71,7 @@ def measure_poses(run: TrainedRun) -> RunPoses:
         correction = correction_components(in_recording["estimated"][::every], in_recording["corrected"][::every])
     return RunPoses(
         num_poses=len(times),
-        seconds=drawn.tolist(),
+        seconds=seconds[::every].tolist(),
         positions={name: (part[::every, :, 3] / scene.scale).tolist() for name, part in positions.items()},
         evo=evo,
         errors=errors,

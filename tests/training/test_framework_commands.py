@@ -191,7 +191,7 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
         exported = read_tum_trajectory(output)
         assert torch.equal(exported.times, times)
         difference = (exported.camera_to_worlds - expected.interpolate(times)).abs().max()
-        # What correction leaves, or the framework's float32 transform.
+        # Correction leaves some error. The framework's float32 transform rounds the other poses.
         assert difference < (0.2 if poses == "corrected" else 1e-6)
 
 
