@@ -9,19 +9,25 @@ from __future__ import annotations
 
 import shlex
 import time
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+import tyro
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.utils import writer
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
-from benchmarks.runs import new_trainer, run_benchmark, write_result
+from aenerf_ns.training.trainer import AENeRFTrainer
+from benchmarks.runs import run_benchmark, write_result
 from benchmarks.step.worker import train_steps
 
-_STEPS_BEFORE = 20
+# Steps that the schedules are made for, and steps that are taken before the measurement.
+_STEPS, _STEPS_BEFORE = 30000, 20
 # So many kernels are listed, those that take longest.
 _KERNELS = 12
 
@@ -53,7 +59,7 @@ class Profile:
             write_result(self.output, {"steps": self.steps, "rows": rows})
 
     def _profile(self, words: list[str], folder: Path) -> dict[str, Any]:
-        trainer = new_trainer(words, self.data, folder, steps=30000, seed=1)
+        trainer = _new_trainer(words, self.data, folder)
         on_gpu = trainer.pipeline.device.type == "cuda"
 
         def train(count: int) -> float:
@@ -96,6 +102,27 @@ class Profile:
                 for event in kernels[:_KERNELS]
             ],
         }
+
+
+def _new_trainer(words: list[str], data: Path, output: Path) -> AENeRFTrainer:
+    """Set up a training, by a method and options of ns-train, that evaluates and saves nothing on its way."""
+    # Otherwise this training would write into the logs of the one before.
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
+    method, *options = words
+    config: Any = tyro.cli(type(all_methods[method]), default=deepcopy(all_methods[method]), args=options)
+    config.machine.seed, config.vis = 1, "tensorboard"
+    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = data
+    never = dict.fromkeys(
+        ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images", "steps_per_save"), _STEPS + 1
+    )
+    # A new configuration, because the schedules follow the number of steps when it is made.
+    config = replace(config, max_num_iterations=_STEPS, output_dir=output, timestamp="now", **never)
+    torch.manual_seed(1)
+    trainer: AENeRFTrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
 
 
 if __name__ == "__main__":

@@ -74,8 +74,7 @@ rays, or three with the temporal loss."""
 
 _MODE = "--pipeline.model.camera-optimizer.mode"
 _OFF, _SPLINE = (_MODE, "off"), (_MODE, "spline")
-# nerfacto in the proportions of aenerf-small.
-_SMALL_NERFACTO = (
+SMALL_NERFACTO = (
     "--pipeline.datamanager.train-num-rays-per-batch", "1024",
     "--pipeline.model.num-levels", "8",
     "--pipeline.model.max-res", "256",
@@ -87,6 +86,7 @@ _SMALL_NERFACTO = (
     "--pipeline.model.num-nerf-samples-per-ray", "24",
     "--pipeline.model.proposal-weights-anneal-max-num-iters", "200",
 )  # fmt: skip
+"""Options of nerfacto that give it the proportions of aenerf-small."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ class Plan:
     def _rows_of(self, method: Method) -> dict[str, tuple[str, tuple[str, ...], tuple[str, ...], tuple[str, ...]]]:
         """Return method and options of ns-train, aenerf reconstruct and aenerf convert by row."""
         if method == "nerfacto":
-            return {CEILING: (method, () if self.scale == "full" else _SMALL_NERFACTO, (), ())}
+            return {CEILING: (method, () if self.scale == "full" else SMALL_NERFACTO, (), ())}
         train = tuple(shlex.split(self.train))
         off, spline = (*train, *_OFF), (*train, *_SPLINE)
         images: tuple[str, ...] = ()

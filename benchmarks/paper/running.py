@@ -30,7 +30,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.provenance import provenance
 from benchmarks.paper.plan import CEILING, Dataset, Run, digest, scene_name
-from benchmarks.runs import exclusive, make_dataset, run_command
+from benchmarks.runs import exclusive, run_command
 
 # Parts of a training. The framework evaluates the validation views after each part but the last, because it counts the
 # final step as one less.
@@ -121,15 +121,23 @@ class Runner:
         return self._make_dataset(dataset.name, "simulate", "--scene", scene, *dataset.command[2:])
 
     def _make_dataset(self, name: str, command: str, *arguments: str) -> Path:
+        """Make a dataset by a command of aenerf, unless it has been made, and return its folder.
+
+        If another process is making it, this one waits.
+        """
         if name in self._failed:
             # Each run of this dataset would make it again and fail again.
             raise self._failed[name]
         folder, log = self._folder / "datasets" / name, self._folder / "logs" / f"{name}.log"
+        words = (str(Path(sys.executable).with_name("aenerf")), command, *arguments, "--output", str(folder.resolve()))
         try:
-            return make_dataset(folder, log, command, arguments, self._folder, **self._variables)
+            with exclusive(folder):
+                if not folder.exists():
+                    run_command(words, log, self._folder, **self._variables)
         except DataError as error:
             self._failed[name] = error
             raise
+        return folder
 
     def _train(self, run: Run, data: Path) -> tuple[str, ...]:
         """Train, evaluate, and return the command of the training, without the folders of this machine."""

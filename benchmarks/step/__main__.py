@@ -25,6 +25,7 @@ from typing import Any, Literal, get_args
 import torch
 
 from aenerf_ns.errors import DataError
+from benchmarks.paper.plan import SMALL_NERFACTO
 from benchmarks.runs import die_with_parent, run_benchmark, run_command, write_result
 
 Measurement = Literal["small", "small-two-threads", "full", "temporal-loss", "nerfacto-small", "nerfacto-full"]
@@ -41,12 +42,9 @@ _FULL = ("aenerf", *_SMALL[1:], *_FULL_RAYS)
 # The framework's implementation that needs no CUDA extension. Its grids, networks and samples are those of `aenerf`.
 _NERFACTO = ("nerfacto", "--pipeline.model.implementation", "torch")
 _NERFACTO_FULL = (*_NERFACTO, *_FULL_RAYS)
-# The sizes are those of `aenerf-small`.
+# Its proposal network is that of `aenerf-small`, too.
 _NERFACTO_SMALL = (
-    *_NERFACTO, _RAYS, "1024", *_CHUNK, "--pipeline.model.num-levels", "8", "--pipeline.model.max-res", "256",
-    "--pipeline.model.log2-hashmap-size", "15", "--pipeline.model.hidden-dim", "32",
-    "--pipeline.model.hidden-dim-color", "32", "--pipeline.model.num-nerf-samples-per-ray", "24",
-    "--pipeline.model.num-proposal-iterations", "1", "--pipeline.model.num-proposal-samples-per-ray", "48",
+    *_NERFACTO, *SMALL_NERFACTO, *_CHUNK,
     "--pipeline.model.proposal-net-args-list.0.num-levels", "4",
     "--pipeline.model.proposal-net-args-list.0.max-res", "64",
     "--pipeline.model.proposal-net-args-list.0.log2-hashmap-size", "14",
