@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.camera.image_encoding import decode
-from aenerf_ns.simulator.arrays import Texture
+from aenerf_ns.simulator.arrays import Array, Texture
 from aenerf_ns.simulator.textures import ALBEDO_RANGE
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

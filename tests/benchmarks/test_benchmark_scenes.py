@@ -14,8 +14,8 @@ from trimesh.triangles import area
 from aenerf_ns.errors import DataError
 from aenerf_ns.simulator.rendering.mesh_loading import load_mesh
 from benchmarks.scenes import assets, catalog, furnishings, meshes, object_scenes, place_scenes, shapes
+from benchmarks.scenes.build import write_glb
 from benchmarks.scenes.cleaning import without_coincident_faces
-from benchmarks.scenes.glb import write_glb
 from benchmarks.scenes.obj import read_obj, triangulate
 
 PLAIN = meshes.Material("plain", np.full((2, 2, 3), 128, np.uint8))
