@@ -16,7 +16,7 @@ from torch import Tensor
 from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import EventPairs
-from aenerf_ns.events.picture import PolaritySums, polarity_picture
+from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sorted_events import SortedEvents, sort_events
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import tracked
@@ -27,8 +27,6 @@ from aenerf_ns.recording.time_units import require_covered
 if TYPE_CHECKING:
     from aenerf_ns.events.polarity_drift import PolarityDrift
 
-# Events in a picture, as a share of the sensor's pixels: enough to show edges, too few to smear them.
-_PICTURE_DENSITY = 0.25
 # The most rows that a timeline is made from, in memory and in a file, where each row is a page to read.
 _TIMELINE_ROWS, _TIMELINE_ROWS_IN_FILE = 1 << 23, 1 << 18
 
@@ -48,15 +46,6 @@ class EventDataset(InputDataset):
         seconds: Tensor = self._dataparser_outputs.cameras.metadata[REFERENCE_SECONDS]
         return seconds[:, 0]
 
-    @property
-    def pairs(self) -> EventPairs:
-        """All pairs of events in the time window. The first access reads the whole event file, or finds its pairs.
-
-        Raises:
-            DataError: the event file is missing or malformed, or no event lies in the time window.
-        """
-        return self._pairs_and_pictures[0]
-
     @cached_property
     def polarity_drift(self) -> PolarityDrift:
         """How the contrast thresholds of the pixels differ. The first access goes through all :attr:`pairs`."""
@@ -65,18 +54,13 @@ class EventDataset(InputDataset):
 
         return polarity_drift(self.pairs)
 
-    @property
-    def windows(self) -> SortedEvents:
-        """All events in the time window, in the order of time. The first access reads the whole event file.
+    @cached_property
+    def pairs(self) -> EventPairs:
+        """All pairs of events in the time window. The first access reads the whole event file, or finds its pairs.
 
         Raises:
             DataError: the event file is missing or malformed, or no event lies in the time window.
         """
-        return self._windows_and_pictures[0]
-
-    @cached_property
-    def _pairs_and_pictures(self) -> tuple[EventPairs, NDArray[np.int16]]:
-        """The pairs, and for each camera the (height, width) sum of polarities around its time."""
         scene = self.scene
         events, camera = scene.event_file, scene.event_camera
         events.require()
@@ -85,7 +69,6 @@ class EventDataset(InputDataset):
             "refractory_period": scene.sensor.refractory_period,
             "window": [scene.window.start, scene.window.end, scene.window.gaps],
             "usable": zlib.crc32(usable.data),
-            "camera_times": scene.camera_times.tolist(),
         }
         file = PairFile(events, made_from)
         found = file.find()
@@ -97,23 +80,22 @@ class EventDataset(InputDataset):
             # Several processes read a short recording side by side.
             with file.making(alone=count is None or count > EVENTS_IN_MEMORY):
                 # Another process may have made the file meanwhile.
-                found = file.find() or self._read_events(file, usable, count)
+                found = file.find()
+                if found is None:
+                    found = self._read_events(file, usable, count)
         else:
-            CONSOLE.print(f"{file.path.name}: {found[0].summary()}.", markup=False)
-        self._require_covered(found[0].num_events, found[0].num_outside)
+            CONSOLE.print(f"{file.path.name}: {found.summary()}.", markup=False)
+        self._require_covered(found.num_events, found.num_outside)
         return found
 
-    def _read_events(
-        self, file: PairFile, usable: NDArray[np.bool_], count: int | None
-    ) -> tuple[EventPairs, NDArray[np.int16]]:
-        """Make pairs and pictures, and keep them if they are in a file."""
+    def _read_events(self, file: PairFile, usable: NDArray[np.bool_], count: int | None) -> EventPairs:
+        """Make pairs, and keep them if they are in a file."""
         from aenerf_ns.events.pairing import pair_events
 
         scene = self.scene
         events = scene.event_file
-        pictures = self._new_pictures()
         pairs = pair_events(
-            pictures.watch(self._chunks(count)),
+            self._chunks(count),
             refractory_period=scene.sensor.refractory_period,
             window=scene.window,
             usable=usable,
@@ -124,33 +106,28 @@ class EventDataset(InputDataset):
         if len(pairs) == 0:
             self._require_covered(pairs.num_events, pairs.num_outside)
             raise DataError(events.path, "no pixel has two events", "record longer, or widen the time window")
-        sums = pictures.sums(*usable.shape)
-        file.keep(pairs, sums)
-        return pairs, sums
+        file.keep(pairs)
+        return pairs
 
     @cached_property
-    def _windows_and_pictures(self) -> tuple[SortedEvents, NDArray[np.int16]]:
-        """The events, and for each camera the (height, width) sum of polarities around its time."""
+    def windows(self) -> SortedEvents:
+        """All events in the time window, in the order of time. The first access reads the whole event file.
+
+        Raises:
+            DataError: the event file is missing or malformed, or no event lies in the time window.
+        """
         scene = self.scene
         scene.event_file.require()
         _, usable = scene.event_camera.pixel_directions()
-        pictures = self._new_pictures()
-        chunks = pictures.watch(self._chunks(scene.event_file.count()))
-        windows = sort_events(chunks, window=scene.window, usable=usable)
+        windows = sort_events(self._chunks(scene.event_file.count()), window=scene.window, usable=usable)
         CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.", markup=False)
         self._require_covered(len(windows.times) + windows.num_outside + windows.num_unusable, windows.num_outside)
-        return windows, pictures.sums(*usable.shape)
+        return windows
 
     def _require_covered(self, num_events: int, num_outside: int) -> None:
         # Gaps of the poses are left out on purpose, and are most of some recordings.
         if self.scene.is_whole and not self.scene.window.gaps:
             require_covered(self.scene.event_file.path, num_events, num_events - num_outside)
-
-    def _new_pictures(self) -> PolaritySums:
-        """Make an accumulator of the events around each camera's time."""
-        camera = self.scene.event_camera
-        half = max(int(_PICTURE_DENSITY * camera.width * camera.height) // 2, 1)
-        return PolaritySums(self.scene.camera_times.tolist(), half)
 
     def _chunks(self, count: int | None) -> Iterable[EventStream]:
         """Read the events in pieces, with a progress bar towards their number, if that is known."""
@@ -158,27 +135,30 @@ class EventDataset(InputDataset):
         return tracked(events.chunks(), f"Reading {events.path.name}", count)
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
-        """Return the (H, W, 3) image of a camera, or a picture of the events nearest in time if it has no image."""
+        """Return the (H, W, 3) image of a camera, or a picture of events around its time if it has no image."""
         scene = self.scene
         if scene.has_image[image_idx]:
             return super().get_numpy_image(image_idx)
-        width, height = scene.event_camera.width, scene.event_camera.height
-        if not self.has_events:
-            net = np.zeros((height, width), np.int16)
-        else:
-            net = (self._windows_and_pictures if self._has_windows else self._pairs_and_pictures)[1][image_idx]
-        rows, columns = np.nonzero(net)
-        return polarity_picture(columns, rows, net[rows, columns], width, height)
+        events = self.events_around(int(scene.camera_times[image_idx]), self.usual_number_of_events)
+        return polarity_picture(events.x, events.y, events.p, events.width, events.height)
+
+    @property
+    def usual_number_of_events(self) -> int:
+        """Events in a picture that show edges without smearing them: a quarter of the pixels."""
+        camera = self.scene.event_camera
+        return min(max(camera.width * camera.height // 400 * 100, 200), 20_000)
+
+    def events_around(self, time: int, count: int) -> EventStream:
+        """Return about ``count`` events around a time in nanoseconds; none where there is no file."""
+        if self.has_events:
+            return self.timeline.nearest(time, count)
+        nothing, camera = np.zeros(0, np.uint16), self.scene.event_camera
+        return EventStream(nothing, nothing, np.zeros(0, np.int64), np.zeros(0, np.int8), camera.width, camera.height)
 
     @property
     def has_events(self) -> bool:
         """Whether the event file is there. A trained run may be opened where it is not."""
         return self.scene.event_file.path.exists()
-
-    @property
-    def _has_windows(self) -> bool:
-        """Whether the events were read as windows for training: reading them again, as pairs, would take as long."""
-        return "_windows_and_pictures" in vars(self)
 
     @cached_property
     def timeline(self) -> EventStream:
@@ -187,7 +167,8 @@ class EventDataset(InputDataset):
         Raises:
             DataError: see :attr:`pairs`.
         """
-        if self._has_windows:
+        # Reading again, as pairs, what was read as windows for training would take as long.
+        if "windows" in vars(self):
             return self.windows.events(_every(len(self.windows.times), _TIMELINE_ROWS))
         # Rows that are mapped from a file are read-only.
         in_memory = self.pairs.rows.flags.writeable

@@ -18,14 +18,13 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import EventPairs, map_rows
 from aenerf_ns.events.stream import EventFile
 
 # Counted up when the layout of the file, of the rows or of what is kept with them changes.
-_VERSION = 3
+_VERSION = 4
 # The end of the file: length of the description as JSON in front of it, and this word.
 _WORD = b"aenerf-pairs"
 # Attributes of a reader of events that are no options. The last three are read from the file when they are asked for.
@@ -36,9 +35,9 @@ _NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "in
 class PairFile:
     """Keep the pairs of an event file, or of a folder of event files, in a file beside it.
 
-    The file holds the rows of :class:`~aenerf_ns.events.pair_store.EventPairs`, then ``replacement_rows``,
-    ``block_ends`` and the pictures, all as they are in memory, then a description as JSON, with what the pairs depend
-    on besides the events (``made_from``). It is written under another name, and renamed when it is whole.
+    The file holds the rows of :class:`~aenerf_ns.events.pair_store.EventPairs`, then ``replacement_rows`` and
+    ``block_ends``, all as they are in memory, then a description as JSON, with what the pairs depend on besides the
+    events (``made_from``). It is written under another name, and renamed when it is whole.
     """
 
     def __init__(self, events: EventFile, made_from: Mapping[str, Any]) -> None:
@@ -51,8 +50,8 @@ class PairFile:
         self._is_kept = False
         self._printed: set[str] = set()
 
-    def find(self) -> tuple[EventPairs, NDArray[np.int16]] | None:
-        """Find the pairs and the pictures of an earlier run. None, and a line why, if they must be made."""
+    def find(self) -> EventPairs | None:
+        """Find the pairs of an earlier run. None, and a line why, if they must be made."""
         if not self.path.is_file():
             return None
         try:
@@ -70,8 +69,8 @@ class PairFile:
             CONSOLE.print(line, style="yellow", markup=False)
         self._printed.add(line)
 
-    def _read(self, file: BinaryIO) -> tuple[EventPairs, NDArray[np.int16]] | None:
-        """Read the pairs and the pictures, None if they are of other events or options.
+    def _read(self, file: BinaryIO) -> EventPairs | None:
+        """Read the pairs, None if they are of other events or options.
 
         Raises:
             ValueError, KeyError or TypeError: the file is broken.
@@ -95,12 +94,11 @@ class PairFile:
             arrays.append(array)
         if file.tell() != end or checksum != about["checksum"]:
             raise ValueError("its parts have other sizes or bytes than it says")
-        replacement_rows, block_ends, pictures = arrays
+        replacement_rows, block_ends = arrays
         numbers = {name: int(about["numbers"][name]) for name in _NUMBERS}
-        pairs = EventPairs(
+        return EventPairs(
             rows=map_rows(file, num_rows), replacement_rows=replacement_rows, block_ends=block_ends, **numbers
         )
-        return pairs, pictures
 
     def open(self) -> tuple[BinaryIO, Path]:
         """Open a new file for the rows. Return it with a folder for temporary files."""
@@ -125,8 +123,8 @@ class PairFile:
         # The lock keeps apart the processes of one host only. The next one there overwrites what a killed one left.
         return self.path.with_name(f"{self.path.name}.{socket.gethostname()}.part")
 
-    def keep(self, pairs: EventPairs, pictures: NDArray[np.int16]) -> None:
-        """Keep pairs and pictures if their rows went to a file. Otherwise delete an older file of pairs."""
+    def keep(self, pairs: EventPairs) -> None:
+        """Keep pairs if their rows went to a file. Otherwise delete an older file of pairs."""
         if self._new is None:
             with suppress(OSError):
                 self.path.unlink(missing_ok=True)
@@ -134,7 +132,7 @@ class PairFile:
         if not self._is_kept:
             return
         checksum, arrays = 0, []
-        for array in (pairs.replacement_rows, pairs.block_ends, pictures):
+        for array in (pairs.replacement_rows, pairs.block_ends):
             self._new.write(array.data)
             checksum = zlib.crc32(array.data, checksum)
             arrays.append((array.dtype.str, array.shape))

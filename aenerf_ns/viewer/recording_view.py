@@ -43,11 +43,7 @@ class RecordingView:
         self._dataset = dataset
         self.camera = dataset.scene.event_camera
         self.duration = dataset.scene.trajectory.duration
-
-    @property
-    def usual_number_of_events(self) -> int:
-        """Events in a picture that show edges without smearing them: a quarter of the pixels."""
-        return min(max(self.camera.width * self.camera.height // 400 * 100, 200), 20_000)
+        self.usual_number_of_events = dataset.usual_number_of_events
 
     @property
     def vertical_field_of_view(self) -> float:
@@ -86,11 +82,7 @@ class RecordingView:
 
     def events(self, seconds: float, count: int) -> EventStream:
         """Return about ``count`` events around a time since the trajectory's start; none where there is no file."""
-        if not self._dataset.has_events:
-            nothing = np.zeros(0, np.uint16)
-            size = self.camera.width, self.camera.height
-            return EventStream(nothing, nothing, np.zeros(0, np.int64), np.zeros(0, np.int8), *size)
-        return self._dataset.timeline.nearest(self._dataset.scene.trajectory.start + round(seconds * 1e9), count)
+        return self._dataset.events_around(self._dataset.scene.trajectory.start + round(seconds * 1e9), count)
 
     def picture(self, events: EventStream) -> NDArray[np.uint8]:
         """Return a picture (height, width, 3) of events, as wide as the viewer's panel: red positive, blue negative."""

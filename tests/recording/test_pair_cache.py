@@ -128,8 +128,8 @@ def test_changed_events_or_options_make_new_pairs(
         lambda content: content[16:],
         lambda content: content + content[-20:],
         lambda content: content.replace(b'"num_rows"', b'"num_cows"'),
-        # In the pictures, which stand behind 208 rows.
-        lambda content: content[:4200] + bytes([content[4200] ^ 1]) + content[4201:],
+        # In the replacement rows, which stand behind 208 rows.
+        lambda content: content[:3400] + bytes([content[3400] ^ 1]) + content[3401:],
     ],
 )
 def test_broken_file_is_made_again(
