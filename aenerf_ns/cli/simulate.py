@@ -16,7 +16,6 @@ from aenerf_ns.files.limits import MAX_ROWS
 from aenerf_ns.simulator.options import BUILT_IN, SensorNoise, require_scene_file
 
 if TYPE_CHECKING:
-    from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.simulator.simulation import Simulation
@@ -101,7 +100,7 @@ class Simulate(SimulationCommand):
                 scene, camera, sensor, self.speed, duration, self.max_displacement, self.seed, noise
             )
             truth = simulation.trajectory(self.pose_rate)
-            estimated, report = self._estimate_poses(simulation, camera, truth)
+            estimated, report = self._estimate_poses(simulation, truth)
         num_events = 0
         with NativeDatasetWriter(lock, camera, sensor, "srgb", scene.aabb) as writer:
             writer.add_trajectories(estimated, truth)
@@ -132,16 +131,10 @@ class Simulate(SimulationCommand):
             f"Train with: {training_command(self.output)}"
         )
 
-    def _estimate_poses(
-        self, simulation: Simulation, camera: CameraIntrinsics, truth: Trajectory
-    ) -> tuple[Trajectory, dict[str, Any] | None]:
+    def _estimate_poses(self, simulation: Simulation, truth: Trajectory) -> tuple[Trajectory, dict[str, Any] | None]:
         """Make the estimated trajectory and, if COLMAP estimates it, COLMAP's report."""
         if self.poses == "noise":
             return self.add_pose_noise(truth), None
-        from aenerf_ns.simulator.simulated_poses import estimate_simulated_poses
-
-        estimated, report, summary = estimate_simulated_poses(
-            simulation, camera, truth, self.frame_rate, self.exposure, self.seed
-        )
+        estimated, report, summary = simulation.estimate_poses(truth, self.frame_rate, self.exposure, self.seed)
         say(summary)
         return estimated, report

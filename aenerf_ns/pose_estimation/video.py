@@ -111,7 +111,7 @@ def _open_file(source: Path, needs_times: bool) -> Video:
     def read() -> Iterator[NDArray[np.uint8]]:
         capture = _open_capture(source)
         while True:
-            with _silent_opencv():
+            with silent_opencv():
                 decoded, frame = capture.read()
             if not decoded:
                 return
@@ -119,7 +119,7 @@ def _open_file(source: Path, needs_times: bool) -> Video:
 
     capture, milliseconds = _open_capture(source), []
     # Every frame is decoded, because a container's own number and rate of frames may be wrong.
-    with _silent_opencv():
+    with silent_opencv():
         while capture.grab():
             milliseconds.append(capture.get(cv2.CAP_PROP_POS_MSEC))
     frame = next(read(), None)
@@ -143,7 +143,7 @@ def _open_capture(source: Path) -> cv2.VideoCapture:
         source.open("rb").close()
     # The other backends take the numbers in a file's name for a pattern of many files, and ffmpeg takes a relative name
     # with a colon for a protocol.
-    with _silent_opencv():
+    with silent_opencv():
         capture = cv2.VideoCapture(str(source.absolute()), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise DataError(source, "not a video that can be read", "convert it to MP4, or give a folder of images")
@@ -151,7 +151,7 @@ def _open_capture(source: Path) -> cv2.VideoCapture:
 
 
 @contextmanager
-def _silent_opencv() -> Iterator[None]:
+def silent_opencv() -> Iterator[None]:
     """Keep OpenCV and its ffmpeg from printing errors of their own beside the one line."""
     name = "OPENCV_FFMPEG_LOGLEVEL"
     level, before = cv2.getLogLevel(), os.environ.get(name)

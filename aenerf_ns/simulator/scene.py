@@ -2,24 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.simulator.arrays import Array
+from aenerf_ns.simulator.blender import BlenderRenderer
 from aenerf_ns.simulator.paths import CameraPath
-
-
-class SceneRenderer(Protocol):
-    """Render pictures of a scene."""
-
-    def render(
-        self, camera_to_world: ArrayLike, intrinsics: Sequence[float], width: int, height: int, samples: int
-    ) -> tuple[NDArray[np.float32], ...]:
-        """Return radiance (H, W, 3) and depth (H, W), and maybe more: see `rendering.renderer.Renderer`."""
+from aenerf_ns.simulator.rendering.renderer import Renderer
 
 
 @dataclass(frozen=True)
@@ -37,7 +25,7 @@ class SimulationScene:
     """
 
     name: str
-    renderer: SceneRenderer
+    renderer: Renderer | BlenderRenderer
     path: CameraPath
     focal_ratio: float
     aabb: Array | None

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.image_encoding import encode, to_channels
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.progress import progress_bar
@@ -135,6 +137,52 @@ class Simulation:
         radiance = sum(self._render(self._scene.path(float(s)), _RAYS_OF_EXPOSURES)[0] for s in parameters) / steps
         seen = to_channels(torch.from_numpy(radiance), self._sensor.num_channels)
         return _display(seen.squeeze(-1))
+
+    def estimate_poses(
+        self, truth: Trajectory, frame_rate: float, exposure: float, seed: int
+    ) -> tuple[Trajectory, dict[str, Any], str]:
+        """Run COLMAP on the frames of a camera at the event sensor's position, as in a DAVIS.
+
+        The truth provides only what pictures cannot: the position, orientation and scale of the world.
+
+        Args:
+            truth: the true trajectory.
+            frame_rate: frames a second.
+            exposure: seconds for which a frame is exposed. Motion blurs the frame meanwhile.
+            seed: of COLMAP.
+
+        Returns:
+            the estimated trajectory, a report of its making and its errors, and a summary in words.
+
+        Raises:
+            ValueError: frame rate and exposure do not fit each other or the path.
+            DataError: COLMAP finds no poses.
+        """
+        # Imported lazily, because few simulations need COLMAP.
+        from aenerf_ns.pose_estimation.from_frames import compare_with_truth, estimate_poses
+
+        times = self.frame_times(frame_rate, exposure)
+        frames = (self.blurred_frame(int(time), exposure) for time in times)
+        found = estimate_poses(frames, times, self._camera, "frames of aenerf simulate", seed)
+        true_poses = torch.stack([self.pose(time)[:3] for time in found.trajectory.times.tolist()])
+        estimated, errors = compare_with_truth(found.trajectory, true_poses)
+        knots = truth.knots_between(estimated.start, estimated.end)
+        if len(knots) < 2:
+            raise DataError(
+                "aenerf simulate",
+                f"COLMAP's poses span {len(estimated)} frames, and fewer than two of the true poses",
+                "give a higher --pose-rate",
+            )
+        between = pose_errors(estimated.interpolate(knots), truth.interpolate(knots))
+        settings = {"frame_rate": frame_rate, "exposure_seconds": exposure}
+        report = {**settings, **found.report(), "errors": errors, "errors_between_frames": between}
+        summary = (
+            f"{found.summary()}\nMean errors {errors['rotation_error_degrees']:.2f} degrees and "
+            f"{errors['translation_error']:.2g} m at the frames, {between['rotation_error_degrees']:.2f} degrees and "
+            f"{between['translation_error']:.2g} m interpolated between them; {errors['misplaced_frames']} frames "
+            f"misplaced, {errors['flipped_frames']} of them flipped."
+        )
+        return estimated, report, summary
 
     def reference_picture(self, camera_to_world: NDArray[np.float64] | Tensor) -> ReferencePicture:
         """Render the picture from a (4, 4) pose, without noise or blur."""

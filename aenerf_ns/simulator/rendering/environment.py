@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.limits import require_at_most, require_file
+from aenerf_ns.pose_estimation.video import silent_opencv
 from aenerf_ns.simulator.arrays import Array
 
 # 16384 x 8192 pixels, uncompressed.
@@ -70,22 +73,15 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
     Raises:
         DataError: the file is missing or is not a panorama.
     """
-    import cv2
-
     require_file(path)
     with reading(path):
         require_at_most(path, _MAX_BYTES)
         with path.open("rb") as file:
             begin = file.read(2)
-    # OpenCV prints errors of its own beside the one line.
-    level = cv2.setLogLevel(0)
-    try:
+    picture = None
+    with silent_opencv(), suppress(cv2.error):
         # It is read from the file, because imdecode leaves temporary files behind for pictures that are too large.
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if begin == b"#?" else None
-    except cv2.error:
-        picture = None
-    finally:
-        cv2.setLogLevel(level)
     if picture is None or picture.ndim != 3 or picture.dtype != np.float32:
         raise DataError(path, "not a Radiance picture", "give an equirectangular .hdr file")
     rows, columns = picture.shape[:2]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.simulator.arrays import Array
-from aenerf_ns.simulator.rendering.mesh import Mesh
+from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas
 from aenerf_ns.simulator.rendering.mip_maps import lookup, mip_maps
 from aenerf_ns.simulator.rendering.vectors import cross, interpolate, row, subtract
 
@@ -42,8 +42,7 @@ class Surface(NamedTuple):
 
 def make_surface(mesh: Mesh, light_point: NDArray[np.integer]) -> Surface:
     """Build the arrays of a mesh, given the light points (F, 3) of its faces' corners."""
-    a, b, c = mesh.vertices[mesh.faces.T]
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = 2 * normals_and_areas(mesh)[1]
     p, q, r = mesh.uv[mesh.faces.T]
     in_texture = np.abs((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
     texels = np.array([*(len(image) * image.shape[1] for image in mesh.textures), 0.0])
