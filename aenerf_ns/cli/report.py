@@ -84,19 +84,20 @@ class ReportCommand:
         paired = comparison.paired_differences(reports, shared)
         left_out = comparison.views_left_out(reports, shared)
         page = make_page(reports, paired, left_out, mixed, shared)
-        with creating(self.output / "report.html") as page_file:
-            page_file.write_text(page, "utf8")
-            with (self.output / "views.csv").open("w", encoding="utf8", newline="") as file:
-                table = csv.DictWriter(file, ("run", "file", *VIEW_COLUMNS), lineterminator="\n")
-                table.writeheader()
-                table.writerows(view_rows(reports))
-            figures = {
-                "runs": [report.as_json() for report in reports],
-                "paired_differences": paired,
-                "views_not_in_all_runs": left_out,
-                "protocol_differences": mixed,
-            }
-            (self.output / "report.json").write_text(json.dumps(figures, indent=1) + "\n", "utf8")
+        figures = {
+            "runs": [report.as_json() for report in reports],
+            "paired_differences": paired,
+            "views_not_in_all_runs": left_out,
+            "protocol_differences": mixed,
+        }
+        with creating(self.output / "views.csv") as path, path.open("w", encoding="utf8", newline="") as file:
+            table = csv.DictWriter(file, ("run", "file", *VIEW_COLUMNS), lineterminator="\n")
+            table.writeheader()
+            table.writerows(view_rows(reports))
+        with creating(self.output / "report.json") as path:
+            path.write_text(json.dumps(figures, indent=1) + "\n", "utf8")
+        with creating(self.output / "report.html") as path:
+            path.write_text(page, "utf8")
         size = len(page.encode()) / 1e6
         say(f"{self.output / 'report.html'}: {size:.1f} MB, with views.csv and report.json.")
 

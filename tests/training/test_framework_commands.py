@@ -279,6 +279,7 @@ def test_a_point_cloud_is_in_the_world_of_the_recording(with_events: Path, works
 
 def test_a_report_explains_a_run(with_events: Path, workspace: Path) -> None:
     ReportCommand((with_events.parent,), workspace / "report").main()
+    assert {file.name for file in (workspace / "report").iterdir()} == {"report.html", "report.json", "views.csv"}
     page = (workspace / "report" / "report.html").read_text()
     assert len(page.encode()) < 10e6
     (figures,) = json.loads((workspace / "report" / "report.json").read_text())["runs"]
