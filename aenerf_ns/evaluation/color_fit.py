@@ -78,7 +78,7 @@ class ColorFit:
         # Reference views are carried over to the frame that the corrected poses have at this step.
         cameras = replace(pixels.cameras, camera_to_worlds=model.camera_optimizer.apply_to_camera(pixels.cameras))
         rays = cameras.generate_rays(pixels.view[:count], coords=pixels.coordinates[:count])
-        log_radiance = model.render_log_radiance(rays)
+        log_radiance = model.render_rays(rays, "log_radiance")[0]
         if pixels.radiance is None:
             correction.stretch(log_radiance)
         else:

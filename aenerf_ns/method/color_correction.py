@@ -183,13 +183,7 @@ class TranslatedGammaColorCorrection(AffineColorCorrection):
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
         """Fit the reference radiance by least squares with the algorithm of Levenberg and Marquardt, per channel.
 
-        The affine fit is the start.
-
-        Args:
-            log_radiance: (N, channels) rendered.
-            reference: (N, channels) linear radiance in [0, 1] of the same pixels.
-            num_views: number of reference views these pixels are from.
-            rough: leave out whatever takes time. This fit takes milliseconds, so it is the same either way.
+        The affine fit is the start. This takes milliseconds, so a rough fit is the same.
         """
         super().fit(log_radiance, reference, num_views)
         self.black.fill_(_EPSILON)
@@ -204,11 +198,7 @@ class TranslatedGammaColorCorrection(AffineColorCorrection):
 
     @torch.no_grad()
     def stretch(self, log_radiance: Tensor) -> None:
-        """Apply the percentile stretch, without reference images.
-
-        Args:
-            log_radiance: (N, channels) rendered.
-        """
+        """Apply the percentile stretch, without reference images."""
         super().stretch(log_radiance)
         self.black.fill_(_EPSILON)
 
@@ -277,14 +267,7 @@ class NetworkColorCorrection(AffineColorCorrection):
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
-        """Fit the affine map, then the network to the error of display values that is left, by Adam.
-
-        Args:
-            log_radiance: (N, channels) rendered.
-            reference: (N, channels) linear radiance in [0, 1] of the same pixels.
-            num_views: number of reference views these pixels are from.
-            rough: fit the affine map only.
-        """
+        """Fit the affine map, then, unless ``rough``, the network to the error of display values left, by Adam."""
         super().fit(log_radiance, reference, num_views)
         self._reset_network()
         if rough:
@@ -310,11 +293,7 @@ class NetworkColorCorrection(AffineColorCorrection):
 
     @torch.no_grad()
     def stretch(self, log_radiance: Tensor) -> None:
-        """Apply the percentile stretch alone, without reference images.
-
-        Args:
-            log_radiance: (N, channels) rendered.
-        """
+        """Apply the percentile stretch alone, without reference images."""
         super().stretch(log_radiance)
         self._reset_network()
 

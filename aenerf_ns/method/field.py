@@ -54,21 +54,6 @@ class DensityShape:
     average_init_density: float
 
 
-@dataclass(frozen=True)
-class RadianceShape:
-    """The network from feature and view direction to radiance.
-
-    Attributes:
-        num_channels: radiance channels of the sensor, 1 or 3.
-        num_hidden_layers: number of hidden layers.
-        hidden_dim: width of the hidden layers.
-    """
-
-    num_channels: int
-    num_hidden_layers: int
-    hidden_dim: int
-
-
 class IntegratedEncoding(NeRFEncoding):
     """Sines and cosines of positions in the unit cube, with 1, 2, 4, ... periods across it, and the positions.
 
@@ -169,12 +154,10 @@ class EventRadianceField(DensityField):
     The encoding of the view direction is sinusoidal, because the framework's spherical harmonics run without gradients.
 
     Args:
-        aabb: see :class:`DensityField`.
-        spatial_distortion: see :class:`DensityField`.
-        encoding: see :class:`DensityField`.
-        density: the network to density and feature.
-        radiance: the network to radiance.
-        to_field_space: see :class:`DensityField`.
+        aabb, spatial_distortion, encoding, shape, to_field_space: see :class:`DensityField`.
+        num_channels: radiance channels of the sensor, 1 or 3.
+        num_hidden_layers: of the network from feature and view direction to radiance.
+        hidden_dim: width of these layers.
     """
 
     def __init__(
@@ -182,19 +165,22 @@ class EventRadianceField(DensityField):
         aabb: Tensor,
         spatial_distortion: SpatialDistortion | None,
         encoding: Encoding,
-        density: DensityShape,
-        radiance: RadianceShape,
+        shape: DensityShape,
         to_field_space: ToFieldSpace | None,
+        *,
+        num_channels: int,
+        num_hidden_layers: int,
+        hidden_dim: int,
     ) -> None:
-        super().__init__(aabb, spatial_distortion, encoding, density, to_field_space)
+        super().__init__(aabb, spatial_distortion, encoding, shape, to_field_space)
         self.direction_encoding = NeRFEncoding(
             in_dim=3, num_frequencies=4, min_freq_exp=0.0, max_freq_exp=3.0, include_input=True, implementation="torch"
         )
         self.radiance_network = MLP(
-            in_dim=self.direction_encoding.get_out_dim() + density.feature_dim,
-            num_layers=radiance.num_hidden_layers + 1,
-            layer_width=radiance.hidden_dim,
-            out_dim=radiance.num_channels,
+            in_dim=self.direction_encoding.get_out_dim() + shape.feature_dim,
+            num_layers=num_hidden_layers + 1,
+            layer_width=hidden_dim,
+            out_dim=num_channels,
             activation=SharpSoftplus(),
             implementation="torch",
         )

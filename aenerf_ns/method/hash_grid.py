@@ -17,7 +17,8 @@ _PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 Implementation = Literal["auto", "torch"]
 
-_BY_DEVICE = {"cpu": "numba", "cuda": "triton"}
+# The modules of the fast implementations.
+_BY_DEVICE = {"cpu": f"{__package__}.kernels.hash_grid_numba", "cuda": f"{__package__}.kernels.hash_grid_triton"}
 
 
 class Kernels(Protocol):
@@ -97,13 +98,13 @@ class HashEncoding(FrameworkHashEncoding):
         # Without points a kernel has nothing to run on.
         if self._implementation == "torch" or len(positions) == 0:
             return None
-        by_device = _BY_DEVICE.get(positions.device.type)
+        module = _BY_DEVICE.get(positions.device.type)
         fits = (
             is_float_in_memory(positions)
             and is_float_in_memory(self.hash_table)
             and forward_ad.unpack_dual(self.hash_table).tangent is None
         )
-        return try_load(_module(by_device), positions.device) if by_device is not None and fits else None
+        return try_load(module, positions.device) if module is not None and fits else None
 
     def _plain(self, positions: Tensor) -> Tensor:
         scaled = positions.mT[:, None] * self._scales
@@ -120,10 +121,6 @@ class HashEncoding(FrameworkHashEncoding):
             near, far = features.unbind(0)
             features = torch.lerp(near, far, weight)
         return features.transpose(0, 1).flatten(1)
-
-
-def _module(implementation: str) -> str:
-    return f"{__package__}.kernels.hash_grid_{implementation}"
 
 
 class _HashGrid(torch.autograd.Function):

@@ -365,10 +365,6 @@ class AENeRFModel(Model):
         }
         return self.image_metrics(predicted, reference), images
 
-    def render_log_radiance(self, rays: RayBundle) -> Tensor:
-        """Return log-radiance (N, channels) of any number of rays, rendered in evaluation mode."""
-        return self.render_rays(rays, "log_radiance")[0]
-
     @torch.no_grad()
     def render_rays(self, rays: RayBundle, *names: str) -> list[Tensor]:
         """Return the outputs (N, channels) with the given names of any number of rays, rendered in evaluation mode."""

@@ -15,7 +15,6 @@ from aenerf_ns.method.field import (
     EventRadianceField,
     IntegratedEncoding,
     ProposalNetwork,
-    RadianceShape,
 )
 from aenerf_ns.method.hash_grid import HashEncoding, Implementation
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
@@ -112,8 +111,10 @@ def make_networks(
             DensityShape(
                 field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "exp", average_init_density
             ),
-            RadianceShape(num_channels, num_hidden_layers=2, hidden_dim=field.hidden_dim),
             field_warp,
+            num_channels=num_channels,
+            num_hidden_layers=2,
+            hidden_dim=field.hidden_dim,
         )
         return radiance_field, [
             ProposalNetwork(
@@ -138,9 +139,11 @@ def make_networks(
         DensityShape(
             field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "softplus", average_init_density
         ),
-        # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
-        RadianceShape(num_channels, num_hidden_layers=1, hidden_dim=128),
         field_warp,
+        num_channels=num_channels,
+        # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
+        num_hidden_layers=1,
+        hidden_dim=128,
     )
     if field.xavier_initialization:
         for layer in radiance_field.density_network.layers:

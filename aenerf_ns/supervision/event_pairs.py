@@ -240,10 +240,8 @@ class PairSampler(Sampler):
     or in their file, and a step copies one pinned array to the device without waiting.
 
     Args:
-        config: the options.
-        dataset: the training data.
+        config, dataset, device: see :class:`Sampler`.
         supervision: tells whether rates are needed and whether the refractory period is learned.
-        device: of the batches.
 
     Raises:
         DataError: an option is out of range.
@@ -376,8 +374,9 @@ class _PairTable:
         self._batch_device = torch.device(device)
         arrays = (pairs.rows, pairs.replacement_rows, pairs.block_ends)
         size = sum(array.nbytes for array in arrays)
-        self._device = self._batch_device if _fits(size, self._batch_device) else torch.device("cpu")
-        if self._device != self._batch_device:
+        self._device = self._batch_device
+        if self._device.type != "cpu" and size > _SHARE_OF_FREE_MEMORY * torch.cuda.mem_get_info(self._device)[0]:
+            self._device = torch.device("cpu")
             CONSOLE.print(
                 f"The pairs take {size / 1e9:.1f} GB, more than half of the GPU's free memory: they stay outside"
             )
@@ -437,9 +436,7 @@ def find_rows(
     """Find the rows of pairs in a table of pairs, without waiting for a GPU.
 
     Args:
-        rows: see :class:`~aenerf_ns.events.pair_store.EventPairs`.
-        replacement_rows: see there.
-        block_ends: see there.
+        rows, replacement_rows, block_ends: see :class:`~aenerf_ns.events.pair_store.EventPairs`.
         moments: (M,) int64 nanoseconds along the intervals of all pairs, laid end to end. Each finds its pair.
         events: (N - M,) int64 numbers below the number of pairs. Each finds a pair of its own.
         spans: (N,) int64, how many consecutive pairs to join that end with the found one, if that many may be joined.
@@ -459,8 +456,3 @@ def find_rows(
     row = torch.cat([BLOCK * block + (ends <= moments[:, None]).sum(1), by_event])
     spans = spans.minimum(max_span(rows[:, 1][row]))
     return rows[torch.stack([row, row - 1, row - spans], 1)]
-
-
-def _fits(size: int, device: torch.device) -> bool:
-    """Return whether a table of ``size`` bytes fits on a device beside the model."""
-    return device.type == "cpu" or size <= _SHARE_OF_FREE_MEMORY * torch.cuda.mem_get_info(device)[0]

@@ -20,6 +20,7 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """For torch's Adam, which gets all fields."""
 
 
+@dataclass
 class _StepsFactor:
     """Factor on a learning rate that rises linearly and falls at milestones.
 
@@ -27,23 +28,22 @@ class _StepsFactor:
     refuses to load NumPy's numbers, which the framework's exponential and cosine decay leave in checkpoints.
     """
 
-    def __init__(self, warm_up: int, milestones: list[int], gamma: float) -> None:
-        self.warm_up = warm_up
-        self.milestones = milestones
-        self.gamma = gamma
+    warm_up: int
+    milestones: list[int]
+    gamma: float
 
     def __call__(self, step: int) -> float:
         return _rise(step, self.warm_up) * self.gamma ** sum(step >= milestone for milestone in self.milestones)
 
 
+@dataclass
 class _CosineFactor:
     """Factor on a learning rate that is zero, rises linearly and falls as half a cosine."""
 
-    def __init__(self, delay: int, warm_up: int, last_step: int, final_factor: float) -> None:
-        self.delay = delay
-        self.warm_up = warm_up
-        self.last_step = last_step
-        self.final_factor = final_factor
+    delay: int
+    warm_up: int
+    last_step: int
+    final_factor: float
 
     def __call__(self, step: int) -> float:
         falling = (1 + math.cos(math.pi * min(step / max(self.last_step, 1), 1.0))) / 2

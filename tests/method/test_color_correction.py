@@ -233,13 +233,13 @@ def test_a_rough_fit_leaves_the_network_out(tmp_path: Path) -> None:
 def test_reference_views_are_placed_by_the_poses_of_the_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline = make_pipeline(tmp_path / "made", "val", pose_correction="spline")
     seen: list[torch.Tensor] = []
-    render = pipeline.model.render_log_radiance
+    render = pipeline.model.render_rays
 
-    def spy(rays: RayBundle) -> torch.Tensor:
+    def spy(rays: RayBundle, *names: str) -> list[torch.Tensor]:
         seen.append(rays.origins)
-        return render(rays)
+        return render(rays, *names)
 
-    monkeypatch.setattr(pipeline.model, "render_log_radiance", spy)
+    monkeypatch.setattr(pipeline.model, "render_rays", spy)
     pipeline.color_fit.fit()
     correction = pipeline.model.camera_optimizer
     assert correction.twists is not None

@@ -68,7 +68,7 @@ def implementation(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
     """The name of a fast implementation. Without a GPU Triton's kernels are interpreted (see conftest), on the CPU."""
     pytest.importorskip(request.param)
     if request.param == "triton" and not torch.cuda.is_available():
-        monkeypatch.setitem(hash_grid._BY_DEVICE, "cpu", "triton")
+        monkeypatch.setitem(hash_grid._BY_DEVICE, "cpu", hash_grid._BY_DEVICE["cuda"])
     return request.param
 
 
@@ -83,7 +83,7 @@ def threads() -> Iterator[None]:
 def make_pair(implementation: str, **options: int) -> tuple[HashEncoding, HashEncoding]:
     """The plain and a fast encoding with one table, on the device of the fast one."""
     device = "cuda" if implementation == "triton" and torch.cuda.is_available() else "cpu"
-    assert loader.try_load(hash_grid._module(implementation), torch.device(device)) is not None
+    assert loader.try_load(hash_grid._BY_DEVICE[device], torch.device(device)) is not None
     plain, fast = (HashEncoding(name, **{**OPTIONS, **options}).to(device) for name in ("torch", "auto"))
     torch.nn.init.uniform_(plain.hash_table, -1, 1)
     fast.load_state_dict(plain.state_dict())

@@ -280,7 +280,7 @@ def test_rendering_in_chunks_changes_nothing() -> None:
     model = make_model(eval_num_rays_per_chunk=3).train()
     rays = make_rays()
     whole = make_model().eval()(make_rays())["log_radiance"]
-    torch.testing.assert_close(model.render_log_radiance(rays), whole)
+    torch.testing.assert_close(model.render_rays(rays, "log_radiance"), [whole])
     assert model.training
 
 

@@ -180,9 +180,8 @@ class FlowPatchSampler(WindowSampler):
 
     Args:
         config: the options. ``share_of_all_pixels`` has no effect.
-        dataset: the training data.
+        dataset, device: see :class:`~aenerf_ns.supervision.base.Sampler`.
         supervision: a :class:`PAEv3DSupervision`.
-        device: of the batches.
 
     Raises:
         DataError: an option is out of range, or no patch can be used.

@@ -181,10 +181,8 @@ class WindowSampler(Sampler):
     counted.
 
     Args:
-        config: the options.
-        dataset: the training data.
+        config, dataset, device: see :class:`Sampler`.
         supervision: a :class:`WindowSupervision`.
-        device: of the batches.
 
     Raises:
         DataError: an option is out of range.
