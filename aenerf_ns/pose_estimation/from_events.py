@@ -42,11 +42,7 @@ def estimate_poses_from_events(
     one machine with one version of COLMAP.
 
     Args:
-        capture: the events and the camera's intrinsics.
-        window: events outside it are left out.
-        source: the dataset, for messages.
-        seed: of COLMAP's random samples.
-        weights, folder: see :func:`match_event_images`.
+        capture, window, source, seed, weights, folder: see :func:`match_event_images`.
 
     Raises:
         DataError: there are too few events for three images, or COLMAP places no images.

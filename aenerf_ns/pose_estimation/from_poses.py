@@ -60,20 +60,18 @@ class RefinedPoses:
     seconds: float
     draw: Callable[[Mapping[str, Array]], Image.Image]
 
-    def weak_stretches(self) -> list[tuple[int, int]]:
-        """Return the first and last times in nanoseconds of runs of images whose given poses nearly stay."""
-        return [(int(self.times[first]), int(self.times[end - 1])) for first, end in runs_of(self.is_weak)]
-
     def report(self) -> dict[str, Any]:
         """Return the figures as plain values for JSON."""
         degrees, translation = self._moved()
+        # First and last times of runs of images whose given poses nearly stay.
+        weak = [(int(self.times[first]), int(self.times[end - 1])) for first, end in runs_of(self.is_weak)]
         return {
             "images": len(self.times),
             "tracks": self.num_tracks,
             "correction_degrees": degrees,
             "correction_translation": translation,
             "shared_error": self.shared_error.report(),
-            "weak_stretches_ns": self.weak_stretches(),
+            "weak_stretches_ns": weak,
             "seconds": self.seconds,
             "summary": self.summary(),
         }
@@ -116,10 +114,7 @@ def refine_poses(
 
     Args:
         recording: its events, poses and intrinsics.
-        window: events outside it are left out.
-        source: the dataset, for messages.
-        seed: of COLMAP's random samples.
-        weights, folder: see :func:`match_event_images`.
+        window, source, seed, weights, folder: see :func:`match_event_images`.
 
     Raises:
         DataError: there are too few events for three images with a pose, or too few tracks.

@@ -224,9 +224,7 @@ class BlenderRenderer:
         """Render a picture through a pinhole camera.
 
         Args:
-            camera_to_world: (4, 4) or (3, 4), OpenCV axes.
-            intrinsics: (fx, fy, cx, cy) in pixels, pixel centers at +0.5. Pixels are square: fy is not used.
-            width, height: size of the picture in pixels.
+            camera_to_world, intrinsics, width, height: see `Renderer.render`. Pixels are square: fy is not used.
             samples: a quarter of the rays per pixel; or 1 for a single one, through the center and not denoised.
             limit: brighter radiance is clipped to this value.
 
