@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -98,14 +98,10 @@ class SimulationCommand:
 
     def make_sensor(self) -> tuple[SensorModel, SensorNoise]:
         """Make the sensor and its noise."""
+        from aenerf_ns.files.transforms import sensor_values
+
         sensor, noise = SENSORS[self.sensor]
-        given: dict[str, Any] = {
-            "positive_contrast_threshold": self.positive_contrast_threshold,
-            "negative_contrast_threshold": self.negative_contrast_threshold,
-            "refractory_period": self.refractory_period_ns,
-        }
-        changed = {name: value for name, value in given.items() if value is not None}
-        return replace(sensor, bayer_pattern=self.bayer_pattern, **changed), self.noise.with_defaults(noise)
+        return replace(sensor, **sensor_values(self)), self.noise.with_defaults(noise)
 
     def add_pose_noise(self, poses: Trajectory) -> Trajectory:
         """Add errors to true poses."""
