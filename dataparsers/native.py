@@ -13,18 +13,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError, value_errors_as_data_error
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sensor import SensorModel, sensor_values, states_thresholds
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.files.limits import file_inside
-from aenerf_ns.files.transforms import (
-    EventCamera,
-    Transforms,
-    frame_from_event,
-    read_transforms,
-    rigid_motion,
-    sensor_values,
-    states_thresholds,
-)
+from aenerf_ns.files.transforms import EventCamera, Transforms, frame_from_event, read_transforms, rigid_motion
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig, SensorOptions

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from aenerf_ns.cli.ranges import require_range, require_seed
-from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.events.sensor import BayerPattern, SensorModel, sensor_values
 from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.simulator.options import DURATIONS, MIN_CONTRAST_THRESHOLD, SENSORS, SensorName, SensorNoise
 
@@ -98,8 +98,6 @@ class SimulationCommand:
 
     def make_sensor(self) -> tuple[SensorModel, SensorNoise]:
         """Make the sensor and its noise."""
-        from aenerf_ns.files.transforms import sensor_values
-
         sensor, noise = SENSORS[self.sensor]
         return replace(sensor, **sensor_values(self)), self.noise.with_defaults(noise)
 

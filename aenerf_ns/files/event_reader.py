@@ -58,7 +58,7 @@ class EventFile(ABC):
 
     @abstractmethod
     def read_chunks(self) -> Iterator[EventStream]:
-        """Yield the events in pieces that fit in memory. Any exception may be raised."""
+        """Yield the events in pieces that fit in memory. Whatever it raises becomes a DataError."""
 
     def read_time_span(self) -> tuple[int, int] | None:
         """Return the times of the first and the last event in nanoseconds, or None without events."""
@@ -95,12 +95,12 @@ class EventFile(ABC):
         return span
 
     def count(self) -> int | None:
-        """Return what :meth:`read_count` finds, or raise a DataError."""
+        """Return what :meth:`read_count` returns, or raise a DataError."""
         with bounded(self.path, self.kind, self.extra):
             return self.read_count()
 
     def assumed_unit(self) -> TimeUnit | None:
-        """Return what :meth:`read_assumed_unit` finds, or raise a DataError."""
+        """Return what :meth:`read_assumed_unit` returns, or raise a DataError."""
         with bounded(self.path, self.kind, self.extra):
             return self.read_assumed_unit()
 
