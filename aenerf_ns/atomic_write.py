@@ -1,8 +1,9 @@
-"""Writing a file whole or not at all."""
+"""Writing a file or a folder whole or not at all."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -10,9 +11,10 @@ from pathlib import Path
 
 @contextmanager
 def atomic_write(path: Path, partial: Path | None = None) -> Iterator[Path]:
-    """Yield a path to write a file to, which gets its final name when the context ends without an error.
+    """Yield a path to write a file or a new folder to. It gets its final name when the context ends without an error.
 
-    After a kill or a crash of the machine, the name stands for the old or the new contents, never for a part of them.
+    After a kill or a crash of the machine, the name of a file stands for the old or the new contents, never for a part
+    of them. What is in a folder may be lost in a crash.
 
     Args:
         path: the final name. Its folder is made if it does not exist.
@@ -25,12 +27,14 @@ def atomic_write(path: Path, partial: Path | None = None) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         yield partial
-        _sync(partial)
+        if partial.is_file():
+            _sync(partial)
         partial.replace(path)
         # Some file systems cannot, and the file is whole.
         with suppress(OSError):
             _sync(path.parent)
     finally:
+        shutil.rmtree(partial, ignore_errors=True)
         partial.unlink(missing_ok=True)
 
 

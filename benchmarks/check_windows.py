@@ -24,7 +24,8 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.checking.report import check
 from aenerf_ns.cli.dataset import DatasetCommand
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.time_units import require_one_unit
@@ -43,9 +44,6 @@ class _EventsInMemory(EventFile):
 
     def read_chunks(self) -> Iterator[EventStream]:
         yield self._events
-
-    def time_span(self) -> tuple[int, int]:
-        return int(self._events.t[0]), int(self._events.t[-1])
 
 
 def _poses(change: Callable[[Tensor], Tensor]) -> Callable[..., Given]:

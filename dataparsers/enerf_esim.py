@@ -15,7 +15,7 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_arrays import XYTP_MATRIX, ArrayEventFile, load_npy
-from aenerf_ns.files.event_reader import EventReader
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.limits import list_files, require_one
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
@@ -24,7 +24,7 @@ from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import read_image_times, views_on_trajectory
 
 
-class EsimEventFolder(EventReader):
+class EsimEventFolder(EventFile):
     """A folder of .npy files with rows of x, y, t in nanoseconds and p: one stream, in the order of the names."""
 
     def _files(self) -> list[ArrayEventFile]:
@@ -36,19 +36,15 @@ class EsimEventFolder(EventReader):
             file.drop_malformed, file.left_out = self.drop_malformed, self.left_out
         return files
 
-    def require(self) -> None:
-        if not self.path.is_dir():
-            raise DataError(self.path, "there is no such folder of events", "check the path of the dataset")
-
-    def _chunks(self) -> Iterator[EventStream]:
+    def read_chunks(self) -> Iterator[EventStream]:
         for file in self._files():
             yield from file.read_chunks()
 
-    def _time_span(self) -> tuple[int, int] | None:
+    def read_time_span(self) -> tuple[int, int] | None:
         files = [file for file in self._files() if file.count()]
         return (files[0].time_span()[0], files[-1].time_span()[1]) if files else None
 
-    def _count(self) -> int:
+    def read_count(self) -> int:
         return sum(file.count() or 0 for file in self._files())
 
 

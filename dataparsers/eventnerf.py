@@ -5,7 +5,7 @@ It follows the format of NeRF++: text files of matrices. The unit of the events'
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory, require_rigid
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, ArrayEventFile
 from aenerf_ns.files.limits import list_files, read_text, require_one
 from aenerf_ns.files.text import TimeUnit, parse_numbers
@@ -29,7 +28,7 @@ from aenerf_ns.recording.views import image_files, image_files_of_poses, views_o
 # A DAVIS 346C.
 _WIDTH, _HEIGHT = 346, 260
 # NeRF++ scales the cameras of a scene into the unit sphere.
-UNIT_SPHERE = 1.0
+_UNIT_SPHERE = 1.0
 # A matrix has 20 numbers.
 _MAX_BYTES = 1 << 16
 
@@ -46,24 +45,31 @@ class EvenPosesDataParserConfig(ObjectDataParserConfig):
     last_pose_time_ns: int | None = None
     """Time of the last pose on the clock of the events, in nanoseconds. By default the time of the last event."""
 
-    def spread(self, poses: Tensor, event_file: EventFile, source: Path, first: int | None = None) -> Trajectory:
-        """Return the trajectory of (N, 4, 4) poses at even times.
+    def make_even_recording(
+        self, capture: Capture, poses: Tensor, source: Path, images: Path, first: int | None = None
+    ) -> Recording:
+        """Make a recording of poses at even times, in the unit sphere.
 
         The first and the last time are stored in the configuration, so that opening a trained run needs no events.
 
         Args:
+            capture: the cameras and their events, whose span gives the times that nothing else states.
             poses: (N, 4, 4) camera-to-world.
-            event_file: the events, whose span gives the times that nothing else states.
             source: the file or folder of the poses, for messages.
+            images: folder of an image for each pose, or of none.
             first: default time of the first pose in nanoseconds. None: the time of the first event.
         """
         if self.first_pose_time_ns is None:
-            self.first_pose_time_ns = event_file.time_span()[0] if first is None else first
+            self.first_pose_time_ns = capture.event_file.time_span()[0] if first is None else first
         if self.last_pose_time_ns is None:
-            self.last_pose_time_ns = event_file.time_span()[1]
+            self.last_pose_time_ns = capture.event_file.time_span()[1]
         duration, steps = self.last_pose_time_ns - self.first_pose_time_ns, max(len(poses) - 1, 1)
         times = [self.first_pose_time_ns + duration * index // steps for index in range(len(poses))]
-        return Trajectory(times, poses, source)
+        reference = Trajectory(times, poses, source)
+        # There may be no images.
+        timed = list(zip(times, image_files_of_poses(images, len(poses)), strict=False))
+        views, box = views_on_trajectory(timed, reference), self.scene_box(_UNIT_SPHERE)
+        return self.make_recording(reference, capture, reference_views=views, scene_box=box)
 
 
 @dataclass
@@ -92,17 +98,10 @@ class EventNeRFDataParser(EventDataParser):
     def read_recording(self) -> Recording:
         split = self._split()
         capture, _ = self.read_capture()
-        poses = _read_poses(split)
         # Pose i of N is at i / (N - 1) of the time of the last event.
-        reference = self.config.spread(poses, capture.event_file, split / "pose", first=0)
-        # There may be no images.
-        images = zip(reference.times.tolist(), image_files_of_poses(split / "rgb", len(poses)), strict=False)
-        return self.config.make_recording(
-            reference,
-            capture,
-            reference_views={**views_on_trajectory(list(images), reference), **_held_out_views(split.parent)},
-            scene_box=self.config.scene_box(UNIT_SPHERE),
-        )
+        recording = self.config.make_even_recording(capture, _read_poses(split), split / "pose", split / "rgb", 0)
+        views = {**recording.reference_views, **_held_out_views(split.parent)}
+        return replace(recording, reference_views=views)
 
     def poses_path(self) -> Path:
         return self._split() / "pose"

@@ -13,18 +13,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError, value_errors_as_data_error
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sensor import SensorModel, sensor_values, states_thresholds
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.files.limits import file_inside
-from aenerf_ns.files.transforms import (
-    EventCamera,
-    Transforms,
-    frame_from_event,
-    read_transforms,
-    rigid_motion,
-    sensor_values,
-    states_thresholds,
-)
+from aenerf_ns.files.transforms import EventCamera, Transforms, frame_from_event, read_transforms, rigid_motion
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig, SensorOptions
@@ -118,13 +110,13 @@ def _read_views(
     mount = torch.eye(4, dtype=torch.float64)
     if meta.event_camera.T_frame_event is not None or any(frame.transform_matrix is None for frame in meta.frames):
         mount = frame_from_event(path, meta.event_camera, lens)
-    views: dict[str, ReferenceView] = {}
-    known: set[str] = set()
+    # None for a frame that is left out.
+    views: dict[str, ReferenceView | None] = {}
     for index, frame in enumerate(meta.frames):
         name, time, key = frame.file_path, frame.timestamp, f"frames[{index}]"
-        if name in known:
+        if name in views:
             raise DataError(path, f"{key} names {name} again", "list each image once")
-        known.add(name)
+        views[name] = None
         file = file_inside(path.parent, name, path)
         if not file.is_file():
             raise DataError(path, f"{key} names {name}, which does not exist", "copy the images too")
@@ -137,19 +129,18 @@ def _read_views(
         else:
             pose = homogeneous(reference.interpolate(time)) @ torch.linalg.inv(mount)
         views[name] = ReferenceView(file, pose, time)
-    if len(views) < len(known):
-        CONSOLE.print(
-            f"{len(known) - len(views)} of {len(known)} frames are left out: the true trajectory has no pose for them."
-        )
+    num_lost = sum(view is None for view in views.values())
+    if num_lost:
+        CONSOLE.print(f"{num_lost} of {len(views)} frames are left out: the true trajectory has no pose for them.")
     splits: dict[Split, list[ReferenceView]] = {}
     for split in SPLITS:
         names = getattr(meta, f"{split}_filenames")
-        unknown = [name for name in names if name not in known]
+        unknown = [name for name in names if name not in views]
         if unknown:
             raise DataError(
                 path, f"{split}_filenames names {unknown[0]}, which is not among the frames", "add it there"
             )
-        splits[split] = [views[name] for name in names if name in views]
+        splits[split] = [view for name in names if (view := views[name]) is not None]
     return splits
 
 

@@ -16,9 +16,9 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.calibration import Calibration, read_calibration
 from aenerf_ns.files.colmap import read_colmap_focal_shares, read_colmap_poses
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.limits import require_one
 from aenerf_ns.files.open import SUFFIXES, open_event_file
 from aenerf_ns.files.text import TimeUnit

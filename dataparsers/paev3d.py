@@ -13,14 +13,13 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, require_rigid
-from aenerf_ns.dataparsers.eventnerf import UNIT_SPHERE, EvenPosesDataParserConfig, read_intrinsics
+from aenerf_ns.dataparsers.eventnerf import EvenPosesDataParserConfig, read_intrinsics
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import open_npz_member, read_npy_header
 from aenerf_ns.files.event_hdf5 import TXYP_MATRIX, Hdf5TableFile
 from aenerf_ns.files.limits import list_files, require_one
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.recording import Capture, Recording
-from aenerf_ns.recording.views import image_files_of_poses, views_on_trajectory
 
 _WIDTH, _HEIGHT = 640, 480
 # The file of a frame names some hundred objects at most.
@@ -49,15 +48,7 @@ class PAEv3DDataParser(EventDataParser):
         folder = self.poses_path()
         poses = torch.stack([_read_camera_pose(file) for file in list_files(folder, "*.npz")])
         # The first pose is at the first event, the last pose at the last event.
-        reference = self.config.spread(poses @ OPENCV_TO_OPENGL, capture.event_file, folder)
-        # There may be no images.
-        images = zip(reference.times.tolist(), image_files_of_poses(folder, len(poses)), strict=False)
-        return self.config.make_recording(
-            reference,
-            capture,
-            reference_views=views_on_trajectory(list(images), reference),
-            scene_box=self.config.scene_box(UNIT_SPHERE),
-        )
+        return self.config.make_even_recording(capture, poses @ OPENCV_TO_OPENGL, folder, folder)
 
     def poses_path(self) -> Path:
         scene = self._scene()

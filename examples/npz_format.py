@@ -17,7 +17,8 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import EventDataParserConfig
@@ -38,14 +39,6 @@ class NpzEventFile(EventFile):
                 self.height,
                 self.path,
             )
-
-    def time_span(self) -> tuple[int, int]:
-        self.require()
-        with np.load(self.path) as file:
-            t = file["t"]
-        if len(t) == 0:
-            raise self.empty_error()
-        return int(t[0]) * 1_000, int(t[-1]) * 1_000
 
 
 @dataclass

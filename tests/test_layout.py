@@ -23,11 +23,11 @@ MAY_USE: dict[str, set[str]] = {
     "events": {"errors", "camera"},
     # Events in, images out: where the camera was, and what the images are for, is not its business.
     "reconstruction": {"errors", "events"},
-    "files": {"errors", "events", "camera"},
+    "files": {"errors", "atomic_write", "events", "camera"},
     "recording": {"errors", "progress", "events", "camera", "files"},
     # Poses of a recording from its frames: a tool, which only commands and the simulator use.
     "pose_estimation": {"errors", "progress", "events", "reconstruction", "camera", "files", "recording"},
-    "checking": {"progress", "events", "camera", "recording"},
+    "checking": {"progress", "events", "camera", "files", "recording"},
     "supervision": {"errors", "events", "camera", "recording"},
     "method": {"errors", "camera", "recording", "supervision"},
     # What is done with a trained run, without the trainer.

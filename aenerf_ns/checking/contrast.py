@@ -39,34 +39,26 @@ from aenerf_ns.events.stream import EventStream
 _SHUFFLED_COLUMNS = (("p",), ("x", "y"), ("x", "y", "p"))
 _PICTURE_HEIGHT = 480
 
-
-@dataclass(frozen=True)
-class WarpSettings:
-    """How a recording is cut into slices, and how finely a slice is warped."""
-
-    num_slices: int = 8
-    """Slices of a recording."""
-    densities: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-    """Events per pixel in a slice. They are tried in turn, until the image without warping is smeared."""
-    smeared_contrast: float = 0.05
-    """An image of less contrast is smeared."""
-    max_events: int = 40_000
-    """Events of a slice that are warped. More do not change the result."""
-    num_poses: int = 96
-    """Poses within a slice. From one to the next, nothing moves visibly."""
-    depth_step: float = 1.5
-    """Pixels that events at the ends of a slice move from one depth to the next."""
-    min_usable_share: float = 0.5
-    """A slice is cut to the events that have a pose and a direction under both hypotheses. If a smaller share of the
-    events is left, the slice is not compared."""
-    hopeless_share: float = 0.85
-    """An alternative is first tried on a third of the slices. If its contrast is not above this share of the given
-    contrast, it is not tried on the others."""
-    num_shuffles: int = 2
-    """How often the events are shuffled in each of three ways."""
-
-
-_SETTINGS = WarpSettings()
+# Slices of a recording.
+_NUM_SLICES = 8
+# Events per pixel in a slice. They are tried in turn, until the image without warping is smeared.
+_DENSITIES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+# An image of less contrast is smeared.
+_SMEARED_CONTRAST = 0.05
+# Events of a slice that are warped. More do not change the result.
+_MAX_EVENTS = 40_000
+# Poses within a slice. From one to the next, nothing moves visibly.
+_NUM_POSES = 96
+# Pixels that events at the ends of a slice move from one depth to the next.
+_DEPTH_STEP = 1.5
+# A slice is cut to the events that have a pose and a direction under both hypotheses. If a smaller share of the events
+# is left, the slice is not compared.
+_MIN_USABLE_SHARE = 0.5
+# An alternative is first tried on a third of the slices. If its contrast is not above this share of the given
+# contrast, it is not tried on the others.
+_HOPELESS_SHARE = 0.85
+# How often the events are shuffled in each of three ways.
+_NUM_SHUFFLES = 2
 
 
 @dataclass(frozen=True)
@@ -91,36 +83,16 @@ class WarpedSlice:
     points: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class _SliceGeometry:
-    """Where the events of a slice were seen, under a hypothesis.
-
-    ``points`` are (N, 2) directions on the plane at depth 1, ``pose_indices`` (N,) the events' poses, and ``poses``
-    (P, 3, 4) relative to the ``reference`` (4, 4), which is the pose in the middle of the slice. ``intrinsics`` are
-    fx fy cx cy of the images.
-    """
-
-    points: NDArray[np.float64]
-    pose_indices: NDArray[np.int64]
-    poses: NDArray[np.float64]
-    reference: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
-
-    def lines(self) -> NDArray[np.float32]:
-        """Return where the reference view sees the events, for :func:`accumulate`."""
-        return _lines(self.points, self.pose_indices, self.poses, self.intrinsics)
-
-
 def choose_runs(num_events: int, camera: CameraIntrinsics) -> tuple[NDArray[np.int64], int]:
     """Return where in a recording the runs of consecutive events begin that are looked at, and the length of a run.
 
     Runs are as long as the longest slice. A short recording is one run with all its events.
     """
     width, height, _ = image_size(camera.width, camera.height)
-    length = int(_SETTINGS.densities[-1] * width * height)
-    if num_events <= _SETTINGS.num_slices * length:
+    length = int(_DENSITIES[-1] * width * height)
+    if num_events <= _NUM_SLICES * length:
         return np.zeros(1, np.int64), num_events
-    return np.linspace(0, num_events - length, _SETTINGS.num_slices).astype(np.int64), length
+    return np.linspace(0, num_events - length, _NUM_SLICES).astype(np.int64), length
 
 
 def longest_stretches(runs: list[EventStream], window: TimeWindow, min_events: int) -> list[EventStream]:
@@ -130,7 +102,7 @@ def longest_stretches(runs: list[EventStream], window: TimeWindow, min_events: i
     ``min_events`` are left out.
     """
     stretches = [run.between(*piece) for run in runs for piece in window.pieces()]
-    longest = sorted((part for part in stretches if len(part) >= min_events), key=len)[-_SETTINGS.num_slices :]
+    longest = sorted((part for part in stretches if len(part) >= min_events), key=len)[-_NUM_SLICES:]
     return sorted(longest, key=lambda part: part.t[0])
 
 
@@ -156,24 +128,24 @@ class WarpedEvents:
         self._plane = directions[..., :2] * [1, -1] / depth
         # Chooses the events of long slices, and the position of each event within its pixel.
         rng = np.random.default_rng(0)
-        self._jitter = rng.uniform(-0.5, 0.5, (_SETTINGS.max_events, 2)) / [camera.fx, camera.fy]
+        self._jitter = rng.uniform(-0.5, 0.5, (_MAX_EVENTS, 2)) / [camera.fx, camera.fy]
         self._slices = self._cut(runs, rng)
         self.given = [self._warp(events, GIVEN) for events in self._slices]
 
     def _cut(self, runs: list[EventStream], rng: np.random.Generator) -> list[EventStream]:
         """Return slices of the runs, long enough that an image without warping is smeared."""
-        for density in _SETTINGS.densities:
+        for density in _DENSITIES:
             size = int(density * self._width * self._height)
             slices = []
             for run in runs:
-                count = min(max(len(run) // size, 1), _SETTINGS.num_slices // len(runs))
+                count = min(max(len(run) // size, 1), _NUM_SLICES // len(runs))
                 length = len(run) if len(run) < 2 * size else size
                 for begin in np.linspace(0, len(run) - length, count) if count > 1 else [(len(run) - length) / 2]:
                     events = run[int(begin) : int(begin) + length]
-                    if len(events) > _SETTINGS.max_events:
-                        events = events[np.sort(rng.choice(len(events), _SETTINGS.max_events, replace=False))]
+                    if len(events) > _MAX_EVENTS:
+                        events = events[np.sort(rng.choice(len(events), _MAX_EVENTS, replace=False))]
                     slices.append(events)
-            if contrast_of([self._warp(events, STILL) for events in slices]) < _SETTINGS.smeared_contrast:
+            if contrast_of([self._warp(events, STILL) for events in slices]) < _SMEARED_CONTRAST:
                 break
         return slices
 
@@ -195,7 +167,7 @@ class WarpedEvents:
             events, as_given = self._slices[index], self.given[index]
             visible = has_direction[events.y, events.x]
             usable = visible & covered.contains(events.t + hypothesis.clock_offset)
-            if usable.sum() < max(_SETTINGS.min_usable_share * visible.sum(), 2):
+            if usable.sum() < max(_MIN_USABLE_SHARE * visible.sum(), 2):
                 continue
             part = events[usable]
             given.append(as_given if usable.all() else self._warp(part, GIVEN))
@@ -217,7 +189,7 @@ class WarpedEvents:
         found = []
         for hypothesis in (*ALTERNATIVES, *map(clock_hypothesis, offsets)):
             comparison = self.compare(hypothesis, slice(None, None, 3))
-            if comparison is not None and comparison.contrast > _SETTINGS.hopeless_share * comparison.given:
+            if comparison is not None and comparison.contrast > _HOPELESS_SHARE * comparison.given:
                 comparison = self.compare(hypothesis)
             if comparison is not None:
                 found.append(comparison)
@@ -242,7 +214,7 @@ class WarpedEvents:
         """
         rng = np.random.default_rng(0)
         contrasts = []
-        for columns in _SHUFFLED_COLUMNS * _SETTINGS.num_shuffles:
+        for columns in _SHUFFLED_COLUMNS * _NUM_SHUFFLES:
             permuted = []
             for events in self._slices:
                 order = rng.permutation(len(events))
@@ -250,8 +222,16 @@ class WarpedEvents:
             contrasts.append(contrast_of([self._warp(events, GIVEN) for events in permuted]))
         return np.array(contrasts)
 
-    def _geometry(self, events: EventStream, hypothesis: Hypothesis) -> _SliceGeometry:
-        camera, num_poses, focal_factor = self._camera, _SETTINGS.num_poses, hypothesis.focal_factor
+    def _geometry(
+        self, events: EventStream, hypothesis: Hypothesis
+    ) -> tuple[NDArray[np.float32], float, NDArray[np.float64], NDArray[np.float64]]:
+        """Return where the reference view, which has the pose in the middle of a slice, sees the events of the slice.
+
+        Returns:
+            Lines for :func:`accumulate`, the largest distance of a pose from the reference, the reference (4, 4), and
+            fx fy cx cy of the images.
+        """
+        camera, num_poses, focal_factor = self._camera, _NUM_POSES, hypothesis.focal_factor
         # Times since 1970 would be rounded by 128 ns as decimals, and may then lie outside the poses.
         times = events.t[0] + np.linspace(0, events.t[-1] - events.t[0], num_poses).astype(np.int64)
         if hypothesis.still:
@@ -261,26 +241,23 @@ class WarpedEvents:
                 self._meant[hypothesis.poses] = self._trajectory.transform(hypothesis.poses)
             poses = homogeneous(self._meant[hypothesis.poses].interpolate(times + hypothesis.clock_offset))
         reference = poses[num_poses // 2]
+        relative = np.ascontiguousarray((torch.linalg.inv(reference) @ poses)[:, :3].numpy())
         duration = max(int(events.t[-1] - events.t[0]), 1)
-        return _SliceGeometry(
-            points=(hypothesis.plane(self._plane)[events.y, events.x] + self._jitter[: len(events)]) / focal_factor,
-            pose_indices=np.rint((events.t - events.t[0]) / duration * (num_poses - 1)).astype(np.int64),
-            poses=np.ascontiguousarray((torch.linalg.inv(reference) @ poses)[:, :3].numpy()),
-            reference=reference.numpy(),
-            intrinsics=np.array([camera.fx * focal_factor, camera.fy * focal_factor, camera.cx, camera.cy])
-            / self._binning,
-        )
+        indices = np.rint((events.t - events.t[0]) / duration * (num_poses - 1)).astype(np.int64)
+        points = (hypothesis.plane(self._plane)[events.y, events.x] + self._jitter[: len(events)]) / focal_factor
+        focal = camera.fx * focal_factor, camera.fy * focal_factor
+        intrinsics = np.array([*focal, camera.cx, camera.cy]) / self._binning
+        baseline = float(np.linalg.norm(relative[:, :, 3], axis=1).max())
+        return _lines(points, indices, relative, intrinsics), baseline, reference.numpy(), intrinsics
 
     def _warp(self, events: EventStream, hypothesis: Hypothesis) -> WarpedSlice:
         """Warp a slice at every depth, and keep the depth of most contrast in each tile."""
-        geometry = self._geometry(events, hypothesis)
-        lines, polarity = geometry.lines(), events.p.astype(np.float32)
-        fx, fy, cx, cy = geometry.intrinsics
-        baseline = float(np.linalg.norm(geometry.poses[:, :, 3], axis=1).max())
+        lines, baseline, reference, (fx, fy, cx, cy) = self._geometry(events, hypothesis)
+        polarity = events.p.astype(np.float32)
         inverse_depths = np.zeros(1)
         if baseline > 0:
-            steps = np.arange(0, self._width / _SETTINGS.depth_step + 1)
-            inverse_depths = steps * _SETTINGS.depth_step / (fx * baseline)
+            steps = np.arange(0, self._width / _DEPTH_STEP + 1)
+            inverse_depths = steps * _DEPTH_STEP / (fx * baseline)
         net, total = np.zeros((2, self._height, self._width), np.float32)
         measured = []
         for inverse_depth in inverse_depths:
@@ -293,7 +270,7 @@ class WarpedEvents:
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = 1 / inverse_depths[best]
             in_camera = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None]
-            points = in_camera @ geometry.reference[:3, :3].T + geometry.reference[:3, 3]
+            points = in_camera @ reference[:3, :3].T + reference[:3, 3]
         return WarpedSlice(
             energy=np.take_along_axis(energy, best[None], 0)[0],
             brightness=np.take_along_axis(brightness, best[None], 0)[0],
@@ -309,11 +286,10 @@ class WarpedEvents:
         """
         best = max(range(len(self.given)), key=lambda index: contrast_of([self.given[index]]))
         events, depth = self._slices[best], self.given[best].depth
-        geometry, polarity = self._geometry(events, GIVEN), events.p.astype(np.float32)
+        polarity = events.p.astype(np.float32)
         unwarped, warped, net, total = np.zeros((4, self._height, self._width), np.float32)
-        still = replace(geometry, poses=np.tile(np.eye(3, 4), (_SETTINGS.num_poses, 1, 1)))
-        accumulate(still.lines(), polarity, np.float32(0), unwarped, total)
-        lines, depth_of_pixel = geometry.lines(), np.kron(depth, np.ones((TILE, TILE)))
+        accumulate(self._geometry(events, STILL)[0], polarity, np.float32(0), unwarped, total)
+        lines, depth_of_pixel = self._geometry(events, GIVEN)[0], np.kron(depth, np.ones((TILE, TILE)))
         for value in np.unique(depth):
             accumulate(lines, polarity, np.float32(1 / value), net, total)
             warped[depth_of_pixel == value] = net[depth_of_pixel == value]

@@ -31,59 +31,45 @@ _MAX_GAPS_SHOWN = 5
 _MILLISECOND = 1_000_000
 
 
-@dataclass(frozen=True)
-class CheckLimits:
-    """A figure beyond its limit is a problem."""
-
-    min_polarity_share: float = 0.02
-    min_correlation: float = -0.4
-    """Of the polarities with the change from frame to frame."""
-    threshold_deviations: float = 2.0
-    """A ratio of the thresholds that differs from the estimate by so many times its uncertainty is clearly another."""
-    max_repeated_share: float = 0.05
-    max_hot_pixel_share: float = 0.01
-    min_covered_share: float = 0.5
-    """Share of the events that have a pose."""
-    gap_factor: float = 5
-    """A gap is longer than this many median intervals of the poses."""
-    max_gap_share: float = 0.01
-    min_in_box_share: float = 0.5
-    noise_deviations: float = 4.0
-    noise_factor: float = 1.5
-    """Contrast above that of the shuffled events by these standard deviations and by this factor is not noise."""
-    min_slices: int = 2
-    """One slice alone gives no verdict."""
-    min_clock_slices: int = 4
-    """Nor do two or three about the clock: of the many offsets that are tried, one fits a hand's shaking by chance."""
-    min_share_in_favor: float = 0.5
-    """Share of the slices that, each by itself, must clearly fit another meaning of the poses for it to be named."""
-    max_elsewhere_share: float = 0.3
-    """Share of the slices that clearly fit another meaning of the poses, and not all the same one. With the poses of
-    another path it is about half."""
-    outlier_share: float = 1e-3
-    """Share of the events at each side that does not count for the extent of the events."""
-    corner_share: float = 0.02
-    filled_share: float = 0.75
-    """Events that begin at the corner, within the first share of the sensor, and end within the second do not fill
-    it."""
-    half_share: float = 0.52
-    """Nor do events that end within this share, wherever they begin: what is in the middle reaches beyond it."""
-    focal_lengths: tuple[float, float] = (0.15, 30.0)
-    """By the width of the sensor. No lens of an event camera is wider or longer."""
-    max_principal_point: float = 0.2
-    """Distance of the principal point from the middle, as a share of the sensor."""
-    equal_poses: float = 1e-12
-    max_still_share: float = 0.05
-    """Share of the events that fall between equal poses."""
-    jump_factor: float = 5
-    """A jump is faster than the steps around it, and than the median, by this factor."""
-    min_events: int = 2_000
-    """Fewer events give no contrast."""
-    min_tile_contrast: float = 0.5
-    """The depth of a tile with less than this share of the mean contrast is not trusted."""
-
-
-_LIMITS = CheckLimits()
+# Shares of the events beyond which something is wrong.
+_MIN_POLARITY_SHARE, _MAX_REPEATED_SHARE, _MAX_HOT_PIXEL_SHARE = 0.02, 0.05, 0.01
+# Of the polarities with the change from frame to frame.
+_MIN_CORRELATION = -0.4
+# A ratio of the thresholds that differs from the estimate by so many times its uncertainty is clearly another.
+_THRESHOLD_DEVIATIONS = 2.0
+# Share of the events that have a pose, and of what is seen that is in the scene box.
+_MIN_COVERED_SHARE, _MIN_IN_BOX_SHARE = 0.5, 0.5
+# A gap is longer than this many median intervals of the poses. This share of the events may fall in gaps.
+_GAP_FACTOR, _MAX_GAP_SHARE = 5, 0.01
+# Contrast above that of the shuffled events by these standard deviations and by this factor is not noise.
+_NOISE_DEVIATIONS, _NOISE_FACTOR = 4.0, 1.5
+# One slice alone gives no verdict.
+_MIN_SLICES = 2
+# Nor do two or three about the clock: of the many offsets that are tried, one fits a hand's shaking by chance.
+_MIN_CLOCK_SLICES = 4
+# Share of the slices that, each by itself, must clearly fit another meaning of the poses for it to be named.
+_MIN_SHARE_IN_FAVOR = 0.5
+# Share of the slices that clearly fit another meaning of the poses, and not all the same one. With the poses of another
+# path it is about half.
+_MAX_ELSEWHERE_SHARE = 0.3
+# Share of the events at each side that does not count for the extent of the events.
+_OUTLIER_SHARE = 1e-3
+# Events that begin at the corner, within the first share of the sensor, and end within the second do not fill it.
+_CORNER_SHARE, _FILLED_SHARE = 0.02, 0.75
+# Nor do events that end within this share, wherever they begin: what is in the middle reaches beyond it.
+_HALF_SHARE = 0.52
+# By the width of the sensor. No lens of an event camera is wider or longer.
+_FOCAL_LENGTHS = (0.15, 30.0)
+# Distance of the principal point from the middle, as a share of the sensor.
+_MAX_PRINCIPAL_POINT = 0.2
+# Poses that differ by less are equal. This share of the events may fall between equal poses.
+_EQUAL_POSES, _MAX_STILL_SHARE = 1e-12, 0.05
+# A jump is faster than the steps around it, and than the median, by this factor.
+_JUMP_FACTOR = 5
+# Fewer events give no contrast.
+_MIN_EVENTS = 2_000
+# The depth of a tile with less than this share of the mean contrast is not trusted.
+_MIN_TILE_CONTRAST = 0.5
 
 
 @dataclass
@@ -135,13 +121,16 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     _check_polarity(result, correlation)
     _check_thresholds(result, recording, changes, balance, correlation or 0.0)
     _check_poses(result, recording, window, num_covered)
-    is_simple = _check_lens(result, recording.event_camera) | _check_steps(result, recording.trajectory, window)
+    num_problems = len(result.problems)
+    _check_lens(result, recording.event_camera)
+    _check_steps(result, recording.trajectory, window)
+    is_simple = len(result.problems) > num_problems
     # The events are read once more only where there can be enough.
-    runs = _read_runs(recording, window, num_covered) if num_covered >= _LIMITS.min_events else []
-    runs = longest_stretches(runs, window, _LIMITS.min_events)
+    runs = _read_runs(recording, window, num_covered) if num_covered >= _MIN_EVENTS else []
+    runs = longest_stretches(runs, window, _MIN_EVENTS)
     if not runs:
         result.figures.append(
-            f"Contrast of warped events: not computed, because no {_LIMITS.min_events} events have poses without a gap."
+            f"Contrast of warped events: not computed, because no {_MIN_EVENTS} events have poses without a gap."
         )
         return result
     with progress_bar() as progress:
@@ -201,19 +190,19 @@ def _check_events(result: CheckResult, noise: NoiseRate, bayer_pattern: str | No
     figures.append(f"Rate over time, 0 to {highest:,.0f} events a second:\n  |{_histogram(statistics.rate)}|")
     positive = statistics.num_positive / count
     figures.append(f"Polarity: {positive:.1%} positive")
-    if not _LIMITS.min_polarity_share < positive < 1 - _LIMITS.min_polarity_share:
+    if not _MIN_POLARITY_SHARE < positive < 1 - _MIN_POLARITY_SHARE:
         problems.append(
             f"{positive:.1%} of the events are positive: check that the polarities were written as they were recorded"
         )
     repeated = statistics.num_repeated / count
     figures.append(f"Events with the pixel and time of another: {repeated:.2%}")
-    if repeated > _LIMITS.max_repeated_share:
+    if repeated > _MAX_REPEATED_SHARE:
         problems.append(
             f"{repeated:.1%} of the events have the pixel and time of another: check that no events were written "
             "twice, and that their times kept all their digits"
         )
     pairs = statistics.pair_times - statistics.start
-    if len(pairs) >= _LIMITS.min_events and (pairs % _MILLISECOND == 0).all():
+    if len(pairs) >= _MIN_EVENTS and (pairs % _MILLISECOND == 0).all():
         problems.append(
             "all times of events are whole milliseconds: the camera's have microseconds, which tell the order of the "
             "events; write them with all their digits"
@@ -225,7 +214,7 @@ def _check_events(result: CheckResult, noise: NoiseRate, bayer_pattern: str | No
         noise_share = min(noise_rate * seconds * statistics.counts.size / count, 1)
         figures.append(f"Noise: at most {noise_rate:.2g} events a second a pixel, {noise_share:.1%} of all")
     share = statistics.counts[hot].sum() / count
-    if share > _LIMITS.max_hot_pixel_share:
+    if share > _MAX_HOT_PIXEL_SHARE:
         problems.append(
             f"hot pixels make {share:.1%} of the events: leave them out with aenerf convert --drop-hot-pixels"
         )
@@ -235,7 +224,7 @@ def _check_polarity(result: CheckResult, correlation: float | None) -> None:
     if correlation is None:
         return
     result.figures.append(f"Correlation of the polarities with the change from frame to frame: {correlation:+.2f}")
-    if correlation < _LIMITS.min_correlation:
+    if correlation < _MIN_CORRELATION:
         result.problems.append(
             f"events fall where the frames become brighter (correlation {correlation:+.2f}): the polarities look "
             "reversed. Write p as -p, unless the frames are negatives or have another clock"
@@ -257,8 +246,8 @@ def _check_thresholds(
         size, low, high = changes.negative_threshold(ratio)
         figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
     # Reversed polarities reverse the ratio.
-    is_reversed = correlation < _LIMITS.min_correlation
-    if abs(ratio - used) > _LIMITS.threshold_deviations * uncertainty and not is_reversed:
+    is_reversed = correlation < _MIN_CORRELATION
+    if abs(ratio - used) > _THRESHOLD_DEVIATIONS * uncertainty and not is_reversed:
         value = f"{ratio * sensor.negative_contrast_threshold:.3g}"
         if recording.has_assumed_thresholds:
             result.sensor_options = {"positive-contrast-threshold": value}
@@ -289,14 +278,14 @@ def _check_poses(result: CheckResult, recording: Recording, window: TimeWindow, 
         figures.append(f"True poses: {len(recording.ground_truth)}, for evaluation")
     covered = num_covered / statistics.num_events
     figures.append(f"Events with a pose: {covered:.1%}")
-    if covered < _LIMITS.min_covered_share:
+    if covered < _MIN_COVERED_SHARE:
         problems.append(
             f"only {covered:.1%} of the events have a pose, the others are not used: check the clocks of events and "
             "poses, or cut the recording"
         )
     # The gaps of the window were already reported when the dataset was opened.
     known = np.isin(times[:-1], [first for first, _ in window.gaps])
-    gaps = np.flatnonzero((intervals > _LIMITS.gap_factor * median) & ~known)
+    gaps = np.flatnonzero((intervals > _GAP_FACTOR * median) & ~known)
     if len(gaps):
         # The share is that of the sampled pairs, each counted at its later event.
         segment = np.searchsorted(times, statistics.pair_times[:, 1]) - 1
@@ -304,24 +293,23 @@ def _check_poses(result: CheckResult, recording: Recording, window: TimeWindow, 
         longest = gaps[np.argsort(-intervals[gaps], kind="stable")[:_MAX_GAPS_SHOWN]]
         named = ", ".join(f"{intervals[i] * 1e-9:.3f} s after {times[i]} ns" for i in longest)
         figures.append(f"Gaps between poses: {len(gaps)}, with {share:.1%} of the events; the longest: {named}")
-        if share > _LIMITS.max_gap_share:
+        if share > _MAX_GAP_SHARE:
             problems.append(
                 f"{share:.1%} of the events fall in gaps between poses, where they are interpolated: give the missing "
                 "poses, or leave the gaps out (--max-pose-gap-ns of the dataparser)"
             )
 
 
-def _check_lens(result: CheckResult, camera: CameraIntrinsics) -> bool:
-    """Compare the lens with the sensor and with where the events are, and return whether there is a problem."""
+def _check_lens(result: CheckResult, camera: CameraIntrinsics) -> None:
+    """Compare the lens with the sensor and with where the events are."""
     height, width = result.statistics.counts.shape
-    num_problems = len(result.problems)
     # A hot pixel may lie anywhere.
     rows, columns = (
-        np.searchsorted(np.cumsum(counts), np.array([_LIMITS.outlier_share, 1 - _LIMITS.outlier_share]) * counts.sum())
+        np.searchsorted(np.cumsum(counts), np.array([_OUTLIER_SHARE, 1 - _OUTLIER_SHARE]) * counts.sum())
         for counts in (result.statistics.counts.sum(1), result.statistics.counts.sum(0))
     )
     begin, end = (np.array([columns[i] / width, rows[i] / height]) for i in (0, 1))
-    if (end < _LIMITS.half_share).all() or ((begin < _LIMITS.corner_share).all() and end.min() < _LIMITS.filled_share):
+    if (end < _HALF_SHARE).all() or ((begin < _CORNER_SHARE).all() and end.min() < _FILLED_SHARE):
         result.problems.append(
             f"all events lie in the first {columns[1] + 1} x {rows[1] + 1} of {width} x {height} pixels: if they were "
             "binned or cropped, give the intrinsics of that size (binned by 2: half the focal lengths and the "
@@ -329,7 +317,7 @@ def _check_lens(result: CheckResult, camera: CameraIntrinsics) -> bool:
         )
     point = camera.cx, camera.cy
     shares = camera.cx / width, camera.cy / height
-    if any(abs(share - 0.5) > _LIMITS.max_principal_point for share in shares):
+    if any(abs(share - 0.5) > _MAX_PRINCIPAL_POINT for share in shares):
         result.problems.append(
             f"the principal point ({camera.cx:g}, {camera.cy:g}) is far from the middle of {width} x {height} pixels, "
             "as of another resolution: check the intrinsics, unless this is a part of a larger sensor"
@@ -339,23 +327,21 @@ def _check_lens(result: CheckResult, camera: CameraIntrinsics) -> bool:
             f"the principal point ({camera.cx:g}, {camera.cy:g}) seems to have x and y swapped, for {width} x {height} "
             "pixels: check the intrinsics"
         )
-    low, high = _LIMITS.focal_lengths
+    low, high = _FOCAL_LENGTHS
     if not low * width < camera.fx < high * width:
         result.problems.append(
             f"a focal length of {camera.fx:g} pixels is {camera.fx / width:.2g} times the width of the sensor: give it "
             "in pixels (millimeters by the size of a pixel)"
         )
-    return len(result.problems) > num_problems
 
 
-def _check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow) -> bool:
-    """Look for poses that stand still while there are events, or jump, and return whether there is a problem."""
-    num_problems = len(result.problems)
+def _check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow) -> None:
+    """Look for poses that stand still while there are events, or jump."""
     times, poses = trajectory.times.numpy(), trajectory.camera_to_worlds
-    still = np.flatnonzero(((poses[1:] - poses[:-1]).abs().flatten(1).amax(1) < _LIMITS.equal_poses).numpy())
+    still = np.flatnonzero(((poses[1:] - poses[:-1]).abs().flatten(1).amax(1) < _EQUAL_POSES).numpy())
     segment = np.searchsorted(times, result.statistics.pair_times[:, 1]) - 1
     share = float(np.isin(segment, still).mean()) if len(segment) else 0.0
-    if share > _LIMITS.max_still_share:
+    if share > _MAX_STILL_SHARE:
         result.problems.append(
             f"{share:.1%} of the events fall between poses that are equal (the first at {times[still[0]]} ns): "
             "tracking may have been lost there, or poses were repeated; leave these poses out, and see "
@@ -367,14 +353,13 @@ def _check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow
         rates = steps.numpy() / seconds
         padded = np.pad(rates, 3, mode="edge")
         around = np.max([padded[3 + k : 3 + k + len(rates)] for k in (-3, -2, 2, 3)], 0)
-        jumps |= (rates > _LIMITS.jump_factor * around) & (rates > _LIMITS.jump_factor * np.median(rates))
+        jumps |= (rates > _JUMP_FACTOR * around) & (rates > _JUMP_FACTOR * np.median(rates))
     jumps &= window.contains(times[:-1]) & window.contains(times[1:])
     if jumps.any():
         result.problems.append(
             f"the poses jump (steps: {jumps.sum()}, the first after {times[:-1][jumps][0]} ns): tracking may have been "
             "lost there, or placeholders stand among the poses; leave these poses out"
         )
-    return len(result.problems) > num_problems
 
 
 def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -> bool:
@@ -397,8 +382,8 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) 
     clocks = [c.hypothesis.clock_offset for c in alternatives if c.hypothesis.clock_offset and c.is_clearly_worse]
     if clocks:
         figures.append(f"  clearly less if the clock of the poses is off by {min(map(abs, clocks)) * 1e-9:g} s")
-    noise = max(mean + _LIMITS.noise_deviations * deviation, _LIMITS.noise_factor * mean)
-    if is_simple or num_slices < _LIMITS.min_slices:
+    noise = max(mean + _NOISE_DEVIATIONS * deviation, _NOISE_FACTOR * mean)
+    if is_simple or num_slices < _MIN_SLICES:
         reason = "what is wrong above" if is_simple else "too few events"
         figures.append(f"Because of {reason}, the contrast does not tell whether poses, lens and clock are right.")
         return not is_simple
@@ -409,8 +394,8 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) 
         and c.contrast > noise
         and len(c.slices_in_favor)
         >= max(
-            _LIMITS.min_clock_slices if c.hypothesis.clock_offset else _LIMITS.min_slices,
-            _LIMITS.min_share_in_favor * num_slices,
+            _MIN_CLOCK_SLICES if c.hypothesis.clock_offset else _MIN_SLICES,
+            _MIN_SHARE_IN_FAVOR * num_slices,
         )
     ]
     if better:
@@ -442,7 +427,7 @@ def _check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) 
             f"shuffled {mean:.3f} +/- {deviation:.3f}): they are noise, or the poses are of another recording: check "
             "the polarities, the order of the columns and the poses"
         )
-    elif len(in_favor_of_others) > max(_LIMITS.max_elsewhere_share * num_slices, _LIMITS.min_clock_slices - 1):
+    elif len(in_favor_of_others) > max(_MAX_ELSEWHERE_SHARE * num_slices, _MIN_CLOCK_SLICES - 1):
         problems.append(
             f"{len(in_favor_of_others)} of {num_slices} slices of the events clearly fit another meaning of the poses, "
             "and not all the same one: the poses are of another recording, or wrong in places"
@@ -461,7 +446,7 @@ def _check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording
     energy, brightness, depth, point = (
         np.stack([getattr(part, name) for part in warped.given]) for name in ("energy", "brightness", "depth", "points")
     )
-    trusted = (energy > _LIMITS.min_tile_contrast * contrast_of(warped.given) * brightness) & np.isfinite(depth)
+    trusted = (energy > _MIN_TILE_CONTRAST * contrast_of(warped.given) * brightness) & np.isfinite(depth)
     weight, depth, point = energy[trusted], depth[trusted], point[trusted]
     if len(depth) == 0:
         return None
@@ -482,7 +467,7 @@ def _check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording
         inside = ((point >= box[0].numpy()) & (point <= box[1].numpy())).all(1)
         share = weight[inside].sum() / weight.sum()
         result.figures.append(f"Within the scene box: {share:.1%} of it")
-        if share < _LIMITS.min_in_box_share and len(warped.given) >= _LIMITS.min_slices:
+        if share < _MIN_IN_BOX_SHARE and len(warped.given) >= _MIN_SLICES:
             result.problems.append(
                 f"the scene box holds only {share:.1%} of what is seen: state a larger scene_box, or none"
             )

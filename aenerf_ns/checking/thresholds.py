@@ -6,7 +6,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import EventFile
 
 # Parts of the recording at whose ends the balance is compared.
 _NUM_PARTS = 60

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.camera.trajectory import Trajectory
-    from aenerf_ns.events.filters import EventFilters, FilteredEventFile
+    from aenerf_ns.events.filters import EventFilters, EventSelection
     from aenerf_ns.events.stream import EventStream
     from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
     from aenerf_ns.recording.dataparser import EventDataParser
@@ -94,7 +94,18 @@ class Convert(DatasetCommand):
                     "--weights", f"--poses {self.poses} makes no images of events", "choose --poses refined or events"
                 )
             require_weights(self.weights)
-        filters = self._make_filters()
+        from aenerf_ns.events.filters import EventFilters
+
+        with value_errors_as_data_error("aenerf convert", "see aenerf convert --help"):
+            filters = EventFilters(
+                start=self.start_time_ns,
+                end=self.end_time_ns,
+                region=self.region,
+                hot_pixels=self.drop_hot_pixels,
+                pixel_share=self.pixel_share,
+                shortest_interval=self.shortest_interval_ns,
+                seed=self.seed,
+            )
         parser = self.open_dataset()
         parser.config.drop_malformed |= self.drop_malformed
         with exclusive_output(self.output) as lock:
@@ -104,22 +115,8 @@ class Convert(DatasetCommand):
     def _colmap_folder(self) -> Path:
         return self.output.with_name(f".{self.output.name}.colmap")
 
-    def _make_filters(self) -> EventFilters:
-        from aenerf_ns.events.filters import EventFilters
-
-        with value_errors_as_data_error("aenerf convert", "see aenerf convert --help"):
-            return EventFilters(
-                start=self.start_time_ns,
-                end=self.end_time_ns,
-                region=self.region,
-                hot_pixels=self.drop_hot_pixels,
-                pixel_share=self.pixel_share,
-                shortest_interval=self.shortest_interval_ns,
-                seed=self.seed,
-            )
-
     def _convert(self, parser: EventDataParser, filters: EventFilters, lock: OutputLock) -> None:
-        from aenerf_ns.events.filters import FilteredEventFile
+        from aenerf_ns.events.filters import EventSelection
         from aenerf_ns.recording.images import check_image
         from aenerf_ns.recording.poses_report import POSES_PICTURE
         from aenerf_ns.recording.time_units import require_covered
@@ -127,7 +124,8 @@ class Convert(DatasetCommand):
 
         has_given_poses = self.poses in ("given", "refined")
         capture, images = (parser.recording, []) if has_given_poses else parser.read_frames()
-        events = FilteredEventFile(capture.event_file, filters, capture.sensor.bayer_pattern)
+        source = capture.event_file
+        events = EventSelection(source.path, source.width, source.height, filters, capture.sensor.bayer_pattern)
         # Refused before poses are found, which may take hours.
         if self.region is not None and capture.sensor.bayer_pattern and (self.region[0] % 2 or self.region[1] % 2):
             raise DataError(
@@ -152,7 +150,7 @@ class Convert(DatasetCommand):
             # The dataset's own longest gap is about its own poses, but one that was given is about these.
             if any(option.replace("-", "_").startswith("max_pose_gap_ns=") for option in self.format_options):
                 recording = replace(recording, max_pose_gap=parser.config.max_pose_gap_ns)
-        trajectory = _cut(recording, events, filters.window)
+        trajectory = _cut(recording, filters.window)
         views = {
             split: thin_views(
                 [view for view in views if view.time is None or filters.window.contains(view.time)],
@@ -203,7 +201,7 @@ class Convert(DatasetCommand):
             )
         kept = [(time, file) for time, file in images if window.contains(time)]
         times, files = [time for time, _ in kept], [file for _, file in kept]
-        first, last = span = capture.event_file.ordered_time_span()
+        first, last = span = capture.event_file.time_span()
         # Before COLMAP's work, which may take hours.
         num_inside = sum(first <= time <= last for time in times)
         if num_inside <= len(times) // 10:
@@ -255,12 +253,12 @@ class Convert(DatasetCommand):
         return replace(recording, trajectory=found.trajectory), report, found.draw(paths)
 
 
-def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) -> Trajectory:
+def _cut(recording: Recording, window: TimeWindow) -> Trajectory:
     """Crop the poses to the time window, or return all poses if the window has no bounds."""
     from aenerf_ns.camera.time_window import TimeWindow
 
-    first, last = recording.event_file.ordered_time_span()
-    start, end = events.time_span()
+    first, last = recording.event_file.time_span()
+    start, end = max(first, window.start), min(last, window.end)
     if end < start:
         raise DataError(
             recording.event_file.path,
@@ -271,7 +269,7 @@ def _cut(recording: Recording, events: FilteredEventFile, window: TimeWindow) ->
     return recording.trajectory if window == TimeWindow() else covered
 
 
-def _copy_events(recording: Recording, events: FilteredEventFile, writer: NativeDatasetWriter) -> tuple[int, int, int]:
+def _copy_events(recording: Recording, events: EventSelection, writer: NativeDatasetWriter) -> tuple[int, int, int]:
     """Write the kept events, and count the events that were read, those that were written, and those with a pose."""
     from aenerf_ns.events.filters import hot_pixel_summary
 
@@ -291,7 +289,8 @@ def _copy_events(recording: Recording, events: FilteredEventFile, writer: Native
         num_written += len(chunk)
         num_covered += int(known.contains(chunk.t).sum())
     if num_written == 0:
-        raise events.empty_error()
+        remedy = "widen the time window, the region of interest or the share"
+        raise DataError(source.path, "no event is left", remedy)
     if events.hot_pixels is not None and events.counts is not None:
         say(hot_pixel_summary(events.hot_pixels, events.counts))
     return num_read, num_written, num_covered

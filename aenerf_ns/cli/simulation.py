@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from aenerf_ns.cli.ranges import require_range, require_seed
-from aenerf_ns.events.sensor import BayerPattern, SensorModel
+from aenerf_ns.events.sensor import BayerPattern, SensorModel, sensor_values
 from aenerf_ns.files.output_paths import require_absent
 from aenerf_ns.simulator.options import DURATIONS, MIN_CONTRAST_THRESHOLD, SENSORS, SensorName, SensorNoise
 
@@ -99,13 +99,7 @@ class SimulationCommand:
     def make_sensor(self) -> tuple[SensorModel, SensorNoise]:
         """Make the sensor and its noise."""
         sensor, noise = SENSORS[self.sensor]
-        given: dict[str, Any] = {
-            "positive_contrast_threshold": self.positive_contrast_threshold,
-            "negative_contrast_threshold": self.negative_contrast_threshold,
-            "refractory_period": self.refractory_period_ns,
-        }
-        changed = {name: value for name, value in given.items() if value is not None}
-        return replace(sensor, bayer_pattern=self.bayer_pattern, **changed), self.noise.with_defaults(noise)
+        return replace(sensor, **sensor_values(self)), self.noise.with_defaults(noise)
 
     def add_pose_noise(self, poses: Trajectory) -> Trajectory:
         """Add errors to true poses."""

@@ -18,19 +18,12 @@ if TYPE_CHECKING:
     from aenerf_ns.evaluation.run import TrainedRun
 
 
-RunPath = Annotated[
-    Path,
-    tyro.conf.Positional,
-    tyro.conf.arg(metavar="RUN", help="The run: its config.yml, or its folder. --load-config RUN works too."),
-]
-"""The run that a command works on."""
-
-
 @dataclass
 class RunCommand:
     """A command that works on a trained run."""
 
-    load_config: RunPath
+    load_config: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run: its config.yml, or its folder. --load-config RUN works too."""
     data: Path | None = field(default=None, kw_only=True)
     """Where the dataset of the run is now, if it was moved."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 
 import cv2
 import numba
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.camera.time_window import FIRST_TIME, LAST_TIME, TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventStream
 
 _NEVER = np.iinfo(np.int64).min
 
@@ -57,10 +58,8 @@ class EventFilters:
         for time in (self.start, self.end):
             if time is not None and not FIRST_TIME <= time <= LAST_TIME:
                 raise ValueError(f"the time window ends at {time} ns, which must fit in 64 bits")
-        if self.shortest_interval > LAST_TIME:
-            raise ValueError(f"the shortest interval is {self.shortest_interval} ns, longer than any recording")
-        if self.shortest_interval < 0:
-            raise ValueError(f"the shortest interval must not be negative, not {self.shortest_interval} ns")
+        if not 0 <= self.shortest_interval <= LAST_TIME:
+            raise ValueError(f"the shortest interval must be from 0 to {LAST_TIME} ns, not {self.shortest_interval}")
         if self.start is not None and self.end is not None and self.start > self.end:
             raise ValueError(f"the time window ends at {self.end} ns, before it begins at {self.start} ns")
         if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) <= 0):
@@ -72,7 +71,7 @@ class EventFilters:
         return TimeWindow(FIRST_TIME if self.start is None else self.start, LAST_TIME if self.end is None else self.end)
 
 
-def count_events(chunks: Iterable[EventStream], width: int, height: int) -> NDArray[np.int64]:
+def count_events(chunks: Iterable[EventStream], height: int, width: int) -> NDArray[np.int64]:
     """Return the (height, width) int64 number of events of every pixel, in one pass over the stream."""
     counts = np.zeros(width * height, np.int64)
     for chunk in chunks:
@@ -140,11 +139,13 @@ def hot_pixel_summary(hot: NDArray[np.bool_], counts: NDArray[np.integer]) -> st
     return f"Hot pixels: {len(rows)}, with {share:.2%} of the events. (x, y) and events: {named}{more}."
 
 
-class FilteredEventFile(EventFile):
-    """Read an event file and keep only some of its events.
+class EventSelection:
+    """Keep only some of the events of a file.
 
     Args:
-        source: the event file.
+        source: the file, for messages.
+        width: number of pixel columns of its sensor.
+        height: number of pixel rows of its sensor.
         filters: the events to keep.
         bayer_pattern: of a color sensor; see :func:`find_hot_pixels`.
 
@@ -157,82 +158,56 @@ class FilteredEventFile(EventFile):
         counts: (height, width) number of events of every pixel of the source; None when ``hot_pixels`` is None.
     """
 
-    def __init__(self, source: EventFile, filters: EventFilters, bayer_pattern: str | None = None) -> None:
-        x, y, width, height = filters.region or (0, 0, source.width, source.height)
-        if x + width > source.width or y + height > source.height:
+    def __init__(
+        self, source: Path, width: int, height: int, filters: EventFilters, bayer_pattern: str | None = None
+    ) -> None:
+        self._region = filters.region or (0, 0, width, height)
+        if self._region[0] + self._region[2] > width or self._region[1] + self._region[3] > height:
+            region = " ".join(map(str, self._region))
             raise DataError(
-                source.path,
-                f"the region of interest {x} {y} {width} {height} (x, y, width, height) reaches beyond its "
-                f"{source.width} x {source.height} pixels",
+                source,
+                f"the region of interest {region} (x, y, width, height) reaches beyond its {width} x {height} pixels",
                 "give one on the sensor",
             )
-        super().__init__(source.path, width, height)
-        self._source = source
+        self._shape = (height, width)
         self._filters, self._bayer_pattern = filters, bayer_pattern
-        self._corner = (x, y)
         self.hot_pixels: NDArray[np.bool_] | None = None
         self.counts: NDArray[np.int64] | None = None
 
-    def find_hot_pixels(self, chunks: Iterable[EventStream] | None = None) -> None:
-        """Find the hot pixels if the filters leave them out. Reads the whole source.
-
-        Args:
-            chunks: all chunks of the source, given by a caller that shows progress; by default they are read here.
-        """
+    def find_hot_pixels(self, chunks: Iterable[EventStream]) -> None:
+        """Find the hot pixels in all chunks of the source, if the filters leave them out."""
         if self._filters.hot_pixels:
-            within = self._within(self._source.chunks() if chunks is None else chunks)
-            self.counts = count_events(within, self._source.width, self._source.height)
+            self.counts = count_events(self._within(chunks), *self._shape)
             self.hot_pixels = find_hot_pixels(self.counts, self._bayer_pattern)
 
-    def read_chunks(self) -> Iterator[EventStream]:
-        yield from self.filtered(self._source.chunks())
-
     def filtered(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
-        """Yield the kept events of each chunk. Pass every chunk of the source, in order."""
-        if self._filters.hot_pixels and self.hot_pixels is None:
-            self.find_hot_pixels()
-        keep = self._kept_pixels()
+        """Yield the kept events of each chunk. Pass every chunk of the source, in order. Find the hot pixels before."""
+        x, y, width, height = self._region
+        keep = np.zeros(self._shape, bool)
+        keep[y : y + height, x : x + width] = True
+        if self._filters.pixel_share < 1:
+            keep &= np.random.default_rng(self._filters.seed).random(self._shape) < self._filters.pixel_share
+        if self.hot_pixels is not None:
+            keep &= ~self.hot_pixels
         last_kept = np.full(keep.size, _NEVER, np.int64)
-        x0, y0 = self._corner
         for chunk in self._within(chunks):
             kept = _select(
                 chunk.x, chunk.y, chunk.t, keep.ravel(), chunk.width, self._filters.shortest_interval, last_kept
             )
             yield EventStream(
-                (chunk.x[kept] - x0).astype(np.uint16),
-                (chunk.y[kept] - y0).astype(np.uint16),
+                (chunk.x[kept] - x).astype(np.uint16),
+                (chunk.y[kept] - y).astype(np.uint16),
                 chunk.t[kept],
                 chunk.p[kept],
-                self.width,
-                self.height,
-                self.path,
+                width,
+                height,
+                chunk.source,
             )
 
     def _within(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
         window = self._filters.window
         for chunk in chunks:
             yield chunk.between(window.start, window.end)
-
-    def _kept_pixels(self) -> NDArray[np.bool_]:
-        """Return (height, width) bool, whether the events of a pixel of the source are kept."""
-        (x, y), shape = self._corner, (self._source.height, self._source.width)
-        keep = np.zeros(shape, bool)
-        keep[y : y + self.height, x : x + self.width] = True
-        if self._filters.pixel_share < 1:
-            keep &= np.random.default_rng(self._filters.seed).random(shape) < self._filters.pixel_share
-        if self.hot_pixels is not None:
-            keep &= ~self.hot_pixels
-        return keep
-
-    def time_span(self) -> tuple[int, int]:
-        """Return the first and the last time in nanoseconds that a kept event can have."""
-        first, last = self._source.time_span()
-        window = self._filters.window
-        return max(first, window.start), min(last, window.end)
-
-    def empty_error(self) -> DataError:
-        """Return the error for a file without kept events."""
-        return DataError(self.path, "no event is left", "widen the time window, the region of interest or the share")
 
 
 @numba.njit(cache=True)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,19 @@ class SensorModel:
         if not self.bayer_pattern:
             return np.zeros(len(x), dtype=np.int64)
         return self.color_filter[y % 2, x % 2]
+
+
+def sensor_values(stated: object) -> dict[str, Any]:
+    """Return by their names in :class:`SensorModel` the values that an event camera, or the options, state: those
+    attributes of the same names, and ``refractory_period_ns``, that are not None."""
+    names = {field.name: field.name for field in fields(SensorModel)} | {"refractory_period": "refractory_period_ns"}
+    values = {name: getattr(stated, key, None) for name, key in names.items()}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def states_thresholds(stated: object) -> bool:
+    """Return whether an event camera, or the options, state a contrast threshold."""
+    return any(name.endswith("contrast_threshold") for name in sensor_values(stated))
 
 
 def require_event_sensor_size(

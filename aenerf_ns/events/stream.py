@@ -1,18 +1,15 @@
-"""Validated event streams, in memory and in files."""
+"""Validated event streams."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.errors import DataError, require_file
-from aenerf_ns.events.left_out import LeftOut
-from aenerf_ns.events.sensor import require_event_sensor_size
+from aenerf_ns.errors import DataError
 
 UNSORTED_REMEDY = (
     "a few such events can be left out (--drop-malformed); many such events mean that times overflowed or that your "
@@ -24,6 +21,16 @@ OUTSIDE_REMEDY = (
     "check the sensor size and the order of the columns; a few such events can be left out (--drop-malformed)"
 )
 """How to mend events outside the sensor."""
+
+
+def unsorted_error(source: str | Path, index: int, time: int, previous: int) -> DataError:
+    """Return the error for an event that is before the one ahead of it, in nanoseconds."""
+    return DataError(
+        source,
+        f"event {index} is at {time} ns, before the event ahead of it at {previous} ns",
+        UNSORTED_REMEDY,
+    )
+
 
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 
@@ -82,7 +89,7 @@ class EventStream:
                 )
         if (self.t[1:] < self.t[:-1]).any():
             index = int(np.argmax(self.t[1:] < self.t[:-1])) + 1
-            raise _unsorted(self.source, index, int(self.t[index]), int(self.t[index - 1]))
+            raise unsorted_error(self.source, index, int(self.t[index]), int(self.t[index - 1]))
         if (np.abs(self.p) != 1).any():
             index = int(np.argmax(np.abs(self.p) != 1))
             raise DataError(
@@ -128,111 +135,3 @@ class EventStream:
         if len(self) <= count:
             return self
         return self[np.linspace(0, len(self) - 1, count).astype(np.int64)]
-
-
-def _unsorted(source: str | Path, index: int, time: int, previous: int) -> DataError:
-    return DataError(
-        source,
-        f"event {index} is at {time} ns, before the event ahead of it at {previous} ns",
-        UNSORTED_REMEDY,
-    )
-
-
-class EventFile(ABC):
-    """A file of events, opened only when its events are needed.
-
-    Readers of a format implement :meth:`read_chunks` and :meth:`time_span`. This class checks that the whole stream is
-    in order.
-
-    Args:
-        path: the file.
-        width: number of pixel columns of the sensor.
-        height: number of pixel rows of the sensor.
-
-    Attributes:
-        drop_malformed: leave out, count and name events outside the sensor or out of order, in place of raising an
-            error, as long as they are few.
-
-    Raises:
-        DataError: no event sensor has so many pixels.
-    """
-
-    drop_malformed = False
-
-    def __init__(self, path: Path, width: int, height: int) -> None:
-        require_event_sensor_size(width, height, path)
-        self.path = path
-        self.width = width
-        self.height = height
-        self.left_out = LeftOut()
-
-    @abstractmethod
-    def read_chunks(self) -> Iterator[EventStream]:
-        """Yield the events in pieces that fit in memory. Each piece is checked by itself.
-
-        Raises:
-            DataError: the file is missing or its content cannot be used.
-        """
-
-    @abstractmethod
-    def time_span(self) -> tuple[int, int]:
-        """Return the times of the first and the last event in nanoseconds. Some formats must be read through.
-
-        Raises:
-            DataError: the file is missing or empty.
-        """
-
-    def ordered_time_span(self) -> tuple[int, int]:
-        """Return the times of the first and the last event in nanoseconds, checked to be in order.
-
-        Raises:
-            DataError: the file is missing or empty, or the last event is before the first.
-        """
-        first, last = self.time_span()
-        if last < first:
-            raise DataError(
-                self.path,
-                f"its last event, at {last} ns, is before its first, at {first} ns",
-                UNSORTED_REMEDY,
-            )
-        return first, last
-
-    def count(self) -> int | None:
-        """Return the number of events, or None if the file must be read through to count them."""
-        return None
-
-    def assumed_unit(self) -> str | None:
-        """Return the unit of the times ("ns", "us", "ms" or "s") that is assumed or that the user states, or None
-        where the file or its format states it."""
-        return None
-
-    def require(self) -> None:
-        """Raise a DataError if the file does not exist."""
-        require_file(self.path)
-
-    def empty_error(self) -> DataError:
-        """Return the error for a file without events."""
-        return DataError(self.path, "the file holds no events", "record or convert it again")
-
-    def chunks(self) -> Iterator[EventStream]:
-        """Yield all events in pieces that fit in memory, in the order of their times.
-
-        Raises:
-            DataError: the file is missing, empty or out of order, or an event is malformed.
-        """
-        self.require()
-        self.left_out.restart()
-        total, last_time = 0, None
-        for chunk in self.read_chunks():
-            if len(chunk) == 0:
-                continue
-            if last_time is not None and chunk.t[0] < last_time:
-                raise _unsorted(self.path, total, int(chunk.t[0]), last_time)
-            last_time = int(chunk.t[-1])
-            total += len(chunk)
-            yield chunk
-        if self.drop_malformed:
-            self.left_out.require_few(self.path, total)
-        self.left_out.print_once(self.path)
-        if total == 0:
-            raise self.empty_error()

@@ -17,8 +17,8 @@ from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import to_image
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile
 from aenerf_ns.export.rendering import corrected_poses, render
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.progress import track, tracked
 from aenerf_ns.recording.images import read_image
 from aenerf_ns.recording.recording import SPLITS

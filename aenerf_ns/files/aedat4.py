@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.files.event_reader import EventReader, batches, resolve_sensor_size
+from aenerf_ns.files.event_reader import EventFile, batches, resolve_sensor_size
 from aenerf_ns.files.limits import MAX_HEADER, MAX_PIECE, MAX_TABLE_BYTES, require_unpacked_size
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
@@ -36,7 +36,7 @@ _HEADER_COMPRESSION, _HEADER_TABLE_POSITION, _HEADER_INFO = range(3)
 _ROW_STREAM, _ROW_COUNT = 1, 2
 
 
-class Aedat4File(EventReader):
+class Aedat4File(EventFile):
     """Read the events of one stream of an AEDAT4 file.
 
     Args:
@@ -125,7 +125,7 @@ class Aedat4File(EventReader):
                 if count:
                     yield np.frombuffer(data, _EVENT, count, begin)
 
-    def _chunks(self) -> Iterator[EventStream]:
+    def read_chunks(self) -> Iterator[EventStream]:
         for events in batches(self._event_packets()):
             x, y = (events[name].astype(np.uint16) for name in "xy")
             polarity = np.where(events["on"], 1, -1).astype(np.int8)
@@ -136,14 +136,14 @@ class Aedat4File(EventReader):
             self._fail("an event has a time of more than 292 years")
         return time * 1000
 
-    def _time_span(self) -> tuple[int, int] | None:
+    def read_time_span(self) -> tuple[int, int] | None:
         first, last = (next(self._event_packets(backwards), None) for backwards in (False, True))
         if first is None or last is None:
             return None
         start, end = self._nanoseconds(np.array([first["time"][0], last["time"][-1]])).tolist()
         return start, end
 
-    def _count(self) -> int | None:
+    def read_count(self) -> int | None:
         if self._table is None or self._file_size - self._table > MAX_TABLE_BYTES:
             return None
         with self.path.open("rb") as file:

@@ -13,11 +13,11 @@ from torch import Tensor
 from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics, Origin
 from aenerf_ns.errors import DataError, value_errors_as_data_error
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sensor import SensorModel, sensor_values, states_thresholds
 from aenerf_ns.files.json_file import convert
 from aenerf_ns.files.kalibr import motion_between, read_camchain
 from aenerf_ns.files.plain_yaml import read_plain_yaml
-from aenerf_ns.files.transforms import frame_from_event, read_transforms, sensor_values, states_thresholds
+from aenerf_ns.files.transforms import frame_from_event, read_transforms
 
 
 class _Values(msgspec.Struct):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.event_table import EventLayout, EventTableFile
 from aenerf_ns.files.limits import bounded, require_unpacked_size
 from aenerf_ns.files.text import TimeUnit

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
-from aenerf_ns.files.event_reader import resolve_sensor_size
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import EventFile, resolve_sensor_size
 from aenerf_ns.files.event_table import FORMATS_REMEDY, EventLayout, EventTableFile
 from aenerf_ns.files.limits import bounded, require_unpacked_size
 from aenerf_ns.files.prophesee import PropheseeHeader

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.left_out import LeftOut
 from aenerf_ns.events.stream import OUTSIDE_REMEDY, EventStream
-from aenerf_ns.files.event_reader import CHUNK, Columns, EventReader
+from aenerf_ns.files.event_reader import CHUNK, Columns, EventFile
+from aenerf_ns.files.left_out import LeftOut
 from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
@@ -45,7 +45,7 @@ class EventLayout:
         return dict.fromkeys(name for name, _ in self.columns.values()).keys()
 
 
-class EventTableFile(EventReader):
+class EventTableFile(EventFile):
     """Read a file whose arrays hold events as an :class:`EventLayout` says, or in another unit of the times.
 
     Formats implement :meth:`open_arrays`.
@@ -66,13 +66,13 @@ class EventTableFile(EventReader):
             DataError: the file or an array is missing, or cannot be read.
         """
 
-    def _chunks(self) -> Iterator[EventStream]:
+    def read_chunks(self) -> Iterator[EventStream]:
         with self.open_arrays() as arrays:
             length, tick = self._length(arrays), self._tick(arrays)
             for first in range(0, length, CHUNK):
                 yield self._read(arrays, first, first + CHUNK, tick)
 
-    def _time_span(self) -> tuple[int, int] | None:
+    def read_time_span(self) -> tuple[int, int] | None:
         with self.open_arrays() as arrays:
             length, tick = self._length(arrays), self._tick(arrays)
             if length == 0:
@@ -80,7 +80,7 @@ class EventTableFile(EventReader):
             first, last = (self._read(arrays, index, index + 1, tick) for index in (0, length - 1))
             return int(first.t[0]), int(last.t[0])
 
-    def _count(self) -> int:
+    def read_count(self) -> int:
         with self.open_arrays() as arrays:
             return self._length(arrays)
 
@@ -117,7 +117,7 @@ class EventTableFile(EventReader):
             columns[column] = piece if part is None else piece[part] if isinstance(part, str) else piece[:, part]
         return columns
 
-    def _assumed_unit(self) -> TimeUnit | None:
+    def read_assumed_unit(self) -> TimeUnit | None:
         with self.open_arrays() as arrays:
             return self._given_unit or (None if self._stated_unit(arrays) else self._guessed_unit(arrays))
 

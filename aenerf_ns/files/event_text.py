@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.files.event_reader import EventReader
+from aenerf_ns.files.event_reader import EventFile, resolve_sensor_size
 from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.files.limits import MAX_LINE
 from aenerf_ns.files.text import NANOSECONDS, TIME_NAME, TimeUnit, require_utf8
@@ -89,18 +89,12 @@ def _parse_names(line: bytes) -> tuple[list[str], TimeUnit | None] | None:
     return (names, match[1]) if match and set(_COLUMNS) <= set(names) else None  # type: ignore[return-value]
 
 
-def has_commas(beginning: bytes) -> bool:
-    """Tell from the beginning of a file of text whether commas separate its numbers."""
-    row = next((line for line in beginning.split(b"\n") if _is_row(line)), b"")
-    return b"," in row.split(b"#", 1)[0]
-
-
 def _line_name(line: int, num_before: int | None) -> str:
     return "the last line" if num_before is None else f"line {num_before + line + 1}"
 
 
-class TextEventFile(EventReader):
-    """Read lines of t, x, y and p, with polarity 0 or 1, or -1 or 1 (Mueggler et al. 2017).
+class TextEventFile(EventFile):
+    """Read lines of t, x, y and p, with polarity 0 or 1, or -1 or 1 (Mueggler et al. 2017). Commas may separate them.
 
     The first line may hold the width and the height of the sensor, as E2VID's has. It, or a comment ahead of the
     events, may name the columns, which may then have any order, and state the unit of the times: t[ns] or time_us.
@@ -112,7 +106,7 @@ class TextEventFile(EventReader):
             seconds.
     """
 
-    with_commas = False
+    _with_commas = False
     _stated_unit: TimeUnit | None = None
 
     def __init__(self, path: Path, width: int, height: int, time_unit: TimeUnit | None = None) -> None:
@@ -123,13 +117,16 @@ class TextEventFile(EventReader):
         """Return the names of the columns, x, y, t and p among them. Read the header, if there is one."""
         beginning = file.read(_SAMPLE_BYTES)
         require_utf8(self.path, beginning)
+        first_row = next((line for line in beginning.split(b"\n") if _is_row(line)), b"")
+        self._with_commas = b"," in first_row.split(b"#", 1)[0]
         begin = len(_BYTE_ORDER_MARK) if beginning.startswith(_BYTE_ORDER_MARK) else 0
         file.seek(begin)
         named = None
         while line := self._line(file):
             size = _SIZE.match(line)
             if size:
-                self._require_size(size[1] or size[3], size[2] or size[4])
+                stated = int(size[1] or size[3]), int(size[2] or size[4])
+                resolve_sensor_size(self.path, stated, self.width, self.height)
             elif _is_row(line):
                 break
             else:
@@ -151,20 +148,11 @@ class TextEventFile(EventReader):
         file.seek(begin)
         return names
 
-    def _require_size(self, width: bytes, height: bytes) -> None:
-        if (int(width), int(height)) != (self.width, self.height):
-            stated = f"{int(width)} x {int(height)} pixels"
-            raise DataError(
-                self.path,
-                f"its header says {stated}, the calibration {self.width} x {self.height}",
-                "give the calibration of this sensor",
-            )
-
     def _order(self, file: BinaryIO) -> list[str]:
         """Return the columns of lines without names, the order of the Event Camera Dataset unless another one fits."""
         text = file.read(_SAMPLE_BYTES)
         text = text[: text.rfind(b"\n") + 1] or text + b"\n"
-        whole, fraction, _ = parse_lines(text, self.with_commas, [0, 1, 2, 3])
+        whole, fraction, _ = parse_lines(text, self._with_commas, [0, 1, 2, 3])
         fitting = []
         for order in _ORDERS:
             x, y, t, p = (order.index(name) for name in _COLUMNS)
@@ -177,7 +165,7 @@ class TextEventFile(EventReader):
             )
             if good.sum() >= (_LEFT_OUT_FITS if self.drop_malformed else 1) * len(good):
                 fitting.append(order)
-        if self.with_commas and whole.shape[1] > 0 and len(fitting) != 1:
+        if self._with_commas and whole.shape[1] > 0 and len(fitting) != 1:
             raise self._unnamed(text.split(b"\n")[0])
         return list((fitting or _ORDERS)[0])
 
@@ -188,7 +176,7 @@ class TextEventFile(EventReader):
             "it must name the columns, x, y, t and p among them, separated by commas or blanks",
         )
 
-    def _assumed_unit(self) -> TimeUnit | None:
+    def read_assumed_unit(self) -> TimeUnit | None:
         unit = self._unit_of(self._ends())
         return None if self._stated_unit else unit
 
@@ -203,13 +191,13 @@ class TextEventFile(EventReader):
         """Return the unit that is stated or given, or assumed of the times at the ends of the file."""
         return self._stated_unit or self._time_unit or ("s" if any(lines.fraction[2].any() for lines in ends) else "us")
 
-    def _chunks(self) -> Iterator[EventStream]:
+    def read_chunks(self) -> Iterator[EventStream]:
         tick = NANOSECONDS[self._unit_of(self._ends())]
         with self.path.open("rb") as file:
             for lines in self._lines(file, self._names(file)):
                 yield self._events(lines, tick)
 
-    def _time_span(self) -> tuple[int, int] | None:
+    def read_time_span(self) -> tuple[int, int] | None:
         ends = self._ends()
         if not ends:
             return None
@@ -249,14 +237,14 @@ class TextEventFile(EventReader):
     def _parse_block(self, text: bytes, num_before: int | None, names: list[str]) -> _Lines:
         # A name that comes twice means its first column.
         slots = [_COLUMNS.find(name) if names.index(name) == i else -1 for i, name in enumerate(names)]
-        whole, fraction, fault = parse_lines(text, self.with_commas, slots)
+        whole, fraction, fault = parse_lines(text, self._with_commas, slots)
         if fault is not None:
             line = _line_name(text.count(b"\n", 0, fault), num_before)
             raise self._malformed(line, text[fault : text.index(b"\n", fault)], names)
         return _Lines(text, num_before, whole, fraction)
 
     def _fields(self, line: bytes) -> list[bytes]:
-        return [field.strip() for field in line.split(b"#")[0].split(b"," if self.with_commas else None)]
+        return [field.strip() for field in line.split(b"#")[0].split(b"," if self._with_commas else None)]
 
     def _malformed(self, line_name: str, line: bytes, names: list[str]) -> DataError:
         fields = self._fields(line)
@@ -283,12 +271,6 @@ class TextEventFile(EventReader):
             left_out=self.left_out if self.drop_malformed else None,
         )
         return self._stream(events)
-
-
-class CsvEventFile(TextEventFile):
-    """Read comma-separated values."""
-
-    with_commas = True
 
 
 def parse_lines(

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.left_out import LeftOut
 from aenerf_ns.files.event_reader import CHUNK, Columns
+from aenerf_ns.files.left_out import LeftOut
 
 TIME_HIGH = 0x8
 """The kind of word that holds the upper bits of a time, in both encodings."""
@@ -277,18 +277,13 @@ def decode_words(
                     f"word {num_before + position} is {block[position]:#x}, which {encoding.name} does not have",
                     "the file is damaged or in another encoding: copy or record it again",
                 )
-            yield _begin_of(columns, n)
+            yield tuple(column[:n] for column in columns)  # type: ignore[misc]
             columns, n = _empty_columns(), 0
         num_before += len(block)
     if n:
-        yield _begin_of(columns, n)
+        yield tuple(column[:n] for column in columns)  # type: ignore[misc]
 
 
 def _empty_columns() -> Columns:
     x, y = np.empty((2, CHUNK), np.uint16)
     return x, y, np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int8)
-
-
-def _begin_of(columns: Columns, n: int) -> Columns:
-    x, y, t, p = columns
-    return x[:n], y[:n], t[:n], p[:n]

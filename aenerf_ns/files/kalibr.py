@@ -15,7 +15,7 @@ from aenerf_ns.files.json_file import convert
 from aenerf_ns.files.plain_yaml import read_plain_yaml
 from aenerf_ns.files.transforms import Matrix, Row, rigid_motion
 
-_REMEDY, _OTHER_MODEL = "give the camchain that Kalibr wrote", "calibrate again with pinhole-radtan or pinhole-equi"
+_REMEDY = "give the camchain that Kalibr wrote, or calibrate again with pinhole-radtan or pinhole-equi"
 
 
 class ChainCamera(msgspec.Struct, kw_only=True):
@@ -54,9 +54,7 @@ def read_camchain(path: Path) -> dict[str, ChainCamera]:
     cameras: dict[str, ChainCamera] = {}
     # cam10 follows cam9.
     for name in sorted(chain, key=lambda name: (len(name), name)):
-        models = chain[name].get("camera_model", "pinhole"), chain[name].get("distortion_model", "none")
-        is_read = models in (("pinhole", "radtan"), ("pinhole", "equidistant"), ("pinhole", "none"))
-        cameras[name] = convert(path, chain[name], ChainCamera, _REMEDY if is_read else _OTHER_MODEL, name)
+        cameras[name] = convert(path, chain[name], ChainCamera, _REMEDY, name)
         if cameras[name].T_cn_cnm1 is not None:
             _motion_from_previous(path, cameras, name)
     return cameras

@@ -6,12 +6,11 @@ import re
 from pathlib import Path
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files.aedat4 import Aedat4File
 from aenerf_ns.files.event_arrays import open_array_events
 from aenerf_ns.files.event_hdf5 import open_hdf5_events
-from aenerf_ns.files.event_reader import resolve_sensor_size
-from aenerf_ns.files.event_text import CsvEventFile, TextEventFile, has_commas
+from aenerf_ns.files.event_reader import EventFile, resolve_sensor_size
+from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.limits import bounded
 from aenerf_ns.files.prophesee import HEADER_BYTES, PropheseeDatFile, PropheseeHeader, PropheseeRawFile
 from aenerf_ns.files.rosbag import BAG_MAGIC, RosbagEventFile
@@ -60,7 +59,7 @@ def open_event_file(
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "events.txt"  # seconds, x, y, polarity
         ...     np.savetxt(path, [[0.001, 3, 4, 1], [0.002, 5, 6, 0]], fmt="%.3f %d %d %d")
-        ...     for events in open_event_file(path, width=8, height=8).read_chunks():
+        ...     for events in open_event_file(path, width=8, height=8).chunks():
         ...         print(events.x, events.y, events.t, events.p)
         [3 5] [4 6] [1000000 2000000] [ 1 -1]
     """
@@ -88,7 +87,7 @@ def open_event_file(
         size = resolve_sensor_size(path, None, width, height)
         if name == "NumPy":
             return open_array_events(path, *size, time_unit)
-        return (CsvEventFile if has_commas(beginning) else TextEventFile)(path, *size, time_unit)
+        return TextEventFile(path, *size, time_unit)
 
 
 def _read_beginning(path: Path) -> bytes:

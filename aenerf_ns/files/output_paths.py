@@ -6,9 +6,10 @@ import errno
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
+from aenerf_ns.atomic_write import atomic_write
 from aenerf_ns.errors import DataError, reading, reason
 
 
@@ -74,18 +75,13 @@ def creating(output: Path, option: str = "--output") -> Iterator[Path]:
     # A link stays one. Writers choose the format by the suffix.
     final = Path(os.path.realpath(output))
     partial = final.with_name(f".{final.stem[:99]}.partial{final.suffix}")
+    # Of a command that was killed.
+    shutil.rmtree(partial, ignore_errors=True)
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        # Of a command that was killed.
-        shutil.rmtree(partial, ignore_errors=True)
-        yield partial
-        partial.replace(final)
+        with atomic_write(final, partial):
+            yield partial
     except OSError as error:
         raise output_error(output, error, option) from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        with suppress(OSError):
-            partial.unlink()
 
 
 def output_error(output: Path, error: OSError | ValueError, option: str = "--output") -> DataError:

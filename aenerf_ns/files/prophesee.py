@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.files.event_reader import CHUNK, EventReader, resolve_sensor_size
+from aenerf_ns.files.event_reader import CHUNK, EventFile, resolve_sensor_size
 
 if TYPE_CHECKING:
     from aenerf_ns.files.evt_words import Encoding
@@ -96,7 +96,7 @@ class PropheseeHeader:
         return None
 
 
-class PropheseeRawFile(EventReader):
+class PropheseeRawFile(EventFile):
     """Read a RAW file: a header, then the words that the camera sent, in EVT 2.0 or EVT 3.0.
 
     The size of the sensor is None where the header states it.
@@ -111,7 +111,7 @@ class PropheseeRawFile(EventReader):
         super().__init__(path, *resolve_sensor_size(path, header.size, width, height))
         self._encoding, self._begin = _encoding_name(path, header), header.end
 
-    def _chunks(self) -> Iterator[EventStream]:
+    def read_chunks(self) -> Iterator[EventStream]:
         # Imported lazily: every command of every method imports this module, and numba is slow to import.
         from aenerf_ns.files.evt_words import EVT2, EVT3, decode_words, initial_state, without_damaged_times
 
@@ -159,7 +159,7 @@ def _encoding_name(path: Path, header: PropheseeHeader) -> str:
     return name
 
 
-class PropheseeDatFile(EventReader):
+class PropheseeDatFile(EventFile):
     """Read a DAT file of version 2: a header, the type and size of a record, then records of 8 bytes.
 
     The size of the sensor is None where the header states it.
@@ -185,7 +185,7 @@ class PropheseeDatFile(EventReader):
         self._begin = header.end + len(kind)
         self._num_events, self._rest = divmod(path.stat().st_size - self._begin, _RECORD.itemsize)
 
-    def _count(self) -> int:
+    def read_count(self) -> int:
         return self._num_events
 
     def _require_end(self) -> None:
@@ -193,7 +193,7 @@ class PropheseeDatFile(EventReader):
             end = self._begin + self._num_events * _RECORD.itemsize
             self._leave_out_end(f"a record of {_RECORD.itemsize} bytes", end)
 
-    def _chunks(self) -> Iterator[EventStream]:
+    def read_chunks(self) -> Iterator[EventStream]:
         self._require_end()
         previous = None
         with self.path.open("rb") as file:
@@ -205,7 +205,7 @@ class PropheseeDatFile(EventReader):
                 x, y = ((address >> shift & 0x3FFF).astype(np.uint16) for shift in (0, 14))
                 yield self._stream((x, y, time * 1000, 2 * (address >> 28).astype(np.int8) - 1))
 
-    def _time_span(self) -> tuple[int, int] | None:
+    def read_time_span(self) -> tuple[int, int] | None:
         self._require_end()
         count = self._num_events
         if count == 0:

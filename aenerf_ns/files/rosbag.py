@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.files.event_reader import Columns, EventReader, batches, resolve_sensor_size
+from aenerf_ns.files.event_reader import Columns, EventFile, batches, resolve_sensor_size
 from aenerf_ns.files.limits import MAX_HEADER, bounded, require_unpacked_size, size_on_disk
 from aenerf_ns.files.plain_yaml import read_plain_yaml
 
@@ -84,7 +84,7 @@ class _Message:
     content: NDArray
 
 
-class RosbagEventFile(EventReader):
+class RosbagEventFile(EventFile):
     """Read the events of one topic of a bag, at the times of ROS.
 
     An EventPacket has the times of the camera's own clock. One offset brings them all to the clock of ROS: the smallest
@@ -116,11 +116,6 @@ class RosbagEventFile(EventReader):
                 if next(self._messages(), None) is None:
                     raise self.empty_error()
         super().__init__(path, *resolve_sensor_size(path, None, *self._size))
-
-    def require(self) -> None:
-        """Raise a DataError when the bag does not exist. A bag of ROS 2 may be a folder."""
-        if not self.path.is_dir():
-            super().require()
 
     @contextmanager
     def _open(self) -> Iterator[rosbag1.Reader | rosbag2.Reader]:
@@ -217,10 +212,10 @@ class RosbagEventFile(EventReader):
         middle = sorted(later)[len(later) // 2]
         return offsets[0] + min(time for time in later if time > middle - _MAX_DELAY)
 
-    def _chunks(self) -> Iterator[EventStream]:
+    def read_chunks(self) -> Iterator[EventStream]:
         yield from map(self._stream, self._columns())
 
-    def _time_span(self) -> tuple[int, int] | None:
+    def read_time_span(self) -> tuple[int, int] | None:
         first = next(self._columns(), None)
         if first is None:
             return None

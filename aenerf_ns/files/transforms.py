@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import torch
@@ -15,7 +15,6 @@ from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics, Origin
 from aenerf_ns.camera.trajectory import require_rigid
 from aenerf_ns.errors import DataError, value_errors_as_data_error
-from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.json_file import Nanoseconds, convert, read_json
 
 _MOUNT = "T_frame_event"
@@ -77,19 +76,6 @@ class EventCamera(_Camera, kw_only=True):
     refractory_period_ns: int = 0
     bayer_pattern: str = ""
     T_frame_event: Matrix | None = None
-
-
-def sensor_values(stated: object) -> dict[str, Any]:
-    """Return by their names in :class:`~aenerf_ns.events.sensor.SensorModel` the values that an event camera, or the
-    options, state: those attributes of the same names, and ``refractory_period_ns``, that are not None."""
-    names = {field.name: field.name for field in fields(SensorModel)} | {"refractory_period": "refractory_period_ns"}
-    values = {name: getattr(stated, key, None) for name, key in names.items()}
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def states_thresholds(stated: object) -> bool:
-    """Return whether an event camera, or the options, state a contrast threshold."""
-    return any(name.endswith("contrast_threshold") for name in sensor_values(stated))
 
 
 class Frame(msgspec.Struct, kw_only=True):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
-from aenerf_ns.errors import DataError, require_file
+from aenerf_ns.errors import DataError
 from aenerf_ns.files.text import (
     POSE_COLUMNS,
     TIME_NAME,
@@ -38,7 +38,6 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
             not increase.
     """
-    require_file(path)
     rows = read_rows(path, POSE_COLUMNS)
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
@@ -61,8 +60,10 @@ def _quaternion_order(line: str) -> str:
     if len(names) == len(POSE_COLUMNS.split()):
         names = names[4:]
     else:
-        names = re.findall(r"\bq\w*?[wxyz]\b", line)[:4] if TIME_NAME.match(line) else []
-    return "".join(name[-1] for name in names)
+        names = re.findall(r"\bq\w*?[wxyzrijk]\b", line)[:4] if TIME_NAME.match(line) else []
+    order = "".join(name[-1] for name in names)
+    # By the real part and the three imaginary units.
+    return order.translate(str.maketrans("rijk", "wxyz")) if sorted(order) == sorted("rijk") else order
 
 
 def poses_from_quaternions(source: Path, positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> Tensor:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.filters import EventFilters, FilteredEventFile
+from aenerf_ns.events.filters import EventFilters, EventSelection
 from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_folder
 from aenerf_ns.progress import progress_bar, tracked
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL, batches_of
@@ -62,7 +62,7 @@ def match_event_images(
     num_events = round(_BATCHES * EVENTS_PER_PIXEL * camera.width * camera.height)
     # Pixels that fire by themselves would be features that do not move.
     filters = EventFilters(start=window.start, end=window.end, hot_pixels=True)
-    kept = FilteredEventFile(events, filters, capture.sensor.bayer_pattern)
+    kept = EventSelection(events.path, events.width, events.height, filters, capture.sensor.bayer_pattern)
     kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
     chunks = kept.filtered(tracked(events.chunks(), "Making images of the events", events.count()))
     if weights is None:

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError, value_errors_as_data_error
-from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sensor import SensorModel, sensor_values, states_thresholds
 from aenerf_ns.files.limits import MAX_TIME
-from aenerf_ns.files.transforms import sensor_values, states_thresholds
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.recording import Capture, Recording
 from aenerf_ns.recording.views import MAX_VIEWS

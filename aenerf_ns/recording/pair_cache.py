@@ -21,14 +21,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import EventPairs, map_rows
-from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.event_reader import EventFile
 
 # Counted up when the layout of the file, of the rows or of what is kept with them changes.
 _VERSION = 4
 # The end of the file: length of the description as JSON in front of it, and this word.
 _WORD = b"aenerf-pairs"
-# Attributes of a reader of events that are no options. The last three are read from the file when they are asked for.
-_NOT_OPTIONS = ("path", "left_out", "_span", "_clock_offset", "_stated_unit")
+# Attributes of a reader of events that are no options. The last four are read from the file when they are asked for.
+_NOT_OPTIONS = ("path", "left_out", "_span", "_clock_offset", "_stated_unit", "_with_commas")
 _NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "int")
 
 
@@ -52,7 +52,8 @@ class PairFile:
 
     def find(self) -> EventPairs | None:
         """Find the pairs of an earlier run. None, and a line why, if they must be made."""
-        if not self.path.is_file():
+        self._looked_at = _stamps(self.path)
+        if not self._looked_at:
             return None
         try:
             with self.path.open("rb") as file:
@@ -148,7 +149,7 @@ class PairFile:
         self._new.flush()
         os.fsync(self._new.fileno())
         # Another host may have made it meanwhile: what that one maps would be gone from a network folder.
-        if self.find() is None:
+        if _stamps(self.path) == self._looked_at:
             self._part.rename(self.path)
         CONSOLE.print(f"The pairs are in {self.path}, for the next run. It may be deleted.", markup=False)
 

@@ -12,7 +12,7 @@ from aenerf_ns.camera.image_encoding import ImageEncoding
 from aenerf_ns.camera.intrinsics import CameraIntrinsics, Origin
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.event_reader import EventFile
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")

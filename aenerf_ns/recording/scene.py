@@ -13,7 +13,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.event_reader import EventFile
 
 SCENE_KEY = "scene"
 """The key of the :class:`SceneRecording` in the metadata of Nerfstudio's dataparser outputs and datasets."""

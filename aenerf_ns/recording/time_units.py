@@ -6,7 +6,7 @@ from pathlib import Path
 
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.text import UNIT_NAMES
 from aenerf_ns.progress import tracked
 
@@ -34,7 +34,7 @@ def require_one_unit(events: EventFile, poses: Trajectory, option: str) -> Span:
         DataError: the events are missing or out of order, or fit the poses only if the times of either have another
             unit.
     """
-    span, known = events.ordered_time_span(), (poses.start, poses.end)
+    span, known = events.time_span(), (poses.start, poses.end)
     seconds, covered = (span[1] - span[0]) * 1e-9, _common(span, known)
     is_given = len(poses.knots_between(*span)) >= _MIN_POSES and covered >= _MIN_COVERED * (span[1] - span[0])
     power = unit_steps(span, known, _SURE_OVERLAP if is_given else _MIN_OVERLAP)

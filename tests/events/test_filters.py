@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.events.filters import EventFilters, FilteredEventFile, count_events, find_hot_pixels
+from aenerf_ns.events.filters import EventFilters, EventSelection, count_events, find_hot_pixels
 from aenerf_ns.events.pairing import pair_events
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import EventFile
 
 WIDTH, HEIGHT = 6, 5
 Row = tuple[int, int, int, int]
@@ -28,9 +29,12 @@ def file_of(rows: list[Row], *sizes: int) -> EventFile:
     return EventsInMemory(make_stream(rows, WIDTH, HEIGHT), sizes)
 
 
-def rows_of(event_file: EventFile) -> list[Row]:
-    chunks = list(event_file.read_chunks())
-    assert all((chunk.width, chunk.height) == (event_file.width, event_file.height) for chunk in chunks)
+def kept_of(event_file: EventFile, filters: EventFilters) -> list[Row]:
+    selection = EventSelection(event_file.path, WIDTH, HEIGHT, filters)
+    selection.find_hot_pixels(event_file.chunks())
+    chunks = list(selection.filtered(event_file.chunks()))
+    size = filters.region[2:] if filters.region else (WIDTH, HEIGHT)
+    assert all((chunk.width, chunk.height) == size for chunk in chunks)
     columns = (np.concatenate([getattr(chunk, name) for chunk in chunks]).tolist() for name in "xytp")
     return list(zip(*columns, strict=True))
 
@@ -70,11 +74,7 @@ def test_filters_are_those_of_brute_force_however_the_stream_is_cut(
     filters = EventFilters(start=start, end=end, region=region, shortest_interval=shortest_interval)
     x0, y0, width, height = region or (0, 0, WIDTH, HEIGHT)
     keep = {(x, y) for x in range(x0, x0 + width) for y in range(y0, y0 + height)}
-    filtered = FilteredEventFile(file_of(rows, *sizes), filters)
-    assert rows_of(filtered) == kept_by_brute_force(rows, filters, keep)
-    assert (filtered.width, filtered.height) == (width, height)
-    first, last = filtered.time_span()
-    assert all(first <= t <= last for _, _, t, _ in rows_of(filtered))
+    assert kept_of(file_of(rows, *sizes), filters) == kept_by_brute_force(rows, filters, keep)
 
 
 @settings(max_examples=50, deadline=None)
@@ -82,10 +82,10 @@ def test_filters_are_those_of_brute_force_however_the_stream_is_cut(
 def test_a_share_of_the_pixels_keeps_all_their_events_and_so_their_pairs(
     rows: list[Row], sizes: list[int], share: float, seed: int
 ) -> None:
-    kept = rows_of(FilteredEventFile(file_of(rows, *sizes), EventFilters(pixel_share=share, seed=seed)))
+    kept = kept_of(file_of(rows, *sizes), EventFilters(pixel_share=share, seed=seed))
     pixels = {row[:2] for row in kept}
     assert kept == [row for row in rows if row[:2] in pixels]
-    assert kept == rows_of(FilteredEventFile(file_of(rows), EventFilters(pixel_share=share, seed=seed)))
+    assert kept == kept_of(file_of(rows), EventFilters(pixel_share=share, seed=seed))
     if kept:
         # Every pair of the filtered stream is one of the whole stream.
         pairs, whole = (pair_events([make_stream(part, WIDTH, HEIGHT)]) for part in (kept, rows))
@@ -96,7 +96,7 @@ def test_the_share_of_pixels_is_as_asked_and_seeded() -> None:
     everywhere = [(x, y, 0, 1) for y in range(HEIGHT) for x in range(WIDTH)]
 
     def pixels(seed: int) -> list[Row]:
-        return rows_of(FilteredEventFile(file_of(everywhere), EventFilters(pixel_share=0.5, seed=seed)))
+        return kept_of(file_of(everywhere), EventFilters(pixel_share=0.5, seed=seed))
 
     assert pixels(1) == pixels(1)
     assert len({tuple(pixels(seed)) for seed in range(5)}) == 5
@@ -137,16 +137,18 @@ def test_hot_pixels_are_left_out_and_told() -> None:
     rows = [(int(x), int(y), 2 * i, 1) for i, (x, y) in enumerate(rng.integers(0, (WIDTH, HEIGHT), (300, 2)))]
     rows += [(4, 2, 2 * i + 1, 1) for i in range(300)]
     rows.sort(key=lambda row: row[2])
-    filtered = FilteredEventFile(file_of(rows, 100, 0, 200), EventFilters(hot_pixels=True))
-    assert rows_of(filtered) == [row for row in rows if row[:2] != (4, 2)]
+    file, filters = file_of(rows, 100, 0, 200), EventFilters(hot_pixels=True)
+    assert kept_of(file, filters) == [row for row in rows if row[:2] != (4, 2)]
+    filtered = EventSelection(file.path, WIDTH, HEIGHT, filters)
+    filtered.find_hot_pixels(file.chunks())
     assert filtered.hot_pixels is not None
     assert filtered.counts is not None
     assert np.argwhere(filtered.hot_pixels).tolist() == [[2, 4]]
-    np.testing.assert_array_equal(filtered.counts, count_events([make_stream(rows, WIDTH, HEIGHT)], WIDTH, HEIGHT))
+    np.testing.assert_array_equal(filtered.counts, count_events([make_stream(rows, WIDTH, HEIGHT)], HEIGHT, WIDTH))
     # Only the time window counts: within it the pixel is as the others.
     quiet = [row for row in rows if row[:2] != (4, 2) or row[2] < 300]
     filters = EventFilters(start=301, hot_pixels=True)
-    assert rows_of(FilteredEventFile(file_of(quiet), filters)) == [row for row in quiet if row[2] >= 301]
+    assert kept_of(file_of(quiet), filters) == [row for row in quiet if row[2] >= 301]
 
 
 def test_a_cropped_camera_sees_the_same_directions() -> None:
@@ -179,5 +181,5 @@ def test_impossible_filters_are_refused(values: dict) -> None:
 def test_events_are_counted_on_a_sensor_of_more_pixels_than_16_bits_hold() -> None:
     x, y = np.array([1279, 3, 1279], np.uint16), np.array([719, 700, 719], np.uint16)
     events = EventStream(x, y, np.arange(3), np.ones(3, np.int8), 1280, 720)
-    counts = count_events([events, events], 1280, 720)
+    counts = count_events([events, events], 720, 1280)
     assert (counts[719, 1279], counts[700, 3], counts.sum()) == (4, 2, 6)

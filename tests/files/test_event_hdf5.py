@@ -12,8 +12,9 @@ import pytest
 from helpers.event_table_writers import HEIGHT, WIDTH, made_columns, signed, write_prophesee, write_tum_vie
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter, open_hdf5_events
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.open import open_event_file
 
 

@@ -13,14 +13,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile
-from aenerf_ns.files.event_text import CsvEventFile, TextEventFile, parse_lines
+from aenerf_ns.files.event_reader import EventFile
+from aenerf_ns.files.event_text import TextEventFile, parse_lines
 from aenerf_ns.files.open import open_event_file
 from aenerf_ns.files.text import TimeUnit
 
 
 def open_events(path: Path) -> EventFile:
-    return (CsvEventFile if path.suffix == ".csv" else TextEventFile)(path, WIDTH, HEIGHT)
+    return TextEventFile(path, WIDTH, HEIGHT)
 
 
 def written(path: Path, text: str) -> Path:
@@ -167,5 +167,5 @@ def test_refuse_another_unit_than_that_in_the_names(tmp_path: Path) -> None:
 
 def test_refuse_the_size_of_another_sensor(tmp_path: Path) -> None:
     path = written(tmp_path / "events.txt", SPELLINGS["e2vid.txt"])
-    with pytest.raises(DataError, match="its header says 96 x 72 pixels, the calibration 48 x 36"):
+    with pytest.raises(DataError, match="its sensor has 96 x 72 pixels, but 48 x 36 were given"):
         next(open_event_file(path, 48, 36).chunks())

@@ -28,7 +28,7 @@ from helpers.own_recordings import random_events, write_calibration, write_poses
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.enerf_esim import EsimEventFolder
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.open import open_event_file
 
 ROWS: Rows = [(i % WIDTH, i % HEIGHT, 100_000 + 10 * i, 1 - 2 * (i % 2)) for i in range(5000)]
@@ -138,6 +138,21 @@ def test_leave_out_events_between_the_files_of_a_folder(tmp_path: Path, capsys: 
         assert file.time_span() == (ROWS[0][2], ROWS[-1][2])
         np.testing.assert_array_equal(read(file)[:, 2], [t for _, _, t, _ in ROWS])
     assert capsys.readouterr().out.count("1 out of order (the first at 100010 ns)") == 1
+
+
+@pytest.mark.parametrize("number", [1, 5])
+def test_late_times_at_the_end_of_a_chunk_cost_no_later_event(
+    number: int, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("aenerf_ns.files.event_table.CHUNK", 1000)
+    rows = [(x, y, t + 10**6 * (1000 - number <= i < 1000), p) for i, (x, y, t, p) in enumerate(ROWS)]
+    WRITERS[".npz"](folder / "late.npz", rows)
+    file = opened(folder / "late.npz")
+    file.drop_malformed = True
+    expected = [t * 1000 for _, _, t, _ in ROWS[: 1000 - number] + ROWS[1000:]]
+    np.testing.assert_array_equal(read(file)[:, 2], expected)
+    assert file.time_span() == (expected[0], expected[-1])
+    assert f"left out: {number} out of order (the first at 11" in capsys.readouterr().out
 
 
 def evt2_of(*values: int) -> bytes:

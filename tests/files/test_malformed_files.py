@@ -27,11 +27,11 @@ from helpers.event_file_writers import (
 from helpers.event_table_writers import HEIGHT, WIDTH, ZEROS, N, T, made_columns, records, replaced, write_dsec
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile
 from aenerf_ns.files import event_text
 from aenerf_ns.files.event_arrays import open_array_events
 from aenerf_ns.files.event_hdf5 import open_hdf5_events
-from aenerf_ns.files.event_text import CsvEventFile, TextEventFile
+from aenerf_ns.files.event_reader import EventFile
+from aenerf_ns.files.event_text import TextEventFile
 from aenerf_ns.files.open import open_event_file
 
 
@@ -197,13 +197,13 @@ FAULTS: dict[str, tuple[bytes | Callable[[Path], object], str]] = {
     "txt: in UTF-16": ("1 2 3 1\n".encode("utf-16"), "it is text in UTF-16"),
     "csv: in UTF-16 without a mark": ("x,y,t,p\n1,2,3,1\n".encode("utf-16-le"), "it is text in UTF-16"),
     "csv: with semicolons": (b"1;2;3;1\n", "line 1 has 1 fields: '1;2;3;1'"),
-    "csv: of another size": (b"%geometry:640,480\n1,2,1,3\n", "says 640 x 480 pixels, the calibration"),
+    "csv: of another size": (b"%geometry:640,480\n1,2,1,3\n", "its sensor has 640 x 480 pixels, but"),
 }
 READERS: dict[str, Callable[..., EventFile]] = {
     "npz": open_array_events,
     "npy": open_array_events,
     "h5": open_hdf5_events,
-    "csv": CsvEventFile,
+    "csv": TextEventFile,
     "txt": TextEventFile,
 }
 

@@ -44,6 +44,8 @@ POSES = {
     "w first, and a remark": f"# t tx ty tz qw qx qy qz (w first)\n{W_FIRST}",
     "w first in ROS": f"timestamp,p.x,p.y,p.z,orientation.w,orientation.x,orientation.y,orientation.z\n{W_FIRST}",
     "w first as r": f"time,x,y,z,rw,rx,ry,rz\n{W_FIRST}",
+    "w first by units": f"t,x,y,z,qr,qi,qj,qk\n{W_FIRST}",
+    "w last by units, and a remark": f"# t x y z q_i q_j q_k q_r (unit)\n0.492 {POSE}\n0.496 {POSE}\n",
     "w first by numbers": f"t,x,y,z,q0,q1,q2,q3\n{W_FIRST}",
     "w first with dots": f"# t x y z q.w q.x q.y q.z\n{W_FIRST}",
     "w first behind secs": f"# secs, tx, ty, tz, qw, qx, qy, qz\n{W_FIRST}",

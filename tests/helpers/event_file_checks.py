@@ -9,7 +9,7 @@ import pytest
 from hypothesis import strategies as st
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventFile
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.open import open_event_file
 from helpers.event_file_writers import Rows
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from aenerf_ns.events.stream import EventFile, EventStream
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import EventFile
 
 FUZZ_EXAMPLES = int(os.environ.get("AENERF_FUZZ_EXAMPLES", "60"))
 """Examples of each test that feeds readers with damaged and random input; many more when they are set to."""
@@ -42,9 +43,6 @@ class EventsInMemory(EventFile):
         for size in [*self._sizes, len(self._events)]:
             yield self._events[begin : begin + size]
             begin += size
-
-    def time_span(self) -> tuple[int, int]:
-        return int(self._events.t[0]), int(self._events.t[-1])
 
     def require(self) -> None:
         pass

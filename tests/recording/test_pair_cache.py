@@ -22,6 +22,7 @@ from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.recording.pair_cache import PairFile
 from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSamplerConfig, PairSupervisionConfig
 
 KEPT = "events.h5.pairs"
@@ -187,7 +188,9 @@ def test_hosts_do_not_share_a_file(data: Path, long_recording: list[Path], monke
         yield from chunks
 
     monkeypatch.setattr(Hdf5EventFile, "read_chunks", met)
-    pairs = opened(data).pairs
+    with monkeypatch.context() as patch:
+        patch.setattr(PairFile, "_read", lambda *_: pytest.fail("the other host's file is read"))
+        pairs = opened(data).pairs
     ((other, inode),) = others
     assert_same(pairs, other)
     assert (data / KEPT).stat().st_ino == inode

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,15 @@ from aenerf_ns.errors import DataError
 
 # Of more than this share a file is not a recording with a few faults, but read wrongly. A few events are always few.
 _MAX_SHARE, _FEW = 0.001, 10
+# More than there are damaged times in a row.
+_NUM_WAITING = 64
 
 
 class LeftOut:
     """Counts the events that are left out while a file is read, by the reason.
 
     Attributes:
-        last_time: nanoseconds of the last event that was kept, or None.
+        waiting: x, y, t and p of the last events of a piece, until the next one tells whether their times are too late.
     """
 
     def __init__(self) -> None:
@@ -28,7 +30,8 @@ class LeftOut:
 
     def restart(self) -> None:
         """Forget all counts, because the file is read from its beginning."""
-        self.last_time: int | None = None
+        self._last_time: int | None = None
+        self.waiting: list[NDArray] = []
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
 
@@ -42,15 +45,28 @@ class LeftOut:
         self._counts[reason] = self._counts.get(reason, 0) + number
         self._first.setdefault(reason, where)
 
-    def add_out_of_order(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Count the fewest events whose absence leaves (N,) times in order, and return which to keep."""
-        keep = np.ones(len(times), bool) if self.last_time is None else times >= self.last_time
+    def in_order(self, columns: Sequence[NDArray]) -> list[NDArray]:
+        """Leave out and count the fewest events whose absence leaves the others in order.
+
+        Args:
+            columns: x, y, t and p of a piece.
+
+        Returns:
+            The columns without these events, and without the last ones: these are ``waiting`` for the next piece.
+        """
+        if self.waiting:
+            columns = [np.concatenate(parts) for parts in zip(self.waiting, columns, strict=True)]
+        times = columns[2]
+        keep = np.ones(len(times), bool) if self._last_time is None else times >= self._last_time
         if (np.diff(times[keep]) < 0).any():
             keep[keep] = _longest_ordered(times[keep])
         self.add("out of order", ~keep, lambda index: f"at {times[index]} ns")
-        if keep.any():
-            self.last_time = int(times[keep][-1])
-        return keep
+        columns = [column[keep] for column in columns]
+        end = max(len(columns[2]) - _NUM_WAITING, 0)
+        self.waiting = [column[end:] for column in columns]
+        if end > 0:
+            self._last_time = int(columns[2][end - 1])
+        return [column[:end] for column in columns]
 
     def summary(self) -> str:
         """Describe in words what is left out; empty if it is nothing."""
