@@ -129,13 +129,6 @@ def test_other_files_are_one_line(contents: bytes, problem: str, tmp_path: Path)
     assert "\n" not in str(refused.value)
 
 
-def damaged(run: Path, name: str, old: str, new: str) -> Path:
-    text = (run / name).read_text()
-    assert old in text
-    (run / name).write_text(text.replace(old, new, 1))
-    return run
-
-
 def test_values_of_a_wrong_kind_are_one_line(tmp_path: Path) -> None:
     run = train_small_model(tmp_path, "run", 2).base_dir
     (checkpoint,) = run.glob("nerfstudio_models/*")
@@ -147,8 +140,10 @@ def test_values_of_a_wrong_kind_are_one_line(tmp_path: Path) -> None:
         ("method_name: aenerf", "method_name: !!int many", "the run cannot be opened"),
     ):
         text = (run / "config.yml").read_text()
+        assert old in text
+        (run / "config.yml").write_text(text.replace(old, new, 1))
         with pytest.raises(DataError, match=problem) as refused:
-            open_run(damaged(run, "config.yml", old, new))
+            open_run(run)
         assert "\n" not in str(refused.value)
         if problem == "the run cannot be opened":
             error = refused.value.__cause__

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,26 +10,24 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers.dataset_faults import remove
 from helpers.event_file_checks import read
 from helpers.published_datasets import (
-    N_EVENTS,
     WRITERS,
     Truth,
     assert_same_poses,
     config_of,
-    convert_to_native,
     recording_of,
     seconds,
     write_poses,
-    write_robust_enerf,
     write_tum_vie,
 )
 from helpers.small_datasets import AS_RECORDED, parse
 
+from aenerf_ns.cli.convert import Convert
 from aenerf_ns.dataparsers.formats import FORMATS, AutomaticDataParserConfig, recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
-from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.training.datamanager import EventDataManagerConfig
@@ -71,32 +68,11 @@ def test_rays_are_those_of_opencv(written: tuple[str, Truth]) -> None:
         np.testing.assert_allclose(pixels[..., 1], np.arange(v, v + 7)[:, None].repeat(9, 1), rtol=0, atol=1e-6)
 
 
-def test_every_format_is_recognized(written: tuple[str, Truth]) -> None:
-    name, truth = written
-    assert recognize(truth.data) == name
-    parser = AutomaticDataParserConfig(data=truth.data).setup()
-    assert type(parser.config) is type(FORMATS[name])
-    pairs = EventDataset(parser.get_dataparser_outputs("train")).pairs
-    assert pairs.num_events == N_EVENTS
-    assert len(pairs) > 100
-    # The defaults, which all runs share, are unchanged.
-    assert FORMATS[name].start_time_ns is None
-    assert FORMATS[name].data == type(FORMATS[name])().data
-
-
-def test_native_datasets_and_ecd_are_recognized(tmp_path: Path, slider_depth: Path) -> None:
-    convert_to_native(
-        recording_of(config_of("robust-enerf-data", write_robust_enerf(tmp_path / "made").data)), tmp_path / "n"
-    )
-    assert recognize(tmp_path / "n") == "aenerf-data"
-    assert recognize(slider_depth) == "ecd-data"
-
-
 def test_conversion_to_native_changes_nothing(written: tuple[str, Truth], tmp_path: Path) -> None:
     name, truth = written
-    config = config_of(name, truth.data, **AS_RECORDED)
-    folder = convert_to_native(recording_of(config), tmp_path / "native")
-    configs = config, NativeDataParserConfig(data=folder, **AS_RECORDED)
+    Convert(truth.data, tmp_path / "native").main()
+    native = NativeDataParserConfig(data=tmp_path / "native", **AS_RECORDED)
+    configs = config_of(name, truth.data, **AS_RECORDED), native
     before, after = (parse(config).metadata[SCENE_KEY] for config in configs)
     # Equal lenses have equal rays.
     for key in ("event_camera", "sensor", "window", "image_encoding", "bounded"):
@@ -106,14 +82,15 @@ def test_conversion_to_native_changes_nothing(written: tuple[str, Truth], tmp_pa
     np.testing.assert_array_equal(read(before.event_file), read(after.event_file))
 
 
-EVENTS = {
-    "robust-enerf-data": "raw_events.npz",
-    "tum-vie-data": "mocap-desk2-events_left.h5",
-    "eds-data": "events.h5",
-    "enerf-esim-data": "events",
-    "eventnerf-data": "train/events",
-    "paev3d-data": "H5_Files/Bunny/event.h5",
-    "event-recording-data": "events.h5",
+# The events and the poses of each format, and the number of frames with times of their own.
+FILES = {
+    "robust-enerf-data": ("raw_events.npz", "camera_poses.npz", 0),
+    "tum-vie-data": ("mocap-desk2-events_left.h5", "mocap-desk2-vi_gt_data/mocap_data.txt", 0),
+    "eds-data": ("events.h5", "stamped_groundtruth.txt", 3),
+    "enerf-esim-data": ("events", "scene_poses_all.txt", 3),
+    "eventnerf-data": ("train/events", "train/pose", 0),
+    "paev3d-data": ("H5_Files/Bunny/event.h5", "Render_info", 0),
+    "event-recording-data": ("events.h5", "trajectory.txt", 4),
 }
 
 
@@ -121,14 +98,17 @@ def test_run_opens_without_events_and_elsewhere(
     written: tuple[str, Truth], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name, truth = written
+    assert recognize(truth.data) == name
     monkeypatch.chdir(tmp_path)
     config = EventDataManagerConfig(dataparser=AutomaticDataParserConfig(data=Path(truth.data.name)))
     manager = config.setup(device="cpu", test_mode="inference", world_size=1, local_rank=0)
     resolved = manager.resolved_config()
     assert type(resolved.dataparser) is type(FORMATS[name])
+    # The defaults, which all runs share, are unchanged.
+    assert FORMATS[name].start_time_ns is None
+    assert FORMATS[name].data == type(FORMATS[name])().data
     saved = yaml.dump(resolved)
-    events = truth.data / EVENTS[name]
-    shutil.rmtree(events) if events.is_dir() else events.unlink()
+    remove(FILES[name][0])(truth.data)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     again = yaml.load(saved, Loader=yaml.Loader).setup(device="cpu", test_mode="inference", world_size=1, local_rank=0)
@@ -164,24 +144,11 @@ def test_errors_say_that_the_format_was_guessed(tmp_path: Path) -> None:
     assert "guessed" not in str(error.value)
 
 
-POSES = {
-    "robust-enerf-data": "camera_poses.npz",
-    "tum-vie-data": "mocap-desk2-vi_gt_data/mocap_data.txt",
-    "eds-data": "stamped_groundtruth.txt",
-    "enerf-esim-data": "scene_poses_all.txt",
-    "eventnerf-data": "train/pose",
-    "paev3d-data": "Render_info",
-    "event-recording-data": "trajectory.txt",
-}
-# Frames with times of their own.
-FRAMES = {"tum-vie-data": 0, "eds-data": 3, "enerf-esim-data": 3, "event-recording-data": 4}
-
-
 def test_poses_may_be_missing(written: tuple[str, Truth]) -> None:
     name, truth = written
     known = recording_of(config_of(name, truth.data))
-    poses = truth.data / POSES[name]
-    shutil.rmtree(poses) if poses.is_dir() else poses.unlink()
+    _, poses, num_frames = FILES[name]
+    remove(poses)(truth.data)
     # The other files of EDS are those of many formats.
     if name == "eds-data":
         (truth.data / "calibration.json").write_text("{}")
@@ -193,7 +160,7 @@ def test_poses_may_be_missing(written: tuple[str, Truth]) -> None:
         parser.get_dataparser_outputs("train")
     capture, frames = parser.read_frames()
     assert not isinstance(capture, Recording)
-    assert len(frames) == FRAMES.get(name, 0)
+    assert len(frames) == num_frames
     assert (capture.event_camera, capture.sensor) == (known.event_camera, known.sensor)
     assert capture.event_file.path == known.event_file.path
 

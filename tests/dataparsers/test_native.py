@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import torch
@@ -16,7 +15,7 @@ from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.event_hdf5 import Hdf5EventFile, Hdf5EventWriter
+from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.text import format_seconds
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.scene import SCENE_KEY
@@ -69,20 +68,6 @@ def test_options_replace_values_of_the_sensor(tmp_path: Path) -> None:
     )
     with pytest.raises(DataError, match=r"positive_contrast_threshold must be from 0.0001 to 1000, not 0; .*options"):
         parse(NativeDataParserConfig(data=folder, positive_contrast_threshold=0.0))
-
-
-def test_read_other_units_with_an_offset(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "events.h5", "w") as file:
-        for name, dtype in (("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
-            file[f"events/{name}"] = np.ones(3, dtype)
-        file["events/t"] = np.array([1, 2, 5])
-        # As some writers store a string.
-        file["events"].attrs["time_unit"] = np.array([b"us"])
-        file["events"].attrs["time_offset"] = 1000
-    events = Hdf5EventFile(tmp_path / "events.h5", 2, 2)
-    (chunk,) = events.chunks()
-    assert chunk.t.tolist() == [1_001_000, 1_002_000, 1_005_000]
-    assert events.time_span() == (1_001_000, 1_005_000)
 
 
 def test_refuse_to_write_events_out_of_order(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.streams import EventsInMemory, make_stream
+from helpers.streams import EventsInMemory, make_stream, sorted_rows
 from helpers.unpacked_pairs import unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,12 +27,7 @@ from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.supervision.event_pairs import find_rows
 
 WIDTH, HEIGHT = 4, 3
-# Small ranges, so that pixels repeat and times coincide.
-EVENTS = st.lists(
-    st.tuples(st.integers(0, WIDTH - 1), st.integers(0, HEIGHT - 1), st.integers(0, 30), st.sampled_from([-1, 1])),
-    min_size=1,
-    max_size=120,
-).map(lambda rows: sorted(rows, key=lambda row: row[2]))
+EVENTS = sorted_rows(WIDTH, HEIGHT)
 
 
 def brute_force_pairs(rows: list[tuple[int, int, int, int]], refractory_period: int) -> set[tuple[int, ...]]:

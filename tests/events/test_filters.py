@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.streams import EventsInMemory, make_stream
+from helpers.streams import EventsInMemory, make_stream, sorted_rows
 from helpers.unpacked_pairs import unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,12 +17,7 @@ from aenerf_ns.files.event_reader import EventFile
 
 WIDTH, HEIGHT = 6, 5
 Row = tuple[int, int, int, int]
-# Small ranges, so that pixels repeat and times coincide.
-EVENTS = st.lists(
-    st.tuples(st.integers(0, WIDTH - 1), st.integers(0, HEIGHT - 1), st.integers(0, 30), st.sampled_from([-1, 1])),
-    min_size=1,
-    max_size=120,
-).map(lambda rows: sorted(rows, key=lambda row: row[2]))
+EVENTS = sorted_rows(WIDTH, HEIGHT)
 
 
 def file_of(rows: list[Row], *sizes: int) -> EventFile:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -32,26 +33,22 @@ from aenerf_ns.recording.recording import Recording
 TIMES = EPOCH / 1e6 + np.linspace(0, 2, N_POSES)
 
 
-def events_of(recording: Recording) -> dict[str, NDArray]:
-    (events,) = recording.event_file.chunks()
-    return {name: getattr(events, name) for name in "xytp"}
-
-
 def assert_same_events(recording: Recording, expected: dict[str, NDArray]) -> None:
-    found = events_of(recording)
+    (found,) = recording.event_file.chunks()
     for name in "xyp":
-        np.testing.assert_array_equal(found[name], expected[name])
+        np.testing.assert_array_equal(getattr(found, name), expected[name])
     # A float64 holds Unix time to a quarter of a microsecond.
-    np.testing.assert_allclose(found["t"] - EPOCH * 1_000, (expected["t"] - EPOCH) * 1_000, rtol=0, atol=250)
+    np.testing.assert_allclose(found.t - EPOCH * 1_000, (expected["t"] - EPOCH) * 1_000, rtol=0, atol=250)
 
 
-def write_mvsec(folder: Path) -> dict[str, NDArray]:
+def test_mvsec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     events = make_events(346, 260, EPOCH)
-    with h5py.File(folder / "indoor_flying1_data.hdf5", "w") as file:
+    with h5py.File("indoor_flying1_data.hdf5", "w") as file:
         file["davis/left/events"] = np.stack([events["x"], events["y"], events["t"] / 1e6, events["p"]], 1)
         file["davis/left/image_raw"] = np.full((2, 260, 346), 9, np.uint8)
         file["davis/left/image_raw_ts"] = TIMES[[5, 10]]
-    with h5py.File(folder / "indoor_flying1_gt.hdf5", "w") as file:
+    with h5py.File("indoor_flying1_gt.hdf5", "w") as file:
         file["davis/left/pose"], file["davis/left/pose_ts"] = make_poses(), TIMES
     camera = {
         "camera_model": "pinhole",
@@ -61,16 +58,11 @@ def write_mvsec(folder: Path) -> dict[str, NDArray]:
         "distortion_coeffs": [-0.05, -0.01, 0.02, -0.01],
     }
     chain = {"T_cam0_lidar": np.eye(4).tolist(), "cam0": camera, "cam1": {**camera, "T_cn_cnm1": np.eye(4).tolist()}}
-    (folder / "indoor_flying_calib").mkdir()
-    (folder / "indoor_flying_calib/camchain-imucam-indoor_flying.yaml").write_text(json.dumps(chain))
-    return events
-
-
-def test_mvsec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    events = write_mvsec(tmp_path)
+    Path("indoor_flying_calib").mkdir()
+    Path("indoor_flying_calib/camchain-imucam-indoor_flying.yaml").write_text(json.dumps(chain))
     run_example("mvsec_to_recording")
-    recording = recording_of(OwnRecordingDataParserConfig(data=Path("mvsec"), event_camera="cam0", frame_camera="cam0"))
+    options: dict[str, Any] = {"data": Path("mvsec"), "event_camera": "cam0", "frame_camera": "cam0"}
+    recording = recording_of(OwnRecordingDataParserConfig(**options))
     assert_same_events(recording, events)
     assert_same_poses(recording.trajectory.camera_to_worlds, make_poses())
     lens = CameraIntrinsics(346, 260, 226.4, 226.1, 174.1, 134.2, "fisheye", (-0.05, -0.01, 0.02, -0.01))
@@ -78,26 +70,19 @@ def test_mvsec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (view,) = recording.reference_views["test"]
     np.testing.assert_allclose(view.camera_to_world.numpy(), make_poses()[10], rtol=0, atol=1e-6)
     assert np.asarray(Image.open(view.file)).tolist() == np.full((260, 346), 9).tolist()
-
-
-def test_poses_of_devo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_mvsec(tmp_path)
-    run_example("mvsec_to_recording")
+    # Poses that DEVO estimated of it.
     estimated = make_poses()
     estimated[:, :3, 3] *= 0.1
     header = "# timestamp[secs] tx ty tz qx qy qz qw\n"
-    write_poses(tmp_path / "stamped_traj_estimate.txt", estimated, [repr(float(time)) for time in TIMES], header)
-    options = {"data": Path("mvsec"), "event_camera": "cam0", "frame_camera": "cam0"}
-    options["trajectory"] = Path("stamped_traj_estimate.txt")
-    recording = recording_of(OwnRecordingDataParserConfig(**options))
+    write_poses(Path("estimate.txt"), estimated, [repr(float(time)) for time in TIMES], header)
+    recording = recording_of(OwnRecordingDataParserConfig(**options, trajectory=Path("estimate.txt")))
     assert_same_poses(recording.trajectory.camera_to_worlds, estimated)
     assert recording.ground_truth is not None
     assert_same_poses(recording.ground_truth.camera_to_worlds, make_poses())
     # The other file of a run has microseconds.
-    write_poses(tmp_path / "stamped_traj_estimate.txt", estimated, [repr(float(time * 1e6)) for time in TIMES])
-    with pytest.raises(DataError, match=r"stamped_traj_estimate\.txt"):
-        OwnRecordingDataParserConfig(**options).setup().get_dataparser_outputs("train")
+    write_poses(Path("estimate.txt"), estimated, [repr(float(time * 1e6)) for time in TIMES])
+    with pytest.raises(DataError, match=r"estimate\.txt"):
+        OwnRecordingDataParserConfig(**options, trajectory=Path("estimate.txt")).setup().get_dataparser_outputs("train")
 
 
 def test_vector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

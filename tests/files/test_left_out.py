@@ -177,11 +177,6 @@ DAMAGED = {
     "evt3: at the end": (after_an_event(0x8810, 0x2001, 0x2002), [FIRST], 2),
     "evt3: twice": (after_good_times(0x8810, 0x2001, 0x8810, 0x2002, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 2),
     "evt3: far back": (after_good_times(*2 * (0x8F10,), 0x2001, *2 * (0x8010,), 0x6003, 0x2001), [FIRST, NEXT], 1),
-    "evt3: again and again": (
-        after_an_event(*3 * (0x8810, 0x2001, 0x8010, 0x6002, 0x2001), 0x8010, 0x6003, 0x2001),
-        [FIRST, *3 * (0x10002,), NEXT],
-        3,
-    ),
     "evt3: other words in a row": (
         after_an_event(0x8810, 0x2001, 0x8310, 0x2002, 0x8B10, 0x2002, 0x8010, 0x6003, 0x2001),
         [FIRST, NEXT],

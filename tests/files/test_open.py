@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import re
-import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.bag_writers import PACKET, START, array_bag, packet_messages, write_bag, write_bag2
-from helpers.event_file_checks import EDITS, attempt, edited, lapless, read, survives, table, vendor_file
+from helpers.event_file_checks import EDITS, attempt, edited, read, survives, table, vendor_file
 from helpers.event_file_writers import ENCODERS, HEADER2, HEADER3, HEIGHT, ROWS, WIDTH, Rows, aedat4_file, dat, evt2
 from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import HealthCheck, given, settings
@@ -22,8 +19,6 @@ from aenerf_ns.files.open import open_event_file
 
 # Microseconds in which times can be told apart from wrapped ones, less a margin.
 LONGEST_GAP = {"evt2": 8_000_000_000, "evt3": 16_600_000, "dat": 2_100_000_000, "aedat4": 10**15 // 100}
-
-
 LAPS = {"evt2": 1 << 34, "evt3": 1 << 24, "dat": 1 << 32, "aedat4": 1 << 60}
 
 
@@ -31,24 +26,13 @@ LAPS = {"evt2": 1 << 34, "evt3": 1 << 24, "dat": 1 << 32, "aedat4": 1 << 60}
 def recordings(draw: st.DrawFn, longest_gap: int) -> Rows:
     """Events with equal times, neighbors in a row, short and long gaps."""
     gap = st.one_of(st.just(0), st.integers(0, 5000), st.integers(0, longest_gap))
+    neighbors = st.lists(st.integers(1, 4), max_size=12)
+    events = st.tuples(gap, st.integers(0, WIDTH - 1), st.integers(0, HEIGHT - 1), st.sampled_from([-1, 1]), neighbors)
     rows, time = [], draw(st.integers(0, 20_000_000))
-    for step, x, y, p, neighbors in draw(
-        st.lists(
-            st.tuples(
-                gap,
-                st.integers(0, WIDTH - 1),
-                st.integers(0, HEIGHT - 1),
-                st.sampled_from([-1, 1]),
-                st.lists(st.integers(1, 4), max_size=12),
-            ),
-            min_size=1,
-            max_size=30,
-        )
-    ):
+    for step, x, y, p, distances in draw(st.lists(events, min_size=1, max_size=30)):
         time += step
-        columns = np.cumsum([x, *neighbors])
+        columns = np.cumsum([x, *distances])
         rows += [(int(column), y, time, p) for column in columns if column < WIDTH]
-    # The first time of such a file is only known up to its laps.
     return rows
 
 
@@ -59,7 +43,9 @@ def test_read_what_was_encoded_in_any_pieces(name: str, folder: Path) -> None:
     def check(rows: Rows, chunk: int, block: int) -> None:
         path = folder / f"there_and_back.{name}"
         path.write_bytes(ENCODERS[name](rows))
-        expected = lapless(rows, LAPS[name])
+        expected = table(rows)
+        # How often the time wrapped before the first event is not known.
+        expected[:, 2] -= rows[0][2] // LAPS[name] * LAPS[name] * 1000
         for is_small in (False, True):
             with pytest.MonkeyPatch.context() as patch:
                 if is_small:
@@ -107,14 +93,6 @@ def test_real_files_agree_with_independent_reader(
     np.testing.assert_array_equal(events, np.stack(columns, -1, dtype=np.int64, casting="unsafe"))
 
 
-def test_refuse_times_that_go_back(folder: Path) -> None:
-    for name, step in (("evt2", 1000), ("evt3", 60_000), ("dat", 1), ("aedat4", 1)):
-        path = folder / f"back.{name}"
-        path.write_bytes(ENCODERS[name]([(1, 1, 1_000_000, 1), (2, 2, 1_000_000 - step, 1)]))
-        with pytest.raises(DataError, match="before the event ahead of it"):
-            read(open_event_file(path))
-
-
 def test_size_is_stated_or_given(folder: Path) -> None:
     rows = [(1, 2, 3, 1)]
     path = folder / "sized.raw"
@@ -151,63 +129,29 @@ def test_content_tells_the_format(folder: Path) -> None:
         assert read(open_event_file(path)).tolist() == [[1, 2, 3000, 1]], name
 
 
-def test_refuse_paths_that_are_no_files(folder: Path) -> None:
-    for path, message in (
-        (folder, "without .* ros2 bag reindex it"),
-        (folder / "none.raw", "there is no such file"),
-    ):
-        with pytest.raises(DataError, match=message):
-            open_event_file(path)
+def test_refuse_a_folder_that_is_no_bag(folder: Path) -> None:
+    with pytest.raises(DataError, match=r"without .* ros2 bag reindex it"):
+        open_event_file(folder)
 
 
 def made_files(folder: Path) -> dict[str, bytes]:
     """One small file of each kind."""
     files = {name: encode(ROWS) for name, encode in ENCODERS.items()}
     files["aedat4 with a table"] = aedat4_file(ROWS, with_table=True)
-    try:
-        from lz4.frame import compress
-
-        files["aedat4 in lz4"] = aedat4_file(ROWS, 1, compress, with_table=True)
-    except ImportError:
-        pass
-    try:
-        import rosbags  # noqa: F401
-
-        rows = [(x, y, START // 1000 + t, p) for x, y, t, p in ROWS]
-        for compress_bag in ("", "LZ4", "BZ2"):
-            files[f"arrays {compress_bag}"] = array_bag(folder / "fuzz_base.bag", rows, compress_bag).read_bytes()
-        messages = packet_messages(ROWS, [START + 1000 * row[2] for row in ROWS], 9)
-        files["packets"] = write_bag(folder / "fuzz_base.bag", {"/events": (PACKET, messages)}).read_bytes()
-        for storage, suffix in (("SQLITE3", "db3"), ("MCAP", "mcap")):
-            (stored,) = write_bag2(folder / "fuzz_base", messages, PACKET, storage).glob(f"*.{suffix}")
-            files[f"packets.{suffix}"] = stored.read_bytes()
-    except ImportError:
-        pass
+    files["aedat4 in lz4"] = aedat4_file(ROWS, 1, pytest.importorskip("lz4.frame").compress, with_table=True)
+    rows = [(x, y, START // 1000 + t, p) for x, y, t, p in ROWS]
+    for compress in ("", "LZ4", "BZ2"):
+        files[f"arrays {compress}"] = array_bag(folder / "fuzz_base.bag", rows, compress).read_bytes()
+    messages = packet_messages(ROWS, [START + 1000 * row[2] for row in ROWS], 9)
+    files["packets"] = write_bag(folder / "fuzz_base.bag", {"/events": (PACKET, messages)}).read_bytes()
+    for storage, suffix in (("SQLITE3", "db3"), ("MCAP", "mcap")):
+        (stored,) = write_bag2(folder / "fuzz_base", messages, PACKET, storage).glob(f"*.{suffix}")
+        files[f"packets.{suffix}"] = stored.read_bytes()
     return files
 
 
-def beginning_of(name: str) -> bytes:
-    """A whole file of the first 40,000 bytes or so of a recording."""
-    content = vendor_file(name).read_bytes()
-    if name.endswith("aedat4"):
-        # Without a table of packets, and up to the end of one.
-        content = content[:54] + struct.pack("<q", -1) + content[62:]
-        end = 18 + int.from_bytes(content[14:18], "little")
-        while end < 40_000:
-            end += 8 + int.from_bytes(content[end + 4 : end + 8], "little")
-        return content[:end]
-    header = re.match(rb"(% [^\n]*\n)+", content)
-    assert header
-    return content[: header.end() + (2 if name.endswith("dat") else 0) + 40_000]
-
-
-def real_beginnings(folder: Path) -> dict[str, bytes]:
-    return {name: beginning_of(name) for name in ("evt3.raw", "gen4.dat", "davis346.aedat4")}
-
-
-@pytest.mark.parametrize("make_files", [made_files, real_beginnings])
-def test_damaged_files_raise_only_clear_errors(make_files: Callable[[Path], dict[str, bytes]], folder: Path) -> None:
-    files = make_files(folder)
+def test_damaged_files_raise_only_clear_errors(folder: Path) -> None:
+    files = made_files(folder)
 
     def path_of(name: str) -> Path:
         # The suffix tells the storage of bags of ROS 2.

@@ -68,9 +68,3 @@ def test_refuse_another_order_of_the_quaternion(tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text(f"t,x,y,z,qz,qy,qx,qw\n0.492 {POSE}\n0.496 {POSE}\n")
     with pytest.raises(DataError, match="the quaternion's columns in the order z y x w; write them in the order qx qy"):
         read_tum_trajectory(tmp_path / "poses.txt")
-
-
-def test_refuse_poses_in_utf16(tmp_path: Path) -> None:
-    (tmp_path / "poses.txt").write_text(f"0.492 {POSE}\n0.496 {POSE}\n", encoding="utf-16")
-    with pytest.raises(DataError, match="it is text in UTF-16, or no text; save it as UTF-8"):
-        read_tum_trajectory(tmp_path / "poses.txt")

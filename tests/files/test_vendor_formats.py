@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.event_file_checks import lapless, read, table
-from helpers.event_file_writers import WIDTH, aedat4_file, evt3
+from helpers.event_file_checks import read, table
+from helpers.event_file_writers import aedat4_file
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.files import prophesee
@@ -41,17 +41,6 @@ def test_choose_a_stream_of_aedat4(folder: Path) -> None:
     assert len(read(open_event_file(path, topic="0"))) == 1
     with pytest.raises(DataError, match="holds no events"):
         read(open_event_file(path, topic="4"))
-
-
-def test_evt3_keeps_time_over_many_wraps(folder: Path) -> None:
-    rng = np.random.default_rng(0)
-    # Six hours, with breaks of up to 16 s without a word.
-    times = np.cumsum(rng.integers(0, 16_000_000, 2700))
-    rows = [(int(x), 3, int(t), 1) for x, t in zip(rng.integers(0, WIDTH, len(times)), times, strict=True)]
-    path = folder / "long.raw"
-    path.write_bytes(evt3(rows))
-    assert times[-1] > 1000 * (1 << 24)
-    np.testing.assert_array_equal(read(open_event_file(path)), lapless(rows, 1 << 24))
 
 
 @pytest.mark.parametrize("line", [b"", b"%\n", b"%\r\n"])

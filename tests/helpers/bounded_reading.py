@@ -9,33 +9,12 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from aenerf_ns.errors import DataError
 
 # A refusal may take this much memory, beyond what the process has, and this much CPU time. On a slow machine it may
 # take as long as the machine needs to unpack the last number of bytes, because seconds alone would measure the machine.
 MAX_BYTES, MAX_SECONDS, _MAX_UNPACKED = 1 << 30, 2.0, 2 << 30
-
-
-@contextmanager
-def readable_folder() -> Iterator[Path]:
-    """Make a folder that others than root may read too, unlike pytest's."""
-    with TemporaryDirectory() as name:
-        Path(name).chmod(0o755)
-        yield Path(name)
-
-
-@contextmanager
-def little_memory() -> Iterator[None]:
-    """Let the process have 1 GB more than it has."""
-    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (size + MAX_BYTES, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 @contextmanager
@@ -53,11 +32,16 @@ def without_rights_of_root() -> Iterator[None]:
 def refusal(read: Callable[[], object], max_seconds: float = MAX_SECONDS) -> str:
     """Read in little memory and time, and return the line of the error, or nothing where there is none."""
     begin, message = time.process_time(), ""
-    with little_memory(), without_rights_of_root():
-        try:
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (size + MAX_BYTES, before[1]))
+    try:
+        with without_rights_of_root():
             read()
-        except DataError as error:
-            message = str(error)
+    except DataError as error:
+        message = str(error)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
     assert "\n" not in message
     assert len(message) < 800
     seconds = time.process_time() - begin
@@ -71,10 +55,3 @@ def _seconds_to_unpack(size: int) -> float:
     begin = time.process_time()
     zlib.decompress(packed)
     return 8 * (time.process_time() - begin)
-
-
-def read_whole(read: Callable[[], object]) -> None:
-    """Read a whole data set with the rights of root, because numba compiles meanwhile, and then without them."""
-    read()
-    with without_rights_of_root():
-        read()

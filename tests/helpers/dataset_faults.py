@@ -50,10 +50,6 @@ def edit_bytes(pattern: str, edit: Callable[[bytes], bytes]) -> Change:
     return change
 
 
-def truncated(name: str, keep: float = 0.5) -> Change:
-    return edit_bytes(name, lambda content: content[: int(len(content) * keep)])
-
-
 def sparse(pattern: str, begin: bytes | None = None, end: bytes = b"", gigabytes: int = 8) -> Change:
     """Put zeros, which take no room on the disk, behind a file or behind a beginning."""
 
@@ -121,9 +117,9 @@ def edit_npz(name: str, **arrays: object) -> Change:
     return change
 
 
-def npy_header(shape: str, descr: str = "'<i8'", end: str = ", }") -> bytes:
+def npy_header(shape: str, descr: str = "'<i8'") -> bytes:
     """The beginning of an .npy file that states any shape."""
-    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}{end}".encode()
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode()
     text += b" " * (-(len(text) + 11) % 64) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
 
@@ -139,9 +135,9 @@ def zip_members(path: Path) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def member(name: str, array: str, content: bytes, kind: int = zipfile.ZIP_STORED) -> Change:
+def member(name: str, array: str, content: bytes) -> Change:
     """Replace an array of an .npz file by raw bytes."""
-    return lambda folder: rewrite_zip(folder / name, {**zip_members(folder / name), f"{array}.npy": content}, kind)
+    return lambda folder: rewrite_zip(folder / name, {**zip_members(folder / name), f"{array}.npy": content})
 
 
 def edit_hdf5(name: str, edit: Callable[[h5py.File], object]) -> Change:

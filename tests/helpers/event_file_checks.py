@@ -32,13 +32,6 @@ def table(rows: Rows) -> np.ndarray:
     return np.array(rows, dtype=np.int64) * [1, 1, 1000, 1]
 
 
-def lapless(rows: Rows, lap: int) -> np.ndarray:
-    """The rows as a reader sees them that does not know how often the time wrapped before the first event."""
-    expected = table(rows)
-    expected[:, 2] -= (rows[0][2] // lap) * lap * 1000
-    return expected
-
-
 def attempt(file: EventFile) -> None:
     """Read all there is to read, as `aenerf convert` would."""
     file.count()

@@ -87,15 +87,6 @@ def aedat4_packet(rows: Rows) -> bytes:
     return sized(flat_table(b"EVTS", [b""], 0, items, len(rows)))
 
 
-def aedat4_info(streams: dict[int, str], size: str) -> str:
-    nodes = "".join(
-        f'<node name="{number}"><attr key="typeIdentifier" type="string">{kind}</attr>'
-        f'<node name="info">{size}</node></node>'
-        for number, kind in streams.items()
-    )
-    return f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'
-
-
 AEDAT4_SIZE = f'<attr key="sizeX" type="int">{WIDTH}</attr><attr key="sizeY" type="int">{HEIGHT}</attr>'
 
 
@@ -113,7 +104,12 @@ def aedat4_file(
         packets += [(0, compress(aedat4_packet(rows[begin : begin + 3]))), (1, b"frame")]
     packets.insert(3, (0, compress(aedat4_packet([]))))
     body = b"".join(struct.pack("<2i", stream, len(data)) + data for stream, data in packets)
-    info = aedat4_info(streams or {0: "EVTS", 1: "FRME"}, size).encode()
+    nodes = "".join(
+        f'<node name="{number}"><attr key="typeIdentifier" type="string">{kind}</attr>'
+        f'<node name="info">{size}</node></node>'
+        for number, kind in (streams or {0: "EVTS", 1: "FRME"}).items()
+    )
+    info = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
     header_size = len(flat_table(b"IOHE", [b""] * 3, 2, info, len(info)))
     position = 14 + 4 + header_size + len(body) if with_table else -1
     fields = [struct.pack("<i", compression), struct.pack("<q", position), b""]

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.recording.writer import NativeDatasetWriter
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 N_POSES, N_EVENTS = 21, 200
@@ -347,15 +346,3 @@ def interpolated(truth: Truth, time: int) -> NDArray[np.float64]:
     pose[:3, :3] = Slerp(times, Rotation.from_matrix(truth.poses[:, :3, :3]))(now).as_matrix()
     pose[:3, 3] = [np.interp(now, times, values) for values in truth.poses[:, :3, 3].T]
     return pose
-
-
-def convert_to_native(recording: Recording, folder: Path) -> Path:
-    """Converts a recording, without its images."""
-    box = None if recording.scene_box is None else recording.scene_box.numpy()
-    with NativeDatasetWriter(
-        folder, recording.event_camera, recording.sensor, recording.image_encoding, box, recording.max_pose_gap
-    ) as writer:
-        writer.add_trajectories(recording.trajectory)
-        for chunk in recording.event_file.chunks():
-            writer.events.append(chunk)
-    return folder

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from hypothesis import strategies as st
 
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventFile
@@ -29,6 +30,12 @@ def random_stream(count: int, width: int, height: int, end: int, start: int = 0,
     t = np.sort(rng.integers(start, end, count))
     x, y = rng.integers(0, width, count).astype(np.uint16), rng.integers(0, height, count).astype(np.uint16)
     return EventStream(x, y, t, rng.choice(np.array([-1, 1], np.int8), count), width, height, "made")
+
+
+def sorted_rows(width: int, height: int) -> st.SearchStrategy[list[tuple[int, int, int, int]]]:
+    """Draw rows (x, y, t, p) in order, from small ranges, so that pixels repeat and times coincide."""
+    row = st.tuples(st.integers(0, width - 1), st.integers(0, height - 1), st.integers(0, 30), st.sampled_from([-1, 1]))
+    return st.lists(row, min_size=1, max_size=120).map(lambda rows: sorted(rows, key=lambda row: row[2]))
 
 
 class EventsInMemory(EventFile):
