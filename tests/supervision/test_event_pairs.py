@@ -47,17 +47,10 @@ def test_a_pair_spans_several_events(random_poses: torch.Tensor) -> None:
     sampler = make_sampler(random_poses, SensorModel(), max_events_per_pair=3)
     rays, batch = sampler.sample(8000)
     starts, ends = torch.round(rays.times[:, 0] * 1e9).long().chunk(2)
-    counts = zip(
-        starts.tolist(),
-        ends.tolist(),
-        batch.num_positive.tolist(),
-        batch.num_negative.tolist(),
-        batch.last_num_negative.tolist(),
-        [round(seconds, 6) for seconds in batch.last_interval.tolist()],
-        strict=True,
-    )
+    columns = (starts, ends, batch.num_positive, batch.num_negative, batch.last_num_negative, batch.last_interval)
+    rows = np.stack([column.numpy() for column in columns], -1).round(6)
     # All that end with an event of their pixel, never beyond its first.
-    found = Counter(counts)
+    found = Counter(map(tuple, rows.tolist()))
     one, two = (250_000_000, 10**9, 1, 0, 0, 0.75), (5_000, 10**9, 1, 1, 0, 0.75)
     assert found.keys() == {
         (100_000, 600_000_000, 0, 1, 1, 0.5999),

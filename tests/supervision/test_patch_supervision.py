@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.small_models import EPOCH, GAP, KNOTS, make_supervision, make_window_sampler, pixels_of
+from helpers.streams import make_stream
 from nerfstudio.cameras.rays import RayBundle
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -144,8 +145,7 @@ def make_events() -> EventStream:
                     time = int(knot + rng.integers(1, 200_000_000))
                     rows.append((2 * column + pixel % 2, 2 * row + pixel // 2, time, 1))
         rows += [(1, 1, int(knot) + 10, sign) for sign in (1, -1)]
-    x, y, t, p = np.array(sorted(rows, key=lambda row: row[2])).T
-    return EventStream(x.astype(np.uint16), y.astype(np.uint16), t, p.astype(np.int8), WIDTH, HEIGHT)
+    return make_stream(sorted(rows, key=lambda row: row[2]), WIDTH, HEIGHT)
 
 
 def make_sampler(

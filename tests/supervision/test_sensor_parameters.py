@@ -107,16 +107,6 @@ def test_the_starts_of_the_intervals_move_and_what_lies_within_keeps_its_place()
     torch.testing.assert_close(losses["temporal_loss"], shorter["temporal_loss"])
 
 
-def test_they_form_a_parameter_group_and_are_logged() -> None:
-    model = make_learning_model()
-    assert len(model.get_param_groups()["sensor"]) == 2
-    assert "sensor" not in make_model().get_param_groups()
-    outputs = model(make_rays(15, with_times=True))
-    metrics = model.get_metrics_dict(outputs, make_batch(5))
-    assert metrics["contrast_threshold_ratio"] == pytest.approx(1.5, rel=1e-6)
-    assert metrics["refractory_period_ns"] == pytest.approx(20e6, rel=1e-6)
-
-
 @pytest.mark.parametrize("learned", [False, True])
 def test_pairs_are_of_consecutive_events_where_the_refractory_period_is_learned(
     learned: bool, random_poses: torch.Tensor
