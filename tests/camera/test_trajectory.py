@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion, rotation_from_vector
@@ -58,29 +58,25 @@ def degrees_between(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     return torch.as_tensor(np.degrees(Rotation.from_matrix(relative.numpy()).magnitude()))
 
 
-def lerp_and_slerp(times: np.ndarray, poses: torch.Tensor, at: np.ndarray) -> torch.Tensor:
-    rotations = Slerp(times, Rotation.from_matrix(poses[:, :, :3].numpy()))(at).as_matrix()
-    positions = np.stack([np.interp(at, times, poses[:, k, 3].numpy()) for k in range(3)], -1)
-    return torch.from_numpy(np.concatenate([rotations, positions[..., None]], -1))
-
-
 @pytest.mark.parametrize("uneven", [False, True])
-def test_poses_between_knots_beat_lerp_and_slerp(uneven: bool) -> None:
+def test_poses_between_knots_are_near_the_truth(uneven: bool) -> None:
     times = 40_000_000 * np.arange(76)
     if uneven:
         times[1:-1] += np.random.default_rng(1).integers(-12_000_000, 12_000_000, 74)
     fine = np.arange(0, times[-1], 3_000_000)
     knots, truth = smooth_poses(times * 1e-9), smooth_poses(fine * 1e-9)
-    poses, chords = Trajectory(times, knots).interpolate(fine), lerp_and_slerp(times, knots, fine)
-    assert degrees_between(chords, truth).mean() > 0.05
-    assert degrees_between(poses, truth).mean() < degrees_between(chords, truth).mean() / 50
-    assert (poses - truth)[..., 3].norm(dim=-1).mean() < (chords - truth)[..., 3].norm(dim=-1).mean() / 50
+    poses = Trajectory(times, knots).interpolate(fine)
+    # Straight lines between the knots are off by 0.05 degrees and 6e-4.
+    assert degrees_between(poses, truth).mean() < 0.001
+    assert (poses - truth)[..., 3].norm(dim=-1).mean() < 1e-5
     # The ends are no worse.
-    assert degrees_between(poses, truth).max() < degrees_between(chords, truth).mean() / 5
+    assert degrees_between(poses, truth).max() < 0.01
 
 
-def test_spline_is_that_of_scipy() -> None:
-    seconds = np.array([0, 0.8, 2, 3, 4.5, 5, 6, 7.3])
+# Three are joined by a parabola.
+@pytest.mark.parametrize("seconds", [[0, 0.8, 2, 3, 4.5, 5, 6, 7.3], [0, 2.9, 7.3]])
+def test_spline_is_that_of_scipy(seconds: list[float]) -> None:
+    seconds = np.array(seconds)
     knots = smooth_poses(seconds / 10)
     trajectory = Trajectory(np.rint(seconds * 1e9).astype(int), knots)
     fine = np.linspace(0, 7.3, 50)
@@ -111,15 +107,6 @@ def test_two_knots_are_joined_by_a_steady_motion(random_poses: torch.Tensor) -> 
         torch.testing.assert_close(pose[:, 3], torch.lerp(poses[0, :, 3], poses[1, :, 3], weight), rtol=0, atol=1e-12)
         part = Rotation.from_matrix((poses[0, :, :3].T @ pose[:, :3]).numpy()).as_rotvec()
         np.testing.assert_allclose(part, [0, 0, weight * math.pi / 2], rtol=0, atol=1e-3)
-
-
-def test_three_knots_are_joined_by_a_parabola() -> None:
-    seconds = np.array([0, 0.4, 1.0])
-    poses = torch.eye(4, dtype=torch.float64)[:3].repeat(3, 1, 1)
-    poses[:, 0, 3] = torch.from_numpy(seconds**2 - seconds)
-    fine = torch.linspace(0, 1, 9, dtype=torch.float64)
-    x = Trajectory(np.rint(seconds * 1e9).astype(int), poses).pose(fine)[:, 0, 3]
-    torch.testing.assert_close(x, fine**2 - fine, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("lost", [4, 5, 60])
@@ -196,12 +183,6 @@ def test_poses_resolve_nanoseconds_of_unix_time(random_poses: torch.Tensor) -> N
     torch.testing.assert_close(there[:, 3] - here[:, 3], rate[0, :, 3] * 1e-9, rtol=1e-5, atol=1e-15)
 
 
-def test_pose_is_differentiable_in_time(random_poses: torch.Tensor) -> None:
-    trajectory = Trajectory(10**9 * np.arange(8), random_poses)
-    seconds = torch.tensor([0.3, 4.7], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(trajectory.pose, seconds)
-
-
 def test_rate_is_the_derivative_of_the_pose(random_poses: torch.Tensor) -> None:
     trajectory = Trajectory(10**9 * np.arange(8), random_poses)
     seconds = torch.tensor([0.0, 0.3, 2.0, 4.7], dtype=torch.float64)
@@ -209,6 +190,7 @@ def test_rate_is_the_derivative_of_the_pose(random_poses: torch.Tensor) -> None:
     assert torch.equal(pose, trajectory.pose(seconds))
     _, expected = torch.func.jvp(trajectory.pose, (seconds,), (torch.ones_like(seconds),))
     torch.testing.assert_close(rate, expected, rtol=0, atol=1e-13)
+    assert torch.autograd.gradcheck(trajectory.pose, seconds[1::2].requires_grad_())
 
 
 def test_times_outside_the_span_are_refused(random_poses: torch.Tensor) -> None:

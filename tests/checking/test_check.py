@@ -6,7 +6,6 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from decimal import Decimal
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,11 +13,9 @@ import numpy as np
 import pytest
 import torch
 from helpers.dataset_faults import edit_json, set_in
-from helpers.small_datasets import START, write_native
+from helpers.small_datasets import write_native
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
@@ -32,7 +29,6 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
-from aenerf_ns.files.text import format_seconds
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.recording.recording import Recording
 from benchmarks.check_windows import MISTAKES as PLANTED
@@ -43,7 +39,7 @@ PART = 2_600_000_000
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room(tmp_path_factory: pytest.TempPathFactory, small_work: None) -> Path:
     folder = tmp_path_factory.mktemp("check") / "room"
     Simulate(folder, width=64, height=48, max_displacement=1.0, train_images=6, validation_views=1, test_views=1).main()
     return folder
@@ -55,10 +51,6 @@ def all_events(recording: Recording) -> EventStream:
 
 def open_native(folder: Path) -> Recording:
     return NativeDataParserConfig(data=folder).setup().read_recording()
-
-
-def open_ecd(folder: Path) -> Recording:
-    return EcdDataParserConfig(data=folder).setup().read_recording()
 
 
 @pytest.fixture(scope="module")
@@ -90,20 +82,10 @@ MISTAKES = {
 }
 
 
-def test_name_nothing_where_nothing_is_wrong(simulated: tuple[Recording, EventStream]) -> None:
-    recording, events = simulated
-    warped = WarpedEvents([events], recording.trajectory, recording.event_camera)
-    assert warped.compare_without_motion().is_clearly_worse
-    comparisons = warped.compare_alternatives()
-    assert not [c.hypothesis.name for c in comparisons if c.is_clearly_better]
-    assert {c.hypothesis.name for c in comparisons if c.contrast < 0.9 * c.given} >= MISTAKES.keys()
-
-
 def test_no_slice_spans_a_gap_of_the_poses(simulated: tuple[Recording, EventStream]) -> None:
     recording, _ = simulated
     gaps = ((PART // 4, PART // 2), (3 * PART // 5, 3 * PART // 4))
     warped = check(recording, TimeWindow(0, PART, gaps), 1.0).warped
-    assert warped is not None
     assert not any(first < end and last > start for first, last in warped.spans for start, end in gaps)
     # From all three stretches.
     assert warped.spans[0][0] < gaps[0][0]
@@ -144,7 +126,7 @@ def test_clock_remedy_names_the_learning_option() -> None:
 
 
 def test_real_recording_prefers_its_poses(slider_depth: Path) -> None:
-    recording = open_ecd(slider_depth)
+    recording = EcdDataParserConfig(data=slider_depth).setup().read_recording()
     trajectory = recording.trajectory
     events = all_events(recording).between(trajectory.start, trajectory.end)
     warped = WarpedEvents([events], trajectory, recording.event_camera)
@@ -156,19 +138,7 @@ def test_real_recording_prefers_its_poses(slider_depth: Path) -> None:
         assert found[name].is_inconclusive if name in unseen else found[name].is_clearly_worse, name
     for offset in (100_000_000, 500_000_000):
         late = warped.compare(clock_hypothesis(offset))
-        assert late is not None
         assert late.is_clearly_worse
-
-
-@pytest.mark.slow
-def test_name_mistakes_in_the_real_recording(slider_depth: Path) -> None:
-    recording = open_ecd(slider_depth)
-    events = all_events(recording)
-    for name in ("the poses are world-to-camera", "the camera axes x and z are flipped"):
-        assert name in named(*MISTAKES[name](events, recording))
-    # The camera gathers speed at the first pose. Afterwards its speed is constant, and no clock offset shows.
-    (best, *_) = named(*shift_clock(-0.1)(events, recording))
-    assert "behind that of the events" in best
 
 
 def run(folder: Path, **options: Path) -> tuple[int, str]:
@@ -200,108 +170,18 @@ def shuffled(*columns: str) -> Order:
 SHUFFLES = {"polarities": shuffled("p"), "pixels": shuffled("x", "y"), "times": shuffled("x", "y", "p")}
 
 
-def random_events(events: EventStream, rng: np.random.Generator) -> EventStream:
-    x, y = (rng.integers(0, size, len(events)).astype(np.uint16) for size in (events.width, events.height))
-    return replace(events, x=x, y=y, p=rng.choice(np.array([-1, 1], np.int8), len(events)))
-
-
-def assert_noise_is_named(folder: Path, whole: Path, change: Order) -> None:
-    """Check a native dataset whose events are in another order."""
-    rewrite(folder, change(all_events(open_native(whole)), np.random.default_rng(0)))
-    status, output = run(folder)
+@pytest.mark.parametrize("change", SHUFFLES.values(), ids=SHUFFLES)
+def test_reject_noise(change: Order, room: Path, shorter: Path) -> None:
+    rewrite(shorter, change(all_events(open_native(room)), np.random.default_rng(0)))
+    status, output = run(shorter)
     assert status == 1, output
     assert "hardly sharper than the same events in a random order" in output
-    assert "noise" in output
 
 
-@pytest.mark.parametrize("change", [*SHUFFLES.values(), random_events], ids=[*SHUFFLES, "random"])
-def test_reject_noise(change: Order, room: Path, shorter: Path) -> None:
-    assert_noise_is_named(shorter, room, change)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{"scene": "object"}, {"speed": "hard"}, {"scene": "shiny_object"}], ids=str)
-def test_reject_noise_of_other_simulations(options: dict, tmp_path: Path) -> None:
-    size = {"width": 64, "height": 48, "max_displacement": 1.0}
-    whole = tmp_path / "whole"
-    Simulate(whole, train_images=2, validation_views=1, test_views=1, **size, **options).main()
-    status, output = run(whole)
-    assert status == 0, output
-    folder = shutil.copytree(whole, tmp_path / "changed")
-    for change in (*SHUFFLES.values(), random_events):
-        assert_noise_is_named(folder, whole, change)
-
-
-def another_orbit(times: np.ndarray, radius: float, seed: int) -> list[str]:
-    """Lines of poses on a random path around the origin, which the camera looks at."""
-    knots = np.random.default_rng(seed).normal(size=(8, 3))
-    ways = CubicSpline(np.linspace(times[0], times[-1], 8), knots)(times)
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    x = np.cross([0, 0, 1.0], -ways)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    turns = Rotation.from_matrix(np.stack([x, np.cross(-ways, x), -ways], -1)).as_quat()
-    rows = np.concatenate([radius * ways, turns], 1).tolist()
-    return [
-        f"{format_seconds(time)} {' '.join(map(repr, row))}" for time, row in zip(times.tolist(), rows, strict=True)
-    ]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-def test_reject_poses_of_another_path(seed: int, small_object: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(small_object, tmp_path / "changed")
-    true = open_native(folder).trajectory
-    radius = float(true.camera_to_worlds[:, :3, 3].norm(dim=-1).mean())
-    (folder / "trajectory_ground_truth.txt").unlink()
-    (folder / "trajectory_estimated.txt").write_text("\n".join(another_orbit(true.times.numpy(), radius, seed)) + "\n")
-    # The box would also tell.
-    set_in("transforms.json", "scene_box", value=None)(folder)
-    status, output = run(folder)
+def test_reject_poses_of_another_path(shorter: Path) -> None:
+    change_poses(shorter, lambda poses: poses.flip(0))
+    status, output = run(shorter)
     assert status == 1, output
-    assert "the events look as if" in output or "clearly fit another meaning of the poses" in output
-    assert run(small_object)[0] == 0
-
-
-@pytest.fixture(scope="module")
-def small_object(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("object") / "made"
-    views = {"train_images": 2, "validation_views": 1, "test_views": 1}
-    Simulate(folder, scene="object", width=128, height=96, duration=2.0, **views).main()
-    return folder
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("order", [None, *SHUFFLES], ids=["as recorded", *SHUFFLES])
-def test_tell_the_real_recording_from_noise(order: str | None, slider_depth: Path, tmp_path: Path) -> None:
-    events = all_events(open_ecd(slider_depth))
-    folder = shutil.copytree(slider_depth, tmp_path / "made", copy_function=link)
-    (folder / "events.txt").unlink()
-    kept = events if order is None else SHUFFLES[order](events, np.random.default_rng(0))
-    columns = np.stack([kept.t * 1e-9, kept.x, kept.y, kept.p > 0], 1)
-    np.savetxt(folder / "events.txt", columns, fmt="%.9f %d %d %d")
-    status, output = run(folder)
-    assert status == (0 if order is None else 1), output
-    assert ("hardly sharper" in output) == (order is not None)
-
-
-def link(source: str, target: str) -> None:
-    Path(target).symlink_to(source)
-
-
-@pytest.mark.parametrize("factor", [10**3, 10**6, 10**9])
-def test_name_the_factor_of_the_pose_times(factor: int, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    folder = write_native(tmp_path / "made")
-    events = all_events(open_native(folder))
-    # Since the beginning of the recording; since 1970 no clock counts so far.
-    rewrite(folder, replace(events, t=events.t - START))
-    lines = (folder / "trajectory_estimated.txt").read_text().splitlines()
-    for name in ("trajectory_estimated.txt", "trajectory_ground_truth.txt"):
-        rows = [line.split() for line in lines[1:]]
-        times = [int(Decimal(row[0]) * 10**9 - START) * factor // 10 for row in rows]
-        text = "".join(f"{format_seconds(t)} {' '.join(row[1:])}\n" for t, row in zip(times, rows, strict=True))
-        (folder / name).write_text(text)
-    assert run(folder)[0] == 2
-    assert f"{factor:,} times too small, or those of the poses too large" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -323,12 +203,14 @@ def change_poses(folder: Path, function: Callable[[torch.Tensor], torch.Tensor])
 
 
 def test_command_finds_nothing_and_draws_a_picture(shorter: Path, tmp_path: Path) -> None:
+    set_in("transforms.json", "scene_box", value=[[-8.0] * 3, [8.0] * 3])(shorter)
     status, output = run(shorter, picture=tmp_path / "warped.png")
     assert status == 0, output
     assert "No problems found" in output
     count = len(all_events(open_native(shorter)))
     assert f"Events: {count:,} in 2." in output
     assert "Events with a pose: 100.0%" in output
+    assert "Within the scene box: 100" in output
     # The camera is well inside a room of some meters.
     near, far = (float(output.split("What is seen is ")[1].split()[i]) for i in (0, 2))
     assert 0.3 < near < 2 < far < 8
@@ -373,12 +255,10 @@ def test_command_reports_gaps_and_missing_poses(shorter: Path) -> None:
 
 
 def test_scene_box_must_hold_what_is_seen(shorter: Path) -> None:
-    for side, status in ((8.0, 0), (0.5, 1)):
-        set_in("transforms.json", "scene_box", value=[[-side] * 3, [side] * 3])(shorter)
-        found, output = run(shorter)
-        assert found == status, output
-        assert "Within the scene box: " in output
-        assert ("the scene box holds only" in output) == (status == 1)
+    set_in("transforms.json", "scene_box", value=[[-0.5] * 3, [0.5] * 3])(shorter)
+    status, output = run(shorter)
+    assert status == 1
+    assert "the scene box holds only" in output
 
 
 def test_few_events_are_not_warped(tmp_path: Path) -> None:
@@ -421,7 +301,8 @@ def number_after(words: str, output: str) -> float:
 
 
 def test_real_events_are_compared_with_frames(slider_depth: Path) -> None:
-    _, output = run(slider_depth)
+    status, output = run(slider_depth)
+    assert status == 0, output
     assert number_after("change from frame to frame: ", output) > 0.7
     # No file states the thresholds. Of the balance of 50,000 polarities and of three pairs of frames, each alone:
     assert "(assumed: 1.00)" in output
@@ -494,18 +375,25 @@ def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
     assert "Because of too few events, the contrast does not tell" in output
 
 
-@pytest.mark.parametrize("num_slices", [3, 4])
-def test_a_clock_is_named_where_four_slices_fit_it(num_slices: int) -> None:
-    clock = SimpleNamespace(
-        hypothesis=clock_hypothesis(20_000_000), contrast=0.9, given=0.5, slices_in_favor=frozenset(range(num_slices)),
-        is_clearly_better=True, is_clearly_worse=False, is_inconclusive=False, is_like=lambda other: False,
-    )  # fmt: skip
+@pytest.mark.parametrize(
+    ("in_favor", "problem"),
+    # Of five slices three say nothing of the clock, and four name it. Four that fit different ones tell of other poses.
+    [([{0, 1, 2}], None), ([{0, 1, 2, 3}], "the clock of the poses is"), ([{0, 1}, {2, 3}], "another meaning of the")],
+)
+def test_a_clock_is_named_where_four_slices_fit_it(in_favor: list[set[int]], problem: str | None) -> None:
+    clocks = [
+        SimpleNamespace(
+            hypothesis=clock_hypothesis(20_000_000 * index), contrast=0.9, given=0.5, slices_in_favor=frozenset(slices),
+            is_clearly_better=True, is_clearly_worse=False, is_inconclusive=False, is_like=lambda other: False,
+        )
+        for index, slices in enumerate(in_favor, 1)
+    ]  # fmt: skip
     warped = SimpleNamespace(
         spans=[(0, 10**8)] * 5,
         compare_without_motion=lambda: SimpleNamespace(given=0.5, contrast=0.2, is_clearly_worse=True),
-        compare_alternatives=lambda: [clock],
+        compare_alternatives=lambda: clocks,
         shuffled_contrasts=lambda: np.array([0.1, 0.1]),
     )
     result = SimpleNamespace(figures=[], problems=[])
-    assert _check_contrast(result, warped, is_simple=False) == (num_slices < 4)  # type: ignore[arg-type]
-    assert [clock.hypothesis.name in problem for problem in result.problems] == [True] * (num_slices - 3)
+    assert _check_contrast(result, warped, is_simple=False) == (problem is None)
+    assert [problem in found for found in result.problems] == [True] * (problem is not None)

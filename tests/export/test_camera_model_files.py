@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
@@ -88,28 +90,25 @@ def assert_read(outputs: DataparserOutputs, images: list[PlacedImage], points: O
     np.testing.assert_array_equal(outputs.metadata["points3D_rgb"], points.colors)
 
 
-# The framework refuses COLMAP's only model with k3, and a fourth parameter of a fisheye lens.
-READ_BY_THE_FRAMEWORK = {
-    **{name: LENSES[name] for name in ("pinhole", "radial-tangential")},
-    "fisheye": replace(LENSES["fisheye"], distortion=(0.01, -0.02, 0.003, 0.0)),
-}
+COLMAP = partial(ColmapDataParserConfig, colmap_path=Path("sparse/0"), downscale_factor=1)
+NERFSTUDIO = partial(NerfstudioDataParserConfig, load_3D_points=True, downscale_factor=1)
 
 
-@pytest.mark.parametrize("name", READ_BY_THE_FRAMEWORK)
-def test_framework_reads_the_model(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
-    images, points = write(tmp_path, READ_BY_THE_FRAMEWORK[name], random_poses)
-    config = ColmapDataParserConfig(data=tmp_path, colmap_path=Path("sparse/0"), downscale_factor=1)
-    for split in ("train", "val", "test"):
-        of_split = [image for image in images if image.split == split]
-        assert_read(config.setup().get_dataparser_outputs(split), of_split, points, tmp_path)
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_framework_reads_transforms_json(name: str, tmp_path: Path, random_poses: torch.Tensor) -> None:
-    # The dataparser reads the points by Open3D, which needs a libusb that the system may lack.
+@pytest.mark.parametrize(
+    ("dataparser", "lens"),
+    [
+        *((NERFSTUDIO, lens) for lens in LENSES.values()),
+        # The framework refuses COLMAP's only model with k3, and a fourth parameter of a fisheye lens.
+        *((COLMAP, LENSES[name]) for name in ("pinhole", "radial-tangential")),
+        (COLMAP, replace(LENSES["fisheye"], distortion=(0.01, -0.02, 0.003, 0.0))),
+    ],
+)
+def test_framework_reads_the_cameras(
+    dataparser: Callable[..., DataParserConfig], lens: CameraIntrinsics, tmp_path: Path, random_poses: torch.Tensor
+) -> None:
+    # Points are read by Open3D, which needs a libusb that the system may lack.
     load_open3d()
-    images, points = write(tmp_path, LENSES[name], random_poses)
-    config = NerfstudioDataParserConfig(data=tmp_path, downscale_factor=1, load_3D_points=True)
+    images, points = write(tmp_path, lens, random_poses)
     for split in ("train", "val", "test"):
         of_split = [image for image in images if image.split == split]
-        assert_read(config.setup().get_dataparser_outputs(split), of_split, points, tmp_path)
+        assert_read(dataparser(data=tmp_path).setup().get_dataparser_outputs(split), of_split, points, tmp_path)

@@ -32,9 +32,9 @@ def run(*command: str | Path, cwd: Path, fails: bool = False, gpu: bool = False)
 
 
 def simulate(folder: Path, *options: str) -> Path:
-    """Simulates a small recording in this process."""
+    """Simulates a small recording in this process, of few frames: for tests in which exact events do not matter."""
     size = ("--width", "48", "--height", "36", "--train-images", "4", "--validation-views", "4", "--test-views", "3")
-    tyro.cli(Simulate, args=["--output", str(folder), *size, *options]).main()
+    tyro.cli(Simulate, args=["--output", str(folder), "--max-displacement", "2", *size, *options]).main()
     return folder
 
 

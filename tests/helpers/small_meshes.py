@@ -54,16 +54,10 @@ def plate(half: float, picture: np.ndarray | None = None, tiles: float = 1.0) ->
 
 def joined(*meshes: Mesh) -> Mesh:
     first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)]),
-        np.concatenate([mesh.uv for mesh in meshes]),
-        np.concatenate([mesh.color for mesh in meshes]),
-        np.concatenate([mesh.texture for mesh in meshes]),
-        np.concatenate([mesh.emission for mesh in meshes]),
-        np.concatenate([mesh.gloss for mesh in meshes]),
-        (),
-    )
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)])
+    names = ("vertices", "uv", "color", "texture", "emission", "gloss")
+    parts = {name: np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in names}
+    return Mesh(faces=faces, textures=(), **parts)
 
 
 def ray_directions(intrinsics: tuple[float, ...], width: int, height: int) -> np.ndarray:

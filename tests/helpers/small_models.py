@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,17 +14,20 @@ from nerfstudio.data.scene_box import SceneBox
 
 from aenerf_ns.camera.alignment import Similarity
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
 from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
-from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.pairing import pair_events
 from aenerf_ns.events.polarity_drift import PolarityDrift, polarity_drift
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.sorted_events import sort_events
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
+from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
-from aenerf_ns.supervision.base import LossCoefficients, SupervisionConfig
+from aenerf_ns.supervision.base import LossCoefficients, SamplerConfig, SupervisionConfig
 from aenerf_ns.supervision.event_pairs import (
     PairBatch,
     PairLossCoefficients,
@@ -37,9 +41,10 @@ CAMERA = CameraIntrinsics(4, 3, 5.0, 5.0, 2.0, 1.5, "radial_tangential", (-0.1, 
 
 
 ALL_LOSSES = PairLossCoefficients(temporal_loss=1e-3)
-
-
 EPOCH = 1_600_000_000_000_000_000
+# Poses every 0.2 s; the middle interval is a gap.
+KNOTS = EPOCH + 200_000_000 * np.arange(8)
+GAP = (int(KNOTS[3]), int(KNOTS[4]))
 
 
 def make_scene(
@@ -65,16 +70,28 @@ def make_supervision(config: SupervisionConfig, sensor: SensorModel | None = Non
     return config.setup(sensor=sensor or SensorModel(), loss_coefficients=LossCoefficients())
 
 
-@dataclass
-class FivePairs:
-    """A training dataset of five events at two pixels."""
+def make_window_sampler(
+    config: SamplerConfig,
+    supervision: SupervisionConfig,
+    events: EventStream,
+    end: int,
+    poses: torch.Tensor,
+    camera: CameraIntrinsics,
+    sensor: SensorModel | None = None,
+) -> Any:
+    """A sampler of windows of the time from the first pose to an end, without the gap."""
+    sensor = sensor or SensorModel()
+    window = TimeWindow(int(KNOTS[0]), end, (GAP,))
+    scene = replace(make_scene(sensor, Trajectory(KNOTS, poses), camera), window=window)
+    windows = sort_events([events], window=window, usable=camera.pixel_directions()[1])
+    dataset = SimpleNamespace(scene=scene, windows=windows)
+    return config.setup(dataset=dataset, supervision=make_supervision(supervision, sensor), device="cpu")
 
-    scene: SceneRecording
-    pairs: EventPairs
 
-    @property
-    def polarity_drift(self) -> PolarityDrift:
-        return polarity_drift(self.pairs)
+def pixels_of(rays: RayBundle, camera: CameraIntrinsics = CAMERA) -> list[int]:
+    """The number of the pixel that each ray leaves."""
+    directions = camera.pixel_directions()[0].reshape(-1, 3)
+    return [int(np.abs(directions - ray).sum(1).argmin()) for ray in rays.metadata[CAMERA_DIRECTIONS].numpy()]
 
 
 def make_sampler(
@@ -85,18 +102,29 @@ def make_sampler(
     share: float = 0.0,
     temporal: bool = False,
     learn_refractory_period: bool = False,
+    drift: PolarityDrift | None = None,
 ) -> PairSampler:
+    """A sampler of five events at two pixels."""
     rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
     stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
     _, usable = camera.pixel_directions()
     pairs = pair_events([stream], refractory_period=sensor.refractory_period, usable=usable)
-    trajectory = Trajectory(EPOCH + 200_000_000 * np.arange(8), random_poses)
+    trajectory = Trajectory(KNOTS, random_poses)
+    scene, drift = make_scene(sensor, trajectory, camera), drift or polarity_drift(pairs)
     return PairSamplerConfig(max_events_per_pair=max_events_per_pair, silent_pair_share=share).setup(
-        dataset=FivePairs(make_scene(sensor, trajectory, camera), pairs),
+        dataset=SimpleNamespace(scene=scene, pairs=pairs, polarity_drift=drift),
         supervision=PairSupervisionConfig(learn_refractory_period=learn_refractory_period).setup(
             sensor=sensor, loss_coefficients=PairLossCoefficients(temporal_loss=float(temporal))
         ),
         device="cpu",
+    )
+
+
+def make_correction(trajectory: Trajectory, ground_truth: Trajectory | None = None, **options: Any) -> PoseCorrection:
+    """A correction that has learned nothing yet, with cameras at the first three poses."""
+    times = trajectory.times[:3]
+    return PoseCorrectionConfig(**options).setup(
+        num_cameras=len(times), device="cpu", trajectory=trajectory, camera_times=times, ground_truth=ground_truth
     )
 
 

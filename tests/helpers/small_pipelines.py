@@ -19,6 +19,7 @@ from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 from aenerf_ns.training.pipeline import AENeRFPipeline, AENeRFPipelineConfig
+from helpers.small_models import SMALL_FIELD, SMALL_PROPOSAL
 from helpers.streams import make_stream
 
 
@@ -48,8 +49,8 @@ def make_pipeline_config(
             for _ in range(num_views + 1):
                 writer.add_image("test", np.full((4, 6, 3), (204, 102, 51), np.uint8), poses[2])
     model = AENeRFModelConfig(
-        field=FieldConfig(num_samples_per_ray=12, num_levels=4, max_resolution=32, log2_hashmap_size=10),
-        proposal=ProposalConfig(num_samples_per_ray=(16,), max_resolutions=(16,), num_levels=2, log2_hashmap_size=8),
+        field=FieldConfig(**SMALL_FIELD),
+        proposal=ProposalConfig(**SMALL_PROPOSAL),
         color_correction_num_rays=64,
         camera_optimizer=PoseCorrectionConfig(mode=pose_correction),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
@@ -26,8 +26,15 @@ def own_log() -> Iterator[None]:
         writer.EVENT_STORAGE.clear()
 
 
-def train_small_model(folder: Path, name: str, num_steps: int, seed: int = 42, **options: Any) -> AENeRFTrainer:
-    """Train a small model as ns-train does, on the dataset ``data`` of a folder."""
+def train_small_model(
+    folder: Path,
+    name: str,
+    num_steps: int,
+    seed: int = 42,
+    prepare: Callable[[AENeRFTrainer], object] = lambda trainer: None,
+    **options: Any,
+) -> AENeRFTrainer:
+    """Train a small model as ns-train does, on the dataset ``data`` of a folder; ``prepare`` may change the trainer."""
     config = AENeRFTrainerConfig(
         method_name="aenerf",
         experiment_name=name,
@@ -50,5 +57,6 @@ def train_small_model(folder: Path, name: str, num_steps: int, seed: int = 42, *
     with own_log():
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
+        prepare(trainer)
         trainer.train()
     return trainer

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
+import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 import torch.nn.functional as F
@@ -29,8 +31,6 @@ def values_and_derivatives(
     with forward_ad.dual_level():
         outputs, rates = forward_ad.unpack_dual(activation(forward_ad.make_dual(inputs * 1, tangents * 1)))
     (outputs * weights + rates * of_rates).sum().backward()
-    assert inputs.grad is not None
-    assert tangents.grad is not None
     return [outputs.detach(), rates.detach(), inputs.grad, tangents.grad]
 
 
@@ -60,15 +60,12 @@ def test_values_that_are_not_finite_stay_so() -> None:
     assert outputs[2].isnan()
 
 
-def test_every_number_of_threads_gives_the_same_bytes() -> None:
-    inputs = torch.randn(3, 5000, generator=torch.Generator().manual_seed(1))
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            results.append(SharpSoftplus()(inputs))
-    finally:
-        torch.set_num_threads(before)
+def test_every_number_of_threads_gives_the_same_bytes(request: pytest.FixtureRequest) -> None:
+    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+    inputs, results = torch.randn(3, 5000, generator=torch.Generator().manual_seed(1)), []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        results.append(SharpSoftplus()(inputs))
     assert torch.equal(*results)
 
 

@@ -89,18 +89,14 @@ def test_a_step_on_windows_computes_on_the_device_alone(supervision: Supervision
 
 
 @NEEDS_SIMULATION
-def test_a_tensor_left_on_the_cpu_would_be_noticed() -> None:
+def test_tensors_left_on_the_cpu_transfers_and_waits_would_be_noticed() -> None:
     model = make_model(camera_optimizer=PoseCorrectionConfig(mode="spline"))
-    with SimulatedCuda():
+    with SimulatedCuda() as gpu:
         to_device(model)
         model.camera_optimizer._twist_units = torch.ones(6)
         with pytest.raises(RuntimeError, match="same device"):
             model(to_device(make_rays(10, with_times=True)))
-
-
-@NEEDS_SIMULATION
-def test_transfers_and_waits_would_be_noticed() -> None:
-    with SimulatedCuda() as gpu:
+        gpu.counts = Counts()
         values = torch.arange(3.0).to(device())
         torch.zeros(3, device=device()).copy_(torch.ones(3))
         assert values.tolist() == [0.0, 1.0, 2.0]
@@ -187,27 +183,18 @@ def test_a_step_waits_once_and_copies_nothing_else(temporal: bool, tmp_path: Pat
 # bytes of the Triton kernels are by formula: positions, features and their gradients come from memory, the tables from
 # the cache.
 @NEEDS_SIMULATION
-@pytest.mark.parametrize(
-    ("grid", "temporal", "launches", "gigabytes"),
-    [
-        ("torch", False, 976, 49.2),
-        ("torch", True, 1832, 60.5),
-        ("triton", False, 881, 14.6),
-        ("triton", True, 1637, 20.6),
-    ],
-)
+@pytest.mark.parametrize(("temporal", "launches", "gigabytes"), [(False, 881, 14.6), (True, 1637, 20.6)])
 def test_what_a_step_of_the_full_method_costs(
-    grid: str, temporal: bool, launches: int, gigabytes: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    temporal: bool, launches: int, gigabytes: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pytest.importorskip("triton")
+    from aenerf_ns.method.kernels import hash_grid_triton
+
     trainer = make_trainer(tmp_path / "data", narrow=False, temporal=temporal)
     with FakeTensorMode(allow_non_fake_inputs=True), SimulatedCuda() as gpu:
-        if grid == "triton":
-            pytest.importorskip("triton")
-            from aenerf_ns.method.kernels import hash_grid_triton
-
-            monkeypatch.setattr(hash_grid_triton, "_fill_features", CountedKernel(gpu, 20))
-            monkeypatch.setattr(hash_grid_triton, "_add_gradients", CountedKernel(gpu, 32))
-            monkeypatch.setattr(HashEncoding, "_choose", lambda self, positions: hash_grid_triton)
+        monkeypatch.setattr(hash_grid_triton, "_fill_features", CountedKernel(gpu, 20))
+        monkeypatch.setattr(hash_grid_triton, "_add_gradients", CountedKernel(gpu, 32))
+        monkeypatch.setattr(HashEncoding, "_choose", lambda self, positions: hash_grid_triton)
         move_to_device(trainer)
         # The optimizers make their states in the first step, and at step 7 all of them step.
         train(trainer, gpu, 7)

@@ -10,12 +10,10 @@ import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
 
-import imageio_ffmpeg
 import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.small_trainings import train_small_model
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
@@ -27,7 +25,6 @@ from aenerf_ns.camera.rotation import rotation_from_vector
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
-from aenerf_ns.cli.export import ExportVideo
 from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.formats import FORMATS, recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -56,27 +53,26 @@ class FirstSeventh(RoomPath):
 
 
 @pytest.fixture(scope="module")
-def room() -> SimulationScene:
+def room(small_work: None) -> SimulationScene:
     return dataclasses.replace(open_scene("room"), path=FirstSeventh())
 
 
 @pytest.fixture(scope="module")
-def dataset(room: SimulationScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A dataset whose poses COLMAP estimated from 14 frames, and what the command printed."""
+def dataset(room: SimulationScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset whose poses COLMAP estimated from 14 frames."""
     folder = tmp_path_factory.mktemp("colmap") / "scene"
-    with pytest.MonkeyPatch.context() as patch, CONSOLE.capture() as output:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr("aenerf_ns.simulator.open_scene.open_scene", lambda *_: room)
         Simulate(
             folder, poses="colmap", width=160, height=120, duration=14 / 25 - 0.03, max_displacement=2.0,
             train_images=3, validation_views=1, test_views=1, positive_contrast_threshold=0.12,
             negative_contrast_threshold=0.12,
         ).main()  # fmt: skip
-    return folder, output.get()
+    return folder
 
 
-def test_colmap_finds_simulated_poses(dataset: tuple[Path, str]) -> None:
-    folder, output = dataset
-    report = json.loads((folder / "poses_report.json").read_text())
+def test_colmap_finds_simulated_poses(dataset: Path) -> None:
+    report = json.loads((dataset / "poses_report.json").read_text())
     assert report["frames"] == 14
     assert report["registered_frames"] == report["model_sizes"][0] == 14
     assert report["mean_reprojection_error_pixels"] < 1
@@ -87,14 +83,11 @@ def test_colmap_finds_simulated_poses(dataset: tuple[Path, str]) -> None:
     errors = report["errors"]
     assert errors["largest_rotation_error_degrees"] < 4
     assert errors["misplaced_frames"] == errors["flipped_frames"] == 0
-    assert "14 of 14 frames registered" in output
-    assert "without a pose" not in output
-
-
-def test_dataset_holds_metric_poses(dataset: tuple[Path, str]) -> None:
-    folder, _ = dataset
+    assert "14 of 14 frames registered" in report["summary"]
+    assert "without a pose" not in report["summary"]
+    # The poses are metric.
     estimated, truth = (
-        read_tum_trajectory(folder / f"trajectory_{name}.txt") for name in ("estimated", "ground_truth")
+        read_tum_trajectory(dataset / f"trajectory_{name}.txt") for name in ("estimated", "ground_truth")
     )
     assert np.diff(estimated.times.numpy()).tolist() == [FRAME] * 13
     assert estimated.start == 1_500_000
@@ -103,7 +96,7 @@ def test_dataset_holds_metric_poses(dataset: tuple[Path, str]) -> None:
     error = (estimated.camera_to_worlds - true)[..., 3].norm(dim=-1)
     assert 1e-5 < error.mean() < 0.05 * estimated.extent
     # Events before the first estimated pose and after the last one are not trained on.
-    outputs = NativeDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
+    outputs = NativeDataParserConfig(data=dataset).setup().get_dataparser_outputs("train")
     window = outputs.metadata[SCENE_KEY].window
     assert estimated.start <= window.start < window.end == estimated.end < truth.end
 
@@ -122,58 +115,54 @@ def test_colmap_estimates_intrinsics(room: SimulationScene) -> None:
 
 
 @pytest.fixture(scope="module")
-def bare(dataset: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The events of the dataset and the size of its sensor, without lens, frames and poses."""
     folder = tmp_path_factory.mktemp("bare")
     (folder / "calibration.json").write_text(json.dumps({"event_camera": {"width": 160, "height": 120}}))
-    shutil.copy(dataset[0] / "events.h5", folder)
+    shutil.copy(dataset / "events.h5", folder)
     return folder
 
 
 @pytest.fixture(scope="module")
-def found(bare: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The folder of a dataset "data", whose poses and lens were found from its events, and what the command printed."""
-    folder = tmp_path_factory.mktemp("found")
-    with CONSOLE.capture() as output:
-        Convert(bare, output=folder / "data", poses="events").main()
-    return folder, output.get()
+def found(bare: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset whose poses and lens were found from its events."""
+    folder = tmp_path_factory.mktemp("found") / "data"
+    Convert(bare, output=folder, poses="events").main()
+    return folder
 
 
-def test_find_poses_and_lens_of_a_bare_recording(
-    found: tuple[Path, str], dataset: tuple[Path, str], room: SimulationScene
-) -> None:
-    folder, output = found[0] / "data", found[1]
-    report = json.loads((folder / "poses_report.json").read_text())
+def test_find_poses_and_lens_of_a_bare_recording(found: Path, dataset: Path, room: SimulationScene) -> None:
+    report = json.loads((found / "poses_report.json").read_text())
     assert report["registered_frames"] >= report["frames"] - 1 > 9
     assert report["agreement"] > 0.8
-    assert "images of the events registered" in output
-    trajectory = read_tum_trajectory(folder / "trajectory_estimated.txt")
-    truth = read_tum_trajectory(dataset[0] / "trajectory_ground_truth.txt")
+    assert "images of the events registered" in report["summary"]
+    trajectory = read_tum_trajectory(found / "trajectory_estimated.txt")
+    truth = read_tum_trajectory(dataset / "trajectory_ground_truth.txt")
     errors = pose_errors(trajectory.camera_to_worlds, truth.interpolate(trajectory.times))
     # Measured: 0.5 degrees and 9 mm on a path of 1.1 m.
     assert errors["rotation_error_degrees"] < 2
     assert errors["translation_error"] < 0.03
     # It says how its poses and its lens were found.
     with CONSOLE.capture() as checked, contextlib.suppress(SystemExit):
-        Check(folder).main()
+        Check(found).main()
     told = " ".join(checked.get().split())
     assert f"How they were found: {report['summary'].splitlines()[0]}" in told
     assert "The intrinsics were estimated with the poses: focal length" in told
-    lens = json.loads((folder / "transforms.json").read_text())["event_camera"]
+    lens = json.loads((found / "transforms.json").read_text())["event_camera"]
     assert lens["intrinsics_origin"] == "estimated"
     # Measured: 5 % too long on this short path.
     assert lens["fl_x"] == lens["fl_y"] == pytest.approx(room.intrinsics(160, 120)[0], rel=0.1)
-    with Image.open(folder / "poses_report.png") as picture:
+    with Image.open(found / "poses_report.png") as picture:
         assert picture.size == (1456, 484)
     # The dataset can be trained on. Its world has COLMAP's scale, which training changes.
-    outputs = NativeDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
+    outputs = NativeDataParserConfig(data=found).setup().get_dataparser_outputs("train")
     assert outputs.cameras.camera_to_worlds[..., 3].abs().max() == pytest.approx(1, rel=0.1)
     scene = outputs.metadata[SCENE_KEY]
     assert (scene.window.start, scene.window.end) == (trajectory.start, trajectory.end)
 
 
 def test_an_interrupted_search_goes_on(
-    found: tuple[Path, str], bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    found: Path, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command, kept = Convert(bare, output=tmp_path / "data", poses="events"), tmp_path / ".data.colmap"
 
@@ -198,7 +187,7 @@ def test_an_interrupted_search_goes_on(
     command.main()
     assert not kept.exists()
     for name in ("trajectory_estimated.txt", "transforms.json"):
-        assert (tmp_path / "data" / name).read_bytes() == (found[0] / "data" / name).read_bytes()
+        assert (tmp_path / "data" / name).read_bytes() == (found / name).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -260,26 +249,13 @@ def test_worlds_stand_upright() -> None:
     assert model.compute_mean_reprojection_error() < 1e-3
 
 
-@pytest.mark.slow
-def test_from_a_bare_recording_to_a_video(found: tuple[Path, str], tmp_path: Path) -> None:
-    trainer = train_small_model(found[0], "run", 2)
-    trainer.config.save_config()
-    ExportVideo(trainer.base_dir, tmp_path / "video.mp4", rate=10).main()
-    width, height = next(imageio_ffmpeg.read_frames(str(tmp_path / "video.mp4")))["size"]
-    # Events, rendered events, rendering and depth beside each other.
-    assert width > 4 * 160
-    assert height > 120
-
-
-@pytest.mark.parametrize(
-    ("degrees", "offset", "images"), [(0.0, 0, "filter"), (0.0, 15_000_000, "filter"), (2.0, 0, "network")]
-)
+@pytest.mark.parametrize(("degrees", "offset", "images"), [(0.0, 15_000_000, "filter"), (2.0, 0, "network")])
 def test_refine_given_poses(
-    dataset: tuple[Path, str], tmp_path: Path, degrees: float, offset: int, images: str, request: pytest.FixtureRequest
+    dataset: Path, tmp_path: Path, degrees: float, offset: int, images: str, request: pytest.FixtureRequest
 ) -> None:
     weights = request.getfixturevalue("firenet_weights") if images == "network" else None
     given = tmp_path / "given"
-    shutil.copytree(dataset[0], given)
+    shutil.copytree(dataset, given)
     truth = read_tum_trajectory(given / "trajectory_ground_truth.txt")
     noisy = perturb(truth, degrees, degrees * 0.03, 0.15, seed=2)
     late = Trajectory(noisy.times + offset, noisy.camera_to_worlds)
@@ -293,7 +269,7 @@ def test_refine_given_poses(
     times = refined.knots_covered_by(truth)
     found = pose_errors(refined.interpolate(times), truth.interpolate(times))
     assert found["rotation_error_degrees"] == pytest.approx(after, abs=1e-4)
-    assert (report["correction_degrees"] > 0.5) == (degrees + offset > 0)
+    assert report["correction_degrees"] > 0.5
     shared = report["shared_error"]
     assert shared["clock_offset_seconds"] * 1e9 == pytest.approx(offset, abs=3_000_000)
     assert ("ms ahead of that of the events" in report["summary"]) == (offset > 0)
@@ -302,14 +278,17 @@ def test_refine_given_poses(
         assert picture.size == (1456, 484)
 
 
-def test_refuse_poses_beside_the_events(dataset: tuple[Path, str], tmp_path: Path) -> None:
+def test_refuse_too_few_events_and_poses_beside_them(bare: Path, dataset: Path, tmp_path: Path) -> None:
+    message = r"its events make . images"
+    with pytest.raises(DataError, match=message):
+        Convert(bare, output=tmp_path / "scene", poses="events", end_time_ns=10_000_000).main()
     given = tmp_path / "given"
-    shutil.copytree(dataset[0], given)
+    shutil.copytree(dataset, given)
     truth = read_tum_trajectory(given / "trajectory_ground_truth.txt")
     first = truth.times < truth.start + 20_000_000
     cut = Trajectory(truth.times[first], truth.camera_to_worlds[first])
     write_tum_trajectory(given / "trajectory_estimated.txt", cut)
-    with pytest.raises(DataError, match=r"its events make . images"):
+    with pytest.raises(DataError, match=message):
         Convert(given, output=tmp_path / "scene", poses="refined").main()
 
 
@@ -351,12 +330,6 @@ def test_draw_tracks_and_paths() -> None:
 def test_name_the_command_that_finds_poses(bare: Path) -> None:
     with pytest.raises(DataError, match=r"trajectory.txt: there are no such poses; .*aenerf convert .* --poses events"):
         _ = FORMATS[recognize(bare)].__class__(data=bare).setup().recording
-
-
-def test_refuse_too_few_events(bare: Path, tmp_path: Path) -> None:
-    short = Convert(bare, output=tmp_path / "scene", poses="events", end_time_ns=10_000_000)
-    with pytest.raises(DataError, match=r"its events make . images"):
-        short.main()
 
 
 def test_refuse_frames_without_texture() -> None:

@@ -44,7 +44,6 @@ def model(radius: float, turn: float, num_wrong: int = 0, num_points: int = 2000
 @pytest.mark.parametrize("num_wrong", [0, 200])
 def test_the_box_holds_what_is_seen_and_little_more(num_wrong: int) -> None:
     box = box_of(model(3.0, 2 * np.pi, num_wrong))
-    assert box is not None
     np.testing.assert_allclose(box, [[-1.18] * 3, [1.18] * 3], atol=0.03)
 
 

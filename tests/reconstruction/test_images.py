@@ -34,8 +34,7 @@ def radiance(index: int) -> NDArray[np.float64]:
 def events() -> Iterator[EventStream]:
     simulator = EventSimulator(SIZE, SIZE, SENSOR)
     for index in range(NUM_FRAMES):
-        x, y, t, p = simulator(radiance(index), index * STEP)
-        yield EventStream(x, y, t, p, SIZE, SIZE)
+        yield EventStream(*simulator(radiance(index), index * STEP), SIZE, SIZE)
 
 
 def test_images_are_those_of_the_light() -> None:

@@ -57,15 +57,3 @@ def test_both_directions_of_time_count_alike(events: EventStream) -> None:
     # The last image of each is of one direction only. Images that wait for less than all that follows differ a little.
     for k in range(99):
         assert np.abs(images[k] - mirrored[98 - k]).max() < 0.03 * np.ptp(images[k]), k
-
-
-def test_a_change_shows_before_and_after_it() -> None:
-    # Noise everywhere, and one pixel that gets much brighter in the middle.
-    generator = np.random.default_rng(1)
-    rows = [(generator.integers(WIDTH), generator.integers(HEIGHT), time, 1 - 2 * (time % 2)) for time in range(1200)]
-    rows[600:620] = [(4, 5, time, 1) for time in range(600, 620)]
-    stream = make_stream(rows, WIDTH, HEIGHT)
-    states = [state for _, state in log_intensities(batches_of([stream], BATCH), SensorModel(0.3, 0.2), 0.12)]
-    # States 9 and 10 are those before and after the events of the pixel.
-    assert states[9].argmin() == states[10].argmax() == 5 * WIDTH + 4
-    assert states[10][5, 4] - states[9][5, 4] == pytest.approx(20 * 0.3, rel=0.05)

@@ -20,13 +20,6 @@ from aenerf_ns.simulator.rendering.mesh_repair import repair
 pytestmark = pytest.mark.usefixtures("small_work")
 
 
-def test_even_sky() -> None:
-    mesh, _ = repair(mesh_of(trimesh.creation.icosphere(2)), 1.0)
-    scene = light_mesh(mesh, sky((1, 2, 3), (1, 2, 3)), [], BLACK)
-    np.testing.assert_allclose(scene.light[0], np.tile([1, 2, 3], (len(scene.light[0]), 1)), rtol=1e-4)
-    assert scene.light[1].max() == 0
-
-
 def test_linear_sky() -> None:
     scene = light_mesh(repair(plate(1.0), 0.2)[0], sky(BLACK, (1, 2, 0.5)), [], BLACK)
     # The mean of (1 + cos) / 2 over cosine-weighted directions is 5 / 6 above, 1 / 6 below.

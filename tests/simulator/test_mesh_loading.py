@@ -47,19 +47,13 @@ def test_glb_and_obj_look_alike(tmp_path: Path) -> None:
     assert (glb > 0).any(-1).mean() > 0.15
     np.testing.assert_allclose(glb, obj, atol=2e-3)
     # At a point of the top, the picture has the texture's value.
-    overhead = baked_mesh(scaled(load_mesh(tmp_path / "box.glb", True), 1.0), BLACK).render(
-        OVERHEAD, (100.0, 100.0, 0.5, 0.5), 1, 1, 1
-    )[0][0, 0]
-    rng = np.random.default_rng(0)
-    picture = decode(rng.integers(40, 220, (12, 16, 3)).astype(np.uint8) / 255, "srgb")[::-1]
-    # u = 0 + 0.2, v = 0 + 0.2 there
-    column, row = 0.2 * 16 - 0.5, 0.2 * 12 - 0.5
-    i, j = int(column), int(row)
-    fx, fy = column - i, row - j
-    value = (1 - fy) * ((1 - fx) * picture[j, i] + fx * picture[j, i + 1]) + fy * (
-        (1 - fx) * picture[j + 1, i] + fx * picture[j + 1, i + 1]
-    )
-    np.testing.assert_allclose(overhead, value * [0.8, 1.0, 0.6], atol=1e-3)
+    picture = decode(np.random.default_rng(0).integers(40, 220, (12, 16, 3)).astype(np.uint8) / 255, "srgb")[::-1]
+    # The center of a texel. The texture's origin is at -0.2 m there.
+    pose = OVERHEAD.copy()
+    pose[:2, 3] = 3.5 / 16 - 0.2, 2.5 / 12 - 0.2
+    scene = baked_mesh(scaled(load_mesh(tmp_path / "box.glb", True), 1.0), BLACK)
+    overhead = scene.render(pose, (100.0, 100.0, 0.5, 0.5), 1, 1, 1)[0][0, 0]
+    np.testing.assert_allclose(overhead, picture[2, 3] * [0.8, 1.0, 0.6], atol=1e-3)
 
 
 def test_ply_colors_are_srgb(tmp_path: Path) -> None:

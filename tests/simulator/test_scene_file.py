@@ -126,7 +126,6 @@ def test_materials_get_coats(box_file: Path) -> None:
     )
     np.testing.assert_array_equal(diffuse.renderer.light, shiny.renderer.light)
     assert diffuse.renderer.reflections is None
-    assert shiny.renderer.reflections is not None
     np.testing.assert_allclose(shiny.renderer.reflections.coats.specular, 0.5)
     np.testing.assert_allclose(shiny.renderer.reflections.coats.lobe, np.sqrt(2) * 0.04, rtol=1e-6)
     pose, intrinsics = shiny.path(0.99), shiny.intrinsics(64, 48)  # from above, where the lamp is mirrored
@@ -146,7 +145,6 @@ def test_bare_mesh_is_in_view(tmp_path: Path) -> None:
     scene = open_scene(str(tmp_path / "box.ply"))
     assert len(scene.notes) == 1
     assert "scaled by 0.02" in scene.notes[0]
-    assert scene.aabb is not None
     brightest = 0.0
     for pose in [*(scene.path(k / 9) for k in range(10)), *scene.path.test_views(10, 0)]:
         radiance, depth, alpha = scene.renderer.render(pose, scene.intrinsics(60, 45), 60, 45, 4)

@@ -6,21 +6,18 @@ import math
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import cast
 
 import cv2
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
 from aenerf_ns.camera.image_encoding import decode, encode
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.pose_estimation.video import Video, open_video
 from aenerf_ns.simulator.esim import EventSimulator
-from aenerf_ns.simulator.options import Interpolation, SensorNoise
+from aenerf_ns.simulator.options import Interpolation
 from aenerf_ns.simulator.textures import spectral_noise
 from aenerf_ns.simulator.video_events import quantization_epsilon, video_events, video_simulator
 
@@ -29,14 +26,14 @@ LEVELS = decode(np.arange(256) / 255, "srgb")
 
 
 class StoredVideo:
-    """The frames of a list at regular times."""
+    """The frames of a list, by default at regular times."""
 
     source = Path("stored")
 
-    def __init__(self, frames: list[NDArray[np.uint8]]) -> None:
+    def __init__(self, frames: list[NDArray[np.uint8]], times: NDArray[np.int64] | None = None) -> None:
         self._frames = frames
         self.height, self.width = frames[0].shape[:2]
-        self.times = FRAME * np.arange(len(frames), dtype=np.int64)
+        self.times = FRAME * np.arange(len(frames), dtype=np.int64) if times is None else times
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
         return iter(self._frames)
@@ -46,12 +43,11 @@ def events_of(
     frames: list[NDArray[np.uint8]],
     sensor: SensorModel,
     interpolation: Interpolation = "linear",
-    noise: SensorNoise = SensorNoise(),  # noqa: B008
-    seed: int = 0,
+    times: NDArray[np.int64] | None = None,
 ) -> EventStream:
-    video = cast(Video, StoredVideo(frames))
-    simulator = video_simulator(video, sensor, noise, seed)
-    return EventStream.concatenate([interval.events for interval in video_events(video, simulator, interpolation)])
+    video = StoredVideo(frames, times)
+    intervals = video_events(video, video_simulator(video, sensor), interpolation)
+    return EventStream.concatenate([interval.events for interval in intervals])
 
 
 def gray(levels: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -59,22 +55,13 @@ def gray(levels: NDArray[np.integer]) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("rising", [True, False])
-def test_events_cross_thresholds(rising: bool, tmp_path: Path) -> None:
+def test_events_cross_thresholds(rising: bool) -> None:
     # Gray levels that rise or fall from frame to frame: every crossing is at a known place of a polyline.
     rng = np.random.default_rng(0)
     levels = np.sort(rng.integers(0, 256, (6, 5, 4)), axis=0)
     levels = levels if rising else levels[::-1]
     times = np.cumsum(rng.integers(10_000_000, 50_000_000, 6))
-    lines = []
-    for index, (level, time) in enumerate(zip(levels, times.tolist(), strict=True)):
-        Image.fromarray(level.astype(np.uint8)).save(tmp_path / f"{index}.png")
-        lines.append(f"0.{time:09d} {index}.png\n")
-    (tmp_path / "images.txt").write_text("".join(lines))
-    sensor = SensorModel(0.21, 0.17)
-    video = open_video(tmp_path)
-    events = EventStream.concatenate(
-        [interval.events for interval in video_events(video, video_simulator(video, sensor), "linear")]
-    )
+    events = events_of([gray(level) for level in levels], SensorModel(0.21, 0.17), times=times)
     # As stated in the docs: the step from gray level 0 to 2 is the smaller threshold.
     epsilon = 2 / 255 / 12.92 / (math.exp(0.17) - 1)
     log_radiance = np.log(LEVELS[levels] + epsilon)
@@ -191,8 +178,8 @@ def test_memory_of_long_video(interpolation: Interpolation) -> None:
 
     video = LongVideo([np.zeros((16, 16, 3), np.uint8)] * 40)
     most = 0
-    simulator = video_simulator(cast(Video, video), SensorModel())
-    for interval in video_events(cast(Video, video), simulator, interpolation):
+    simulator = video_simulator(video, SensorModel())
+    for interval in video_events(video, simulator, interpolation):
         del interval
         most = max(most, sum(frame() is not None for frame in alive))
     assert len(alive) == 40

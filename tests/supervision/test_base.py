@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.small_models import make_rays
 from helpers.small_pipelines import make_pipeline_config
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor, nn
 
-from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
 from aenerf_ns.supervision.base import Batch, LossCoefficients, Sampler, SamplerConfig, Supervision, SupervisionConfig
 
 
@@ -58,7 +58,7 @@ class Gray(Supervision):
 
 @dataclass
 class MomentSamplerConfig(SamplerConfig):
-    """Draws rays straight ahead at random moments."""
+    """Draws the same rays each time."""
 
     _target: type = field(default_factory=lambda: MomentSampler)
 
@@ -67,19 +67,10 @@ class MomentSampler(Sampler):
     batch_type = Moments
 
     def prepare(self) -> None:
-        self.duration = (self.dataset.scene.trajectory.end - self.dataset.scene.trajectory.start) * 1e-9
+        pass
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, Moments]:
-        ahead = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(num_rays, 3)
-        rays = RayBundle(
-            origins=torch.zeros(num_rays, 3),
-            directions=ahead.float(),
-            pixel_area=torch.ones(num_rays, 1),
-            camera_indices=torch.zeros(num_rays, 1, dtype=torch.long),
-            times=self.duration * torch.rand(num_rays, 1, dtype=torch.float64),
-            metadata={CAMERA_DIRECTIONS: ahead},
-        )
-        return rays, Moments(torch.full((num_rays, 1), 0.5))
+        return make_rays(num_rays, with_times=True), Moments(torch.full((num_rays, 1), 0.5))
 
 
 def test_another_supervision_is_trained_and_what_it_learns_is_logged(tmp_path: Path) -> None:

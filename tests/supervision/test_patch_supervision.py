@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from helpers.small_models import EPOCH, make_scene, make_supervision
+from helpers.small_models import EPOCH, GAP, KNOTS, make_supervision, make_window_sampler, pixels_of
+from helpers.streams import make_stream
+from nerfstudio.cameras.rays import RayBundle
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
-from aenerf_ns.camera.time_window import TimeWindow
-from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.sorted_events import SortedEvents, sort_events
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.recording.scene import SceneRecording
 from aenerf_ns.supervision.peers.paev3d import (
     FlowPatchSampler,
     FlowPatchSamplerConfig,
@@ -31,8 +27,6 @@ from aenerf_ns.supervision.peers.paev3d import (
 
 WIDTH, HEIGHT = 9, 7
 CAMERA = CameraIntrinsics(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (0.0, 0.0, 0.0, 0.0, 0.0))
-KNOTS = EPOCH + 200_000_000 * np.arange(8)
-GAP = (int(KNOTS[3]), int(KNOTS[4]))
 ALL = torch.ones(3, dtype=torch.bool)
 
 
@@ -140,14 +134,6 @@ def test_gradients_are_finite_where_nothing_is_opaque_and_nothing_moves() -> Non
         assert gradient is None or gradient.isfinite().all()
 
 
-@dataclass
-class Windows:
-    """A training dataset."""
-
-    scene: SceneRecording
-    windows: SortedEvents
-
-
 def make_events() -> EventStream:
     """One event a pixel in each interval between poses, in patches with 0 to 4 active pixels, and two that cancel."""
     rng = np.random.default_rng(0)
@@ -159,35 +145,25 @@ def make_events() -> EventStream:
                     time = int(knot + rng.integers(1, 200_000_000))
                     rows.append((2 * column + pixel % 2, 2 * row + pixel // 2, time, 1))
         rows += [(1, 1, int(knot) + 10, sign) for sign in (1, -1)]
-    x, y, t, p = np.array(sorted(rows, key=lambda row: row[2])).T
-    return EventStream(x.astype(np.uint16), y.astype(np.uint16), t, p.astype(np.int8), WIDTH, HEIGHT)
+    return make_stream(sorted(rows, key=lambda row: row[2]), WIDTH, HEIGHT)
 
 
 def make_sampler(
     random_poses: torch.Tensor, camera: CameraIntrinsics = CAMERA, events: EventStream | None = None, **options: Any
 ) -> FlowPatchSampler:
-    window = TimeWindow(int(KNOTS[0]), int(KNOTS[-1]), (GAP,))
-    scene = replace(make_scene(SensorModel(), Trajectory(KNOTS, random_poses), camera), window=window)
-    windows = sort_events([events or make_events()], window=window, usable=camera.pixel_directions()[1])
-    return FlowPatchSamplerConfig(**{"longest_window": 0.0, **options}).setup(
-        dataset=Windows(scene, windows),
-        supervision=make_supervision(PAEv3DSupervisionConfig(), SensorModel()),
-        device="cpu",
-    )
+    config, supervision = FlowPatchSamplerConfig(**{"longest_window": 0.0, **options}), PAEv3DSupervisionConfig()
+    return make_window_sampler(config, supervision, events or make_events(), int(KNOTS[-1]), random_poses, camera)
 
 
-def pixels_of(rays: Any) -> np.ndarray:
+def patches_of(rays: RayBundle) -> np.ndarray:
     """The (patches, 4, 2) rows and columns of the pixels of a batch."""
-    directions, _ = CAMERA.pixel_directions()
-    starts = rays.metadata[CAMERA_DIRECTIONS].numpy()[: len(rays) // 2]
-    number = np.abs(directions.reshape(1, -1, 3) - starts[:, None]).sum(-1).argmin(1)
-    return np.stack(np.divmod(number, WIDTH), -1).reshape(-1, 4, 2)
+    return np.stack(np.divmod(pixels_of(rays[: len(rays) // 2], CAMERA), WIDTH), -1).reshape(-1, 4, 2)
 
 
 def test_patches_are_drawn_by_their_number_of_active_pixels(random_poses: torch.Tensor) -> None:
     sampler = make_sampler(random_poses)
     rays, batch = sampler.sample(8 * 1024)
-    patches = pixels_of(rays)
+    patches = patches_of(rays)
     corner = patches[:, 0]
     assert (corner % 2 == 0).all()
     assert (patches - corner[:, None] == [[0, 0], [0, 1], [1, 0], [1, 1]]).all()
@@ -220,7 +196,7 @@ def test_displacements_are_those_of_the_flow_and_are_zero_where_nothing_happens(
     events = make_events()
     sampler = make_sampler(random_poses, pixels_per_window=64)
     rays, batch = sampler.sample(8 * 256)
-    patches = pixels_of(rays).reshape(-1, 2)
+    patches = patches_of(rays).reshape(-1, 2)
     starts, ends = (torch.round(rays.times[:, 0] / 0.2).long()).chunk(2)
     parts = [events.between(int(first), int(last)) for first, last in ((KNOTS[0], GAP[0]), (GAP[1], KNOTS[-1]))]
     size = 2 * WIDTH * HEIGHT

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from helpers.simulated_cuda import NEEDS_SIMULATION, Counts, SimulatedCuda, device
-from helpers.small_models import CAMERA, EPOCH, make_rays, make_scene, make_supervision
+from helpers.small_models import CAMERA, EPOCH, GAP, KNOTS, make_rays, make_supervision, make_window_sampler, pixels_of
 from helpers.streams import make_stream
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.metadata_keys import CAMERA_DIRECTIONS
 from aenerf_ns.camera.time_window import TimeWindow
-from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.events.sorted_events import SortedEvents, sort_events
+from aenerf_ns.events.sorted_events import sort_events
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.recording.scene import SceneRecording
+from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.supervision.base import SupervisionConfig
 from aenerf_ns.supervision.peers.windows import (
     EventNeRFSupervisionConfig,
@@ -33,9 +31,6 @@ from aenerf_ns.supervision.peers.windows import (
 )
 from aenerf_ns.supervision.pixel_rays import PixelRays
 
-# Poses every 0.2 s; the middle interval is a gap.
-KNOTS = EPOCH + 200_000_000 * np.arange(8)
-GAP = (int(KNOTS[3]), int(KNOTS[4]))
 EVENTS = make_stream(
     [
         (x, y, EPOCH + t, p)
@@ -48,26 +43,11 @@ EVENTS = make_stream(
 )  # fmt: skip
 
 
-@dataclass
-class Windows:
-    """A training dataset with events at three pixels."""
-
-    scene: SceneRecording
-    windows: SortedEvents
-
-
 def make_sampler(
     random_poses: torch.Tensor, sensor: SensorModel | None = None, camera: CameraIntrinsics = CAMERA, **options: Any
 ) -> WindowSampler:
-    sensor = sensor or SensorModel()
-    window = TimeWindow(int(KNOTS[0]), int(KNOTS[-1]) - 50_000_000, (GAP,))
-    scene = replace(make_scene(sensor, Trajectory(KNOTS, random_poses), camera), window=window)
-    events = sort_events([EVENTS], window=window, usable=camera.pixel_directions()[1])
-    return WindowSamplerConfig(**options).setup(
-        dataset=Windows(scene, events),
-        supervision=make_supervision(EventNeRFSupervisionConfig(), sensor),
-        device="cpu",
-    )
+    config, end = WindowSamplerConfig(**options), int(KNOTS[-1]) - 50_000_000
+    return make_window_sampler(config, EventNeRFSupervisionConfig(), EVENTS, end, random_poses, camera, sensor)
 
 
 def windows_of(rays: Any) -> list[tuple[int, int]]:
@@ -80,10 +60,7 @@ def test_a_pixel_has_the_events_of_its_window_and_rays_at_both_ends(random_poses
     sampler = make_sampler(random_poses, SensorModel(bayer_pattern="RGGB"), longest_window=1.0, pixels_per_window=3)
     rays, batch = sampler.sample(2400)
     assert rays.origins.shape == (2400, 3)
-    directions, _ = CAMERA.pixel_directions()
-    pixels = [
-        int(np.abs(directions.reshape(-1, 3) - ray).sum(1).argmin()) for ray in rays.metadata[CAMERA_DIRECTIONS].numpy()
-    ]
+    pixels = pixels_of(rays)
     assert pixels[:1200] == pixels[1200:]
     seconds = np.round((rays.times[:, 0] * 1e9).numpy()).astype(np.int64) + EPOCH
     for index, (pixel, start, end) in enumerate(zip(pixels[:1200], seconds[:1200], seconds[1200:], strict=True)):
@@ -167,13 +144,12 @@ def test_a_batch_goes_to_the_device_in_one_copy(random_poses: torch.Tensor) -> N
 
 
 def test_sampling_is_seeded(random_poses: torch.Tensor) -> None:
-    sampler = make_sampler(random_poses, longest_window=1.0, pixels_per_window=4)
-    torch.manual_seed(3)
-    first, _ = sampler.sample(80)
-    torch.manual_seed(3)
-    again, _ = sampler.sample(80)
-    assert torch.equal(first.times, again.times)
-    assert torch.equal(first.directions, again.directions)
+    sampler, batches = make_sampler(random_poses, longest_window=1.0, pixels_per_window=4), []
+    for _ in range(2):
+        torch.manual_seed(3)
+        batches.append(sampler.sample(80)[0])
+    assert torch.equal(batches[0].times, batches[1].times)
+    assert torch.equal(batches[0].directions, batches[1].directions)
 
 
 @pytest.mark.parametrize(
@@ -290,26 +266,15 @@ def true_log_radiance(times: np.ndarray, pixel: int) -> np.ndarray:
     return np.sin((3 + pixel) * times) + 0.3 * np.cos(17 * times + pixel)
 
 
-def ideal_events(sensor: SensorModel) -> EventStream:
-    """The events of ideal pixels that see :func:`true_log_radiance`, on a fine raster of times."""
-    rows = []
-    raster = np.arange(0, 1.2e9, 2e4)
-    for pixel in range(12):
-        values = true_log_radiance(raster * 1e-9, pixel)
-        reference = values[0]
-        for time, value in zip(raster, values, strict=True):
-            if value >= reference + sensor.positive_contrast_threshold:
-                reference += sensor.positive_contrast_threshold
-                rows.append((pixel % 4, pixel // 4, int(time), 1))
-            elif value <= reference - sensor.negative_contrast_threshold:
-                reference -= sensor.negative_contrast_threshold
-                rows.append((pixel % 4, pixel // 4, int(time), -1))
-    return make_stream(sorted(rows, key=lambda row: row[2]))
-
-
 def test_the_events_of_a_window_tell_the_true_change_to_within_a_threshold_at_either_end() -> None:
     sensor = SensorModel(0.2, 0.15)
-    stream = ideal_events(sensor)
+    simulator, pixels = EventSimulator(4, 3, sensor, log_epsilon=0.0), np.arange(12)
+    stream = EventStream.concatenate(
+        [
+            EventStream(*simulator(np.exp(true_log_radiance(time * 1e-9, pixels)).reshape(3, 4), time), 4, 3)
+            for time in range(0, 1_200_000_000, 1_000_000)
+        ]
+    )
     events = sort_events([stream], window=TimeWindow(0, 1_200_000_000), usable=np.ones((3, 4), bool))
     eventnerf = make_supervision(EventNeRFSupervisionConfig(), sensor)
     evnerf = make_supervision(EvNeRFSupervisionConfig(), sensor)
@@ -317,7 +282,6 @@ def test_the_events_of_a_window_tell_the_true_change_to_within_a_threshold_at_ei
     for _ in range(50):
         start, end = np.sort(rng.integers(0, 1_200_000_001, 2))
         counts = events.counts(int(start), int(end))
-        pixels = np.arange(12)
         truth = true_log_radiance(end * 1e-9, pixels) - true_log_radiance(start * 1e-9, pixels)
         told = counts[0] * 0.2 - counts[1] * 0.15
         assert np.abs(truth - told).max() < 0.35 + 1e-3

@@ -14,6 +14,7 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,28 +27,26 @@ import trimesh
 import websockets.sync.client
 import yaml
 from helpers.browser import chromium
-from helpers.commands import CPU, TIMEOUT, newest_config, run
+from helpers.commands import CPU, TIMEOUT, newest_config, run, simulate
 from helpers.dataset_faults import set_in
 from helpers.small_trainings import own_log
 from helpers.small_viewers import free_port
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.scripts import train
 from nerfstudio.scripts.eval import ComputePSNR
-from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, SpiralRender
+from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, RenderInterpolated, SpiralRender
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
 from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export import ExportCameras, ExportFrames, ExportMesh, ExportTrajectory, ExportVideo
 from aenerf_ns.cli.report import ReportCommand
-from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.open3d_import import load_open3d
 
-# Steps of the run that all tests look at, and how much better than an untrained field it must be on held-out views.
+# Of the run that all tests look at.
 STEPS = 300
-PSNR_MARGIN = 3.0
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +58,10 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def trained(workspace: Path) -> Path:
+def trained(workspace: Path, small_work: None) -> Path:
     """config.yml of a run on a tiny simulated room, whose events are gone since."""
-    data = workspace / "room"
-    noise = {"pose_noise_degrees": 1.5, "pose_noise_translation": 0.04}
-    Simulate(output=data, width=48, height=36, train_images=4, validation_views=4, test_views=3, **noise).main()
+    noise = ("--pose-noise-degrees", "1.5", "--pose-noise-translation", "0.04")
+    data = simulate(workspace / "room", "--max-displacement", "1", *noise)
     run(
         "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", str(STEPS),
         "--steps-per-save", "200", "--data", data,
@@ -81,21 +79,14 @@ def events_of(data: Path) -> Iterator[None]:
     (data / "events.h5").rename(data / "events.gone")
 
 
-def train_again(config: Path, name: str, **settings: Any) -> Path:
-    """Train in this process with some other settings, and return the new run's config.yml. Starting takes long."""
-    changed = yaml.load(config.read_text(), Loader=yaml.Loader)
-    changed.experiment_name, changed.timestamp = name, "{timestamp}"
-    for setting, value in settings.items():
-        setattr(changed, setting, value)
-    with own_log(), events_of(changed.data):
-        train.main(changed)
-    return newest_config(Path("outputs") / name)
-
-
 @pytest.fixture(scope="module")
 def untrained(trained: Path) -> Path:
-    """config.yml of a run of one step on the same data."""
-    return train_again(trained, "untrained", max_num_iterations=1)
+    """config.yml of a run of one step on the same data, trained in this process: starting takes long."""
+    config = yaml.load(trained.read_text(), Loader=yaml.Loader)
+    config.experiment_name, config.timestamp, config.max_num_iterations = "untrained", "{timestamp}", 1
+    with own_log(), events_of(config.data):
+        train.main(config)
+    return newest_config(Path("outputs") / "untrained")
 
 
 @pytest.fixture
@@ -138,7 +129,7 @@ def test_training_beats_an_untrained_field_on_held_out_views(evaluated: dict, un
             assert figures[metric] == pytest.approx(mean, rel=1e-5)
     ComputePSNR(untrained, workspace / "untrained.json").main()
     worse = json.loads((workspace / "untrained.json").read_text())["results"]
-    assert results["psnr"] > worse["psnr"] + PSNR_MARGIN
+    assert results["psnr"] > worse["psnr"] + 3
     assert results["ssim"] > worse["ssim"]
 
 
@@ -340,28 +331,23 @@ def with_other_views(untrained: Path, workspace: Path) -> Path:
 def test_runs_with_other_test_views_are_not_compared_in_silence(
     trained: Path, with_other_views: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    message = r"test views: 3 \(room\) and 3 \(other\); both runs have 2 images of the same .* --allow-different"
     with monkeypatch.context() as patch:
         # It is refused before anything is measured.
         patch.setattr("aenerf_ns.report.measuring.evaluate", None)
-        with pytest.raises(
-            DataError,
-            match=r"test views: 3 \(room\) and 3 \(other\); both runs have 2 images of the same name and content; "
-            ".* --allow-different-protocols",
-        ):
+        with pytest.raises(DataError, match=message):
             ReportCommand((trained, with_other_views), workspace / "mixed").main()
     ReportCommand((trained, with_other_views), workspace / "mixed", allow_different_protocols=True).main()
     figures = json.loads((workspace / "mixed" / "report.json").read_text())
     assert figures["views_not_in_all_runs"] == {"room": ["images/test/00002.png"], "other": ["images/val/00000.png"]}
-    ours, theirs = ({v["file"]: v for v in one["evaluation"]["views"]} for one in figures["runs"])
     row = next(row for row in figures["paired_differences"] if row["metric"] == "psnr")
-    files = [f"images/test/{index:05d}.png" for index in range(2)]
     assert (row["run"], row["minus"], row["num_views"]) == ("other", "room", 2)
-    expected = np.mean([theirs[file]["placed"]["psnr"] - ours[file]["placed"]["psnr"] for file in files])
-    assert row["mean"] == pytest.approx(expected, rel=1e-5)
-    assert row["interval"][0] < row["mean"] < row["interval"][1]
+    # It is untrained.
+    assert row["mean"] < 0
     page = (workspace / "mixed" / "report.html").read_text()
     assert "These runs were measured differently" in page
     assert "2 test views are in all runs" in page
+    assert "Left out: 1 of room, 1 of other." in page
     # Their events are gone, which the page says.
     assert "the events are no longer at" in page
     # The same truth beside each rendering of a view.
@@ -370,21 +356,13 @@ def test_runs_with_other_test_views_are_not_compared_in_silence(
     assert [pictures[0], pictures[2]] == [pictures[1], pictures[3]]
 
 
-def test_rendering_a_video_by_the_command(trained: Path, workspace: Path) -> None:
-    video = workspace / "interpolate.mp4"
-    mode = ("interpolate", "--interpolation-steps", "2")
-    run("ns-render", *mode, "--load-config", trained, "--output-path", video, cwd=workspace)
-    require_video(video)
-
-
-def test_rendering_a_spiral(trained: Path, workspace: Path) -> None:
-    video = workspace / "spiral.mp4"
-    SpiralRender(trained, video, seconds=0.2).main()
-    require_video(video)
-
-
-def require_video(file: Path) -> None:
-    frames = imageio.imread(file, plugin="pyav")
+@pytest.mark.parametrize(
+    "render", [partial(RenderInterpolated, interpolation_steps=2), partial(SpiralRender, seconds=0.2)]
+)
+def test_rendering_a_video(render: Any, trained: Path, tmp_path: Path) -> None:
+    video = tmp_path / "video.mp4"
+    render(trained, video).main()
+    frames = imageio.imread(video, plugin="pyav")
     assert len(frames) >= 3
     assert frames.shape[1:] == (36, 48, 3)
     assert frames.std() > 5
@@ -393,21 +371,10 @@ def require_video(file: Path) -> None:
 def test_rendering_a_camera_path_of_the_viewer(trained: Path, workspace: Path) -> None:
     pose = np.eye(4)
     pose[:3, 3] = (0.1, 0.0, 0.1)
-    # What the viewer's render tab writes.
-    path = {
-        "default_fov": 75.0,
-        "default_transition_sec": 2.0,
-        "keyframes": [],
-        "camera_type": "perspective",
-        "render_height": 36,
-        "render_width": 48,
-        "fps": 2,
-        "seconds": 1.0,
-        "is_cycle": False,
-        "smoothness_value": 0.0,
-        "camera_path": [{"camera_to_world": pose.flatten().tolist(), "fov": 75.0, "aspect": 4 / 3, "render_time": 0.0}]
-        * 2,
-    }
+    # The part of what the viewer's render tab writes that is read.
+    camera = {"camera_to_world": pose.flatten().tolist(), "fov": 75.0, "aspect": 4 / 3, "render_time": 0.0}
+    path = {"camera_type": "perspective", "render_height": 36, "render_width": 48, "fps": 2, "seconds": 1.0}
+    path["camera_path"] = [camera] * 2
     (workspace / "path.json").write_text(json.dumps(path))
     RenderCameraPath(
         trained, workspace / "path", camera_path_filename=workspace / "path.json", output_format="images"

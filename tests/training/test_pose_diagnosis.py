@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
+from helpers.small_trainings import train_small_model
+from nerfstudio.utils.eval_utils import eval_setup
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.rotation import rotation_from_vector
@@ -66,7 +67,6 @@ def diagnosed(pipeline: AENeRFPipeline) -> dict[str, Any]:
 def move(pipeline: AENeRFPipeline, size: float) -> None:
     """Turn the corrected poses by different angles at every knot."""
     twists = pipeline.model.camera_optimizer.twists
-    assert twists is not None
     with torch.no_grad():
         twists.control_twists[:, 3:] = size * torch.randn(
             len(twists.control_twists), 3, generator=torch.Generator().manual_seed(0)
@@ -123,36 +123,21 @@ def test_still_camera_and_few_events_can_be_diagnosed(tmp_path: Path, mode: str)
 
 
 def test_last_step_is_diagnosed_and_kept_in_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pipeline = make_pipeline(tmp_path / "made", "val", pose_correction="spline")
-    config = SimpleNamespace(
-        max_num_iterations=20, schedule_length=20, steps_per_save=1000, logging=SimpleNamespace(steps_per_log=10),
-    )  # fmt: skip
-    trainer = SimpleNamespace(
-        local_rank=0, _start_step=100, config=config, optimizers=SimpleNamespace(optimizers={}, parameters={}),
-        device="cpu", grad_scaler=torch.amp.GradScaler("cpu", enabled=False),
-    )  # fmt: skip
-    # Of the run that this run goes on from.
-    pipeline.set_extra_state({"summary": "of before"})
-    callbacks = pipeline.get_training_callbacks(SimpleNamespace(trainer=trainer))
-    (callback,) = [c.func for c in callbacks if c.func.__name__ == "diagnose_poses"]
-    states = []
-    for step in range(100, 120):
-        move(pipeline, 0.001)
-        callback(step)
-        states.append(pipeline.state_dict()["_extra_state"])
-    assert states[:-1] == [None] * 19
-    found = states[-1]
-    assert found["correction_rotation_degrees"] > 0.01
-    torch.save(pipeline.state_dict(), tmp_path / "checkpoint.pt")
-    opened = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
+    save = {"steps_per_save": 2, "save_only_latest_checkpoint": False}
+    first = train_small_model(tmp_path, "first", 3, schedule_length=8)
+    trainer = train_small_model(tmp_path, "second", 5, load_dir=first.checkpoint_dir, **save)
+    # Not that of the run that this one goes on from.
+    kept = [torch.load(path, weights_only=True)["pipeline"] for path in sorted(trainer.checkpoint_dir.iterdir())]
+    *before, found = [weights["_extra_state"] for weights in kept]
+    assert before == [None] * 2
+    assert found["correction_rotation_degrees"] > 0
+    _, opened, *_ = eval_setup(trainer.base_dir / "config.yml")
     monkeypatch.setattr(opened.model, "get_image_metrics_and_images", lambda *_: ({"psnr": 20.0, "ssim": 0.5}, {}))
-    loaded = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
-    opened.load_pipeline(loaded, 119)
     assert opened.get_average_eval_image_metrics()["pose_diagnosis"] == found
     # Checkpoints of before have no diagnosis.
-    older = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
-    del loaded["_extra_state"]
-    older.load_pipeline(loaded, 119)
+    del kept[-1]["_extra_state"]
+    older = make_pipeline(tmp_path / "data", "test", pose_correction="spline")
+    older.load_pipeline(kept[-1], 7)
     assert older.get_extra_state() is None
 
 

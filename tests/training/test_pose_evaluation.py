@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.dataset_faults import set_in
-from helpers.small_models import make_model
+from helpers.small_models import make_correction, make_model
 from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
@@ -24,7 +24,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.metadata_keys import REFERENCE_SECONDS
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import motion_from_twist, quaternion_from_rotation, rotation_from_vector
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.pose_refinement import refine_camera
 from aenerf_ns.evaluation.poses import camera_speeds, compare_with_ground_truth
@@ -132,16 +132,10 @@ def test_small_rotation_angles_are_exact() -> None:
         assert float(rotation_angle(turned, identity)) == pytest.approx(angle, rel=1e-9)
 
 
-def make_correction(trajectory: Trajectory, ground_truth: Trajectory | None) -> PoseCorrection:
-    """With a correction that is far from none."""
+def learned_correction(trajectory: Trajectory, ground_truth: Trajectory | None) -> PoseCorrection:
+    """A correction that is far from none."""
     torch.manual_seed(0)
-    correction = PoseCorrectionConfig(mode="spline", knot_interval=1.0).setup(
-        num_cameras=0,
-        device="cpu",
-        trajectory=trajectory,
-        camera_times=torch.zeros(0, dtype=torch.int64),
-        ground_truth=ground_truth,
-    )
+    correction = make_correction(trajectory, ground_truth, mode="spline", knot_interval=1.0)
     torch.nn.init.normal_(correction.twists.control_twists, std=0.05)
     return correction
 
@@ -154,7 +148,7 @@ def reference_cameras(poses: torch.Tensor, seconds: list[float]):
 
 def test_without_ground_truth_views_follow_the_correction_of_their_time(random_poses: torch.Tensor) -> None:
     trajectory = make_truth(random_poses)
-    correction = make_correction(trajectory, None)
+    correction = learned_correction(trajectory, None)
     seconds = [1.3, 4.0]
     cameras = reference_cameras(trajectory.pose(torch.tensor(seconds).double()), seconds)
     expected = correction.pose(torch.tensor(seconds).double())
@@ -174,7 +168,7 @@ def test_with_ground_truth_views_are_carried_by_the_alignment_to_it(random_poses
     truth = make_truth(random_poses)
     # The estimated trajectory is the true one in another world, and the correction is none.
     estimated = Trajectory(truth.times, some_similarity()(truth.camera_to_worlds))
-    correction = make_correction(estimated, truth)
+    correction = learned_correction(estimated, truth)
     torch.nn.init.zeros_(correction.twists.control_twists)
     views = random_poses[2:5]
     carried = correction.apply_to_camera(reference_cameras(views, [np.nan, 0.5, 1.0]))
@@ -189,7 +183,6 @@ def test_the_true_poses_may_be_in_another_world(tmp_path: Path) -> None:
     plain = make_pipeline(tmp_path / "plain", "test")
     moved = make_pipeline(tmp_path / "moved", "test", true_world=lambda poses: world(poses[..., :3, :]))
     errors = compare_with_ground_truth(moved.model.camera_optimizer, moved.datamanager.train_dataset.scene)
-    assert errors is not None
     # With digits as the files have them.
     assert all(errors["estimated"][name] < 1e-5 for name in ("rotation_error_degrees", "translation_error"))
     assert errors["estimated"]["translation_error_se3"] > 0.05
@@ -229,10 +222,10 @@ def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tenso
     truth = make_truth(random_poses)
     late = Trajectory(truth.times + 8 * SECOND, truth.camera_to_worlds, "truth.txt")
     with pytest.raises(DataError, match=r"^truth.txt: .*do not cover two of the estimated ones"):
-        make_correction(truth, late)
+        learned_correction(truth, late)
     # Where it covers a part, that part is compared.
     half = truth.crop(0, 3 * SECOND)
-    estimated, corrected, reference = make_correction(truth, half).compared_poses()
+    estimated, corrected, reference = learned_correction(truth, half).compared_poses()
     assert len(estimated) == len(corrected) == len(reference) == len(half)
     # Between true poses that are far apart nothing is known.
     times = torch.arange(40) * (SECOND // 10)
@@ -297,14 +290,10 @@ def test_metrics_are_of_placed_and_of_refined_test_poses(tmp_path: Path, monkeyp
     placed = [camera.camera_to_worlds.clone() for camera, _ in pipeline.datamanager.fixed_indices_eval_dataloader]
     metrics = json.loads(json.dumps(pipeline.get_average_eval_image_metrics(get_std=True)))
     refined = metrics["refined_test_poses"]
-    assert refined.keys() == {"psnr", "psnr_std", "lpips", "test_poses"}
-    for view, file in zip(metrics["views"], pipeline.datamanager.eval_dataset.image_filenames, strict=True):
-        assert file == tmp_path / "made" / view["file"]
-        assert view["placed"].keys() == view["refined"].keys() == {"psnr"}
+    assert refined["test_poses"].endswith(f"from: {metrics['test_poses']}")
+    for view in metrics["views"]:
         # Not taken on the trajectory.
         assert view["time_ns"] is view["camera_speed"] is view["camera_turn_rate_degrees"] is None
-    assert np.mean([view["refined"]["psnr"] for view in metrics["views"]]) == pytest.approx(refined["psnr"])
-    assert refined["test_poses"].endswith(f"from: {metrics['test_poses']}")
     # The pose correction of this pipeline is off.
     assert metrics["test_poses"].startswith("as the dataset gives them")
     after = [camera.camera_to_worlds for camera, _ in pipeline.datamanager.fixed_indices_eval_dataloader]
@@ -347,18 +336,10 @@ def test_speeds_are_in_the_units_of_the_true_poses(random_poses: torch.Tensor) -
     scene = SimpleNamespace(scale=1.0)
     middle = torch.tensor([truth.duration / 2], dtype=torch.float64)
     speeds = [
-        camera_speeds(make_correction(estimated, truth), scene, middle)[0]
+        camera_speeds(learned_correction(estimated, truth), scene, middle)[0]
         for estimated in (truth, Trajectory(truth.times, tenfold))
     ]
     torch.testing.assert_close(speeds[0], speeds[1])
-
-
-def test_opengl_and_opencv_axes_give_the_same_errors(random_poses: torch.Tensor) -> None:
-    truth = make_truth(random_poses)
-    noisy = perturb(truth, rotation_degrees=3.0, translation=0.2, correlation_time=0.3, seed=1)
-    errors = pose_errors(noisy.camera_to_worlds, truth.camera_to_worlds)
-    flipped = [t.transform(lambda poses: poses @ OPENCV_TO_OPENGL).camera_to_worlds for t in (noisy, truth)]
-    assert pose_errors(*flipped) == pytest.approx(errors, rel=1e-9)
 
 
 @pytest.mark.parametrize("mode", [pytest.param("network", marks=pytest.mark.slow), "spline"])
@@ -373,9 +354,7 @@ def test_in_a_known_scene_the_correction_finds_the_true_poses(mode: str) -> None
     model = make_model(bounded=True, camera_optimizer=config, field={"max_resolution": 16}, trajectory=estimated)
     torch.nn.init.uniform_(model.field.encoding.hash_table, -0.5, 0.5)
     model.field.average_init_density = 3.0
-    reference = PoseCorrectionConfig(mode="off").setup(
-        num_cameras=0, device="cpu", trajectory=truth, camera_times=torch.zeros(0, dtype=torch.int64)
-    )
+    reference = make_correction(truth, mode="off")
     correction = model.camera_optimizer
     generator = torch.Generator().manual_seed(0)
 

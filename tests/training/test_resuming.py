@@ -14,6 +14,7 @@ import torch
 from helpers.small_trainings import train_small_model
 from nerfstudio.engine import trainer as framework_trainer
 from nerfstudio.engine.trainer import Trainer
+from torch.utils._pytree import keystr, tree_flatten_with_path
 
 from aenerf_ns.training.trainer import AENeRFTrainer
 
@@ -28,21 +29,15 @@ def checkpoint(trainer: AENeRFTrainer) -> dict[str, Any]:
     return torch.load(path, weights_only=True)
 
 
-def assert_equal(first: Any, second: Any, name: str = "checkpoint") -> None:
-    """Assert that two checkpoints, or parts of them, hold the same values to the bit."""
-    assert type(first) is type(second), name
-    if isinstance(first, dict):
-        assert first.keys() == second.keys(), name
-        for key in first:
-            assert_equal(first[key], second[key], f"{name}.{key}")
-    elif isinstance(first, (list, tuple)):
-        assert len(first) == len(second), name
-        for index, pair in enumerate(zip(first, second, strict=True)):
-            assert_equal(*pair, f"{name}.{index}")
-    elif isinstance(first, torch.Tensor):
-        assert torch.equal(first, second), name
-    else:
-        assert first == second, name
+def assert_equal(first: Any, second: Any) -> None:
+    """Assert that two checkpoints hold the same values to the bit."""
+    ours, theirs = (
+        {keystr(path): leaf for path, leaf in tree_flatten_with_path(checkpoint)[0]} for checkpoint in (first, second)
+    )
+    assert ours.keys() == theirs.keys()
+    for name, one in ours.items():
+        assert type(one) is type(theirs[name]), name
+        assert torch.equal(one, theirs[name]) if isinstance(one, torch.Tensor) else one == theirs[name], name
 
 
 def test_run_in_two_pieces_equals_one(tmp_path: Path) -> None:

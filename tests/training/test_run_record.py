@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import signal
@@ -11,11 +10,12 @@ import sys
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
+import msgspec
 import pytest
 from helpers.small_trainings import train_small_model
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.report.run_files import read_scalars
+from aenerf_ns.report.run_files import read_record, read_scalars
 from aenerf_ns.training import provenance
 from aenerf_ns.training.run_record import ScalarWriter
 from aenerf_ns.training.trainer import AENeRFTrainer
@@ -49,20 +49,20 @@ def test_a_commit_is_that_of_this_package_alone(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_training_records_its_end_and_its_scalars(tmp_path: Path) -> None:
-    trainer = train_small_model(tmp_path, "whole", 12)
-    record = json.loads((trainer.base_dir / "run.json").read_text())
-    assert record["state"] == "finished"
-    assert (record["first_step"], record["steps"], record["planned_steps"], record["seed"]) == (0, 12, 12, 42)
-    assert record["seconds"] > 0
-    assert record["peak_memory_bytes"]["host"] > 1e7
-    with (trainer.base_dir / "scalars.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    losses = {int(row["step"]): float(row["value"]) for row in rows if row["name"] == "Train Loss"}
-    assert list(losses) == [0, 10]
-    assert all(value > 0 for value in losses.values())
-    names = {row["name"] for row in rows}
-    assert "Train Loss Dict/reconstruction_loss" in names
-    assert not any("time" in name for name in names)
+    folder = train_small_model(tmp_path, "whole", 12).base_dir
+    record, scalars = read_record(folder), read_scalars(folder)
+    assert msgspec.to_builtins(record) == json.loads((folder / "run.json").read_text())
+    assert record.describe_state() == "finished: all 12 steps"
+    assert (record.first_step, record.steps, record.planned_steps, record.seed) == (0, 12, 12, 42)
+    assert record.seconds > 0
+    assert record.peak_memory_bytes["host"] > 1e7
+    steps, losses = scalars["Train Loss"]
+    assert steps == [0, 10]
+    assert min(losses) > 0
+    assert "Train Loss Dict/reconstruction_loss" in scalars
+    assert not any("time" in name for name in scalars)
+    # A run of an earlier version has neither.
+    assert read_record(tmp_path) is read_scalars(tmp_path) is None
 
 
 def test_a_run_that_goes_on_in_its_folder_keeps_its_scalars(tmp_path: Path) -> None:
@@ -79,7 +79,6 @@ def test_another_training_in_the_folder_is_refused(tmp_path: Path) -> None:
     owner = "import fcntl, sys; f = open(sys.argv[1], 'a'); fcntl.lockf(f, fcntl.LOCK_EX); print(flush=True); input()"
     command = [sys.executable, "-c", owner, tmp_path / "scalars.csv"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
         other.stdout.readline()
         with pytest.raises(DataError, match="another training writes there; give another --experiment-name"):
             ScalarWriter(tmp_path, resumes=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from itertools import pairwise
 
 import pytest
@@ -47,19 +46,3 @@ def test_the_pose_corrections_rate_rises_and_falls() -> None:
     assert rates[125] == pytest.approx(0.2 * 0.505)
     assert rates[250] == pytest.approx(0.002)
     assert all(later <= earlier for earlier, later in pairwise(rates[15:]))
-
-
-@pytest.mark.parametrize("kind", [RelativeCosineSchedulerConfig, RelativeMultiStepSchedulerConfig])
-def test_a_resumed_run_goes_on_with_the_schedule_in_its_checkpoint(kind: type) -> None:
-    optimizer, scheduler = make_scheduler(kind(max_steps=200))
-    run(optimizer, scheduler, 160)
-    file = io.BytesIO()
-    torch.save((optimizer.state_dict(), scheduler.state_dict()), file)
-    file.seek(0)
-    # The length of the run that resumes is the number of its additional steps.
-    resumed, resumed_scheduler = make_scheduler(kind(max_steps=1000))
-    # Current torch loads nothing but plain numbers and tensors.
-    state, scheduler_state = torch.load(file, weights_only=True)
-    resumed.load_state_dict(state)
-    resumed_scheduler.load_state_dict(scheduler_state)
-    assert run(resumed, resumed_scheduler, 100) == run(optimizer, scheduler, 100)

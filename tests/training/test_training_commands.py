@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +13,23 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+import tyro
 from helpers.commands import CPU, newest_config, run, simulate
 from helpers.small_trainings import own_log
-from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.scripts import train
+from nerfstudio.scripts.render import RenderInterpolated, SpiralRender
 from nerfstudio.utils import writer
 
 from aenerf_ns.cli.evaluate import Evaluate
+from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.errors import DataError
-from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
-from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
+from aenerf_ns.method_configs.aenerf import aenerf_small
 from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(tmp_path_factory: pytest.TempPathFactory, small_work: None) -> Path:
     return tmp_path_factory.mktemp("workspace")
 
 
@@ -37,22 +39,18 @@ def room(workspace: Path) -> Path:
     return simulate(workspace / "room")
 
 
-def train_here(config: AENeRFTrainerConfig, data: Path, folder: Path) -> None:
+def train_here(config: AENeRFTrainerConfig, data: Path, folder: Path, vis: str = "tensorboard") -> None:
     """Trains on the CPU in this process, as ns-train does in a folder."""
-    config.data, config.output_dir, config.vis = data, folder / "outputs", "tensorboard"
+    config.data, config.output_dir, config.vis = data, folder / "outputs", vis
     config.machine.device_type = "cpu"
     with own_log():
         train.main(config)
 
 
-# For tests in which it does not matter how exact the events are.
-FEW_FRAMES = ("--max-displacement", "2")
-
-
 def test_simulated_dataset_is_seeded(workspace: Path) -> None:
     options = (
         "--speed", "hard", "--pose-noise-degrees", "1", "--pose-noise-translation", "0.05", "--pose-rate", "50",
-        "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03", *FEW_FRAMES,
+        "--bayer-pattern", "RGGB", "--contrast-threshold-spread", "0.03", "--width", "24", "--height", "18",
     )  # fmt: skip
     first, again = (simulate(workspace / name, *options) for name in ("first", "again"))
     files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
@@ -63,7 +61,6 @@ def test_simulated_dataset_is_seeded(workspace: Path) -> None:
     np.testing.assert_array_equal(estimated[:, 0], truth[:, 0])
     error = np.linalg.norm(estimated[:, 1:4] - truth[:, 1:4], axis=1)
     assert np.sqrt((error**2).mean()) == pytest.approx(0.05, rel=1e-6)
-    assert "folder exists already" in run("aenerf", "simulate", "--output", first, cwd=workspace, fails=True)
 
 
 def test_neither_images_nor_ground_truth_are_trained_on(room: Path, workspace: Path) -> None:
@@ -90,18 +87,6 @@ def test_neither_images_nor_ground_truth_are_trained_on(room: Path, workspace: P
     assert weights[0]["_extra_state"] == weights[1]["_extra_state"]
     assert weights[0]["_model.camera_optimizer.twists.control_twists"].any()
     assert not torch.equal(*(w["_model.color_correction.offset"] for w in weights))
-
-
-@pytest.mark.parametrize("method", [aenerf, aenerf_mlp])
-def test_methods_for_gpus_train_too(room: Path, workspace: Path, method: MethodSpecification) -> None:
-    config = deepcopy(method.config)
-    config.max_num_iterations = 2
-    config.pipeline.datamanager.train_num_rays_per_batch = 60
-    field, proposal = config.pipeline.model.field, config.pipeline.model.proposal
-    # Smaller ones, because the real ones take minutes.
-    field.log2_hashmap_size, field.hidden_dim, proposal.hidden_dim = 12, 32, 16
-    train_here(config, room, workspace)
-    assert len(list((workspace / "outputs" / "room" / config.method_name).rglob("*.ckpt"))) == 1
 
 
 def train_processes(room: Path, folder: Path, count: int, *options: str) -> list[dict[str, Any]]:
@@ -168,26 +153,17 @@ def test_two_processes_equal_one_with_twice_the_batch(
     assert one["weights"]["camera_optimizer.twists.control_twists"].any()
 
 
-def test_methods_of_the_framework_still_work(workspace: Path) -> None:
-    assert "ecd-data" in run("ns-train", "nerfacto", "--help", cwd=workspace)
+def test_methods_of_the_framework_take_our_dataparsers() -> None:
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=["nerfacto", "ecd-data"])
+    assert isinstance(config.pipeline.datamanager.dataparser, EcdDataParserConfig)
 
 
 def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Path) -> None:
-    output = run(
-        "ns-train",
-        "aenerf-small",
-        *CPU,
-        "--vis",
-        "tensorboard",
-        "--data",
-        workspace / "nothing",
-        cwd=workspace,
-        fails=True,
-    )
+    nothing = ("--vis", "tensorboard", "--data", workspace / "nothing")
+    output = run("ns-train", "aenerf-small", *CPU, *nothing, cwd=workspace, fails=True)
     assert "Traceback" not in output
-    errors = [line for line in output.splitlines() if line.startswith("Error: ")]
-    assert len(errors) == 1
-    assert "nothing: there is no such folder" in errors[0]
+    (error,) = [line for line in output.splitlines() if line.startswith("Error: ")]
+    assert "nothing: there is no such folder" in error
 
 
 def test_a_log_that_needs_a_key_ends_training_with_one_line(
@@ -198,46 +174,39 @@ def test_a_log_that_needs_a_key_ends_training_with_one_line(
 
     # The import of the real one changes the process.
     monkeypatch.setattr(writer, "CometWriter", without_key)
+    message = r"^Error: --vis comet: Comet.ml requires an API key. Set COMET_API_KEY; .*another --vis"
+    with pytest.raises(SystemExit, match=message):
+        train_here(deepcopy(aenerf_small.config), room, tmp_path, vis="comet")
+
+
+def test_training_that_diverges_ends_with_one_line(room: Path, tmp_path: Path) -> None:
     config = deepcopy(aenerf_small.config)
-    config.data, config.output_dir, config.vis = room, tmp_path, "comet"
-    config.machine.device_type = "cpu"
-    with own_log(), pytest.raises(SystemExit) as stopped:
-        train.main(config)
-    assert str(stopped.value).startswith("Error: --vis comet: Comet.ml requires an API key. Set COMET_API_KEY; ")
-    assert "another --vis" in str(stopped.value)
-
-
-def test_training_that_diverges_ends_with_one_line(room: Path, workspace: Path) -> None:
-    output = run(
-        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "20", "--data", room,
-        "--experiment-name", "diverging", "--optimizers.networks.optimizer.lr", "1e30",
-        cwd=workspace, fails=True,
-    )  # fmt: skip
-    assert "Traceback" not in output
-    (error,) = [line for line in output.splitlines() if line.startswith("Error: ")]
-    assert re.match(r"Error: step \d+: (loss|gradient) not finite \(", error)
+    config.max_num_iterations = 20
+    config.optimizers["networks"]["optimizer"].lr = 1e30
+    with pytest.raises(SystemExit, match=r"^Error: step \d+: (loss|gradient) not finite \(.*$"):
+        train_here(config, room, tmp_path)
 
 
 @pytest.fixture(scope="module")
 def without_views(workspace: Path) -> tuple[Path, Path]:
     """A recording without reference views, and config.yml of a run on it."""
     none = ("--train-images", "0", "--validation-views", "0", "--test-views", "0")
-    data = simulate(workspace / "bare", *none, "--scene", "object", *FEW_FRAMES)
-    run(
-        "ns-train", "aenerf-small", *CPU, "--vis", "tensorboard", "--max-num-iterations", "3", "--data", data,
-        cwd=workspace,
-    )  # fmt: skip
+    data = simulate(workspace / "bare", *none, "--scene", "object")
+    config = deepcopy(aenerf_small.config)
+    config.max_num_iterations = 3
+    train_here(config, data, workspace)
     return data, newest_config(workspace / "outputs" / "bare")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [("spiral", "--seconds", "0.1"), ("interpolate", "--interpolation-steps", "1")])
+@pytest.mark.parametrize(
+    "render", [partial(SpiralRender, seconds=0.1), partial(RenderInterpolated, interpolation_steps=1)]
+)
 def test_rendering_without_reference_views_starts_on_the_trajectory(
-    without_views: tuple[Path, Path], workspace: Path, mode: tuple[str, ...]
+    without_views: tuple[Path, Path], tmp_path: Path, render: Any
 ) -> None:
-    video = workspace / f"bare_{mode[0]}.mp4"
-    options = ("--load-config", without_views[1], "--output-path", video, "--downscale-factor", "4")
-    run("ns-render", *mode, *options, cwd=workspace)
+    video = tmp_path / "video.mp4"
+    render(without_views[1], video, downscale_factor=4).main()
     assert video.stat().st_size > 0
 
 
