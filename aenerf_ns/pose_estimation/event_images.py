@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, FilteredEventFile
+from aenerf_ns.events.polarity_drift import drift_of_events
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_folder
 from aenerf_ns.progress import progress_bar, tracked
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL, batches_of
@@ -95,18 +97,21 @@ def images_of_events(
     kept = FilteredEventFile(events, filters, capture.sensor.bayer_pattern)
     kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
 
-    def make_images(num_events: int) -> list[tuple[int, NDArray[np.uint8]]]:
-        chunks = kept.filtered(tracked(events.chunks(), "Making images of the events", events.count()))
+    def filtered(description: str) -> Iterator[EventStream]:
+        return kept.filtered(tracked(events.chunks(), description, events.count()))
+
+    def make_images(num_events: int, drift: NDArray[np.float32] | None) -> list[tuple[int, NDArray[np.uint8]]]:
+        chunks = filtered("Making images of the events")
         if weights is not None:
             network = NetworkImages(load_network(weights), capture.sensor, "cpu")
             batches = batches_of(chunks, num_events // _BATCHES)
             return list(islice(network(batches), _BATCHES - 1, None, _BATCHES))
         decay = _DECAY * num_pixels / num_events
-        states = log_intensities(batches_of(chunks, num_events), capture.sensor, decay)
+        states = log_intensities(batches_of(chunks, num_events), capture.sensor, decay, drift)
         return [(time, _stretched(state)) for time, state in states]
 
     num_events = round(_BATCHES * EVENTS_PER_PIXEL * num_pixels)
-    images = make_images(num_events)
+    images = make_images(num_events, None)
     if len(images) < MIN_IMAGES:
         raise DataError(
             events.path,
@@ -114,8 +119,11 @@ def images_of_events(
             f"poses can be estimated from {MIN_IMAGES} images or more: record for longer, or widen the time window",
         )
     share = _MAX_MOTION / max(_motion([image for _, image in images]), _MAX_MOTION)
-    if share < 1:
-        images = make_images(round(share * num_events))
+    drift = None
+    if weights is None:
+        drift = drift_of_events(filtered("Comparing the pixels"), capture.sensor.refractory_period)
+    if share < 1 or (drift is not None and drift.any()):
+        images = make_images(round(share * num_events), drift)
     times = np.array([moment for moment, _ in images], np.int64)
     # Events of one time may end one image and begin the next.
     later = np.append(True, np.diff(times) > 0)
