@@ -77,11 +77,14 @@ class Reconstruct(DatasetCommand):
     def _source(self, recording: Recording) -> ImageSource:
         import torch
 
+        from aenerf_ns.events.polarity_drift import drift_of_events
         from aenerf_ns.reconstruction.images import FilteredImages, NetworkImages
         from aenerf_ns.reconstruction.weights import load_network
 
         if self.weights is None:
-            return FilteredImages(recording.sensor)
+            events = recording.event_file
+            chunks = tracked(events.chunks(), "Comparing the pixels", events.count())
+            return FilteredImages(recording.sensor, drift_of_events(chunks, recording.sensor.refractory_period))
         device = "cuda" if torch.cuda.is_available() else "cpu"
         return NetworkImages(load_network(self.weights), recording.sensor, device)
 

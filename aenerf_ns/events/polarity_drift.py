@@ -8,13 +8,15 @@ thresholds.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.events.pair_store import EventPairs
-from aenerf_ns.events.pairing import surplus_slopes
+from aenerf_ns.events.pairing import pair_events, surplus_slopes
+from aenerf_ns.events.stream import EventStream
 
 # Of the numbers 1, 2, ..., 6 around their mean. Pixels with fewer events in a half say nothing of their own.
 _MIN_SQUARES = 17.5
@@ -25,6 +27,8 @@ _TYPICAL_VARIANCE, _MIN_VARIANCE = 0.005, 0.0004
 _MAX_DRIFT = 0.5
 # Fewer say too little of how much thresholds differ.
 _MIN_PIXELS = 100
+# Of a stream: they say enough of the pixels of any sensor, and take 1 GB of memory.
+_MAX_EVENTS = 2**25
 
 
 @dataclass(frozen=True)
@@ -89,3 +93,22 @@ def polarity_drift(pairs: EventPairs) -> PolarityDrift:
         variance=((1 - share) * variance).astype(np.float32).reshape(shape),
         spread=float(np.sqrt(variance)),
     )
+
+
+def drift_of_events(chunks: Iterable[EventStream], refractory_period: int) -> NDArray[np.float32]:
+    """Return the (height, width) drift of each pixel, from the first 34 million events of a stream.
+
+    Args:
+        chunks: the stream in pieces, in the order of time, all of one sensor, at least one event.
+        refractory_period: of the sensor, in nanoseconds.
+    """
+    return polarity_drift(pair_events(_beginning(chunks), refractory_period=refractory_period)).drift
+
+
+def _beginning(chunks: Iterable[EventStream]) -> Iterator[EventStream]:
+    count = 0
+    for chunk in chunks:
+        yield chunk
+        count += len(chunk)
+        if count >= _MAX_EVENTS:
+            return

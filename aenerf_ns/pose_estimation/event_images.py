@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, EventSelection
+from aenerf_ns.events.polarity_drift import drift_of_events
+from aenerf_ns.events.stream import EventStream
 from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_folder
 from aenerf_ns.progress import progress_bar, tracked
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL, batches_of
@@ -24,10 +26,16 @@ from aenerf_ns.recording.recording import Capture
 
 # Batches of events from one image to the next, each of as many events as networks are made for.
 _BATCHES = 3
-# Of the filter. Features should show where they are now, which matters more than true brightness.
-_DECAY = 0.12
+# Pixels that the picture moves from one image to the next, at most. A sensor that is slow or has high thresholds gives
+# few events for a motion.
+_MAX_MOTION = 4.5
+# Of the filter, from one image to the next. Features should show where they are now, which matters more than true
+# brightness.
+_DECAY = 0.126
 # Pixels: standard deviation of a Gaussian, and the percentiles of the picture that are shown black and white.
 _BLUR, _PERCENTILES = 0.8, (1.0, 99.0)
+# Pairs of images whose motion is measured, about; number, least quality and distance of their corners.
+_NUM_MOTIONS, _CORNERS = 100, (200, 0.02, 4)
 MIN_IMAGES = 3
 """Images that poses are estimated from, at least."""
 
@@ -41,46 +49,22 @@ def match_event_images(
     weights: Path | None,
     folder: Path | None,
 ) -> Iterator[tuple[ColmapWorkspace, NDArray[np.int64], list[NDArray[np.uint8]]]]:
-    """Make images of the events whenever the picture has got about one event per pixel, and match their features.
+    """Make images of the events (:func:`images_of_events`), and match their features.
 
     Args:
-        capture: the events and the camera's intrinsics.
-        window: events outside it are left out.
+        capture, window, weights: see :func:`images_of_events`.
         source: the dataset, for messages.
         seed: of COLMAP's random samples.
-        weights: file of a network that makes the images; by default, a filter makes them.
         folder: see :func:`~aenerf_ns.pose_estimation.colmap_workspace.work_folder`.
 
     Yields:
-        COLMAP's workspace, and the (N,) times in nanoseconds, increasing, and the images: (height, width) gray, or
-        (height, width, 3) where a network makes them.
+        COLMAP's workspace, and the times and images.
 
     Raises:
         DataError: there are too few events for three images.
     """
-    camera, events = capture.event_camera, capture.event_file
-    num_events = round(_BATCHES * EVENTS_PER_PIXEL * camera.width * camera.height)
-    # Pixels that fire by themselves would be features that do not move.
-    filters = EventFilters(start=window.start, end=window.end, hot_pixels=True)
-    kept = EventSelection(events.path, events.width, events.height, filters, capture.sensor.bayer_pattern)
-    kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
-    chunks = kept.filtered(tracked(events.chunks(), "Making images of the events", events.count()))
-    if weights is None:
-        states = log_intensities(batches_of(chunks, num_events), capture.sensor, _DECAY)
-        images = [(time, _stretched(state)) for time, state in states]
-    else:
-        network = NetworkImages(load_network(weights), capture.sensor, "cpu")
-        images = list(islice(network(batches_of(chunks, num_events // _BATCHES)), _BATCHES - 1, None, _BATCHES))
-    if len(images) < MIN_IMAGES:
-        raise DataError(
-            events.path,
-            f"its events make {len(images)} images of {num_events:,} events each",
-            f"poses can be estimated from {MIN_IMAGES} images or more: record for longer, or widen the time window",
-        )
-    times = np.array([moment for moment, _ in images], np.int64)
-    # Events of one time may end one image and begin the next.
-    later = np.append(True, np.diff(times) > 0)
-    times, pictures = times[later], [image for (_, image), is_later in zip(images, later, strict=True) if is_later]
+    camera = capture.event_camera
+    times, pictures = images_of_events(capture, window, weights)
     with work_folder(folder) as place, progress_bar() as progress:
         workspace = ColmapWorkspace(place, len(times), seed, progress)
         workspace.add_frames(pictures, (camera.width, camera.height), source)
@@ -89,8 +73,81 @@ def match_event_images(
         yield workspace, times, pictures
 
 
+def images_of_events(
+    capture: Capture, window: TimeWindow, weights: Path | None = None
+) -> tuple[NDArray[np.int64], list[NDArray[np.uint8]]]:
+    """Make an image whenever the picture has got about one event per pixel, or has moved far from the last one.
+
+    Args:
+        capture: the events and the camera's intrinsics.
+        window: events outside it are left out.
+        weights: file of a network that makes the images; by default, a filter makes them.
+
+    Returns:
+        The (N,) times in nanoseconds, increasing, and the images: (height, width) gray, or (height, width, 3) where a
+        network makes them.
+
+    Raises:
+        DataError: there are too few events for three images.
+    """
+    camera, events = capture.event_camera, capture.event_file
+    num_pixels = camera.width * camera.height
+    # Pixels that fire by themselves would be features that do not move.
+    filters = EventFilters(start=window.start, end=window.end, hot_pixels=True)
+    kept = EventSelection(events.path, camera.width, camera.height, filters, capture.sensor.bayer_pattern)
+    kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
+
+    def filtered(description: str) -> Iterator[EventStream]:
+        return kept.filtered(tracked(events.chunks(), description, events.count()))
+
+    def make_images(num_events: int, drift: NDArray[np.float32] | None) -> list[tuple[int, NDArray[np.uint8]]]:
+        chunks = filtered("Making images of the events")
+        if weights is not None:
+            network = NetworkImages(load_network(weights), capture.sensor, "cpu")
+            batches = batches_of(chunks, num_events // _BATCHES)
+            return list(islice(network(batches), _BATCHES - 1, None, _BATCHES))
+        decay = _DECAY * num_pixels / num_events
+        states = log_intensities(batches_of(chunks, num_events), capture.sensor, decay, drift)
+        return [(time, _stretched(state)) for time, state in states]
+
+    num_events = round(_BATCHES * EVENTS_PER_PIXEL * num_pixels)
+    images = make_images(num_events, None)
+    if len(images) < MIN_IMAGES:
+        raise DataError(
+            events.path,
+            f"its events make {len(images)} images of {num_events:,} events each",
+            f"poses can be estimated from {MIN_IMAGES} images or more: record for longer, or widen the time window",
+        )
+    share = _MAX_MOTION / max(_motion([image for _, image in images]), _MAX_MOTION)
+    drift = None
+    if weights is None:
+        drift = drift_of_events(filtered("Comparing the pixels"), capture.sensor.refractory_period)
+    if share < 1 or (drift is not None and drift.any()):
+        images = make_images(round(share * num_events), drift)
+    times = np.array([moment for moment, _ in images], np.int64)
+    # Events of one time may end one image and begin the next.
+    later = np.append(True, np.diff(times) > 0)
+    return times[later], [image for (_, image), is_later in zip(images, later, strict=True) if is_later]
+
+
 def _stretched(state: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return (height, width) display values of log-intensities, in which features stand out."""
     smooth = cv2.GaussianBlur(state, (0, 0), _BLUR)
     low, high = np.percentile(smooth, _PERCENTILES)
     return np.rint(np.clip((smooth - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
+
+
+def _motion(images: list[NDArray[np.uint8]]) -> float:
+    """Return the pixels that features move from one image to the next: the median, 0 where none can be tracked."""
+    moved = []
+    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image for image in images]
+    for i in range(0, len(gray) - 1, max(len(gray) // _NUM_MOTIONS, 1)):
+        corners = cv2.goodFeaturesToTrack(gray[i], *_CORNERS)
+        if corners is None:
+            continue
+        ends, found, _ = cv2.calcOpticalFlowPyrLK(gray[i], gray[i + 1], corners, None)
+        back, found_back, _ = cv2.calcOpticalFlowPyrLK(gray[i + 1], gray[i], ends, None)
+        is_tracked = (found & found_back)[:, 0].astype(bool) & (np.linalg.norm(back - corners, axis=2)[:, 0] < 1)
+        if is_tracked.any():
+            moved.append(float(np.median(np.linalg.norm(ends - corners, axis=2)[is_tracked])))
+    return float(np.median(moved)) if moved else 0.0

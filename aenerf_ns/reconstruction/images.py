@@ -40,15 +40,16 @@ class FilteredImages:
 
     Args:
         sensor: contrast thresholds and Bayer pattern.
+        drift: (height, width), how the thresholds of the pixels differ.
     """
 
-    def __init__(self, sensor: SensorModel) -> None:
-        self._sensor = sensor
+    def __init__(self, sensor: SensorModel, drift: NDArray[np.float32] | None = None) -> None:
+        self._sensor, self._drift = sensor, drift
 
     def __call__(self, batches: Iterable[EventStream]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield the images; see :data:`ImageSource`."""
         pattern = self._sensor.bayer_pattern
-        for time, state in log_intensities(batches, self._sensor, _DECAY):
+        for time, state in log_intensities(batches, self._sensor, _DECAY, self._drift):
             # Not above display white, where the exponential of a hot pixel would overflow.
             log_radiance = np.minimum(state + math.log(_MIDDLE_GRAY), 0)
             values = np.rint(np.exp(_DISPLAY_POWER * log_radiance) * 255).astype(np.uint8)

@@ -20,8 +20,12 @@ _LOOK_AHEAD, _MAX_IMAGES_AHEAD = 25.0, 200
 _LAG = 0.1
 
 
+# Of the log-intensity of each pixel, or of any, with a positive and with a negative event.
+_Changes = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
 def log_intensities(
-    batches: Iterable[EventStream], sensor: SensorModel, decay: float
+    batches: Iterable[EventStream], sensor: SensorModel, decay: float, drift: NDArray[np.float32] | None = None
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield for each batch of a stream the time in nanoseconds, its end less a lag, and the (height, width) changes of
     log-intensity that the picture shows.
@@ -36,38 +40,47 @@ def log_intensities(
         sensor: the contrast thresholds.
         decay: share of a pixel's state that is forgotten while the picture gets one event per pixel. It does not depend
             on time, so neither do the images on the camera's speed.
+        drift: (height, width), how the thresholds of the pixels differ (:mod:`aenerf_ns.events.polarity_drift`). Where
+            it is not taken off, a pixel grows brighter or darker with each event, and the images show grain that stands
+            still. None: they do not differ.
     """
+    changes = _changes(sensor, drift)
     held: list[tuple[EventStream, NDArray[np.float32], float]] = []
     forward: _Filter | None = None
     # The latest batches whose images wait for what follows: as many again are yielded at a time.
     num_ahead = 0
     for batch in batches:
         if forward is None:
-            forward = _Filter(batch.width, batch.height, sensor, decay)
+            forward = _Filter(batch.width, batch.height, changes, decay)
         forward.add(batch)
         held.append((batch, forward.state(), forward.weight))
         num_ahead = min(math.ceil(_LOOK_AHEAD * batch.width * batch.height / len(batch)), _MAX_IMAGES_AHEAD)
         if len(held) >= 2 * num_ahead:
-            yield from _finish(held, sensor, decay)[:num_ahead]
+            yield from _finish(held, changes, decay)[:num_ahead]
             held = held[num_ahead:]
-    yield from _finish(held, sensor, decay)
+    yield from _finish(held, changes, decay)
 
 
 def _finish(
-    held: list[tuple[EventStream, NDArray[np.float32], float]], sensor: SensorModel, decay: float
+    held: list[tuple[EventStream, NDArray[np.float32], float]], changes: _Changes, decay: float
 ) -> list[tuple[int, NDArray[np.float32]]]:
     """Return the times, and the weighted means of the states of the forward and the backward filter."""
     both: list[tuple[int, NDArray[np.float32]]] = []
     backward: _Filter | None = None
     for batch, state, weight in reversed(held):
         if backward is None:
-            backward = _Filter(batch.width, batch.height, sensor, decay)
+            backward = _Filter(batch.width, batch.height, changes, decay)
         mean = (weight * state + backward.weight * backward.state()) / (weight + backward.weight)
         # An image of a batch shorter than the lag is dated to the batch's start.
         lag = round(_LAG * batch.width * batch.height)
         both.append((int(batch.t[max(len(batch) - 1 - lag, 0)]), mean))
         backward.add(batch, -1)
     return both[::-1]
+
+
+def _changes(sensor: SensorModel, drift: NDArray[np.float32] | None) -> _Changes:
+    surplus = np.zeros(()) if drift is None else drift.astype(np.float64)
+    return sensor.positive_contrast_threshold * (1 - surplus), -sensor.negative_contrast_threshold * (1 + surplus)
 
 
 class _Filter:
@@ -78,8 +91,8 @@ class _Filter:
     the picture gets events.
     """
 
-    def __init__(self, width: int, height: int, sensor: SensorModel, decay: float) -> None:
-        self._rise, self._fall = sensor.positive_contrast_threshold, -sensor.negative_contrast_threshold
+    def __init__(self, width: int, height: int, changes: _Changes, decay: float) -> None:
+        self._rise, self._fall = (np.broadcast_to(change, (height, width)) for change in changes)
         self._decay = decay / (width * height)
         self._state, self._last = np.zeros((height, width)), np.zeros((height, width), np.int64)
         self._count = 0
@@ -106,5 +119,5 @@ def _integrate(state, last, x, y, p, count, decay, rise, fall):
     for event in range(len(p)):
         row, column = y[event], x[event]
         kept = np.exp(-decay * (count + event - last[row, column])) * state[row, column]
-        state[row, column] = kept + (rise if p[event] > 0 else fall)
+        state[row, column] = kept + (rise[row, column] if p[event] > 0 else fall[row, column])
         last[row, column] = count + event

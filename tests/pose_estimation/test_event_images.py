@@ -1,0 +1,41 @@
+"""Images of the events that poses are estimated from."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from helpers.streams import EventsInMemory
+
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.pose_estimation.event_images import images_of_events
+from aenerf_ns.recording.recording import Capture
+from aenerf_ns.simulator.esim import EventSimulator
+
+WIDTH, HEIGHT = 64, 48
+# Pixels that the picture moves from one frame to the next, and in all frames.
+STEP, LENGTH = 0.25, 300
+
+
+def slide(threshold: float) -> Capture:
+    """Move a texture past a sensor with these contrast thresholds, by one pixel a millisecond."""
+    texture = cv2.GaussianBlur(np.random.default_rng(0).random((HEIGHT, WIDTH + LENGTH)), (0, 0), 1.5)
+    texture = 0.05 + 0.9 * (texture - texture.min()) / np.ptp(texture)
+    sensor = SensorModel(threshold, threshold)
+    simulator = EventSimulator(WIDTH, HEIGHT, sensor)
+    pieces = []
+    for moved in np.arange(0, LENGTH, STEP):
+        frame = cv2.warpAffine(texture, np.array([[1, 0, -moved], [0, 1, 0]]), (WIDTH, HEIGHT))
+        pieces.append(EventStream(*simulator(frame, round(moved * 1e6)), WIDTH, HEIGHT, "made"))
+    camera = CameraIntrinsics(WIDTH, HEIGHT, 60.0, 60.0, WIDTH / 2, HEIGHT / 2)
+    return Capture(EventsInMemory(EventStream.concatenate(pieces)), camera, sensor, camera, "linear")
+
+
+@pytest.mark.parametrize(("threshold", "pixels"), [(0.2, 3.6), (0.4, 4.8)])
+def test_images_of_any_sensor_lie_near_each_other(threshold: float, pixels: float) -> None:
+    # One event per pixel comes with 3.6 and with 11.9 pixels of motion.
+    times, _ = images_of_events(slide(threshold), TimeWindow(None, None))
+    assert np.diff(times).mean() / 1e6 == pytest.approx(pixels, abs=0.2)
