@@ -145,8 +145,8 @@ def _motion(images: list[NDArray[np.uint8]]) -> float:
         corners = cv2.goodFeaturesToTrack(gray[i], *_CORNERS)
         if corners is None:
             continue
-        ends, found, _ = cv2.calcOpticalFlowPyrLK(gray[i], gray[i + 1], corners, None)
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(gray[i + 1], gray[i], ends, None)
+        ends, found, _ = cv2.calcOpticalFlowPyrLK(gray[i], gray[i + 1], corners, np.empty_like(corners))
+        back, found_back, _ = cv2.calcOpticalFlowPyrLK(gray[i + 1], gray[i], ends, np.empty_like(ends))
         is_tracked = (found & found_back)[:, 0].astype(bool) & (np.linalg.norm(back - corners, axis=2)[:, 0] < 1)
         if is_tracked.any():
             moved.append(float(np.median(np.linalg.norm(ends - corners, axis=2)[is_tracked])))
