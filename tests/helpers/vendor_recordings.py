@@ -125,9 +125,11 @@ DATASETS = {**FORMAT_WRITERS, **RECORDINGS}
 
 def read_dataset(kind: str, folder: Path) -> None:
     """Read all of a dataset of one of the kinds. The events of a recording may be a folder."""
+    if kind not in RECORDINGS:
+        read_everything(config_of(kind, folder))
+        return
     events = folder / NAME
-    own = OwnRecordingDataParserConfig(data=folder, events=events if events.is_dir() else None)
-    read_everything(own if kind in RECORDINGS else config_of(kind, folder))
+    read_everything(OwnRecordingDataParserConfig(data=folder, events=events if events.is_dir() else None))
 
 
 # Bombs.
