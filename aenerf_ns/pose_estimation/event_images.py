@@ -147,7 +147,8 @@ def _motion(images: list[NDArray[np.uint8]]) -> float:
             continue
         ends, found, _ = cv2.calcOpticalFlowPyrLK(gray[i], gray[i + 1], corners, np.empty_like(corners))
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(gray[i + 1], gray[i], ends, np.empty_like(ends))
-        is_tracked = (found & found_back)[:, 0].astype(bool) & (np.linalg.norm(back - corners, axis=2)[:, 0] < 1)
+        distances, errors = (np.linalg.norm(np.subtract(place, corners), axis=2)[:, 0] for place in (ends, back))
+        is_tracked = np.logical_and(found, found_back)[:, 0] & (errors < 1)
         if is_tracked.any():
-            moved.append(float(np.median(np.linalg.norm(ends - corners, axis=2)[is_tracked])))
+            moved.append(float(np.median(distances[is_tracked])))
     return float(np.median(moved)) if moved else 0.0
