@@ -140,13 +140,14 @@ def _stretched(state: NDArray[np.float32]) -> NDArray[np.uint8]:
 def _motion(images: list[NDArray[np.uint8]]) -> float:
     """Return the pixels that features move from one image to the next: the median, 0 where none can be tracked."""
     moved = []
-    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image for image in images]
-    for i in range(0, len(gray) - 1, max(len(gray) // _NUM_MOTIONS, 1)):
-        corners = cv2.goodFeaturesToTrack(gray[i], *_CORNERS)
+    for i in range(0, len(images) - 1, max(len(images) // _NUM_MOTIONS, 1)):
+        # The images of networks are gray in three equal channels, unless the sensor sees color.
+        here, there = (cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) if one.ndim == 3 else one for one in images[i : i + 2])
+        corners = cv2.goodFeaturesToTrack(here, *_CORNERS)
         if corners is None:
             continue
-        ends, found, _ = cv2.calcOpticalFlowPyrLK(gray[i], gray[i + 1], corners, np.empty_like(corners))
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(gray[i + 1], gray[i], ends, np.empty_like(ends))
+        ends, found, _ = cv2.calcOpticalFlowPyrLK(here, there, corners, np.empty_like(corners))
+        back, found_back, _ = cv2.calcOpticalFlowPyrLK(there, here, ends, np.empty_like(ends))
         distances, errors = (np.linalg.norm(np.subtract(place, corners), axis=2)[:, 0] for place in (ends, back))
         is_tracked = np.logical_and(found, found_back)[:, 0] & (errors < 1)
         if is_tracked.any():

@@ -91,7 +91,7 @@ class _Walk(Struct, tag_field="kind", tag="walk", forbid_unknown_fields=True, fr
 
 
 class _SceneFile(Struct, forbid_unknown_fields=True, frozen=True):
-    """What a scene.json holds; see docs/simulator.md."""
+    """The contents of a scene.json. docs/simulator.md explains them."""
 
     mesh: str
     up: Literal["y", "z"] | None = None

@@ -185,7 +185,7 @@ def test_each_protocol_is_fitted_on_its_own_views(test_mode: Literal["test", "va
         torch.testing.assert_close(shown, color.expand_as(shown), atol=0.02, rtol=0)
     pipeline.color_fit.fit(1 / 8)
     assert pipeline.model.color_correction.description.endswith("its affine part only")
-    # What the framework asks an optimizer for is what it was.
+    # The fit adds no parameters to those that the framework optimizes.
     assert not any("color_correction" in name for name, _ in pipeline.model.named_parameters())
     replace_color_correction(pipeline.trained_run(), "none")
     outputs = pipeline.model.eval()(rays)

@@ -28,7 +28,7 @@ def test_second_is_refused_while_the_first_lives(tmp_path: Path) -> None:
             ):
                 attempt()
         assert in_use.read_text() == "half written"
-    # What a killed owner leaves hinders nobody.
+    # The file of a lock whose owner was killed does not stop the next command.
     lock.write_text("process 7 on elsewhere")
     write_native(output)
     assert (output / "transforms.json").exists()
