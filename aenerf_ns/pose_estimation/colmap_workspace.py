@@ -119,9 +119,10 @@ class ColmapWorkspace:
         num_frames: number of frames.
         seed: of COLMAP's random samples.
         progress: shows each step.
+        min_motion: pixels that a feature must have moved, or its match is left out.
     """
 
-    def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress) -> None:
+    def __init__(self, folder: Path, num_frames: int, seed: int, progress: Progress, min_motion: float = 0.0) -> None:
         self._folder, self._images, self._database = folder, folder / "images", folder / _DATABASE
         self._pairs = folder / "pairs.txt"
         self._images.mkdir()
@@ -131,6 +132,7 @@ class ColmapWorkspace:
         self._names = [f"{index:08d}.png" for index in range(num_frames)]
         self._seed = seed
         self._progress = progress
+        self._min_motion = min_motion
 
     def add_frames(self, frames: Iterable[Path | NDArray[np.uint8]], size: tuple[int, int], source: str | Path) -> None:
         """Write the frames as image files for COLMAP."""
@@ -225,6 +227,8 @@ class ColmapWorkspace:
     def _verification(self) -> Any:
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = self._seed
+        options.filter_stationary_matches = self._min_motion > 0
+        options.stationary_matches_max_error = self._min_motion
         return options
 
     def hold_out_matches(self, share: float) -> HeldOutMatches:
@@ -354,7 +358,8 @@ class ColmapWorkspace:
         """Return the median number of features in a frame, and the number of pairs of frames that match."""
         with contextlib.closing(pycolmap.Database.open(self._database)) as database:
             counts = [database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()]
-            return statistics.median(counts) if counts else 0.0, database.num_verified_image_pairs()
+            # COLMAP's own count has the pairs without a match too.
+            return statistics.median(counts) if counts else 0.0, len(database.read_two_view_geometry_num_inliers()[0])
 
     @contextlib.contextmanager
     def _step(self, description: str, total: int | None = None) -> Iterator[TaskID]:

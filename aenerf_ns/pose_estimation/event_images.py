@@ -36,6 +36,8 @@ _DECAY = 0.126
 _BLUR, _PERCENTILES = 0.8, (1.0, 99.0)
 # Pairs of images whose motion is measured, about; number, least quality and distance of their corners.
 _NUM_MOTIONS, _CORNERS = 100, (200, 0.02, 4)
+# Pixels that a match must have moved. What a sensor adds or loses leaves ghosts where the scene was, which stand still.
+_MIN_MOTION = 0.5
 MIN_IMAGES = 3
 """Images that poses are estimated from, at least."""
 
@@ -66,7 +68,7 @@ def match_event_images(
     camera = capture.event_camera
     times, pictures = images_of_events(capture, window, weights)
     with work_folder(folder) as place, progress_bar() as progress:
-        workspace = ColmapWorkspace(place, len(times), seed, progress)
+        workspace = ColmapWorkspace(place, len(times), seed, progress, _MIN_MOTION)
         workspace.add_frames(pictures, (camera.width, camera.height), source)
         workspace.find_features(None if capture.intrinsics_origin == "guessed" else camera)
         workspace.match()

@@ -86,7 +86,7 @@ class Poses:
         for option, chosen, known in (("--scenes", names, SCENES), ("--cases", self.cases, _CASES)):
             if unknown := set(chosen) - set(known):
                 raise DataError(option, f"unknown: {', '.join(sorted(unknown))}", f"choose among {', '.join(known)}")
-        os.environ |= {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        os.environ["OMP_NUM_THREADS"] = "1"
         variants = {_DEFAULT: "", **self.variants}
         datasets = {name: self._dataset(name) for name in names}
         settings = [
