@@ -234,12 +234,9 @@ class WarpedEvents:
         camera, num_poses, focal_factor = self._camera, _NUM_POSES, hypothesis.focal_factor
         # Times since 1970 would be rounded by 128 ns as decimals, and may then lie outside the poses.
         times = events.t[0] + np.linspace(0, events.t[-1] - events.t[0], num_poses).astype(np.int64)
-        if hypothesis.still:
-            poses = torch.eye(4, dtype=torch.float64).expand(num_poses, 4, 4)
-        else:
-            if hypothesis.poses not in self._meant:
-                self._meant[hypothesis.poses] = self._trajectory.transform(hypothesis.poses)
-            poses = homogeneous(self._meant[hypothesis.poses].interpolate(times + hypothesis.clock_offset))
+        if hypothesis.poses not in self._meant:
+            self._meant[hypothesis.poses] = self._trajectory.transform(hypothesis.poses)
+        poses = homogeneous(self._meant[hypothesis.poses].interpolate(times + hypothesis.clock_offset))
         reference = poses[num_poses // 2]
         relative = np.ascontiguousarray((torch.linalg.inv(reference) @ poses)[:, :3].numpy())
         duration = max(int(events.t[-1] - events.t[0]), 1)

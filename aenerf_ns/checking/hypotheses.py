@@ -54,7 +54,6 @@ class Hypothesis:
         plane: maps the (height, width, 2) grid of the pixels' directions to the grid of the meant pixels.
         focal_factor: the meant focal lengths by the given ones.
         clock_offset: nanoseconds to add to the time of an event before its pose is looked up.
-        still: whether the camera does not move.
     """
 
     name: str
@@ -63,7 +62,6 @@ class Hypothesis:
     plane: Callable[[NDArray[np.float64]], NDArray[np.float64]] = _identity
     focal_factor: float = 1.0
     clock_offset: int = 0
-    still: bool = False
 
     @property
     def is_of_series(self) -> bool:
@@ -93,7 +91,7 @@ def _swap_rows_and_columns(plane: NDArray[np.float64]) -> NDArray[np.float64]:
 GIVEN = Hypothesis("as given")
 """Poses, clock and pixels mean what the dataset says."""
 
-STILL = Hypothesis("the camera did not move", still=True)
+STILL = Hypothesis("the camera did not move", poses=lambda poses: torch.eye(4).to(poses).expand_as(poses))
 """The camera does not move, so that events are not warped."""
 
 ALTERNATIVES = (

@@ -39,8 +39,9 @@ _MIN_CORRELATION = -0.4
 _THRESHOLD_DEVIATIONS = 2.0
 # Share of the events that have a pose, and of what is seen that is in the scene box.
 _MIN_COVERED_SHARE, _MIN_IN_BOX_SHARE = 0.5, 0.5
-# A gap is longer than this many median intervals of the poses. This share of the events may fall in gaps.
-_GAP_FACTOR, _MAX_GAP_SHARE = 5, 0.01
+# A gap is longer than this many median intervals of the poses. This share of the events may fall in gaps, and of the
+# time in gaps with less than this share of the mean rate.
+_GAP_FACTOR, _MAX_GAP_SHARE, _MIN_GAP_RATE = 5, 0.01, 0.01
 # Contrast above that of the shuffled events by these standard deviations and by this factor is not noise.
 _NOISE_DEVIATIONS, _NOISE_FACTOR = 4.0, 1.5
 # One slice alone gives no verdict.
@@ -66,6 +67,8 @@ _MAX_PRINCIPAL_POINT = 0.2
 _EQUAL_POSES, _MAX_STILL_SHARE = 1e-12, 0.05
 # A jump is faster than the steps around it, and than the median, by this factor.
 _JUMP_FACTOR = 5
+# Scene units to what is seen, or their inverse: poses in millimeters, or a short path that was scaled to one unit.
+_MAX_DISTANCE = 50
 # Fewer events give no contrast.
 _MIN_EVENTS = 2_000
 # The depth of a tile with less than this share of the mean contrast is not trusted.
@@ -287,16 +290,27 @@ def _check_poses(result: CheckResult, recording: Recording, window: TimeWindow, 
     known = np.isin(times[:-1], [first for first, _ in window.gaps])
     gaps = np.flatnonzero((intervals > _GAP_FACTOR * median) & ~known)
     if len(gaps):
-        # The share is that of the sampled pairs, each counted at its later event.
+        # The shares are those of the sampled pairs, each counted at its later event.
         segment = np.searchsorted(times, statistics.pair_times[:, 1]) - 1
-        share = float(np.isin(segment, gaps).mean()) if len(segment) else 0.0
+        shares = np.bincount(segment + 1, minlength=len(times) + 1)[gaps + 1] / max(len(segment), 1)
+        time_shares = np.diff(times.clip(window.start, window.end))[gaps] / (window.end - window.start)
+        share = shares.sum()
+        # Pairs of events span what lies between two recordings that were joined. A slow camera has some events, and a
+        # camera that rests goes on from where it was.
+        has_moved = ((steps > _JUMP_FACTOR * steps.median()) | (degrees > _JUMP_FACTOR * degrees.median())).numpy()
+        empty_share = time_shares[(shares < _MIN_GAP_RATE * time_shares) & has_moved[gaps]].sum()
         longest = gaps[np.argsort(-intervals[gaps], kind="stable")[:_MAX_GAPS_SHOWN]]
         named = ", ".join(f"{intervals[i] * 1e-9:.3f} s after {times[i]} ns" for i in longest)
         figures.append(f"Gaps between poses: {len(gaps)}, with {share:.1%} of the events; the longest: {named}")
+        where = ""
         if share > _MAX_GAP_SHARE:
+            where = f"{share:.1%} of the events fall in gaps between poses"
+        elif empty_share > _MAX_GAP_SHARE:
+            where = f"{empty_share:.1%} of the time are in gaps between poses without events, as of joined recordings"
+        if where:
             problems.append(
-                f"{share:.1%} of the events fall in gaps between poses, where they are interpolated: give the missing "
-                "poses, or leave the gaps out (--max-pose-gap-ns of the dataparser)"
+                f"{where}, where poses are interpolated: give the missing poses, or leave the gaps out "
+                "(--max-pose-gap-ns of the dataparser)"
             )
 
 
@@ -463,6 +477,12 @@ def _check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording
             "pipeline.model.far-plane": f"{10 * far * scale:.2g}",
         }
         result.figures.append(f"Scene units: {scale:.3g} times those of the poses")
+        if not 1 / _MAX_DISTANCE < median * scale < _MAX_DISTANCE:
+            result.problems.append(
+                f"what is seen is {median * scale:.2g} scene units away, where training resolves little: give the "
+                f"format --auto-scale-poses False --scale-factor {1 / median:.1g}, which brings it to about 1, and let "
+                "the check tell the planes for that (--format-options auto-scale-poses=False scale-factor=...)"
+            )
     else:
         inside = ((point >= box[0].numpy()) & (point <= box[1].numpy())).all(1)
         share = weight[inside].sum() / weight.sum()

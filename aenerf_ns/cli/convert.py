@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from aenerf_ns.cli.console import say
-from aenerf_ns.cli.dataset import DatasetCommand, copy_images, open_writer, say_scene_box, training_command
+from aenerf_ns.cli.dataset import (
+    DatasetCommand,
+    copy_images,
+    open_writer,
+    say_scene_box,
+    training_command,
+    views_to_copy,
+)
 from aenerf_ns.cli.ranges import require_seed
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, value_errors_as_data_error
@@ -120,7 +127,6 @@ class Convert(DatasetCommand):
         from aenerf_ns.recording.images import check_image
         from aenerf_ns.recording.poses_report import POSES_PICTURE
         from aenerf_ns.recording.time_units import require_covered
-        from aenerf_ns.recording.views import thin_views
 
         has_given_poses = self.poses in ("given", "refined")
         capture, images = (parser.recording, []) if has_given_poses else parser.read_frames()
@@ -151,13 +157,7 @@ class Convert(DatasetCommand):
             if any(option.replace("-", "_").startswith("max_pose_gap_ns=") for option in self.format_options):
                 recording = replace(recording, max_pose_gap=parser.config.max_pose_gap_ns)
         trajectory = _cut(recording, filters.window)
-        views = {
-            split: thin_views(
-                [view for view in views if view.time is None or filters.window.contains(view.time)],
-                recording.max_views,
-            )
-            for split, views in recording.reference_views.items()
-        }
+        views = views_to_copy(recording, filters.window)
         camera = recording.event_camera
         if self.region is not None:
             camera = camera.crop(*self.region)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from aenerf_ns.camera.intrinsics import CameraIntrinsics
+    from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.recording.dataparser import EventDataParser
     from aenerf_ns.recording.options import EventDataParserConfig
     from aenerf_ns.recording.output_lock import OutputLock
@@ -126,6 +127,25 @@ def open_writer(
         has_estimated_intrinsics=recording.intrinsics_origin == "estimated",
         has_assumed_thresholds=recording.has_assumed_thresholds,
     )
+
+
+def views_to_copy(recording: Recording, window: TimeWindow) -> dict[Split, list[ReferenceView]]:
+    """Choose the views in a time window that a command copies: where a format uses only some, those that training uses.
+
+    Frames outside the events may serve COLMAP, but none of them may take the place of one that training evaluates on.
+    """
+    from aenerf_ns.camera.time_window import TimeWindow
+    from aenerf_ns.recording.views import thin_views
+
+    if recording.max_views is not None:
+        first, last = recording.event_file.time_span()
+        window = TimeWindow(max(first, window.start), min(last, window.end))
+    return {
+        split: thin_views(
+            [view for view in views if view.time is None or window.contains(view.time)], recording.max_views
+        )
+        for split, views in recording.reference_views.items()
+    }
 
 
 def copy_images(writer: NativeDatasetWriter, recording: Recording, views: Mapping[Split, list[ReferenceView]]) -> None:

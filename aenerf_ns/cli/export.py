@@ -133,7 +133,7 @@ class ExportFrames(RunCommand):
                 raise DataError("aenerf export-frames", "--rate and --times are given", "leave out one of the two")
             require_range("rate", self.rate, *RATES)
         _, run, _ = open_run(self.load_config, self.data, test_mode="inference")
-        from aenerf_ns.export.frames import export_frames
+        from aenerf_ns.export.frames import FARTHEST, export_frames
         from aenerf_ns.export.times import times_at_rate, times_from_seconds
 
         if self.times:
@@ -141,8 +141,11 @@ class ExportFrames(RunCommand):
         else:
             times = times_at_rate(run.scene.window, 10.0 if self.rate is None else self.rate)
         with creating(self.output) as folder:
-            export_frames(run, folder, times, self.num_points)
+            far_share = export_frames(run, folder, times, self.num_points)
         say(f"{self.output}: {len(times)} frames with depths, times and cameras.")
+        if far_share > 0:
+            # As of poses in millimeters.
+            say(f"{far_share:.1%} of the pixels are over {FARTHEST:g} units of the recording away: their depth is 0.")
 
 
 @dataclass

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aenerf_ns.cli.console import say
-from aenerf_ns.cli.dataset import DatasetCommand, copy_images, open_writer, training_command
+from aenerf_ns.cli.dataset import DatasetCommand, copy_images, open_writer, training_command, views_to_copy
 from aenerf_ns.cli.ranges import require_range
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError
@@ -121,10 +121,10 @@ class Reconstruct(DatasetCommand):
 
 def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> None:
     """Copy the validation and test views, with which every method on this recording is evaluated."""
-    from aenerf_ns.recording.recording import SPLITS
-    from aenerf_ns.recording.views import thin_views
+    from aenerf_ns.camera.time_window import TimeWindow
 
-    views = {split: thin_views(recording.reference_views[split], recording.max_views) for split in SPLITS[1:]}
+    views = views_to_copy(recording, TimeWindow())
+    del views["train"]
     if recording.frame_camera != recording.event_camera:
         if any(views.values()):
             say("The recording's images are left out: they are of another camera than the events.")

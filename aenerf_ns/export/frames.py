@@ -22,15 +22,20 @@ DEPTH_FOLDER = "depth"
 DEPTH_UNIT = 1e-3
 """Depth per step of a depth picture, in units of the recording: the framework's own default."""
 _MAX_DEPTH = 2**16 - 1
+FARTHEST = _MAX_DEPTH * DEPTH_UNIT
+"""The largest depth that is written, in units of the recording."""
 
 
 @torch.no_grad()
-def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int) -> None:
+def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int) -> float:
     """Render frames and depths at (N,) times in nanoseconds, and write them with their cameras to a new folder.
 
     Depth pictures have 16 bits and hold the distance along the optical axis, in thousandths of the recording's unit,
     0 where no surface is seen or where it is too far. At most ``num_points`` points of the scene are written. The run
     is in evaluation mode.
+
+    Returns:
+        The share of the pixels that see a surface too far away for their depth to be written.
     """
     camera = run.recording.event_camera
     directions, _ = camera.pixel_directions()
@@ -39,15 +44,17 @@ def export_frames(run: TrainedRun, folder: Path, times: Tensor, num_points: int)
     poses = homogeneous(corrected_poses(run, times))
     for name in (IMAGE_FOLDER, DEPTH_FOLDER):
         (folder / name).mkdir(parents=True)
-    images, lines = [], []
+    images, lines, num_far = [], [], 0
     for index, pose in enumerate(track(poses, "Rendering frames")):
         outputs = render(run, camera, pose)
         name = f"{index:06d}.png"
         to_image(outputs["rgb"]).save(folder / IMAGE_FOLDER / name)
         depth = (outputs["depth"].cpu() * along_axis / DEPTH_UNIT).round()[..., 0].numpy()
+        num_far += int((depth > _MAX_DEPTH).sum())
         depth[depth > _MAX_DEPTH] = 0
         Image.fromarray(depth.astype(np.uint16)).save(folder / DEPTH_FOLDER / name)
         images.append(PlacedImage(name, camera, pose.numpy(), depth=f"{DEPTH_FOLDER}/{name}"))
         lines.append(f"{format_seconds(int(times[index]))} {IMAGE_FOLDER}/{name}\n")
     (folder / IMAGE_LIST).write_text("".join(lines), "utf8")
     write_cameras(folder, images, observe_points(run, images, num_points))
+    return num_far / (len(images) * camera.width * camera.height)

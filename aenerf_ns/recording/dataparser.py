@@ -47,6 +47,11 @@ class EventDataParser(DataParser):
     guessed_format: str | None = None
     """The name of this format, where it was recognized and not named: an error may mean that it is another."""
 
+    @property
+    def data(self) -> Path:
+        """The dataset's folder, or the file or folder in it that chooses a part."""
+        return Path(self.config.data)
+
     @abstractmethod
     def read_recording(self) -> Recording:
         """Read the dataset, except for its events.
@@ -76,7 +81,7 @@ class EventDataParser(DataParser):
         Raises:
             DataError: a file is missing or its content cannot be used.
         """
-        with reading(Path(self.config.data)):
+        with reading(self.data):
             if self._lacks_poses():
                 capture, frames = self.read_capture()
                 capture.event_file.drop_malformed = self.config.drop_malformed
@@ -94,7 +99,7 @@ class EventDataParser(DataParser):
         """
         if self._recording.intrinsics_origin == "guessed":
             raise DataError(
-                str(self.config.data),
+                self.data,
                 "the intrinsics of the event camera are not known",
                 f"calibrate it, or have them estimated together with poses: {_ESTIMATE}",
             )
@@ -104,9 +109,9 @@ class EventDataParser(DataParser):
     def _recording(self) -> Recording:
         longest = self.config.max_pose_gap_ns
         if longest is not None and longest <= 0:
-            raise DataError(str(self.config.data), f"max_pose_gap_ns is {longest}", "give a positive number")
+            raise DataError(self.data, f"max_pose_gap_ns is {longest}", "give a positive number")
         try:
-            with reading(Path(self.config.data)):
+            with reading(self.data):
                 if self._lacks_poses():
                     raise DataError(
                         str(self.poses_path()),
@@ -130,7 +135,7 @@ class EventDataParser(DataParser):
     def _lacks_poses(self) -> bool:
         # Where the whole dataset is missing, its reader says so.
         path = self.poses_path()
-        return path is not None and Path(self.config.data).exists() and not path.exists()
+        return path is not None and self.data.exists() and not path.exists()
 
     def scales_poses(self, recording: Recording) -> bool:
         """Return whether training scales the poses of a recording that this parser has read."""
@@ -140,7 +145,7 @@ class EventDataParser(DataParser):
         """Raise a DataError for a lens whose distortion cannot be inverted at any pixel."""
         if not camera.has_valid_pixels():
             raise DataError(
-                str(self.config.data),
+                self.data,
                 f"the {name} sees nothing: its distortion {list(camera.distortion)} can be inverted at no pixel",
                 "check the order and the model of its parameters",
             )
@@ -151,15 +156,13 @@ class EventDataParser(DataParser):
         refractory = recording.sensor.refractory_period
         if refractory >= window.end - window.start:
             raise DataError(
-                str(self.config.data),
+                self.data,
                 f"the refractory period of {refractory} ns is longer than the recording",
                 "give it in nanoseconds",
             )
-        trajectory = recording.trajectory.transform(lambda poses: poses @ OPENCV_TO_OPENGL)
         transform, scale, scene_box = self._world_transform(
-            trajectory.crop(window.start, window.end), recording.scene_box
+            recording.trajectory.crop(window.start, window.end), recording.scene_box
         )
-
         rotation, translation = transform.split((3, 1), -1)
         frame = Similarity(torch.tensor(scale, dtype=torch.float64), rotation, scale * translation[:, 0])
 
@@ -190,7 +193,7 @@ class EventDataParser(DataParser):
             times, images = torch.zeros(0, dtype=torch.int64), {i: view.file for i, view in enumerate(views)}
             frames = ()
         # Nerfstudio wants a file name for every camera, also for one without an image.
-        names = [images.get(index, Path(self.config.data) / f"camera_{index:05d}") for index in range(len(cameras))]
+        names = [images.get(index, self.data / f"camera_{index:05d}") for index in range(len(cameras))]
         return DataparserOutputs(
             image_filenames=names,
             cameras=cameras,
@@ -273,12 +276,12 @@ class EventDataParser(DataParser):
         They may depend on the estimated trajectory and the stated box only, never on a true pose. The box is
         (2, 3), in the scene's frame.
         """
-        poses = homogeneous(trajectory.camera_to_worlds)
+        poses = homogeneous(trajectory.camera_to_worlds) @ OPENCV_TO_OPENGL
         if box is not None:
             center, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
             if not (half > _MIN_BOX).all() or not (box.abs() < _MAX_BOX).all():
                 raise DataError(
-                    str(self.config.data),
+                    self.data,
                     f"the scene box has the corners {box.tolist()}",
                     f"give a box that holds the scene, with sides of {_MIN_BOX:g} to {_MAX_BOX:g}",
                 )

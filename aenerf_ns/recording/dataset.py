@@ -70,43 +70,29 @@ class EventDataset(InputDataset):
             "window": [scene.window.start, scene.window.end, scene.window.gaps],
             "usable": zlib.crc32(usable.data),
         }
-        file = PairFile(events, made_from)
-        found = file.find()
-        if found is None:
-            # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-            from aenerf_ns.events.pairing import EVENTS_IN_MEMORY
+        file, count = PairFile(events, made_from), events.count()
+        # Imported lazily: every ns-* command imports this module, and numba is slow to import.
+        from aenerf_ns.events.pairing import EVENTS_IN_MEMORY, pair_events
 
-            count = events.count()
-            # Several processes read a short recording side by side.
-            with file.making(alone=count is None or count > EVENTS_IN_MEMORY):
-                # Another process may have made the file meanwhile.
-                found = file.find()
-                if found is None:
-                    found = self._read_events(file, usable, count)
-        else:
-            CONSOLE.print(f"{file.path.name}: {found.summary()}.", markup=False)
-        self._require_covered(found.num_events, found.num_outside)
-        return found
-
-    def _read_events(self, file: PairFile, usable: NDArray[np.bool_], count: int | None) -> EventPairs:
-        """Make pairs, and keep them if they are in a file."""
-        from aenerf_ns.events.pairing import pair_events
-
-        scene = self.scene
-        events = scene.event_file
-        pairs = pair_events(
-            self._chunks(count),
-            refractory_period=scene.sensor.refractory_period,
-            window=scene.window,
-            usable=usable,
-            expected_events=count,
-            open_file=file.open,
-        )
-        CONSOLE.print(f"{events.path.name}: {pairs.summary()}.", markup=False)
+        # Several processes read a short recording side by side.
+        with file.making(alone=count is None or count > EVENTS_IN_MEMORY):
+            pairs = file.find()
+            if pairs is not None:
+                CONSOLE.print(f"{file.path.name}: {pairs.summary()}.", markup=False)
+            else:
+                pairs = pair_events(
+                    self._chunks(),
+                    refractory_period=scene.sensor.refractory_period,
+                    window=scene.window,
+                    usable=usable,
+                    open_file=file.open,
+                )
+                CONSOLE.print(f"{events.path.name}: {pairs.summary()}.", markup=False)
+                if len(pairs) > 0:
+                    file.keep(pairs)
+        self._require_covered(pairs.num_events, pairs.num_outside)
         if len(pairs) == 0:
-            self._require_covered(pairs.num_events, pairs.num_outside)
             raise DataError(events.path, "no pixel has two events", "record longer, or widen the time window")
-        file.keep(pairs)
         return pairs
 
     @cached_property
@@ -119,7 +105,7 @@ class EventDataset(InputDataset):
         scene = self.scene
         scene.event_file.require()
         _, usable = scene.event_camera.pixel_directions()
-        windows = sort_events(self._chunks(scene.event_file.count()), window=scene.window, usable=usable)
+        windows = sort_events(self._chunks(), window=scene.window, usable=usable)
         CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.", markup=False)
         self._require_covered(len(windows.times) + windows.num_outside + windows.num_unusable, windows.num_outside)
         return windows
@@ -129,10 +115,10 @@ class EventDataset(InputDataset):
         if self.scene.is_whole and not self.scene.window.gaps:
             require_covered(self.scene.event_file.path, num_events, num_events - num_outside)
 
-    def _chunks(self, count: int | None) -> Iterable[EventStream]:
+    def _chunks(self) -> Iterable[EventStream]:
         """Read the events in pieces, with a progress bar towards their number, if that is known."""
         events = self.scene.event_file
-        return tracked(events.chunks(), f"Reading {events.path.name}", count)
+        return tracked(events.chunks(), f"Reading {events.path.name}", events.count())
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Return the (H, W, 3) image of a camera, or a picture of events around its time if it has no image."""

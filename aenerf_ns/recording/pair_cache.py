@@ -48,7 +48,6 @@ class PairFile:
         self._made_from = json.loads(json.dumps(stated))
         self._new: BinaryIO | None = None
         self._is_kept = False
-        self._printed: set[str] = set()
 
     def find(self) -> EventPairs | None:
         """Find the pairs of an earlier run. None, and a line why, if they must be made."""
@@ -57,18 +56,12 @@ class PairFile:
             return None
         try:
             with self.path.open("rb") as file:
-                found = self._read(file)
+                found, problem = self._read(file), "is of other events or options"
         except (OSError, ValueError, KeyError, TypeError) as error:
-            self._print_once(f"{self.path} is not whole ({error}): it is made again.")
-            return None
+            found, problem = None, f"is not whole ({error})"
         if found is None:
-            self._print_once(f"{self.path} is of other events or options: it is made again.")
+            CONSOLE.print(f"{self.path} {problem}: it is made again.", style="yellow", markup=False)
         return found
-
-    def _print_once(self, line: str) -> None:
-        if line not in self._printed:
-            CONSOLE.print(line, style="yellow", markup=False)
-        self._printed.add(line)
 
     def _read(self, file: BinaryIO) -> EventPairs | None:
         """Read the pairs, None if they are of other events or options.

@@ -10,7 +10,7 @@ from PIL import Image
 
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.files.json_file import read_json
-from aenerf_ns.recording.images import open_image
+from aenerf_ns.recording.images import read_image
 
 POSES_REPORT, POSES_PICTURE = "poses_report.json", "poses_report.png"
 
@@ -44,13 +44,8 @@ def read_poses_report(trajectory: Trajectory) -> PosesReport | None:
         DataError: the report or its picture cannot be read.
     """
     files = {file.name: file for file in poses_report_files(trajectory)}
-    if POSES_REPORT not in files:
-        return None
-    summary = read_json(files[POSES_REPORT], _File).summary
+    summary = read_json(files[POSES_REPORT], _File).summary if POSES_REPORT in files else None
     if summary is None:
         return None
-    drawn = None
-    if POSES_PICTURE in files:
-        with open_image(files[POSES_PICTURE]) as image:
-            drawn = image.convert("RGB")
-    return PosesReport(" ".join(summary.split()), drawn)
+    picture = read_image(files[POSES_PICTURE]).convert("RGB") if POSES_PICTURE in files else None
+    return PosesReport(" ".join(summary.split()), picture)

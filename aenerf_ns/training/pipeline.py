@@ -174,7 +174,7 @@ class AENeRFPipeline(VanillaPipeline):
             optimizer.register_step_pre_hook(check)
         # After every step, because the trainer saves its last checkpoint before it calls the callbacks for the end.
         callbacks = [
-            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], function, update_every_num_iters=1)
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], function)
             for function in (check_losses, diagnose_poses, fit, lambda step: self.recording.after_step())
         ]
         return [*super().get_training_callbacks(training_callback_attributes), *callbacks]

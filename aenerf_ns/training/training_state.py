@@ -9,15 +9,17 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 from torch import nn
 
+from aenerf_ns.errors import DataError
 from aenerf_ns.method.ray_samplers import ProposalSampler
+from aenerf_ns.recording.dataset import EventDataset
 
 
 class TrainingState(nn.Module):
     """Carries the state of a training in checkpoints, so that 100 steps and 100 more are the steps of a run of 200.
 
     The state holds torch's random generators, the gradients that are being accumulated over steps
-    (``gradient_accumulation_steps``), the step at which the proposal networks were last trained, and the number of
-    steps that the schedules are made for.
+    (``gradient_accumulation_steps``), the step at which the proposal networks were last trained, the number of steps
+    that the schedules are made for, and where the scene is in the world of the recording.
     """
 
     def __init__(self) -> None:
@@ -42,6 +44,7 @@ class TrainingState(nn.Module):
             "gradients": accumulating,
             "proposal_sampler": sampler.schedule_state(),
             "schedule_length": trainer.config.schedule_length,
+            "scene_frame": _scene_frame(trainer),
         }
 
     def set_extra_state(self, state: dict[str, Any] | None) -> None:
@@ -54,11 +57,23 @@ class TrainingState(nn.Module):
         Args:
             trainer: of an :class:`~aenerf_ns.training.trainer.AENeRFTrainerConfig`, with its checkpoint loaded.
             sampler: of the model that is trained.
+
+        Raises:
+            DataError: the checkpoint is of a scene that is elsewhere: its field and corrections would be, too.
         """
         self._training = (trainer, sampler)
         state, self._loaded = self._loaded, None
         if state is None:
             return
+        # Checkpoints of earlier versions do not say.
+        before, now = state.get("scene_frame"), _scene_frame(trainer)
+        if before is not None and not torch.allclose(before, now, rtol=1e-5, atol=1e-5 * float(now.abs().max())):
+            raise DataError(
+                str(trainer.config.load_checkpoint),
+                "its scene is scaled, turned or moved otherwise (scene units to a unit of the recording: "
+                f"{_length(before):.5g}, here {_length(now):.5g})",
+                "give the dataset, time window, scale and other options of the format of the first run, or train again",
+            )
         for group, gradients in state["gradients"].items():
             for parameter, gradient in zip(trainer.optimizers.parameters[group], gradients, strict=True):
                 parameter.grad = None if gradient is None else gradient.to(parameter)
@@ -71,6 +86,18 @@ class TrainingState(nn.Module):
         if not comms.is_main_process():
             # The main process alone writes checkpoints. The others must draw batches of their own.
             torch.manual_seed(int(torch.randint(1 << 62, ())) + comms.get_rank())
+
+
+def _scene_frame(trainer: Trainer) -> torch.Tensor:
+    """Return the (3, 4) float64 map from the recording's world to the scene's: its rotation is scaled."""
+    dataset = trainer.pipeline.datamanager.train_dataset
+    assert isinstance(dataset, EventDataset)
+    frame = dataset.scene.frame
+    return torch.cat([frame.scale * frame.rotation, frame.translation[:, None]], -1)
+
+
+def _length(scene_frame: torch.Tensor) -> float:
+    return float(scene_frame[:, 0].norm())
 
 
 def _is_on_gpu(trainer: Trainer) -> bool:

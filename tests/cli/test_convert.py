@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +11,7 @@ import pytest
 import torch
 from helpers.colmap_stand_in import FOUND_BOX, place_frames
 from helpers.dataset_faults import set_in
+from helpers.own_recordings import random_events, write_calibration, write_poses
 from helpers.small_datasets import END, START, make_trajectory, write_ecd, write_native
 from helpers.streams import random_stream
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -22,10 +21,10 @@ from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.cli.convert import Convert
+from aenerf_ns.cli.reconstruct import Reconstruct
 from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.pose_estimation import from_frames
@@ -153,6 +152,21 @@ def test_filters_cut_everything(tmp_path: Path) -> None:
     assert (after.trajectory.start, after.trajectory.end) == (start, START + 1_500_000_000)
     # One of three train images is within the window. Images without a time are kept.
     assert [len(after.reference_views[split]) for split in ("train", "val", "test")] == [1, 1, 2]
+
+
+def test_images_outside_the_events_take_no_places(tmp_path: Path) -> None:
+    # 100 images in 50 s, and events in the first of them only.
+    folder = tmp_path / "made"
+    (folder / "images").mkdir(parents=True)
+    for index in range(100):
+        Image.new("L", (96, 72)).save(folder / "images" / f"{index}.png")
+    (folder / "images.txt").write_text("".join(f"{index / 2 + 0.25} images/{index}.png\n" for index in range(100)))
+    np.savez(folder / "events.npz", **random_events(seconds=1.0))
+    write_calibration(folder / "calibration.json")
+    write_poses(folder / "trajectory.txt", seconds=50.0)
+    Reconstruct(folder, tmp_path / "reconstructed", events_per_pixel=0.1).main()
+    for after in (convert(folder, tmp_path / "converted"), convert(tmp_path / "reconstructed", tmp_path / "again")):
+        assert [len(after.reference_views[split]) for split in ("val", "test")] == [1, 1]
 
 
 def test_hot_pixels_are_named(tmp_path: Path) -> None:
@@ -317,18 +331,15 @@ def test_print_the_command_to_train_with(tmp_path: Path) -> None:
         assert parser.config.auto_scale_poses is scale
 
 
-def test_terminated_command_leaves_no_dataset(tmp_path: Path) -> None:
+def test_terminated_command_leaves_no_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = write_native(tmp_path / "made")
-    t = START + (END - START) // 3_000_000 * np.arange(3_000_000)
-    zeros = np.zeros(len(t), np.uint16)
-    with Hdf5EventWriter(data / "events.h5") as writer:
-        writer.append(EventStream(zeros, zeros, t, np.ones(len(t), np.int8), 6, 4))
-    output, partial = tmp_path / "converted", tmp_path / ".converted.partial"
-    process = subprocess.Popen(["aenerf", "convert", data, "--output", output])
-    while not (partial / "events.h5").exists():
-        assert process.poll() is None
-        time.sleep(0.02)
-    process.terminate()
-    assert process.wait(600) == 128 + signal.SIGTERM
-    assert not output.exists()
-    assert not partial.exists()
+
+    def append(*_: object) -> None:
+        assert (tmp_path / ".converted.partial" / "events.h5").exists()
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Hdf5EventWriter, "append", append)
+    with pytest.raises(SystemExit) as ended:
+        Convert(data, tmp_path / "converted").main()
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]

@@ -17,7 +17,7 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.errors import DataError
 from aenerf_ns.evaluation.run import TrainedRun
-from aenerf_ns.export import mesh
+from aenerf_ns.export import frames, mesh
 from aenerf_ns.export.camera_model_files import PlacedImage
 from aenerf_ns.export.rendering import corrected_poses, observe_points, place_views
 from aenerf_ns.export.times import spread_times, times_at_rate, times_from_seconds
@@ -75,6 +75,16 @@ def test_points_lie_on_their_rays(run: TrainedRun) -> None:
         lens = image.camera
         assert z > 0
         assert (lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy) == pytest.approx((column, row), abs=1e-3)
+
+
+def test_depths_too_far_to_be_written_are_counted(
+    run: TrainedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run.model.field.average_init_density = 1e3
+    rendered = frames.render
+    # As of poses in millimeters.
+    monkeypatch.setattr(frames, "render", lambda *view: {**(out := rendered(*view)), "depth": 1e3 + 0 * out["depth"]})
+    assert frames.export_frames(run, tmp_path / "frames", torch.tensor([SECOND // 4]), 10) == 1.0
 
 
 def test_refuse_a_recording_without_images(tmp_path: Path) -> None:

@@ -59,6 +59,15 @@ def test_run_in_two_pieces_equals_one(tmp_path: Path) -> None:
         train_small_model(tmp_path, "other", 1, load_dir=first.checkpoint_dir)
 
 
+def test_resuming_with_a_scene_elsewhere_is_refused(tmp_path: Path) -> None:
+    first = train_small_model(tmp_path, "first", 1)
+    path = tmp_path / "data" / "trajectory_estimated.txt"
+    # Training scales the poses to one unit.
+    path.write_text(path.read_text().replace("0.10000000149", "0.2"))
+    with pytest.raises(SystemExit, match=r"^Error: \S+\.ckpt: its scene is scaled, .*: 10, here 5\); give the dataset"):
+        train_small_model(tmp_path, "second", 1, load_dir=first.checkpoint_dir)
+
+
 @pytest.mark.parametrize("counts_earlier_steps", [False, True])
 def test_resumed_run_reaches_its_last_step(
     counts_earlier_steps: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

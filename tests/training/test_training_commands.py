@@ -159,11 +159,8 @@ def test_methods_of_the_framework_take_our_dataparsers() -> None:
 
 
 def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Path) -> None:
-    nothing = ("--vis", "tensorboard", "--data", workspace / "nothing")
-    output = run("ns-train", "aenerf-small", *CPU, *nothing, cwd=workspace, fails=True)
-    assert "Traceback" not in output
-    (error,) = [line for line in output.splitlines() if line.startswith("Error: ")]
-    assert "nothing: there is no such folder" in error
+    with pytest.raises(SystemExit, match=r"^Error: \S+nothing: there is no such folder"):
+        train_here(deepcopy(aenerf_small.config), workspace / "nothing", workspace)
 
 
 def test_a_log_that_needs_a_key_ends_training_with_one_line(
@@ -177,14 +174,6 @@ def test_a_log_that_needs_a_key_ends_training_with_one_line(
     message = r"^Error: --vis comet: Comet.ml requires an API key. Set COMET_API_KEY; .*another --vis"
     with pytest.raises(SystemExit, match=message):
         train_here(deepcopy(aenerf_small.config), room, tmp_path, vis="comet")
-
-
-def test_training_that_diverges_ends_with_one_line(room: Path, tmp_path: Path) -> None:
-    config = deepcopy(aenerf_small.config)
-    config.max_num_iterations = 20
-    config.optimizers["networks"]["optimizer"].lr = 1e30
-    with pytest.raises(SystemExit, match=r"^Error: step \d+: (loss|gradient) not finite \(.*$"):
-        train_here(config, room, tmp_path)
 
 
 @pytest.fixture(scope="module")
