@@ -12,8 +12,7 @@ from contextlib import suppress
 
 __version__ = "0.2.0"
 
-# They say nothing that a user could change.
-warnings.filterwarnings("ignore", r"(?s).*TBB threading layer")
+# It says nothing that a user could change.
 warnings.filterwarnings("ignore", r"`torch\.(jit\.script|cuda\.amp)", FutureWarning)
 
 

@@ -16,9 +16,7 @@ from aenerf_ns.files.limits import MAX_ROWS
 from aenerf_ns.simulator.options import BUILT_IN, SensorNoise, require_scene_file
 
 if TYPE_CHECKING:
-    from aenerf_ns.camera.trajectory import Trajectory
     from aenerf_ns.recording.output_lock import OutputLock
-    from aenerf_ns.simulator.simulation import Simulation
 
 
 @dataclass
@@ -100,7 +98,12 @@ class Simulate(SimulationCommand):
                 scene, camera, sensor, self.speed, duration, self.max_displacement, self.seed, noise
             )
             truth = simulation.trajectory(self.pose_rate)
-            estimated, report = self._estimate_poses(simulation, truth)
+            report: dict[str, Any] | None = None
+            if self.poses == "noise":
+                estimated = self.add_pose_noise(truth)
+            else:
+                estimated, report, summary = simulation.estimate_poses(truth, self.frame_rate, self.exposure, self.seed)
+                say(summary)
         num_events = 0
         with NativeDatasetWriter(lock, camera, sensor, "srgb", scene.aabb) as writer:
             writer.add_trajectories(estimated, truth)
@@ -130,11 +133,3 @@ class Simulate(SimulationCommand):
             f"{self.train_images} train, {self.validation_views} validation and {self.test_views} test images.\n"
             f"Train with: {training_command(self.output)}"
         )
-
-    def _estimate_poses(self, simulation: Simulation, truth: Trajectory) -> tuple[Trajectory, dict[str, Any] | None]:
-        """Make the estimated trajectory and, if COLMAP estimates it, COLMAP's report."""
-        if self.poses == "noise":
-            return self.add_pose_noise(truth), None
-        estimated, report, summary = simulation.estimate_poses(truth, self.frame_rate, self.exposure, self.seed)
-        say(summary)
-        return estimated, report

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.recording.writer import NativeDatasetWriter, PoselessRecordingWriter
     from aenerf_ns.simulator.esim import EventSimulator
+    from aenerf_ns.simulator.video_events import VideoInterval
 
 _COMMAND = "aenerf simulate-video"
 
@@ -190,13 +191,12 @@ class SimulateVideo(SimulationCommand):
             writer.add_trajectories(poses.estimated, poses.truth)
             if poses.report is not None:
                 writer.add_poses_report(poses.report)
-
-            def add_image(frame: NDArray[np.uint8], time: int) -> None:
+            num_events = 0
+            for frame, time, events in self._write_events(writer, video, simulator):
+                num_events += len(events)
                 for split, times in chosen.items():
                     if time in times:
                         writer.add_image(split, frame, homogeneous(reference.interpolate(time)), time)
-
-            num_events = self._write_events(writer, video, simulator, add_image)
         counts = ", ".join(f"{len(times)} {split}" for split, times in chosen.items())
         return (
             f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(poses.estimated)} poses, images: "
@@ -212,12 +212,11 @@ class SimulateVideo(SimulationCommand):
 
         kept = spread_evenly(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
         with PoselessRecordingWriter(lock, camera, simulator.sensor) as writer:
-
-            def add_image(frame: NDArray[np.uint8], time: int) -> None:
+            num_events = 0
+            for frame, time, events in self._write_events(writer, video, simulator):
+                num_events += len(events)
                 if time in kept:
                     writer.add_image(frame, time)
-
-            num_events = self._write_events(writer, video, simulator, add_image)
         missing = (
             "" if camera else 'calibration.json (with "image_encoding": "srgb" and the thresholds of this command) and '
         )
@@ -227,24 +226,19 @@ class SimulateVideo(SimulationCommand):
         )
 
     def _write_events(
-        self,
-        writer: NativeDatasetWriter | PoselessRecordingWriter,
-        video: Video,
-        simulator: EventSimulator,
-        add_image: Callable[[NDArray[np.uint8], int], None],
-    ) -> int:
-        """Write and count the events of a video, and give its frames with their times to ``add_image``."""
+        self, writer: NativeDatasetWriter | PoselessRecordingWriter, video: Video, simulator: EventSimulator
+    ) -> Iterator[VideoInterval]:
+        """Write the events of a video, and yield its frames with their events."""
         from aenerf_ns.simulator.video_events import video_events
 
         writer.add_contrast_thresholds(simulator.positive_contrast_threshold, simulator.negative_contrast_threshold)
-        num_events = 0
-        for frame, time, events in video_events(video, simulator, self.interpolation, self.max_displacement):
-            writer.events.append(events)
-            num_events += len(events)
-            add_image(frame, time)
-        if num_events == 0:
+        has_events = False
+        for interval in video_events(video, simulator, self.interpolation, self.max_displacement):
+            writer.events.append(interval.events)
+            has_events |= len(interval.events) > 0
+            yield interval
+        if not has_events:
             raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")
-        return num_events
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
-import numba
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from aenerf_ns.errors import DataError
@@ -165,7 +165,7 @@ class BlenderRenderer:
         scene, layer = self._scene, self._bpy.context.view_layer
         render, cycles, image = scene.render, scene.cycles, scene.render.image_settings
         render.engine, cycles.device = "CYCLES", "CPU"
-        render.threads_mode, render.threads = "FIXED", numba.get_num_threads()
+        render.threads_mode, render.threads = "FIXED", torch.get_num_threads()
         render.use_persistent_data = render.use_compositing = True
         render.use_border = render.use_motion_blur = render.use_multiview = render.use_sequencer = False
         render.use_stamp = render.use_freestyle = False

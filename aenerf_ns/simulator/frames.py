@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from aenerf_ns.simulator.arrays import Array
@@ -69,8 +69,8 @@ def frame_parameters(
     probe = tuple(shrink * np.asarray(intrinsics, np.float64))
     target = _MARGIN * max_displacement
     # A probe is too small to share among threads: synchronizing them takes longer than rendering.
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     try:
         parameters, pose, step = [0.0], scene.path(0.0), 1e-4
         while parameters[-1] < 1.0:
@@ -87,5 +87,5 @@ def frame_parameters(
             pose = next_pose
             step *= min(target / max(displacement, 1e-12), 4.0)
     finally:
-        numba.set_num_threads(threads)
+        torch.set_num_threads(threads)
     return np.array(parameters)

@@ -260,8 +260,8 @@ def _with_exposure(scene: SimulationScene, renderer: Renderer) -> SimulationScen
     brightest = 0.0
     without_highlights = replace(renderer, reflections=None)
     for pose in poses:
-        radiance, _, alpha = without_highlights.render(pose, scene.intrinsics(width, height), width, height, 1)
-        brightest = max(brightest, float(radiance[alpha > 0].max(initial=0.0)))
+        radiance, depth = without_highlights.render(pose, scene.intrinsics(width, height), width, height, 1)
+        brightest = max(brightest, float(radiance[np.isfinite(depth)].max(initial=0.0)))
     if brightest == 0:
         raise DataError(scene.name, "no light reaches what the camera sees", "give it light, or another path")
     return replace(scene, renderer=replace(renderer.with_gain(_MAX_RADIANCE / brightest), limit=1.0))

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.simulator.arrays import Array, Texture
+from aenerf_ns.simulator.arrays import Array, Panorama, Texture
 from aenerf_ns.simulator.rendering.embree import RayCaster
-from aenerf_ns.simulator.rendering.environment import Environment
 from aenerf_ns.simulator.rendering.lighting import AreaLight, light_mesh
 from aenerf_ns.simulator.rendering.mesh import DIFFUSE, Gloss, Mesh, scaled
 from aenerf_ns.simulator.rendering.mesh_repair import repair
@@ -91,7 +90,7 @@ def mesh_of(
 def light_shapes(
     shapes: Sequence[Shape],
     textures: Mapping[str, Texture],
-    environment: Environment,
+    environment: Panorama,
     lamps: Sequence[AreaLight],
     background: Array,
     *,

@@ -322,16 +322,6 @@ def test_sensors_are_decided_by_name_and_seed(name: SensorName) -> None:
     assert len(streams[0]) > 1000
 
 
-def test_accept_single_precision_frames() -> None:
-    image = np.random.default_rng(0).uniform(0, 1, (2, HEIGHT, WIDTH)).astype(np.float32)
-    streams = []
-    for frames in (image, image.astype(np.float64)):
-        simulator = make_simulator(0.2, 0.2)
-        streams.append(simulate(simulator, frames, np.array([0, 1000])))
-    for single, double in zip(*streams, strict=True):
-        np.testing.assert_array_equal(single, double)
-
-
 def test_refuse_frame() -> None:
     simulator = make_simulator(0.2, 0.2)
     good = np.ones((HEIGHT, WIDTH))

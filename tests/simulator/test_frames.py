@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from helpers.small_meshes import ray_directions, scene_file
 
 from aenerf_ns.simulator.frames import frame_displacement, frame_parameters
 from aenerf_ns.simulator.open_scene import open_scene
-from aenerf_ns.simulator.paths import ObjectPath
-from aenerf_ns.simulator.scene import SimulationScene
 
 pytestmark = pytest.mark.usefixtures("small_work")
 
@@ -39,18 +36,17 @@ def test_frame_displacement() -> None:
     )
 
 
-def test_frame_parameters_bound_the_motion(toy: SimulationScene) -> None:
+def test_frame_parameters_bound_the_motion(box_file: Path) -> None:
     width, height = 40, 30
-    intrinsics = toy.intrinsics(width, height)
-    path = ObjectPath(turns=3.0)
-    scene = dataclasses.replace(toy, path=path)
+    scene = open_scene(scene_file(box_file, path={"kind": "around", "radius": 2.5, "turns": 3.0}))
+    intrinsics, path = scene.intrinsics(width, height), scene.path
     parameters = frame_parameters(scene, intrinsics, width, height, 1.0)
     assert parameters[0] == 0
     assert parameters[-1] == 1
     assert (np.diff(parameters) > 0).all()
     moved = []
     for a, b in itertools.pairwise(parameters):
-        depth = toy.renderer.render(path(a), intrinsics, width, height, 1)[1]
+        depth = scene.renderer.render(path(a), intrinsics, width, height, 1)[1]
         moved.append(frame_displacement(depth, path(a), path(b), intrinsics))
     # The bound holds for the coarse depth map of the search; the full one's percentile differs a little.
     assert max(moved) < 1.1

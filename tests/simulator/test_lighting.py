@@ -12,7 +12,7 @@ import trimesh
 from helpers.small_meshes import BLACK, NIGHT, OVERHEAD, joined, light_mesh, mesh_of, plate, ray_directions
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.simulator.rendering.environment import Environment, load_environment, sky
+from aenerf_ns.simulator.rendering.environment import load_environment, sky, split
 from aenerf_ns.simulator.rendering.lighting import AreaLight, light_points
 from aenerf_ns.simulator.rendering.mesh import normals_and_areas
 from aenerf_ns.simulator.rendering.mesh_repair import repair
@@ -82,7 +82,7 @@ def test_small_sun() -> None:
     edges = np.cos(np.pi * np.array([row, row + 1]) / rows)
     direct = 5e4 * 2 * np.pi / columns * (edges[0] - edges[1]) * np.cos(np.pi * (row + 0.5) / rows) / np.pi
     ground, blind = plate(1.0), mesh_of(trimesh.creation.box((0.02, 2, 0.5)).apply_translation((0.5, 0, 0.3)))
-    scene = light_mesh(repair(joined(ground, blind), 0.05)[0], Environment(picture), [], BLACK)
+    scene = light_mesh(repair(joined(ground, blind), 0.05)[0], picture, [], BLACK)
     radiance = scene.render(OVERHEAD, (30.0, 30.0, 30.0, 1.0), 40, 2, 1)[0][0, :, 1]
     x = (np.arange(40) + 0.5 - 30) / 30 * 3.0
     # The blind, from 0.05 to 0.55 m above the ground, throws a shadow as long.
@@ -96,7 +96,7 @@ def test_small_sun() -> None:
 def test_environment_parts_add_up() -> None:
     rng = np.random.default_rng(0)
     picture = rng.uniform(0, 1, (64, 128, 3)).astype(np.float32) ** 8 * 20
-    even, bright = Environment(picture).split()
+    even, bright = split(picture)
     weight = -np.diff(np.cos(np.pi * np.arange(65) / 64))[:, None, None]
     coarse = -np.diff(np.cos(np.pi * np.arange(33) / 32))[:, None, None]
     total = (weight * bright).sum((0, 1)) / 128 + (coarse * even).sum((0, 1)) / 64
@@ -108,7 +108,7 @@ def test_turn_environment_file(tmp_path: Path) -> None:
     picture = np.zeros((16, 32, 3), np.float32)
     picture[:, 16] = (1.0, 2.0, 3.0)  # blue, green, red: just right of +x
     assert cv2.imwrite(str(tmp_path / "a.hdr"), picture)
-    turned = load_environment(tmp_path / "a.hdr", turn_degrees=90, gain=2.0).radiance
+    turned = load_environment(tmp_path / "a.hdr", turn_degrees=90, gain=2.0)
     np.testing.assert_allclose(turned[5, 8], (6.0, 4.0, 2.0), rtol=0.02)  # a quarter to the left: +y
     assert turned.sum() == pytest.approx(turned[:, 8].sum())
     assert cv2.imwrite(str(tmp_path / "b.hdr"), picture[:, :20])

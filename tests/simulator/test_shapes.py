@@ -71,7 +71,7 @@ def test_texture_coordinates() -> None:
     ramp = np.repeat(np.repeat(np.linspace(0.1, 0.8, 64)[None, :, None], 64, axis=0), 3, axis=2).astype(np.float32)
     plate = shapes.panel(ORIGIN, (2, 2), (1, 0, 0), (0, 1, 0), "ramp", 2.0, texture_offset=(0.5, 0.5), tint=(1, 0.5, 0))
     scene = baked_mesh(shapes.mesh_of([plate], {"ramp": ramp}, 0.3), BLACK)
-    radiance, depth, _ = scene.render(OVERHEAD, (30.0, 30.0, 8.0, 6.0), 16, 12, 1)
+    radiance, depth = scene.render(OVERHEAD, (30.0, 30.0, 8.0, 6.0), 16, 12, 1)
     np.testing.assert_allclose(depth, 3.0, rtol=1e-6)
     x = (np.arange(16) + 0.5 - 8.0) / 30.0 * 3.0
     texel = (x / 2 + 0.5) * 64 - 0.5

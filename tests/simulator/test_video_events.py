@@ -88,12 +88,6 @@ def test_two_gray_levels_are_within_a_threshold(threshold: float) -> None:
     assert steps.argmax() == 0
 
 
-def test_flicker_of_dark_pixel_fires_nothing() -> None:
-    rng = np.random.default_rng(0)
-    flicker = [gray(rng.integers(0, 2, (16, 16))) for _ in range(100)]
-    assert len(events_of(flicker, SensorModel(0.25, 0.25))) == 0
-
-
 def test_color_filters() -> None:
     frames = [np.full((4, 6, 3), 100, np.uint8) for _ in range(2)]
     frames[1][..., 0] = 200

@@ -9,22 +9,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 
 from aenerf_ns.progress import progress_bar
-from aenerf_ns.simulator.arrays import Array
+from aenerf_ns.simulator.arrays import Array, Panorama
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
-from aenerf_ns.simulator.rendering.environment import Environment, row_weights
+from aenerf_ns.simulator.rendering.environment import row_weights, split
 from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas, position_ids
 from aenerf_ns.simulator.rendering.mip_maps import lookup, mip_maps, panorama
 from aenerf_ns.simulator.rendering.reflections import make_reflections
 from aenerf_ns.simulator.rendering.renderer import Renderer, make_surroundings
 from aenerf_ns.simulator.rendering.surface import Surface, face_normal, make_surface
-from aenerf_ns.simulator.rendering.vectors import add_scaled, cross, dot, length, row, subtract
+from aenerf_ns.simulator.rendering.vectors import dot, length, row
+from aenerf_ns.threads import run_ranges
 
 _CREASE = math.cos(math.radians(40.0))
 """Cosine of the angle below which adjacent faces belong to one smooth surface."""
@@ -126,7 +129,7 @@ def _smooth_parts(start, order, normals, part):
 def light_mesh(
     mesh: Mesh,
     caster: RayCaster,
-    environment: Environment,
+    environment: Panorama,
     lamps: Sequence[AreaLight],
     background: Array,
     *,
@@ -172,7 +175,7 @@ def compute_light(
     surface: Surface,
     caster: RayCaster,
     points: LightPoints,
-    environment: Environment,
+    environment: Panorama,
     emitters: Array,
     ambient: float,
     seed: int,
@@ -183,10 +186,12 @@ def compute_light(
     positions = np.concatenate([points.position, points.position]) + offset * normals
     size = np.concatenate([points.size, points.size])
     jitter = np.random.default_rng(seed).random((2 * count, 2))
-    even, bright = environment.split()
+    even, bright = split(environment)
     sky = mip_maps([even], bits16=False)
     sun = _Sun(bright, 8.0 * float(np.abs(surface.vertices).max())) if bright.max() > 0 else None
-    directions = _plane_sequence(_DIRECTIONS)
+    # The first points of the R2 low-discrepancy sequence in the unit square (Roberts, 2018), of the plastic number.
+    plastic = 1.32471795724474602596
+    directions = (np.arange(1, _DIRECTIONS + 1)[:, None] * np.array([1 / plastic, 1 / plastic**2])) % 1.0
 
     sharp = np.zeros((2 * count, 3), np.float32)
     sky_light = np.zeros((2 * count, 3), np.float32)
@@ -197,9 +202,7 @@ def compute_light(
             part = slice(start, start + _CHUNK)
             p, n, j = positions[part], normals[part], jitter[part]
             for emitter in emitters:
-                rays = np.empty((len(p) * _STRATA**2, 6), np.float32)
-                weights = np.empty(len(rays), np.float32)
-                _lamp_rays(p, n, j, emitter, offset, rays, weights)
+                rays, weights = _lamp_rays(p, n, j, emitter, offset)
                 _clear_blocked(caster, rays, weights)
                 received = weights.reshape(len(p), -1).mean(axis=1)
                 sharp[part] += received[:, None] * emitter[3].astype(np.float32)
@@ -208,16 +211,19 @@ def compute_light(
                 _clear_blocked(caster, rays, weights)
                 sharp[part] += (weights[:, None] * colors).reshape(len(p), -1, 3).mean(axis=1)
             rays = np.empty((len(p) * _DIRECTIONS, 6), np.float32)
-            _gathering_rays(p, n, j, directions, rays)
+            run_ranges(partial(_gathering_rays, p, n, j, directions, rays), len(p))
             hits = caster.cast(rays)
-            _gather(surface, count, rays, hits, size[part], sky, links[part], sky_light[part], buried[part])
-    albedo = _mean_albedo(surface, count)
+            found = links[part], sky_light[part], buried[part]
+            run_ranges(partial(_gather, surface, count, rays, hits, size[part], sky, *found), len(p))
+    albedo = np.tile(_mean_albedo(surface, count), (2, 1))
     direct = sharp + sky_light + np.float32(ambient)
+    # The mean over a point's rays of the light at their ends, as a matrix.
+    ends_in_sight = links >= 0
+    row_starts = np.append(0, ends_in_sight.sum(axis=1).cumsum())
+    gathering = csr_array((np.ones(row_starts[-1]), links[ends_in_sight], row_starts), shape=(2 * count, 2 * count))
     light = direct
     for _ in range(_BOUNCES):
-        reflected = np.empty_like(light)
-        _follow_links(links, albedo, light, reflected)
-        light = direct + reflected
+        light = direct + (gathering @ (albedo * light) / _DIRECTIONS).astype(np.float32)
     sides = [np.stack([points.corner[:, i], points.corner[:, i - 1]], axis=1) for i in range(3)]
     light = _smooth(light, sharp, buried, np.unique(np.concatenate(sides), axis=0))
     return np.ascontiguousarray(light.reshape(2, count, 3), np.float32)
@@ -249,12 +255,6 @@ def _smooth(
     return light
 
 
-def _plane_sequence(count: int) -> Array:
-    """Return the first points (count, 2) of the R2 low-discrepancy sequence in the unit square (Roberts, 2018)."""
-    plastic = 1.32471795724474602596
-    return (np.arange(1, count + 1)[:, None] * np.array([1 / plastic, 1 / plastic**2])) % 1.0
-
-
 def _neighbor_means(neighbors: NDArray[np.int64], values: NDArray, known: NDArray[np.bool_]) -> NDArray:
     """Return the mean (N, C) over each point and its neighbors, of those that are known; the point's value if none is.
 
@@ -270,16 +270,16 @@ def _neighbor_means(neighbors: NDArray[np.int64], values: NDArray, known: NDArra
 def _mean_albedo(surface: Surface, count: int) -> NDArray[np.float32]:
     """Return the mean color (G, 3) of the faces at each light point."""
     color = np.empty((len(surface.faces), 3), np.float32)
-    _face_colors(surface, color)
+    run_ranges(partial(_face_colors, surface, color), len(color))
     corner = surface.light_point.reshape(-1)
     total = np.stack([np.bincount(corner, column, count) for column in np.repeat(color, 3, axis=0).T], axis=1)
     return (total / np.bincount(corner, minlength=count)[:, None]).astype(np.float32)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _face_colors(surface, colors):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _face_colors(surface, colors, begin, end):
     """Fill the mean color of each face, from the mip level that has about two texels on the face."""
-    for face in numba.prange(len(surface.faces)):
+    for face in range(begin, end):
         i, j, k = surface.faces[face]
         for c in range(3):
             colors[face, c] = (surface.color[i, c] + surface.color[j, c] + surface.color[k, c]) / 3.0
@@ -287,34 +287,33 @@ def _face_colors(surface, colors):
             u = (surface.uv[i, 0] + surface.uv[j, 0] + surface.uv[k, 0]) / 3.0
             v = (surface.uv[i, 1] + surface.uv[j, 1] + surface.uv[k, 1]) / 3.0
             side = math.sqrt(0.5 * length(face_normal(surface, face)))
-            texel = lookup(surface, surface.texture[face], u, v, side * surface.density[face], True)
+            texel = lookup(surface.textures, surface.texture[face], u, v, side * surface.density[face], True)
             for c in range(3):
                 colors[face, c] *= texel[c] / 65535.0
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _lamp_rays(points, normals, jitter, lamp, offset, rays, weights):
-    """Fill segments to a lamp (4, 3), and the irradiance / pi that each alone would bring from unit radiance."""
-    half_u, half_v = row(lamp, 1), row(lamp, 2)
-    # A quarter of the lamp's area long.
-    lamp_normal = cross(half_u, half_v)
-    for n in numba.prange(len(points)):
-        point, normal = row(points, n), row(normals, n)
-        for sample in range(_STRATA * _STRATA):
-            a = 2.0 * (sample % _STRATA + jitter[n, 0]) / _STRATA - 1.0
-            b = 2.0 * (sample // _STRATA + jitter[n, 1]) / _STRATA - 1.0
-            direction = subtract(add_scaled(add_scaled(row(lamp, 0), a, half_u), b, half_v), point)
-            square = dot(direction, direction)
-            distance = math.sqrt(square)
-            cosine = dot(normal, direction) / distance
-            facing = -dot(lamp_normal, direction) / distance
-            reach = (distance - offset) / distance
-            k = n * _STRATA * _STRATA + sample
-            rays[k, 0], rays[k, 1], rays[k, 2] = point
-            for axis in range(3):
-                rays[k, 3 + axis] = reach * direction[axis]
-            is_lit = cosine > 0.0 and facing > 0.0 and reach > 0.0
-            weights[k] = 4.0 * facing * cosine / (math.pi * square) if is_lit else 0.0
+def _lamp_rays(
+    points: Array, normals: Array, jitter: Array, lamp: Array, offset: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return segments (N * samples, 6) to a lamp (4, 3), and the irradiance / pi that each alone would bring.
+
+    The irradiance is of unit radiance.
+    """
+    center, half_u, half_v, _ = lamp
+    sample = np.arange(_STRATA**2)
+    a = 2.0 * (sample % _STRATA + jitter[:, :1]) / _STRATA - 1.0
+    b = 2.0 * (sample // _STRATA + jitter[:, 1:]) / _STRATA - 1.0
+    direction = center + a[..., None] * half_u + b[..., None] * half_v - points[:, None]
+    square = (direction * direction).sum(axis=-1)
+    distance = np.sqrt(square)
+    cosine = (normals[:, None] * direction).sum(axis=-1) / distance
+    # The cross product is a quarter of the lamp's area long.
+    facing = -(np.cross(half_u, half_v) * direction).sum(axis=-1) / distance
+    reach = (distance - offset) / distance
+    rays = np.concatenate([np.broadcast_to(points[:, None], direction.shape), reach[..., None] * direction], axis=-1)
+    is_lit = (cosine > 0) & (facing > 0) & (reach > 0)
+    weights = np.where(is_lit, 4.0 * facing * cosine / (np.pi * square), 0.0)
+    return rays.reshape(-1, 6).astype(np.float32), weights.reshape(-1).astype(np.float32)
 
 
 def _clear_blocked(caster: RayCaster, rays: NDArray[np.float32], weights: NDArray[np.float32]) -> None:
@@ -366,10 +365,10 @@ class _Sun:
         return rays.astype(np.float32), weights.astype(np.float32), self._color[index]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _gathering_rays(points, normals, jitter, directions, rays):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _gathering_rays(points, normals, jitter, directions, rays, begin, end):
     """Fill rays in cosine-weighted directions: ``directions`` (K, 2) in the unit square, shifted by the jitter."""
-    for n in numba.prange(len(points)):
+    for n in range(begin, end):
         nx, ny, nz = row(normals, n)
         # Tangent frame without a branch per axis: Duff et al., JCGT 2017.
         sign = math.copysign(1.0, nz)
@@ -388,15 +387,15 @@ def _gathering_rays(points, normals, jitter, directions, rays):
             ray[5] = u * tz + v * bz + w * nz
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _gather(surface, half, rays, hits, size, sky, links, received, buried):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _gather(surface, half, rays, hits, size, sky, links, received, buried, begin, end):
     """Fill, for each point, where its rays end, the light of the sky, and whether the point is buried.
 
     A link is the light point nearest to the hit, plus ``half`` for the back of a surface, or -1 for the sky. A point is
     buried if it lies inside an object or right beneath one.
     """
     count = links.shape[1]
-    for n in numba.prange(len(links)):
+    for n in range(begin, end):
         red, green, blue, behind, near = 0.0, 0.0, 0.0, 0, 0
         for k in range(count):
             i = n * count + k
@@ -418,20 +417,3 @@ def _gather(surface, half, rays, hits, size, sky, links, received, buried):
             near += hits.distance[i] < size[n]
         received[n, 0], received[n, 1], received[n, 2] = red / count, green / count, blue / count
         buried[n] = behind > 0.75 * count or near == count
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _follow_links(links, albedo, light, reflected):
-    """Fill the light (2 G, 3) that each point receives from the points at the ends of its rays."""
-    half, count = len(albedo), links.shape[1]
-    for n in numba.prange(len(links)):
-        red, green, blue = 0.0, 0.0, 0.0
-        for k in range(count):
-            link = links[n, k]
-            if link < 0:
-                continue
-            point = link - half if link >= half else link
-            red += albedo[point, 0] * light[link, 0]
-            green += albedo[point, 1] * light[link, 1]
-            blue += albedo[point, 2] * light[link, 2]
-        reflected[n, 0], reflected[n, 1], reflected[n, 2] = red / count, green / count, blue / count

@@ -56,8 +56,8 @@ def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
 def lookup(maps, picture, u, v, footprint, repeats):
     """Interpolate a picture at (u, v), in widths and heights of the picture, trilinearly.
 
-    ``maps`` has the fields of `MipMaps`. ``footprint`` is the side of the region to average, in texels of the finest
-    level. Columns repeat. Rows repeat too if ``repeats``; otherwise the first and the last row extend to infinity.
+    ``footprint`` is the side of the region to average, in texels of the finest level. Columns repeat. Rows repeat too
+    if ``repeats``; otherwise the first and the last row extend to infinity.
     """
     first, last = maps.first_level[picture], maps.first_level[picture + 1] - 1
     detail = min(math.log2(max(footprint, 1.0)), float(last - first))
@@ -91,7 +91,7 @@ def lookup(maps, picture, u, v, footprint, repeats):
 
 @numba.njit(cache=True, error_model="numpy")
 def panorama(maps, direction, footprint):
-    """Interpolate an equirectangular picture (see `Environment`) in a direction of any length."""
+    """Interpolate an equirectangular picture (see `Panorama`) in a direction of any length."""
     turn = math.atan2(direction[1], direction[0]) / (2.0 * math.pi)
     down = math.acos(max(-1.0, min(1.0, direction[2] / length(direction)))) / math.pi
     return lookup(maps, 0, 0.5 - turn, down, footprint, False)

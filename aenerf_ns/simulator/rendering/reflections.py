@@ -13,6 +13,7 @@ A surface that is seen in a reflection shows the light that a diffuse surface re
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numba
@@ -25,24 +26,19 @@ from aenerf_ns.simulator.rendering.mesh import Mesh
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, panorama
 from aenerf_ns.simulator.rendering.surface import FOOTPRINT, Surface, diffuse_radiance, face_normal
 from aenerf_ns.simulator.rendering.vectors import add_scaled, cross, divide, dot, interpolate, length, row, subtract
+from aenerf_ns.threads import run_ranges
 
 _MIN_SINE = 0.01
 """Of the angle between a mirrored ray and its face. An interpolated normal may mirror rays into the face."""
 
 
-class Coats(NamedTuple):
-    """The coats of a mesh as the compiled functions read them: F faces, G light points."""
+class Reflections(NamedTuple):
+    """The coats of a mesh of F faces and G light points, and the light that they reflect beside that from the mesh."""
 
     specular: NDArray[np.float32]  # (F,) reflectance at normal incidence, 0 where a face is diffuse
     lobe: NDArray[np.float32]  # (F,) standard deviation of reflected directions, in radians
     curvature: NDArray[np.float32]  # (F,) turn of the normal along the face, in radians per meter
     normal: Array  # (G, 3) unit
-
-
-class Reflections(NamedTuple):
-    """The coats of a mesh, and the light that they reflect beside the light from the mesh itself."""
-
-    coats: Coats
     lamps: Array  # (L, 4, 3) center, half sides and radiance
     environment: MipMaps  # light from far away
     ambient: float  # radiance that arrives from everywhere
@@ -62,8 +58,8 @@ def make_reflections(
     side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
     turn = np.linalg.norm(np.roll(normals, -1, axis=1) - normals, axis=-1)
     curvature = (turn / np.maximum(side, 1e-300)).max(axis=1).astype(np.float32)
-    coats = Coats(specular, np.float32(math.sqrt(2.0)) * roughness**2, curvature, normal)
-    return Reflections(coats, lamps, environment, ambient)
+    lobe = np.float32(math.sqrt(2.0)) * roughness**2
+    return Reflections(specular, lobe, curvature, normal, lamps, environment, ambient)
 
 
 def add_reflections(
@@ -86,15 +82,14 @@ def add_reflections(
         radiance: (rows, columns, 3) diffuse picture, changed in place.
     """
     glossy = np.flatnonzero(hits.face != NOTHING)
-    glossy = glossy[reflections.coats.specular[hits.face[glossy]] > 0]
+    glossy = glossy[reflections.specular[hits.face[glossy]] > 0]
     first = Hits(*(column[glossy] for column in hits))
     mirrored = np.empty((len(glossy), 6), np.float32)
     optics, diffuse, change = (np.empty((len(glossy), 3)) for _ in range(3))
-    _mirror(
-        surface, light, reflections.coats, rays[glossy], first, focal_length, surface.ray_offset,
-        mirrored, optics, diffuse,
-    )  # fmt: skip
-    _reflect(surface, light, *reflections[1:], mirrored, caster.cast(mirrored), optics, diffuse, limit, change)
+    seen = rays[glossy], first, focal_length, surface.ray_offset
+    run_ranges(partial(_mirror, surface, light, reflections, *seen, mirrored, optics, diffuse), len(glossy))
+    found = mirrored, caster.cast(mirrored), optics, diffuse
+    run_ranges(partial(_reflect, surface, light, reflections, *found, limit, change), len(glossy))
     rows, columns = radiance.shape[:2]
     samples = len(rays) // (rows * columns)
     for channel in range(3):
@@ -102,14 +97,14 @@ def add_reflections(
         radiance[..., channel] += total.reshape(rows, columns) / samples
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _mirror(surface, light, coats, rays, hits, focal_length, offset, mirrored, optics, diffuse):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mirror(surface, light, reflections, rays, hits, focal_length, offset, mirrored, optics, diffuse, begin, end):
     """Fill the mirrored rays (N, 6) of rays that hit glossy faces, with unit directions, and the diffuse light there.
 
     ``optics`` (N, 3) are the Fresnel reflectance, the standard deviation of the reflected directions over the sample's
     region, in radians, and the side of that region in meters.
     """
-    for n in numba.prange(len(rays)):
+    for n in range(begin, end):
         face, weights = hits.face[n], _weights(hits, n)
         direction = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
         size = length(direction)
@@ -121,7 +116,7 @@ def _mirror(surface, light, coats, rays, hits, focal_length, offset, mirrored, o
         towards = 1.0 if side == 0 else -1.0
         area = towards * length(face_direction)
         face_direction = divide(face_direction, area)
-        normal = interpolate(coats.normal, row(surface.light_point, face), weights)
+        normal = interpolate(reflections.normal, row(surface.light_point, face), weights)
         normal = divide(normal, towards * length(normal))
         cosine = -dot(normal, direction)
         reflected = add_scaled(direction, 2.0 * cosine, normal)
@@ -133,14 +128,14 @@ def _mirror(surface, light, coats, rays, hits, focal_length, offset, mirrored, o
         for axis in range(3):
             mirrored[n, axis], mirrored[n, 3 + axis] = origin[axis], reflected[axis]
 
-        specular = coats.specular[face]
+        specular = reflections.specular[face]
         # No surface reflects less than 2 % at normal incidence. Below that, the reflectance at grazing angles fades too
         # (Lagarde and de Rousiers, 2014).
         grazing = min(50.0 * specular, 1.0)
         optics[n, 0] = specular + (grazing - specular) * (1.0 - min(max(cosine, 0.0), 1.0)) ** 5
         footprint = FOOTPRINT * depth / (focal_length * math.sqrt(max(abs(facing / area), 0.02)))
-        bend, view = coats.curvature[face] * footprint, 0.5 * FOOTPRINT / focal_length
-        optics[n, 1] = math.sqrt(coats.lobe[face] ** 2 + bend * bend + view * view)
+        bend, view = reflections.curvature[face] * footprint, 0.5 * FOOTPRINT / focal_length
+        optics[n, 1] = math.sqrt(reflections.lobe[face] ** 2 + bend * bend + view * view)
         optics[n, 2] = footprint
         diffuse[n, 0], diffuse[n, 1], diffuse[n, 2] = diffuse_radiance(surface, light, face, side, weights, footprint)
 
@@ -152,10 +147,11 @@ def _weights(hits, n):
     return 1.0 - wj - wk, wj, wk
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _reflect(surface, light, lamps, environment, ambient, rays, hits, optics, diffuse, limit, change):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reflect(surface, light, reflections, rays, hits, optics, diffuse, limit, change, begin, end):
     """Fill how the radiance (N, 3) of glossy surfaces differs from the diffuse radiance, given their mirrored rays."""
-    for n in numba.prange(len(rays)):
+    environment, ambient = reflections.environment, reflections.ambient
+    for n in range(begin, end):
         direction = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
         reflectance, lobe, footprint = row(optics, n)
         face, distance = hits.face[n], hits.distance[n]
@@ -171,7 +167,7 @@ def _reflect(surface, light, lamps, environment, ambient, rays, hits, optics, di
             side = 0 if facing < 0.0 else 1
             r, g, b = diffuse_radiance(surface, light, face, side, _weights(hits, n), region)
         r, g, b = r + ambient, g + ambient, b + ambient
-        for lamp in lamps:
+        for lamp in reflections.lamps:
             covered = _covered_share(lamp, row(rays, n), direction, distance, lobe)
             r += covered * (lamp[3, 0] - r)
             g += covered * (lamp[3, 1] - g)

@@ -11,18 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aenerf_ns.simulator.arrays import Array
+from aenerf_ns.simulator.arrays import Array, Panorama
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
-from aenerf_ns.simulator.rendering.environment import Environment
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, mip_maps, panorama
 from aenerf_ns.simulator.rendering.reflections import Reflections, add_reflections
 from aenerf_ns.simulator.rendering.surface import FOOTPRINT, Surface, diffuse_radiance
 from aenerf_ns.simulator.rendering.vectors import cross, dot, interpolate, row, subtract
+from aenerf_ns.threads import run_ranges
 
 POINT_SPREAD = 0.5
 """Standard deviation of a pixel's Gaussian point-spread function, in pixels."""
@@ -71,23 +72,21 @@ def _intersect(surface, face, origin, direction):
     return (1.0 - second - third, second, third), normal
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _shade(
-    surface, light, hit_faces, rotation, center, intrinsics, offsets, background, sky, limit, radiance, depth, alpha
-):
-    """Shade the hits of `_camera_rays` and fill ``radiance``, ``depth`` and ``alpha``.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _shade(surface, light, hits, camera, offsets, background, sky, limit, radiance, depth, begin, end):
+    """Shade rows of the hits of `_camera_rays` and fill ``radiance`` and ``depth``.
 
     A ray that hits nothing sees the panorama ``sky``, or ``background`` if ``sky`` is empty.
     """
-    height, width = depth.shape
+    width, (rotation, center, intrinsics) = depth.shape[1], camera
     focal, samples = intrinsics[0], len(offsets)
     origin, axis = (center[0], center[1], center[2]), (rotation[0, 2], rotation[1, 2], rotation[2, 2])
-    for y in numba.prange(height):
+    for y in range(begin, end):
         for x in range(width):
             red, green, blue, total_depth, found = 0.0, 0.0, 0.0, 0.0, 0
             for s in range(samples):
                 direction = _direction(rotation, intrinsics, x, y, offsets[s])
-                face = hit_faces[(y * width + x) * samples + s]
+                face = hits[(y * width + x) * samples + s]
                 if face == NOTHING:
                     r, g, b = background[0], background[1], background[2]
                     if len(sky.level) > 0:
@@ -114,7 +113,6 @@ def _shade(
                 blue += b
             radiance[y, x, 0], radiance[y, x, 1], radiance[y, x, 2] = red / samples, green / samples, blue / samples
             depth[y, x] = total_depth / found if found > 0 else math.inf
-            alpha[y, x] = found / samples
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,7 @@ class Renderer:
 
     def render(
         self, camera_to_world: ArrayLike, intrinsics: Sequence[float], width: int, height: int, samples: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Render a picture through a pinhole camera.
 
         Args:
@@ -151,7 +149,7 @@ class Renderer:
 
         Returns:
             radiance (H, W, 3), linear RGB; depth (H, W) along the optical axis, the mean over the rays that hit, inf
-            where none does; alpha (H, W), the fraction of rays that hit. All are float32.
+            where none does. Both are float32.
         """
         pose, lens = np.asarray(camera_to_world, np.float64), tuple(map(float, intrinsics))
         offsets = sample_offsets(samples)
@@ -159,17 +157,15 @@ class Renderer:
         rays = np.empty((height * width * samples, 6), np.float32)
         _camera_rays(rotation, center, lens, offsets, width, rays)
         hits = self.caster.cast(rays)
-        radiance = np.empty((height, width, 3), np.float32)
-        depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-        _shade(
-            self.surface, self.light, hits.face, rotation, center, lens, offsets, self.background, self.surroundings,
-            self.limit, radiance, depth, alpha,
-        )  # fmt: skip
+        radiance, depth = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
+        camera, scene = (rotation, center, lens), (self.background, self.surroundings, self.limit)
+        shade = partial(_shade, self.surface, self.light, hits.face, camera, offsets, *scene, radiance, depth)
+        run_ranges(shade, height)
         if self.reflections is not None:
             add_reflections(
                 self.reflections, self.surface, self.light, self.caster, rays, hits, lens[0], self.limit, radiance
             )
-        return radiance, depth, alpha
+        return radiance, depth
 
     def with_gain(self, gain: float) -> Renderer:
         """Return the renderer of the same scene in ``gain`` times the light. The background does not change."""
@@ -181,9 +177,9 @@ class Renderer:
         )
 
 
-def make_surroundings(environment: Environment | None) -> MipMaps:
+def make_surroundings(environment: Panorama | None) -> MipMaps:
     """Build the panorama behind a mesh, empty where there is no environment to be seen."""
-    return mip_maps([] if environment is None else [environment.radiance], bits16=False)
+    return mip_maps([] if environment is None else [environment], bits16=False)
 
 
 def sample_offsets(samples: int) -> NDArray[np.float64]:

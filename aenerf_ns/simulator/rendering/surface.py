@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from aenerf_ns.simulator.arrays import Array
 from aenerf_ns.simulator.rendering.mesh import Mesh, normals_and_areas
-from aenerf_ns.simulator.rendering.mip_maps import lookup, mip_maps
+from aenerf_ns.simulator.rendering.mip_maps import MipMaps, lookup, mip_maps
 from aenerf_ns.simulator.rendering.vectors import cross, interpolate, row, subtract
 
 FOOTPRINT = 0.5
@@ -18,10 +18,7 @@ FOOTPRINT = 0.5
 
 
 class Surface(NamedTuple):
-    """The arrays of a mesh that the compiled functions read: V vertices, F faces, G light points.
-
-    The last three are the `MipMaps` of the textures. numba takes no tuples within tuples in parallel functions.
-    """
+    """The arrays of a mesh that the compiled functions read: V vertices, F faces, G light points."""
 
     vertices: Array  # (V, 3)
     faces: NDArray[np.int32]  # (F, 3)
@@ -30,9 +27,7 @@ class Surface(NamedTuple):
     texture: NDArray[np.int32]  # (F,) -1 for none
     density: NDArray[np.float32]  # (F,) texels per meter
     light_point: NDArray[np.int32]  # (F, 3) light point of each corner
-    texels: NDArray[np.uint16]
-    level: NDArray[np.int64]
-    first_level: NDArray[np.int64]
+    textures: MipMaps
 
     @property
     def ray_offset(self) -> float:
@@ -54,7 +49,7 @@ def make_surface(mesh: Mesh, light_point: NDArray[np.integer]) -> Surface:
         mesh.texture.astype(np.int32),
         np.sqrt(in_texture * texels[mesh.texture] / np.maximum(area, 1e-300)).astype(np.float32),
         light_point.astype(np.int32),
-        *mip_maps(mesh.textures, bits16=True),
+        mip_maps(mesh.textures, bits16=True),
     )
 
 
@@ -81,6 +76,8 @@ def diffuse_radiance(surface, light, face, side, weights, footprint):
         (i, j, k), (wi, wj, wk) = corners, weights
         u = wi * uv[i, 0] + wj * uv[j, 0] + wk * uv[k, 0]
         v = wi * uv[i, 1] + wj * uv[j, 1] + wk * uv[k, 1]
-        red, green, blue = lookup(surface, surface.texture[face], u, v, footprint * surface.density[face], True)
+        red, green, blue = lookup(
+            surface.textures, surface.texture[face], u, v, footprint * surface.density[face], True
+        )
         r, g, b = r * red / 65535.0, g * green / 65535.0, b * blue / 65535.0
     return r, g, b
