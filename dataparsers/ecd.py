@@ -52,23 +52,22 @@ class EcdDataParser(EventDataParser):
         return self.config.make_recording(reference, capture, reference_views=views, max_views=None)
 
     def poses_path(self) -> Path:
-        return Path(self.config.data) / "groundtruth.txt"
+        return self.data / "groundtruth.txt"
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        folder = Path(self.config.data)
-        if not folder.is_dir():
-            raise DataError(folder, "there is no such folder", "give the folder that holds events.txt as --data")
-        images = read_image_list(folder / IMAGE_LIST) if (folder / IMAGE_LIST).exists() else []
+        if not self.data.is_dir():
+            raise DataError(self.data, "there is no such folder", "give the folder that holds events.txt as --data")
+        images = read_image_list(self.data / IMAGE_LIST) if (self.data / IMAGE_LIST).exists() else []
         stated = (self.config.width, self.config.height)
         size = _DAVIS240C
         if images:
             with open_image(images[0][1]) as image:
                 size = image.size
         width, height = (own if given is None else given for given, own in zip(stated, size, strict=True))
-        camera = _read_calibration(folder / "calib.txt", (width, height))
+        camera = _read_calibration(self.data / "calib.txt", (width, height))
         if not images and None in stated:
             CONSOLE.print(f"The sensor's size {width} x {height} is a guess: if it is another, give width and height.")
-        events = TextEventFile(folder / "events.txt", width, height, "s")
+        events = TextEventFile(self.data / "events.txt", width, height, "s")
         return self.config.make_capture(SensorModel(0.5, 0.5), True, event_file=events, event_camera=camera), images
 
 

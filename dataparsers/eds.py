@@ -63,13 +63,12 @@ class EdsDataParser(EventDataParser):
         return self.config.make_recording(reference, capture, reference_views=views)
 
     def poses_path(self) -> Path:
-        return Path(self.config.data) / "stamped_groundtruth.txt"
+        return self.data / "stamped_groundtruth.txt"
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        folder = Path(self.config.data)
         camera, frame_camera, _ = self._calibration
-        events = Hdf5TableFile(folder / "events.h5", camera.width, camera.height, COLUMNS_AT_TOP)
-        images = read_image_times(folder / "images", folder / "images_timestamps.txt", "us")
+        events = Hdf5TableFile(self.data / "events.h5", camera.width, camera.height, COLUMNS_AT_TOP)
+        images = read_image_times(self.data / "images", self.data / "images_timestamps.txt", "us")
         return self.config.make_capture(
             SensorModel(), True, event_file=events, event_camera=camera, frame_camera=frame_camera
         ), images

@@ -71,15 +71,13 @@ class ENeRFEsimDataParser(EventDataParser):
         return self.config.make_recording(reference, capture, reference_views=views_on_trajectory(images, reference))
 
     def poses_path(self) -> Path:
-        folder = Path(self.config.data)
-        lists = sorted(folder.glob("*poses_all*.txt")) or [folder / "poses_all.txt"]
-        return require_one(lists, folder, "files *poses_all*.txt", "leave the poses of the scene only")
+        lists = sorted(self.data.glob("*poses_all*.txt")) or [self.data / "poses_all.txt"]
+        return require_one(lists, self.data, "files *poses_all*.txt", "leave the poses of the scene only")
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        folder = Path(self.config.data)
-        camera = _read_camera(folder / "poses_bounds.npy")
-        events = EsimEventFolder(folder / "events", camera.width, camera.height)
-        images = read_image_times(folder / "images", folder / "images" / "image_stamps_ns.txt", "ns")
+        camera = _read_camera(self.data / "poses_bounds.npy")
+        events = EsimEventFolder(self.data / "events", camera.width, camera.height)
+        images = read_image_times(self.data / "images", self.data / "images" / "image_stamps_ns.txt", "ns")
         return self.config.make_capture(SensorModel(), True, event_file=events, event_camera=camera), images
 
 

@@ -122,9 +122,8 @@ class EventNeRFDataParser(EventDataParser):
         return capture, []
 
     def _split(self) -> Path:
-        data = Path(self.config.data)
-        splits = [split for split in _training_splits(data) if (split / "intrinsics").is_dir()]
-        return require_one(splits, data, "training splits (train/intrinsics)", "give the folder of one as --data")
+        splits = [split for split in _training_splits(self.data) if (split / "intrinsics").is_dir()]
+        return require_one(splits, self.data, "training splits (train/intrinsics)", "give the folder of one as --data")
 
 
 def _training_splits(data: Path) -> list[Path]:

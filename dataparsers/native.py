@@ -65,7 +65,7 @@ class NativeDataParser(EventDataParser):
         )
 
     def poses_path(self) -> Path:
-        return Path(self.config.data) / f"trajectory_{self.config.poses.replace('-', '_')}.txt"
+        return self.data / f"trajectory_{self.config.poses.replace('-', '_')}.txt"
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         path, meta, capture = self._read_all_but_poses()
@@ -74,7 +74,7 @@ class NativeDataParser(EventDataParser):
 
     def _read_all_but_poses(self) -> tuple[Path, Transforms, Capture]:
         """Return transforms.json, its content, and the cameras."""
-        path = Path(self.config.data) / "transforms.json"
+        path = self.data / "transforms.json"
         meta, frame_camera = read_transforms(path)
         camera = meta.event_camera.intrinsics()
         if meta.event_camera.file is None:

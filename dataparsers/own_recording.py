@@ -83,14 +83,14 @@ class OwnRecordingDataParser(EventDataParser):
     config: OwnRecordingDataParserConfig
 
     def read_recording(self) -> Recording:
-        folder, config = Path(self.config.data), self.config
+        config = self.config
         capture, frame_from_event, timed = self._read_all_but_poses()
         poses = self.poses_path()
-        if poses in (folder / "colmap", config.colmap):
-            images = self._image_list(folder)
+        if poses in (self.data / "colmap", config.colmap):
             if not timed:
-                raise DataError(images, "there is no such list of images", "write a line for each: time[s] file")
-            reference = _read_colmap(poses, timed, images, frame_from_event, capture)
+                remedy = "write a line for each: time[s] file"
+                raise DataError(self._image_list, "there is no such list of images", remedy)
+            reference = _read_colmap(poses, timed, self._image_list, frame_from_event, capture)
         else:
             reference = read_tum_trajectory(poses)
         views = views_on_trajectory(
@@ -99,14 +99,14 @@ class OwnRecordingDataParser(EventDataParser):
         return config.make_recording(reference, capture, reference_views=views)
 
     def poses_path(self) -> Path:
-        folder, config = Path(self.config.data), self.config
+        config = self.config
         if config.colmap and config.poses:
             raise DataError("event-recording-data", "--poses and --colmap are both given", "leave out one of them")
         stated = config.colmap or config.poses
         if stated is not None and not stated.exists():
             option = "--colmap" if config.colmap else "--poses"
             raise DataError(stated, "there is no such file of poses", f"correct {option}, or leave it out")
-        trajectory, model = folder / "trajectory.txt", folder / "colmap"
+        trajectory, model = self.data / "trajectory.txt", self.data / "colmap"
         return stated or (model if model.is_dir() and not trajectory.is_file() else trajectory)
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
@@ -116,16 +116,16 @@ class OwnRecordingDataParser(EventDataParser):
     def _read_all_but_poses(self) -> tuple[Capture, Tensor, list[tuple[int, Path]]]:
         """Read the cameras, the (4, 4) motion from the event camera's to the frame camera's coordinates, and the times
         in nanoseconds and the files of the images."""
-        folder, config = Path(self.config.data), self.config
-        if not folder.is_dir():
-            raise DataError(folder, "there is no such folder", "give the folder of the recording as --data")
-        images = self._image_list(folder)
+        config = self.config
+        if not self.data.is_dir():
+            raise DataError(self.data, "there is no such folder", "give the folder of the recording as --data")
+        images = self._image_list
         timed = read_image_list(images) if config.images is not None or images.is_file() else []
-        calibration = self._read_calibration(folder, bool(timed))
+        calibration = self._read_calibration(bool(timed))
         capture = config.make_capture(
             calibration.sensor,
             calibration.has_assumed_thresholds,
-            event_file=self._event_file(folder, calibration.event_camera.width, calibration.event_camera.height),
+            event_file=self._event_file(calibration.event_camera.width, calibration.event_camera.height),
             event_camera=calibration.event_camera,
             frame_camera=calibration.frame_camera,
             image_encoding=config.image_encoding or calibration.image_encoding,
@@ -133,25 +133,26 @@ class OwnRecordingDataParser(EventDataParser):
         )
         return capture, calibration.frame_from_event, timed
 
-    def _image_list(self, folder: Path) -> Path:
-        return folder / IMAGE_LIST if self.config.images is None else self.config.images
+    @property
+    def _image_list(self) -> Path:
+        return self.config.images or self.data / IMAGE_LIST
 
-    def _read_calibration(self, folder: Path, has_images: bool) -> Calibration:
+    def _read_calibration(self, has_images: bool) -> Calibration:
         config, file = self.config, self.config.calibration
         if file is None:
-            found = [folder / name for name in _CALIBRATIONS if (folder / name).is_file()]
+            found = [self.data / name for name in _CALIBRATIONS if (self.data / name).is_file()]
             if not found:
-                return _guess_calibration(self._event_file(folder))
-            file = require_one(found, folder, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
+                return _guess_calibration(self._event_file())
+            file = require_one(found, self.data, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
         return read_calibration(file, config.event_camera, config.frame_camera, has_images)
 
-    def _event_file(self, folder: Path, width: int | None = None, height: int | None = None) -> EventFile:
+    def _event_file(self, width: int | None = None, height: int | None = None) -> EventFile:
         config = self.config
         if config.events is None:
-            files = sorted(folder / f"events{suffix}" for suffix in SUFFIXES)
-            files = [file for file in files if file.is_file()]
+            files = sorted(file for suffix in SUFFIXES if (file := self.data / f"events{suffix}").is_file())
+            what = f"files events{{{','.join(SUFFIXES)}}}"
             # Stored, so that opening a trained run needs no events.
-            config.events = require_one(files, folder, f"files events{{{','.join(SUFFIXES)}}}", "give one as --events")
+            config.events = require_one(files, self.data, what, "give one as --events")
         return open_event_file(config.events, width, height, config.event_topic, config.event_time_unit)
 
 

@@ -67,8 +67,7 @@ class PAEv3DDataParser(EventDataParser):
         return capture, []
 
     def _scene(self) -> Path:
-        data = Path(self.config.data)
-        return require_one(_scenes(data), data, "scenes (H5_Files/SCENE)", "give the folder of one as --data")
+        return require_one(_scenes(self.data), self.data, "scenes (H5_Files/SCENE)", "give the folder of one as --data")
 
 
 def _scenes(data: Path) -> list[Path]:

@@ -79,11 +79,10 @@ class RobustENeRFDataParser(EventDataParser):
     config: RobustENeRFDataParserConfig
 
     def read_recording(self) -> Recording:
-        folder = Path(self.config.data)
         capture, _ = self.read_capture()
-        frame_camera, views = _read_views(folder)
+        frame_camera, views = _read_views(self.data)
         # Only scenes simulated from Blender have this file.
-        synthetic = (folder / "renderer_params.npz").is_file()
+        synthetic = (self.data / "renderer_params.npz").is_file()
         return self.config.make_recording(
             _read_poses(self.poses_path()),
             capture if frame_camera is None else replace(capture, frame_camera=frame_camera),
@@ -93,12 +92,11 @@ class RobustENeRFDataParser(EventDataParser):
         )
 
     def poses_path(self) -> Path:
-        return Path(self.config.data) / "camera_poses.npz"
+        return self.data / "camera_poses.npz"
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
-        folder = Path(self.config.data)
-        camera, sensor = _read_calibration(folder / "camera_calibration.npz")
-        events = ArrayEventFile(folder / "raw_events.npz", camera.width, camera.height, POSITION_TIMESTAMP_POLARITY)
+        camera, sensor = _read_calibration(self.data / "camera_calibration.npz")
+        events = ArrayEventFile(self.data / "raw_events.npz", camera.width, camera.height, POSITION_TIMESTAMP_POLARITY)
         # The views have no times.
         return self.config.make_capture(sensor, event_file=events, event_camera=camera), []
 

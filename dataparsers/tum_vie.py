@@ -110,7 +110,7 @@ class TumVieDataParser(EventDataParser):
     config: TumVieDataParserConfig
 
     def read_recording(self) -> Recording:
-        events, sequence, side = _choose(Path(self.config.data))
+        events, sequence, side = _choose(self.data)
         capture, imu_from_event, imu_from_frame = self._read_cameras()
         # The motion capture gives the poses of its marker.
         path = _find_calibration(events.parent, f"mocap-imu-calibration{_calibration_set(sequence)}.json")
@@ -133,7 +133,7 @@ class TumVieDataParser(EventDataParser):
         )
 
     def poses_path(self) -> Path:
-        events, sequence, _ = _choose(Path(self.config.data))
+        events, sequence, _ = _choose(self.data)
         return events.parent / f"{sequence}-vi_gt_data" / "mocap_data.txt"
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
@@ -142,7 +142,7 @@ class TumVieDataParser(EventDataParser):
 
     def _read_cameras(self) -> tuple[Capture, Tensor, Tensor]:
         """Read the cameras, and the (4, 4) motions from the event and the frame camera's coordinates to the IMU's."""
-        events, sequence, side = _choose(Path(self.config.data))
+        events, sequence, side = _choose(self.data)
         path = _find_calibration(events.parent, f"camera-calibration{_calibration_set(sequence)}.json")
         cameras = read_json(path, _File[_Cameras]).value0
         (event_camera, imu_from_event), (frame_camera, imu_from_frame) = (

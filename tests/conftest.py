@@ -6,17 +6,12 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import numba
 import pytest
 import torch
 from hypothesis import settings
 
 from aenerf_ns.camera.rotation import rotation_from_vector
-
-if TYPE_CHECKING:
-    from aenerf_ns.simulator.scene import SimulationScene
 
 # For the package `benchmarks`, which is not installed. At the end, because the repository's own `aenerf_ns` lacks two
 # folders of the installed one.
@@ -25,12 +20,6 @@ sys.path.append(str(Path(__file__).parents[1]))
 if not torch.cuda.is_available():
     # Before anything imports Triton: it then interprets its kernels on the CPU.
     os.environ["TRITON_INTERPRET"] = "1"
-
-# numba and PyTorch share one OpenMP. When numba starts its threads, PyTorch gets as many. Threads of all workers
-# then wait for each other, and a training takes up to nine times as long.
-_TORCH_THREADS = torch.get_num_threads()
-numba.set_num_threads(1)
-torch.set_num_threads(_TORCH_THREADS)
 
 # The same examples in every run of the suite, so that a failure is that of a change. Longer runs look for new ones.
 settings.register_profile("suite", derandomize="AENERF_FUZZ_EXAMPLES" not in os.environ)
@@ -87,22 +76,6 @@ def small_work() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mesh_repair, "NUM_CORNERS", 2000)
         yield
-
-
-@pytest.fixture(scope="session")
-def room() -> SimulationScene:
-    """The built-in room."""
-    from aenerf_ns.simulator.open_scene import open_scene
-
-    return open_scene("room")
-
-
-@pytest.fixture(scope="session")
-def toy() -> SimulationScene:
-    """The built-in object."""
-    from aenerf_ns.simulator.open_scene import open_scene
-
-    return open_scene("object")
 
 
 @pytest.fixture

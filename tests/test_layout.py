@@ -18,6 +18,7 @@ MAY_USE: dict[str, set[str]] = {
     "errors": set(),
     "atomic_write": set(),
     "progress": set(),
+    "threads": set(),
     "open3d_import": {"errors"},
     "camera": {"errors"},
     "events": {"errors", "camera"},
@@ -29,7 +30,7 @@ MAY_USE: dict[str, set[str]] = {
     "pose_estimation": {"errors", "progress", "events", "reconstruction", "camera", "files", "recording"},
     "checking": {"progress", "events", "camera", "files", "recording"},
     "supervision": {"errors", "events", "camera", "recording"},
-    "method": {"errors", "camera", "recording", "supervision"},
+    "method": {"errors", "threads", "camera", "recording", "supervision"},
     # What is done with a trained run, without the trainer.
     "evaluation": {"errors", "progress", "camera", "recording", "supervision", "method", "checking"},
     # What the viewer shows of a run. It only looks: the pipeline hands it what it needs.
@@ -41,7 +42,7 @@ MAY_USE: dict[str, set[str]] = {
         "checking",
     },
     # Stands beside the method: only commands and benchmarks use it.
-    "simulator": {"errors", "progress", "open3d_import", "events", "camera", "files", "pose_estimation"},
+    "simulator": {"errors", "progress", "threads", "open3d_import", "events", "camera", "files", "pose_estimation"},
     # What other tools take from a trained run.
     "export": {"errors", "progress", "open3d_import", "events", "camera", "files", "recording", "evaluation"},
     "dataparsers": {"errors", "events", "camera", "files", "recording"},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -16,23 +16,6 @@ from aenerf_ns.method.color_correction import NoColorCorrection
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.recording.dataset import EventDataset
-
-
-@dataclass(frozen=True)
-class _Pixels:
-    """Pixels that a color correction is fitted on.
-
-    Attributes:
-        cameras: of the views.
-        view: (N, 1) index of each pixel's camera.
-        coordinates: (N, 2) row and column.
-        radiance: (N, channels) of the reference image there, or None where there are no references.
-    """
-
-    cameras: Cameras
-    view: Tensor
-    coordinates: Tensor
-    radiance: Tensor | None = None
 
 
 class ColorFit:
@@ -56,7 +39,7 @@ class ColorFit:
         self._dataset = dataset
         self._read_reference_views = read_reference_views
         # Chosen once: otherwise every fit would read the images again.
-        self._pixels: _Pixels | None = None
+        self._pixels: tuple[Cameras, Tensor, Tensor, Tensor | None] | None = None
         # The sign of the slope that was printed last.
         self._was_reversed: bool | None = None
         if model.color_correction.protocol == "affine-test":
@@ -73,24 +56,29 @@ class ColorFit:
             return
         if self._pixels is None:
             self._pixels = self._choose_pixels(correction.split)
-        pixels = self._pixels
-        count = max(round(share * len(pixels.view)), 1)
+        cameras, view, coordinates, radiance = self._pixels
+        count = max(round(share * len(view)), 1)
         # Reference views are carried over to the frame that the corrected poses have at this step.
-        cameras = replace(pixels.cameras, camera_to_worlds=model.camera_optimizer.apply_to_camera(pixels.cameras))
-        rays = cameras.generate_rays(pixels.view[:count], coords=pixels.coordinates[:count])
+        cameras = replace(cameras, camera_to_worlds=model.camera_optimizer.apply_to_camera(cameras))
+        rays = cameras.generate_rays(view[:count], coords=coordinates[:count])
         log_radiance = model.render_rays(rays, "log_radiance")[0]
-        if pixels.radiance is None:
+        if radiance is None:
             correction.stretch(log_radiance)
         else:
-            correction.fit(log_radiance, pixels.radiance[:count], len(cameras), rough=share < 1)
+            correction.fit(log_radiance, radiance[:count], len(cameras), rough=share < 1)
             if share == 1 and correction.is_reversed != self._was_reversed:
                 self._was_reversed = correction.is_reversed
                 color = "[yellow]" if correction.is_reversed else ""
                 slopes = ", ".join(f"{slope:+.2f}" for slope in correction.scale.tolist())
                 CONSOLE.print(f"{color}Color correction: {correction.description}; slope {slopes}.", soft_wrap=True)
 
-    def _choose_pixels(self, split: Literal["val", "test"]) -> _Pixels:
-        """Choose random pixels of all reference views of a split, or of the training cameras where there are none."""
+    def _choose_pixels(self, split: Literal["val", "test"]) -> tuple[Cameras, Tensor, Tensor, Tensor | None]:
+        """Choose random pixels of all reference views of a split, or of the training cameras where there are none.
+
+        Returns:
+            the cameras of the views; of each pixel (N, 1) the index of its camera, (N, 2) row and column, and
+            (N, channels) the radiance of the reference image, None where there are no reference views.
+        """
         references = self._read_reference_views(split)
         views = references or self._dataset
         generator = torch.Generator().manual_seed(0)
@@ -100,14 +88,14 @@ class ColorFit:
         index = (torch.arange(count) % len(views))[torch.randperm(count, generator=generator)]
         size = torch.cat([cameras.height, cameras.width], -1)[index]
         pixels = (torch.rand(count, 2, generator=generator) * size).long()
-        chosen = _Pixels(cameras.to(device), index[:, None].to(device), (pixels + 0.5).to(device))
-        if references is None:
-            return chosen
-        image = torch.zeros(count, 3)
-        for view in range(len(views)):
-            rows, columns = pixels[index == view].T
-            image[index == view] = views.get_image_float32(view)[rows, columns, :3]
-        return replace(chosen, radiance=self._model.reference_radiance(image).to(device))
+        radiance = None
+        if references is not None:
+            image = torch.zeros(count, 3)
+            for view in range(len(views)):
+                rows, columns = pixels[index == view].T
+                image[index == view] = views.get_image_float32(view)[rows, columns, :3]
+            radiance = self._model.reference_radiance(image).to(device)
+        return cameras.to(device), index[:, None].to(device), (pixels + 0.5).to(device), radiance
 
 
 def replace_color_correction(run: TrainedRun, protocol: ColorCorrectionProtocol) -> None:

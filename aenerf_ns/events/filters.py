@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -194,15 +194,8 @@ class EventSelection:
             kept = _select(
                 chunk.x, chunk.y, chunk.t, keep.ravel(), chunk.width, self._filters.shortest_interval, last_kept
             )
-            yield EventStream(
-                (chunk.x[kept] - x).astype(np.uint16),
-                (chunk.y[kept] - y).astype(np.uint16),
-                chunk.t[kept],
-                chunk.p[kept],
-                width,
-                height,
-                chunk.source,
-            )
+            part = chunk[kept]
+            yield replace(part, x=part.x - np.uint16(x), y=part.y - np.uint16(y), width=width, height=height)
 
     def _within(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
         window = self._filters.window

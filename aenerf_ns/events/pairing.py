@@ -17,7 +17,6 @@ from aenerf_ns.events.pair_store import (
     BLOCK,
     COUNT_MASK,
     COUNT_UNIT,
-    INDEX_MASK,
     MAX_JOINED,
     MAX_SPAN,
     NEGATIVE_SHIFT,
@@ -51,7 +50,6 @@ def pair_events(
     refractory_period: int = 0,
     window: TimeWindow = _EVERYTHING,
     usable: NDArray[np.bool_] | None = None,
-    expected_events: int | None = None,
     open_file: Callable[[], tuple[BinaryIO, Path]] | None = None,
     events_in_memory: int = EVENTS_IN_MEMORY,
 ) -> EventPairs:
@@ -66,7 +64,6 @@ def pair_events(
             pair is joined with others only if its interval is at least 4 τ, and theirs are.
         window: events outside the window are left out, and no pair spans a gap.
         usable: (height, width) whether the events of a pixel are used. None: all are.
-        expected_events: the number of events, if known. It saves growing the arrays.
         open_file: called once if the events are too many for memory. Returns a new file, open for reading and writing,
             and a folder for temporary files. The rows are written to the file's start and mapped. None: all events
             stay in memory.
@@ -97,7 +94,7 @@ def pair_events(
                     f"its sensor has {shape[1]} x {shape[0]} pixels, its lens model {used.shape[1]} x {used.shape[0]}",
                     "state one size",
                 )
-            table = _Table(used, refractory_period, min(expected_events or 0, events_in_memory), source)
+            table = _Table(used, refractory_period, source)
         for index, chunk in enumerate(full_chunk.between(*times) for times in pieces):
             if len(chunk) == 0:
                 continue
@@ -131,16 +128,13 @@ class _Table:
         folder: of temporary files.
     """
 
-    def __init__(
-        self, usable: NDArray[np.bool_], refractory_period: int, expected_events: int, source: str | Path
-    ) -> None:
+    def __init__(self, usable: NDArray[np.bool_], refractory_period: int, source: str | Path) -> None:
         height, width = usable.shape
         self._usable = usable.ravel()
         self._shape = (width, height)
         self._refractory_period = refractory_period
         self._source = source
-        # numpy.empty only reserves addresses: memory is used as the events are written.
-        self._entries = np.empty((expected_events, 2), np.int64)
+        self._entries = np.empty((0, 2), np.int64)
         self._last_entry = np.full(usable.size, -1, np.int64)
         self._shortest_interval = np.iinfo(np.int64).max
         # Of unusable, first, merged and refractory events.
@@ -155,6 +149,7 @@ class _Table:
     def add(self, chunk: EventStream) -> None:
         """Add the events of a chunk."""
         if self.size + len(chunk) > len(self._entries):
+            # numpy.empty only reserves addresses: memory is used as the events are written.
             capacity = max(self.size + len(chunk), 3 * len(self._entries) // 2)
             grown = np.empty((capacity, 2), np.int64)
             grown[: self.size] = self._entries[: self.size]
@@ -207,27 +202,27 @@ class _Table:
         if num_rows == 0:
             raise DataError(self._source, "no event lies on a pixel with a direction", "check the lens's distortion")
         num_pairs = num_rows - first - refractory
-        ends = _Ends(num_rows, self._refractory_period)
+        block_ends = np.zeros(-(-num_rows // BLOCK) + 1, np.int64)
+        num_padded = BLOCK * (len(block_ends) - 1)
         if self.file is None:
-            rows, _ = self._by_pixel(self.size, ends.num_padded)
+            rows, _ = self._by_pixel(self.size, num_padded)
             self._entries = rows[:0]
-            ends.finish(rows[:num_rows])
+            _finish(rows[:num_rows], 0, 0, self._refractory_period, block_ends)
         else:
             self.flush(everything=True)
             self._entries = self._entries[:0].copy()
-            self._merge(self.file, ends)
-            rows = map_rows(self.file, ends.num_padded)
-        if ends.block_ends[-1] < 0:
+            self._merge(self.file, block_ends)
+            self.file.write(bytes(16 * (num_padded - num_rows)))
+            self.file.flush()
+            rows = map_rows(self.file, num_padded)
+        if block_ends[-1] < 0:
             remedy = "check the unit of the times, or choose a shorter time window"
             raise DataError(self._source, "its intervals add up to more than 292 years", remedy)
-        tail = np.ones(num_rows - num_pairs, bool)
-        chain_starts = ends.chain_starts()
-        tail[chain_starts[chain_starts >= num_pairs] - num_pairs] = False
         width, height = self._shape
         return EventPairs(
             rows=rows,
-            replacement_rows=num_pairs + np.flatnonzero(tail),
-            block_ends=ends.block_ends,
+            replacement_rows=num_pairs + np.flatnonzero(is_pair(rows[num_pairs:num_rows, 1])),
+            block_ends=block_ends,
             width=width,
             height=height,
             shortest_interval=self._shortest_interval,
@@ -246,18 +241,17 @@ class _Table:
             count: number of events.
             length: of the array that is returned, if it is longer.
         """
-        begins = np.zeros(len(self._usable) + 1, np.int64)
-        _count_pixels(self._entries[:count], begins[1:])
-        np.cumsum(begins, out=begins)
+        counts = np.bincount(pixel_index(self._entries[:count, 1]), minlength=len(self._usable))
+        begins = np.concatenate([[0], np.cumsum(counts)])
         rows = np.empty((count if length is None else length, 2), np.int64)
         _sort_into(self._entries[:count], 0, begins[:-1].copy(), rows)
         rows[count:] = 0
         return rows, begins
 
-    def _merge(self, file: BinaryIO, ends: _Ends) -> None:
-        """Write the events of all runs to a file, sorted by pixel."""
+    def _merge(self, file: BinaryIO, block_ends: NDArray[np.int64]) -> None:
+        """Write the rows of all runs to a file, and fill in the ends of blocks."""
         begins = np.sum([begins for _, begins in self._runs], axis=0)
-        first = 0
+        first = num_chains = 0
         while first < len(begins) - 1:
             # As many pixels as fit, and at least one.
             last = max(int(np.searchsorted(begins, begins[first] + _ROWS_AT_A_TIME, side="right")) - 1, first + 1)
@@ -267,48 +261,11 @@ class _Table:
                 begin, end = int(run_begins[first]), int(run_begins[last])
                 run.seek(16 * begin)
                 _sort_into(np.fromfile(run, np.int64, 2 * (end - begin)).reshape(-1, 2), first, next_rows, rows)
-            ends.finish(rows)
+            num_chains = _finish(rows, begins[first], num_chains, self._refractory_period, block_ends)
             file.write(rows.data)
             first = last
-        file.write(bytes(16 * (ends.num_padded - ends.num_rows)))
-        file.flush()
         for run, _ in self._runs:
             run.close()
-
-
-class _Ends:
-    """Link rows that come sorted by pixel, and note the chain starts and the ends of blocks.
-
-    Args:
-        num_rows: of all pixels.
-        refractory_period: τ in nanoseconds.
-
-    Attributes:
-        num_rows: of all pixels.
-        num_padded: number of rows with those that fill the last block.
-        block_ends: see :class:`EventPairs`.
-    """
-
-    def __init__(self, num_rows: int, refractory_period: int) -> None:
-        num_blocks = -(-num_rows // BLOCK)
-        self.num_rows = num_rows
-        self.num_padded = num_blocks * BLOCK
-        self.block_ends = np.zeros(num_blocks + 1, np.int64)
-        self._refractory_period = refractory_period
-        self._chain_starts: list[NDArray[np.int64]] = []
-        self._num_chains = 0
-        self._row = 0
-
-    def chain_starts(self) -> NDArray[np.int64]:
-        """Return the (H,) int64 rows of the chain starts so far."""
-        return np.concatenate(self._chain_starts)
-
-    def finish(self, rows: NDArray[np.int64]) -> None:
-        """Put maximum span and sums into the next rows, all rows of some pixels."""
-        starts = _finish(rows, self._row, self._num_chains, self._refractory_period, self.block_ends)
-        self._chain_starts.append(self._row + starts)
-        self._num_chains += len(starts)
-        self._row += len(rows)
 
 
 @numba.njit(cache=True)
@@ -351,13 +308,6 @@ def _add_chunk(columns, width, usable, refractory_period, last_time, last_entry,
 
 
 @numba.njit(cache=True)
-def _count_pixels(entries, counts):
-    """Count the events of each pixel."""
-    for i in range(entries.shape[0]):
-        counts[entries[i, 1] >> PIXEL_SHIFT] += 1
-
-
-@numba.njit(cache=True)
 def _sort_into(entries, first_pixel, next_rows, rows):
     """Put events into the rows of their pixels, and move the next rows of the pixels on."""
     for i in range(entries.shape[0]):
@@ -370,12 +320,13 @@ def _sort_into(entries, first_pixel, next_rows, rows):
 
 @numba.njit(cache=True)
 def _finish(rows, row, num_chains, refractory_period, block_ends):
-    """Put maximum span and sums into rows that hold each event's own counts. Returns the chain starts among them.
+    """Put maximum span and sums into the next rows, which hold each event's own counts, and add up the ends of blocks.
+
+    Returns the number of chain starts so far. The rows are all those of some pixels, and ``row`` is the number of rows
+    before them.
 
     For the change that a blind pixel misses see :func:`aenerf_ns.events.pair_store.event_counts`.
     """
-    chain_starts = np.empty(rows.shape[0], np.int64)
-    begin = num_chains
     span = positive = negative = last_own = 0
     rest = 0.0
     was_long = False
@@ -386,7 +337,6 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
         own = rows[i, 1]
         pixel = own >> PIXEL_SHIFT
         if (own >> SPAN_SHIFT) & SPAN_MASK == 0:
-            chain_starts[num_chains - begin] = i
             rows[i, 1] = pixel << PIXEL_SHIFT | num_chains
             num_chains += 1
             positive = negative = last_own = 0
@@ -414,62 +364,7 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
         positive = (positive + COUNT_UNIT * (own & COUNT_MASK)) & COUNT_MASK
         negative = (negative + COUNT_UNIT * (own >> NEGATIVE_SHIFT)) & COUNT_MASK
         rows[i, 1] = pixel << PIXEL_SHIFT | span << SPAN_SHIFT | negative << NEGATIVE_SHIFT | positive
-    return chain_starts[: num_chains - begin].copy()
-
-
-def near_blocks(block_ends: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return an index into the ``block_ends`` of :class:`EventPairs`, so that a search there waits less for memory.
-
-    Returns:
-        (G,) int64, the last block that begins at every G-th step along the intervals or before it, and how many
-        nanoseconds a step takes. A step has 8 blocks on average.
-    """
-    step = int(block_ends[-1]) // max(len(block_ends) // 8, 1) + 1
-    times = step * np.arange(int(block_ends[-1]) // step + 2, dtype=np.int64)
-    return np.searchsorted(block_ends, times, side="right") - 1, step
-
-
-@numba.njit(cache=True)
-def find_rows(rows, replacement_rows, block_ends, near, step, moments, events, spans, found):
-    """Fill in the rows of pairs; see :func:`aenerf_ns.supervision.event_pairs.find_rows`.
-
-    Args:
-        rows: see there.
-        replacement_rows: see there.
-        block_ends: see there.
-        near: as :func:`near_blocks` returns it.
-        step: as :func:`near_blocks` returns it.
-        moments: see there.
-        events: see there.
-        spans: see there.
-        found: (N, 3, 2) int64, the result.
-    """
-    for i in range(spans.shape[0]):
-        if i < moments.shape[0]:
-            # The last block that begins at the moment or before it.
-            block = near[moments[i] // step]
-            count = near[moments[i] // step + 1] - block + 1
-            while count > 1:
-                half = count // 2
-                block = block + half if block_ends[block + half] <= moments[i] else block
-                count -= half
-            row = BLOCK * block
-            left = moments[i] - block_ends[block]
-            while True:
-                if (rows[row, 1] >> SPAN_SHIFT) & SPAN_MASK:
-                    left -= rows[row, 0] - rows[row - 1, 0]
-                    if left < 0:
-                        break
-                row += 1
-        else:
-            row = events[i - moments.shape[0]]
-            if (rows[row, 1] >> SPAN_SHIFT) & SPAN_MASK == 0:
-                row = replacement_rows[rows[row, 1] & INDEX_MASK]
-        span = min(spans[i], (rows[row, 1] >> SPAN_SHIFT) & SPAN_MASK)
-        for part in range(2):
-            found[i, 0, part] = rows[row, part]
-            found[i, 1, part] = rows[row - 1, part]
-            found[i, 2, part] = rows[row - span, part]
+    return num_chains
 
 
 @numba.njit(cache=True)

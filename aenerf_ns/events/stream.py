@@ -129,9 +129,3 @@ class EventStream:
         """
         middle = int(np.searchsorted(self.t, time))
         return self[max(middle - count // 2, 0) : middle + count // 2]
-
-    def subsample(self, count: int) -> EventStream:
-        """Return at most ``count`` of the events, evenly spread over them."""
-        if len(self) <= count:
-            return self
-        return self[np.linspace(0, len(self) - 1, count).astype(np.int64)]

@@ -2,8 +2,8 @@
 
 https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4.0.html
 
-A file holds a header that describes the streams, compressed packets, and a table of the packets. Header, packets and
-table are FlatBuffers (https://flatbuffers.dev/internals/), of which only the few parts in use are read here.
+A file holds a header that describes the streams, compressed packets, and a table of the packets. The table is not read.
+Header and packets are FlatBuffers (https://flatbuffers.dev/internals/). Only the parts that are used are read.
 
 Other readers were tried and are not used: of damaged copies, dv-processing hung on some, and faery and aedat panicked.
 """
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventFile, batches, resolve_sensor_size
-from aenerf_ns.files.limits import MAX_HEADER, MAX_PIECE, MAX_TABLE_BYTES, require_unpacked_size
+from aenerf_ns.files.limits import MAX_HEADER, MAX_PIECE, require_unpacked_size
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 # Microseconds.
@@ -33,7 +33,6 @@ _MAX_MICROSECONDS = np.iinfo(np.int64).max // 1000
 _COMPRESSIONS = ("", "lz4.frame", "lz4.frame", "backports.zstd", "backports.zstd")
 # Indices of the fields in their tables.
 _HEADER_COMPRESSION, _HEADER_TABLE_POSITION, _HEADER_INFO = range(3)
-_ROW_STREAM, _ROW_COUNT = 1, 2
 
 
 class Aedat4File(EventFile):
@@ -143,22 +142,6 @@ class Aedat4File(EventFile):
         start, end = self._nanoseconds(np.array([first["time"][0], last["time"][-1]])).tolist()
         return start, end
 
-    def read_count(self) -> int | None:
-        if self._table is None or self._file_size - self._table > MAX_TABLE_BYTES:
-            return None
-        with self.path.open("rb") as file:
-            file.seek(self._table)
-            table = _Table(self._unpack(file.read()), 4)
-        total = sum(
-            row.number(_ROW_COUNT, "<q", 0)
-            for row in table.rows(0)
-            if row.number(_ROW_STREAM, "<i", -1) == self._number
-        )
-        if total < 0:
-            self._fail(f"its table of packets counts {total} events")
-        require_unpacked_size(self.path, "the stream", total * _EVENT.itemsize, self._file_size)
-        return total
-
 
 def _event_streams(header: _Table) -> dict[str, tuple[int, int] | None]:
     """Return the size of the sensor of each stream of events, by the number of the stream."""
@@ -209,9 +192,3 @@ class _Table:
             return 0, 0
         begin = position + self._unpack("<I", position)
         return begin + 4, self._unpack("<I", begin)
-
-    def rows(self, index: int) -> Iterator[_Table]:
-        """Yield the tables of a vector of tables."""
-        begin, count = self.vector(index)
-        for position in range(begin, begin + 4 * count, 4):
-            yield _Table(self.data, position)

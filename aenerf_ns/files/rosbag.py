@@ -353,12 +353,8 @@ def _aligned_events(fields: _Fields, count: int) -> bytes:
 
 def _first_time(words: NDArray[np.uint16]) -> int | None:
     """Return the first complete time of a packet in EVT 3.0 in nanoseconds, or None when the packet has none."""
-    kinds = words >> 12
-    highs = np.flatnonzero(kinds == 0x8)
-    if len(highs) == 0:
-        return None
-    lows = np.flatnonzero(kinds == 0x6)
-    lows = lows[lows > highs[0]]
+    highs, lows = (np.flatnonzero(words >> 12 == kind) for kind in (0x8, 0x6))
+    lows = lows[lows > highs[0]] if len(highs) else highs
     if len(lows) == 0:
         return None
     high = words[highs[highs < lows[0]][-1]]

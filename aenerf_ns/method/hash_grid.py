@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+from types import ModuleType
+from typing import Any, Literal
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -17,40 +18,8 @@ _PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 Implementation = Literal["auto", "torch"]
 
-# The modules of the fast implementations.
+# The modules of the fast implementations, which have the same functions.
 _BY_DEVICE = {"cpu": f"{__package__}.kernels.hash_grid_numba", "cuda": f"{__package__}.kernels.hash_grid_triton"}
-
-
-class Kernels(Protocol):
-    """A fast implementation: the module ``hash_grid_numba`` or ``hash_grid_triton``.
-
-    All tensors are float32, contiguous and on one device:
-
-    - ``positions`` (N, 3) in [0, 1], where N is not 0;
-    - ``tangents`` (N, 3), the rates of the positions, or None where the positions do not move;
-    - ``table`` (levels x size, 2), level after level;
-    - ``scales`` (levels,), the cells along an axis.
-    """
-
-    def features(
-        self, positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor
-    ) -> tuple[Tensor, Tensor | None]:
-        """Return features (N, 2 levels), and their rates (N, 2 levels) where there are tangents."""
-
-    def gradients(
-        self,
-        positions: Tensor,
-        tangents: Tensor | None,
-        table: Tensor,
-        scales: Tensor,
-        grad: Tensor,
-        grad_rates: Tensor | None,
-        of_positions: bool,
-    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """Return the gradients of the table, and with ``of_positions`` those of positions and tangents.
-
-        ``grad`` and ``grad_rates`` (N, 2 levels) are the gradients of features and rates.
-        """
 
 
 class HashEncoding(FrameworkHashEncoding):
@@ -93,7 +62,7 @@ class HashEncoding(FrameworkHashEncoding):
         features, rates = _HashGrid.apply(positions, tangents, self.hash_table, self._scales.flatten(), chosen)
         return features if tangents is None else forward_ad.make_dual(features, rates)
 
-    def _choose(self, positions: Tensor) -> Kernels | None:
+    def _choose(self, positions: Tensor) -> ModuleType | None:
         """Return the implementation for the positions, None for the plain one."""
         # Without points a kernel has nothing to run on.
         if self._implementation == "torch" or len(positions) == 0:
@@ -132,7 +101,7 @@ class _HashGrid(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor, kernels: Kernels
+        ctx: Any, positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor, kernels: ModuleType
     ) -> tuple[Tensor, Tensor | None]:
         positions = positions.contiguous()
         tangents = None if tangents is None else tangents.contiguous()

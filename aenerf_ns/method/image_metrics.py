@@ -26,7 +26,6 @@ class ImageMetrics:
     """
 
     def __init__(self, with_lpips: bool) -> None:
-        self._with_lpips = with_lpips
         self._lpips: nn.Module | None = None
         self.lpips_absent: str | None = None if with_lpips else "not asked for (--pipeline.model.lpips True)"
 
@@ -53,15 +52,13 @@ class ImageMetrics:
             "psnr": min(float(peak_signal_noise_ratio(predicted, reference, data_range=1.0)), _MAX_PSNR),
             "ssim": float(torch.as_tensor(structural_similarity_index_measure(predicted, reference, data_range=1.0))),
         }
-        if self._with_lpips and self.lpips_absent is None:
+        if self._lpips is None and self.lpips_absent is None:
             self._build_lpips(predicted.device)
         if self._lpips is not None:
             metrics["lpips"] = float(self._lpips(predicted, reference))
         return metrics
 
     def _build_lpips(self, device: torch.device) -> None:
-        if self._lpips is not None:
-            return
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         try:

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -17,7 +16,6 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
-from nerfstudio.fields.base_field import Field
 from nerfstudio.model_components.losses import interlevel_loss
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
@@ -156,7 +154,7 @@ class AENeRFModel(Model):
             self.warp,
         )
         self.proposal_networks = nn.ModuleList(proposal_networks)
-        self.density_fns = [partial(_density, network) for network in proposal_networks]
+        self.density_fns = [network.get_density for network in proposal_networks]
         if config.backbone == "mlp":
             self.density_fns *= len(config.proposal.num_samples_per_ray)
         self.proposal_sampler = ProposalSampler(
@@ -207,28 +205,20 @@ class AENeRFModel(Model):
         assert trainer is not None
         last_accumulated = _ACCUMULATION_SHARE * trainer.config.schedule_length
 
-        def update_warp(step: int) -> None:
-            if self.warp is None:
-                return
-            self.warp.accumulating = step < last_accumulated
-            if self.warp.accumulating and step % _UPDATE_INTERVAL == 0:
-                self.warp.update_weights()
-
-        def set_anneal(step: int) -> None:
+        def before_step(step: int) -> None:
             # https://arxiv.org/pdf/2111.12077.pdf, eq. 18
             progress = min(step / max(self.config.proposal.weights_anneal_iterations, 1), 1.0)
             slope = 10.0
             self.proposal_sampler.set_anneal(slope * progress / ((slope - 1) * progress + 1))
+            if self.warp is not None:
+                self.warp.accumulating = step < last_accumulated
+                if self.warp.accumulating and step % _UPDATE_INTERVAL == 0:
+                    self.warp.update_weights()
 
-        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        places = TrainingCallbackLocation
         return [
-            TrainingCallback(before, set_anneal, update_every_num_iters=1),
-            TrainingCallback(before, update_warp, update_every_num_iters=1),
-            TrainingCallback(
-                [TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
-                self.proposal_sampler.step_cb,
-                update_every_num_iters=1,
-            ),
+            TrainingCallback([places.BEFORE_TRAIN_ITERATION], before_step),
+            TrainingCallback([places.AFTER_TRAIN_ITERATION], self.proposal_sampler.step_cb),
         ]
 
     def forward(self, ray_bundle: RayBundle) -> dict[str, Any]:
@@ -374,10 +364,6 @@ class AENeRFModel(Model):
         rendered = [self(rays[begin : begin + chunk]) for begin in range(0, len(rays), chunk)]
         self.train(was_training)
         return [torch.cat([outputs[name] for outputs in rendered]) for name in names]
-
-
-def _density(network: Field, samples: RaySamples) -> Tensor:
-    return network.get_density(samples)[0]
 
 
 def _require_possible(config: AENeRFModelConfig, duration: float) -> None:

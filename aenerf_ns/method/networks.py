@@ -97,25 +97,34 @@ def make_networks(
     """
     # The proposal networks only follow the field: gradients reach the motion of space by the field alone.
     field_warp, proposal_warp = (None, None) if warp is None else (warp.forward, warp.without_gradient)
+    encoding: HashEncoding | IntegratedEncoding
+    activation: Literal["exp", "softplus"]
     if backbone == "hash":
-        radiance_field = EventRadianceField(
-            aabb,
-            spatial_distortion,
-            HashEncoding(
-                num_levels=field.num_levels,
-                min_res=field.base_resolution,
-                max_res=field.max_resolution,
-                log2_hashmap_size=field.log2_hashmap_size,
-                implementation=field.grid_implementation,
-            ),
-            DensityShape(
-                field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "exp", average_init_density
-            ),
-            field_warp,
-            num_channels=num_channels,
-            num_hidden_layers=2,
-            hidden_dim=field.hidden_dim,
+        encoding = HashEncoding(
+            num_levels=field.num_levels,
+            min_res=field.base_resolution,
+            max_res=field.max_resolution,
+            log2_hashmap_size=field.log2_hashmap_size,
+            implementation=field.grid_implementation,
         )
+        activation, num_radiance_layers, radiance_dim = "exp", 2, field.hidden_dim
+    else:
+        encoding = IntegratedEncoding(field.num_frequencies)
+        # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
+        activation, num_radiance_layers, radiance_dim = "softplus", 1, 128
+    radiance_field = EventRadianceField(
+        aabb,
+        spatial_distortion,
+        encoding,
+        DensityShape(
+            field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, activation, average_init_density
+        ),
+        field_warp,
+        num_channels=num_channels,
+        num_hidden_layers=num_radiance_layers,
+        hidden_dim=radiance_dim,
+    )
+    if backbone == "hash":
         return radiance_field, [
             ProposalNetwork(
                 aabb,
@@ -131,20 +140,6 @@ def make_networks(
             )
             for resolution in proposal.max_resolutions
         ]
-    encoding = IntegratedEncoding(field.num_frequencies)
-    radiance_field = EventRadianceField(
-        aabb,
-        spatial_distortion,
-        encoding,
-        DensityShape(
-            field.num_hidden_layers, field.hidden_dim, field.geometry_feature_dim, "softplus", average_init_density
-        ),
-        field_warp,
-        num_channels=num_channels,
-        # As in NeRF and Mip-NeRF 360, whatever the width of the rest.
-        num_hidden_layers=1,
-        hidden_dim=128,
-    )
     if field.xavier_initialization:
         for layer in radiance_field.density_network.layers:
             nn.init.xavier_uniform_(layer.weight)

@@ -104,7 +104,6 @@ class PoseCorrection(CameraOptimizer):
         # The framework's corrections, one for each camera, are off.
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
-        self._has_penalty = bool(config.trans_l2_penalty or config.rot_l2_penalty)
         self.trajectory = trajectory
         self.register_buffer("_camera_seconds", trajectory.seconds(camera_times), persistent=False)
         times = _compared_times(trajectory, ground_truth)
@@ -313,10 +312,9 @@ class PoseCorrection(CameraOptimizer):
 
     def get_loss_dict(self, loss_dict: dict[str, Tensor]) -> None:
         """Add the mean squared size of the corrections over the recording, so that good poses stay as they are."""
-        if self.twists is None or not self._has_penalty:
-            return
-        penalty = (self._penalties * self._sampled_twists().square().mean(0)).sum()
-        loss_dict["pose_correction_penalty"] = penalty.float()
+        if self.twists is not None and (self.config.trans_l2_penalty or self.config.rot_l2_penalty):
+            penalty = (self._penalties * self._sampled_twists().square().mean(0)).sum()
+            loss_dict["pose_correction_penalty"] = penalty.float()
 
     def get_metrics_dict(self, metrics_dict: dict[str, Any]) -> None:
         """Add the offsets and the root mean square size of the corrections: scene units, degrees and seconds."""

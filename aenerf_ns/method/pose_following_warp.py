@@ -94,15 +94,12 @@ class PoseFollowingWarp(nn.Module):
     def _moved(self, positions: Tensor, grid: Tensor) -> Tensor:
         with torch.no_grad():
             unit = self._to_unit(forward_ad.unpack_dual(positions).primal.flatten(0, -2)).to(grid.dtype)
-        translation, rotation = self._look_up(grid, unit).unflatten(0, positions.shape[:-1]).split(3, -1)
-        return positions - translation - torch.linalg.cross(rotation, positions)
-
-    def _look_up(self, grid: Tensor, unit: Tensor) -> Tensor:
-        """Return values (N, columns) of a grid (r, r, r, columns) between its cells, at unit places (N, 3)."""
         # torch counts the coordinates of a place from the last axis.
         places = (2 * unit - 1).flip(-1)[None, None, None]
         cells = grid.permute(3, 0, 1, 2)[None]
-        return F.grid_sample(cells, places, padding_mode="border", align_corners=False)[0, :, 0, 0].T
+        twists = F.grid_sample(cells, places, padding_mode="border", align_corners=False)[0, :, 0, 0].T
+        translation, rotation = twists.unflatten(0, positions.shape[:-1]).split(3, -1)
+        return positions - translation - torch.linalg.cross(rotation, positions)
 
     def _to_unit(self, positions: Tensor) -> Tensor:
         return to_unit_cube(positions, self._spatial_distortion, self._aabb)

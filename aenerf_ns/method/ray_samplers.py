@@ -48,7 +48,7 @@ class ProposalSampler(ProposalNetworkSampler):
     def generate_ray_samples(
         self,
         ray_bundle: RayBundle | None = None,
-        density_fns: Sequence[Callable[[RaySamples], Tensor]] | None = None,
+        density_fns: Sequence[Callable[[RaySamples], tuple[Tensor, Tensor | None]]] | None = None,
     ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
         """Return samples of the field, and weights and samples of each round of proposals."""
         assert ray_bundle is not None
@@ -61,7 +61,7 @@ class ProposalSampler(ProposalNetworkSampler):
         samples = self.initial_sampler(ray_bundle, num_samples=first)
         for density_fn, count in zip(density_fns, (*others, self.num_nerf_samples_per_ray), strict=True):
             with torch.set_grad_enabled(updated and torch.is_grad_enabled()):
-                weights = samples.get_weights(density_fn(samples))
+                weights = samples.get_weights(density_fn(samples)[0])
             weights_list.append(weights)
             samples_list.append(samples)
             samples = self.pdf_sampler(ray_bundle, samples, weights**self._anneal, num_samples=count)

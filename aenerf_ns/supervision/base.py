@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.supervision.losses import log_radiance_change
 
 
 @dataclass
@@ -153,10 +152,14 @@ class ChangeSupervision(Supervision):
         return self.sensor_thresholds
 
     def changes(self, outputs: Mapping[str, Any], batch: Any) -> tuple[Tensor, Tensor]:
-        """Return the (N,) changes between the two times: as rendered in the pixel's channel, and as the events say."""
+        """Return the (N,) changes Δ between the two times: as rendered in the pixel's channel, and as the events say.
+
+        They say Δ = n₊ C₊ − n₋ C₋ (paper, eq. 5).
+        """
         first, second = outputs["log_radiance"].split(len(batch))[:2]
         rendered = (second - first).gather(1, batch.channel[:, None])[:, 0]
-        return rendered, log_radiance_change(batch.num_positive, batch.num_negative, *self.thresholds(outputs))
+        positive, negative = self.thresholds(outputs)
+        return rendered, batch.num_positive * positive - batch.num_negative * negative
 
     def has_sign(self, change: Tensor, batch: Any) -> Tensor:
         """Return whether the signs of (N,) changes are known. Polarities that cancel have none."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -36,7 +36,7 @@ from aenerf_ns.supervision.base import (
     SamplerConfig,
     SupervisionConfig,
 )
-from aenerf_ns.supervision.losses import log_radiance_change, reconstruction_loss, silent_change, temporal_loss
+from aenerf_ns.supervision.losses import reconstruction_loss, temporal_loss
 from aenerf_ns.supervision.pixel_rays import PixelRays
 from aenerf_ns.supervision.sensor_parameters import SensorParameters
 
@@ -176,8 +176,10 @@ class PairSupervision(ChangeSupervision):
     def losses(self, outputs: Mapping[str, Any], batch: PairBatch) -> dict[str, Tensor]:
         """Return the reconstruction loss (eq. 11), and while training the temporal loss (eq. 12) where it is on."""
         rendered, change = self.changes(outputs, batch)
-        silent = silent_change(rendered, change, *self.thresholds(outputs))
-        target = torch.where(batch.ends_between_events, silent, change)
+        positive, negative = self.thresholds(outputs)
+        # Between two events a pixel's log-radiance is within a threshold of that at its last event.
+        nearest = rendered.clamp(change - negative, change + positive).detach()
+        target = torch.where(batch.ends_between_events, nearest, change)
         unit, weight = self.loss_unit(outputs), batch.weight
         if isinstance(unit, Tensor):
             # Silent pairs tell nothing of a learned threshold, but it would rise because their loss is divided by it.
@@ -186,9 +188,7 @@ class PairSupervision(ChangeSupervision):
         if self.training and "log_radiance_rate" in outputs:
             rate = outputs["log_radiance_rate"].gather(1, batch.channel[:, None])[:, 0]
             interval = batch.last_interval + outputs.get("interval_change", 0.0)
-            last_change = log_radiance_change(
-                batch.last_num_positive, batch.last_num_negative, *self.thresholds(outputs)
-            )
+            last_change = batch.last_num_positive * positive - batch.last_num_negative * negative
             losses["temporal_loss"] = temporal_loss(rate, last_change, interval)
         return losses
 
@@ -383,17 +383,12 @@ class _PairTable:
         self._num_pairs = len(pairs)
         # Known here, because reading it from a GPU in a step would wait for the GPU.
         self._duration = int(pairs.block_ends[-1])
-        self._find_rows: Callable[[Tensor, Tensor, Tensor], Tensor]
-        if self._device.type == "cpu":
-            # Imported lazily: every ns-* command imports this module, and numba is slow to import.
-            from aenerf_ns.events import pairing
-
-            self._find_rows = partial(_find_rows_on_cpu, pairing.find_rows, (*arrays, *pairing.near_blocks(arrays[2])))
-        else:
-            with warnings.catch_warnings():
-                # Torch warns of rows that are mapped read-only. They are only copied.
-                warnings.simplefilter("ignore", UserWarning)
-                self._find_rows = partial(find_rows, *(torch.from_numpy(array).to(self._device) for array in arrays))
+        with warnings.catch_warnings():
+            # Torch warns of rows that are mapped read-only. They are only read.
+            warnings.simplefilter("ignore", UserWarning)
+            self._rows, self._replacement_rows, self._block_ends = (
+                torch.from_numpy(array).to(self._device) for array in arrays
+            )
 
     def draw(self, num_moments: int, num_events: int, max_events: int) -> Tensor:
         """Draw pairs: first around uniform moments at uniform pixels, then pairs that end at uniform events.
@@ -415,19 +410,10 @@ class _PairTable:
         else:
             spans = (max_events + 1) ** torch.rand(num_moments + num_events, dtype=torch.float64, device=device)
             spans = spans.long().clamp_(max=max_events)
-        rows = self._find_rows(moments, events, spans)
+        rows = find_rows(self._rows, self._replacement_rows, self._block_ends, moments, events, spans)
         if device != self._batch_device:
             rows = rows.pin_memory().to(self._batch_device, non_blocking=True)
         return rows
-
-
-def _find_rows_on_cpu(
-    compiled: Callable[..., None], table: tuple[Any, ...], moments: Tensor, events: Tensor, spans: Tensor
-) -> Tensor:
-    """Find rows as :func:`find_rows` does, in less time on a CPU."""
-    found = torch.empty((len(spans), 3, 2), dtype=torch.int64)
-    compiled(*table, *(tensor.numpy() for tensor in (moments, events, spans, found)))
-    return found
 
 
 def find_rows(

@@ -30,26 +30,19 @@ def is_inside(window: TimeWindow, time: int) -> bool:
 
 
 @given(windows())
-def test_a_window_contains_the_times_that_are_in_no_gap(window: TimeWindow) -> None:
+def test_a_window_and_its_pieces_contain_the_times_that_are_in_no_gap(window: TimeWindow) -> None:
     expected = [is_inside(window, time) for time in MOMENTS]
     assert window.contains(MOMENTS).tolist() == expected
     assert [bool(window.contains(time)) for time in MOMENTS] == expected
     times = np.array(MOMENTS[:36]).reshape(4, 3, 3)
     np.testing.assert_array_equal(window.contains(times), np.reshape(expected[:36], (4, 3, 3)))
-
-
-@given(windows())
-def test_the_pieces_are_in_order_and_hold_what_the_window_contains(window: TimeWindow) -> None:
     pieces = window.pieces()
     assert all(first <= last for first, last in pieces)
     assert all(before[1] <= after[0] for before, after in pairwise(pieces))
     covered = {time for first, last in pieces for time in range(first, last + 1)}
-    assert covered == {time for time in MOMENTS if is_inside(window, time)}
-
-
-@given(windows())
-def test_no_piece_reaches_over_a_gap(window: TimeWindow) -> None:
-    for first, last in window.pieces():
+    assert covered == {time for time, inside in zip(MOMENTS, expected, strict=True) if inside}
+    # No piece reaches over a gap.
+    for first, last in pieces:
         assert not any(first <= gap[0] and gap[1] <= last for gap in window.gaps)
 
 

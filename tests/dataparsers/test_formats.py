@@ -20,7 +20,6 @@ from helpers.published_datasets import (
     recording_of,
     seconds,
     write_poses,
-    write_tum_vie,
 )
 from helpers.small_datasets import AS_RECORDED, parse
 
@@ -33,11 +32,9 @@ from aenerf_ns.recording.scene import SCENE_KEY
 from aenerf_ns.training.datamanager import EventDataManagerConfig
 
 
-@pytest.fixture(params=[*WRITERS, "tum-vie-data"])
+@pytest.fixture(params=WRITERS)
 def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Truth]:
     """A dataset of every format, under its name."""
-    if request.param == "tum-vie-data":
-        return request.param, write_tum_vie(tmp_path / "made", request.getfixturevalue("tum_vie_calibration"))
     return request.param, WRITERS[request.param](tmp_path / "made")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers.event_file_writers import HEIGHT, WIDTH, evt3
-from helpers.own_recordings import random_events, write_calibration, write_poses
+from helpers.own_recordings import random_events, write_poses
 from helpers.published_datasets import (
     CALIBRATION,
     CAMCHAIN,
@@ -24,7 +24,6 @@ from helpers.published_datasets import (
     write_own,
 )
 from helpers.small_datasets import make_trajectory
-from PIL import Image
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.dataparsers.formats import recognize
@@ -210,25 +209,6 @@ def test_refuse_a_colmap_model_that_does_not_fit_the_images(placed: Truth) -> No
     listed.write_text("".join(f"7.5 {line.split()[1]}\n" for line in listed.read_text().splitlines()))
     with pytest.raises(DataError, match=r"images.txt: several images are at 7\.500000000 s; give each image its own"):
         opened(placed)
-
-
-@pytest.mark.parametrize(
-    ("unit", "problem"),
-    [
-        (10**3, "as if the times of the images were in milliseconds"),
-        (10**6, "as if the times of the images were in microseconds"),
-        (10**9, "as if the times of the images were in nanoseconds"),
-    ],
-)
-def test_refuse_times_of_images(unit: int, problem: str, tmp_path: Path) -> None:
-    write_calibration(tmp_path / "calibration.json")
-    write_poses(tmp_path / "trajectory.txt")
-    np.savez(tmp_path / "events.npz", **random_events())
-    for index in range(4):
-        Image.new("L", (96, 72)).save(tmp_path / f"{index}.png")
-    (tmp_path / "images.txt").write_text("".join(f"{index * unit // 2} {index}.png\n" for index in range(4)))
-    with pytest.raises(DataError, match=problem):
-        recording_of(OwnRecordingDataParserConfig(data=tmp_path))
 
 
 def test_refuse_many_images_at_one_time_quickly(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from helpers.streams import make_stream
@@ -18,6 +20,7 @@ from aenerf_ns.simulator.options import SensorNoise
 WIDTH, HEIGHT = 48, 36
 
 
+@cache
 def record(noise: SensorNoise, num_frames: int = 400) -> tuple[EventPairs, EventSimulator]:
     """A texture that moves on and on over the sensor, and ends elsewhere than it began."""
     simulator = EventSimulator(WIDTH, HEIGHT, SensorModel(), noise, seed=1)

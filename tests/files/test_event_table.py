@@ -33,7 +33,6 @@ from aenerf_ns.files import event_table, event_text
 from aenerf_ns.files.event_arrays import ArrayEventFile
 from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.files.open import open_event_file
-from aenerf_ns.files.text import TimeUnit
 
 LAYOUTS: dict[str, tuple[str, Callable[[Path, Columns], object]]] = {
     "Robust e-NeRF": ("raw_events.npz", write_robust_enerf),
@@ -77,15 +76,6 @@ def test_read_every_layout_in_pieces(layout: str, tmp_path: Path, monkeypatch: p
     assert events.count() in (N, None)
     assert len(chunks) >= 3
     assert max(map(len, chunks)) <= 128
-
-
-@pytest.mark.parametrize(("unit", "end"), [(None, 299_000), ("ns", 299), ("s", 299 * 10**9)])
-def test_unit_of_times_may_be_given(unit: TimeUnit | None, end: int, tmp_path: Path) -> None:
-    columns = {**made_columns(), "t": np.arange(N)}
-    np.savez(tmp_path / "events.npz", **columns)
-    write_csv(tmp_path / "events.csv", columns)
-    for name in ("events.npz", "events.csv"):
-        assert open_event_file(tmp_path / name, WIDTH, HEIGHT, time_unit=unit).time_span() == (0, end)
 
 
 def test_uncompressed_members_are_mapped(tmp_path: Path) -> None:

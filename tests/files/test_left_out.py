@@ -12,6 +12,7 @@ from helpers.bag_writers import ARRAY, array_message, write_bag
 from helpers.event_file_checks import read
 from helpers.event_file_writers import (
     HEADER2,
+    HEADER3,
     HEIGHT,
     WIDTH,
     Rows,
@@ -168,8 +169,21 @@ def after_good_times(*values: int) -> bytes:
 
 
 FIRST, NEXT = 0x10001, 0x10003
+OTHERS = (0x2005, 0x0007, 0x2006, 0x8001, 0x2007, 0x3008, 0x4FFF)
 DAMAGED = {
     # Words, the times in microseconds of the events that are left, and how many are left out.
+    "evt3: words ahead of the first time": (evt3_of(*OTHERS, 0x6002, 0x2009), [0x1002], 0),
+    "evt3: empty lines of the header": (
+        HEADER3.replace(b"% geo", b"%\n%\r\n% geo") + words("<u2", 0x8001, 0x6002, 7, 0x2009),
+        [0x1002],
+        0,
+    ),
+    "evt3: upper bits alone": (
+        evt3_of(0x8001, 0x6FFF, 7, 0x2001, 0x8002, 0x2002, 0x8002, 0x6003, 0x8002, 0x2003),
+        [0x1FFF, 0x2000, 0x2003],
+        0,
+    ),
+    "evt3: padding of Lucid's cameras": (after_an_event(0x9999, 0x9999, 0x6003, 0x2002, 0x9999), [FIRST, NEXT], 0),
     "evt3: ahead": (after_an_event(0x8810, 0x2001, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 1),
     "evt3: one step ahead": (after_an_event(0x8011, 0x2001, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 1),
     "evt3: one step back": (after_an_event(0x800F, 0x2001, 0x8010, 0x6003, 0x2001), [FIRST, NEXT], 1),
@@ -206,7 +220,7 @@ DAMAGED = {
 
 @pytest.mark.parametrize("block", [1, 4, 1000])
 @pytest.mark.parametrize("kind", DAMAGED)
-def test_damaged_time_does_not_move_later_events(
+def test_words_have_the_times_of_good_ones(
     kind: str, block: int, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("aenerf_ns.files.prophesee.BLOCK", block)
@@ -216,15 +230,6 @@ def test_damaged_time_does_not_move_later_events(
     assert (read(open_event_file(path))[:, 2] // 1000).tolist() == times
     said = capsys.readouterr().out
     assert (f"{number} after a damaged time (the first at word" in said) == (number > 0)
-
-
-def test_skip_padding_of_lucid_cameras(folder: Path) -> None:
-    path = folder / "padded.raw"
-    path.write_bytes(evt3_of(0x8010, 0x6001, 1, 0x2001, 0x9999, 0x9999, 0x6002, 0x2002, 0x9999))
-    assert (read(open_event_file(path))[:, 2] // 1000).tolist() == [0x10001, 0x10002]
-    path.write_bytes(evt3_of(0x8010, 0x6001, 1, 0x2001, 0x9998))
-    with pytest.raises(DataError, match="is 0x9998, which EVT 3"):
-        read(open_event_file(path))
 
 
 def test_convert_leaves_out_malformed_events(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

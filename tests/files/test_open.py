@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.bag_writers import PACKET, START, array_bag, packet_messages, write_bag, write_bag2
 from helpers.event_file_checks import EDITS, attempt, edited, read, survives, table, vendor_file
-from helpers.event_file_writers import ENCODERS, HEADER2, HEADER3, HEIGHT, ROWS, WIDTH, Rows, aedat4_file, dat, evt2
+from helpers.event_file_writers import ENCODERS, HEIGHT, ROWS, WIDTH, Rows, aedat4_file, evt2
 from helpers.streams import FUZZ_EXAMPLES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -85,7 +87,7 @@ def test_real_files_agree_with_independent_reader(
     assert tuple(events[0]) == first
     assert tuple(events[-1]) == last
     assert file.time_span() == (first[2], last[2])
-    assert file.count() == (None if name.endswith(".raw") else count)
+    assert file.count() == (count if name.endswith(".dat") else None)
     faery = pytest.importorskip("faery")
     # The header of evt2.raw does not tell the size.
     other = faery.events_stream_from_file(vendor_file(name), dimensions_fallback=(640, 480)).to_array()
@@ -169,14 +171,27 @@ def test_damaged_files_raise_only_clear_errors(folder: Path) -> None:
     check()
 
 
-def test_random_bytes_raise_only_clear_errors(folder: Path) -> None:
-    path = folder / "fuzz_magic"
-    magics = [HEADER2, HEADER3, dat([]), b"% ", b"#!AER-DAT4.0\r\n", b"#ROSBAG V2.0\n", b""]
+@pytest.mark.parametrize(("compression", "package"), [(1, "lz4.frame"), (2, "lz4.frame"), (4, "backports.zstd")])
+def test_compressed_packets_of_aedat4(
+    compression: int, package: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compress = pytest.importorskip(package).compress
+    rows = [(x, 7, 1_600_000_000_000_000 + x, 1 - 2 * (x % 2)) for x in range(20)]
+    path = folder / "packed.aedat4"
+    path.write_bytes(aedat4_file(rows, compression, compress, with_table=True))
+    file = open_event_file(path)
+    np.testing.assert_array_equal(read(file), table(rows))
+    assert file.time_span() == (rows[0][2] * 1000, rows[-1][2] * 1000)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(DataError, match=re.escape("pip install 'aenerf-ns[aedat4]'")):
+        read(file)
 
-    @settings(max_examples=FUZZ_EXAMPLES, deadline=None)
-    @given(st.sampled_from(magics), st.binary(max_size=400))
-    def check(magic: bytes, content: bytes) -> None:
-        path.write_bytes(magic + content)
-        survives(path)
 
-    check()
+def test_choose_a_stream_of_aedat4(folder: Path) -> None:
+    path = folder / "stereo.aedat4"
+    path.write_bytes(aedat4_file([(1, 2, 3, 1)], streams={0: "EVTS", 4: "EVTS"}))
+    with pytest.raises(DataError, match="several streams hold events; choose one of 0, 4"):
+        open_event_file(path)
+    assert len(read(open_event_file(path, topic="0"))) == 1
+    with pytest.raises(DataError, match="holds no events"):
+        read(open_event_file(path, topic="4"))

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from aenerf_ns.dataparsers.formats import FORMATS
 from aenerf_ns.recording.options import EventDataParserConfig
 from aenerf_ns.recording.recording import Recording
+from helpers import event_table_writers
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 N_POSES, N_EVENTS = 21, 200
@@ -76,6 +77,11 @@ def make_events(width: int, height: int, start: int = 0) -> dict[str, NDArray]:
     }
 
 
+def unsigned(events: dict[str, NDArray]) -> dict[str, NDArray]:
+    """The columns with polarities of 0 and 1."""
+    return {**events, "p": (events["p"] > 0).astype(np.uint8)}
+
+
 def quaternions(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """x, y, z, w."""
     return Rotation.from_matrix(poses[:, :3, :3]).as_quat()
@@ -108,12 +114,7 @@ def write_robust_enerf(
     times = make_times()
     matrix = pinhole(50.0, 52.0, 29.25, 20.5)
     distortion = np.array([-0.05, 0.01, 0.002, -0.001])
-    np.savez(
-        folder / "raw_events.npz",
-        position=np.stack([events["x"], events["y"]], 1),
-        timestamp=events["t"] * 1_000,
-        polarity=events["p"] > 0,
-    )
+    event_table_writers.write_robust_enerf(folder / "raw_events.npz", unsigned(events))
     np.savez(
         folder / "camera_poses.npz",
         T_wc_position=poses[:, :3, 3],
@@ -155,10 +156,29 @@ def tum_vie_matrix(values: dict[str, float]) -> NDArray[np.float64]:
     return pose
 
 
-def write_tum_vie(folder: Path, calibration: Path, sequence: str = "mocap-desk2", side: str = "left") -> Truth:
+def write_tum_vie_calibration(folder: Path) -> None:
+    """Calibration A in the form of the real one."""
+    poses, names = make_poses(5), ("px", "py", "pz", "qx", "qy", "qz", "qw")
+    rows = np.concatenate([poses[:, :3, 3], quaternions(poses)], 1).tolist()
+    marker, *mounts = (dict(zip(names, row, strict=True)) for row in rows)
+    lens = {"fx": 1040.0, "fy": 1041.0, "cx": 634.0, "cy": 263.0, "k1": -0.1, "k2": 0.05, "k3": 0.01, "k4": -0.002}
+    cameras = {
+        "T_imu_cam": mounts,
+        "intrinsics": [{"camera_type": "kb4", "intrinsics": lens}] * 4,
+        "resolution": [[1024, 1024]] * 2 + [[1280, 720]] * 2,
+    }
+    for name, values in (("camera", cameras), ("mocap-imu", {"T_imu_marker": marker})):
+        (folder / f"{name}-calibrationA.json").write_text(json.dumps({"value0": values}))
+
+
+def write_tum_vie(
+    folder: Path, calibration: Path | None = None, sequence: str = "mocap-desk2", side: str = "left"
+) -> Truth:
     folder.mkdir(exist_ok=True)
-    for file in calibration.glob("*.json"):
-        shutil.copyfile(file, folder / file.name)
+    if calibration is None:
+        write_tum_vie_calibration(folder)
+    else:
+        shutil.copytree(calibration, folder, dirs_exist_ok=True)
     index = {"left": 2, "right": 3}[side]
     which = "A" if sequence == "mocap-desk2" else "B"
     cameras = json.loads((folder / f"camera-calibration{which}.json").read_text())["value0"]
@@ -175,8 +195,8 @@ def write_tum_vie(folder: Path, calibration: Path, sequence: str = "mocap-desk2"
     write_poses(truth / "mocap_data.txt", markers, (times // 1_000).astype(str).tolist(), "# timestamp[us] p q\n")
     events = make_events(1280, 720, EPOCH)
     with h5py.File(folder / f"{sequence}-events_{side}.h5", "w") as file:
-        for name, values in events.items():
-            file[f"events/{name}"] = (values > 0).astype(np.uint8) if name == "p" else values
+        for name, values in unsigned(events).items():
+            file[f"events/{name}"] = values
         file["ms_to_idx"] = np.zeros(3, np.uint64)
     write_images(truth / f"{side}_images", 3, (1024, 1024), "{:05d}.jpg")
     stamps = [EPOCH + 100_000, EPOCH + 333_333, EPOCH + 1_900_000]
@@ -195,9 +215,7 @@ def write_eds(folder: Path) -> Truth:
     folder.mkdir()
     poses, times = make_poses(), make_times(EPOCH)
     events = make_events(640, 480, EPOCH)
-    with h5py.File(folder / "events.h5", "w") as file:
-        for name, values in events.items():
-            file[name] = (values > 0).astype(np.uint8) if name == "p" else values
+    event_table_writers.write_eds(folder / "events.h5", unsigned(events))
     write_poses(folder / "stamped_groundtruth.txt", poses, seconds(times), "# t p q\n")
     write_images(folder / "images", 3, (640, 480), "frame_{:010d}.png")
     stamps = [EPOCH + 50_000, EPOCH + 800_000, EPOCH + 1_700_000]
@@ -250,8 +268,7 @@ def write_paev3d(folder: Path) -> Truth:
     poses, events = make_poses(), make_events(640, 480, start=777)
     (folder / "H5_Files" / "Bunny").mkdir(parents=True)
     (folder / "Render_info" / "Bunny").mkdir(parents=True)
-    with h5py.File(folder / "H5_Files" / "Bunny" / "event.h5", "w") as file:
-        file["events"] = np.stack([events["t"], events["x"], events["y"], events["p"] > 0], 1).astype(np.float64)
+    event_table_writers.write_paev3d(folder / "H5_Files" / "Bunny" / "event.h5", unsigned(events))
     for index, pose in enumerate(poses):
         objects = [{"name": "Bunny", "pose": np.eye(4)}, {"name": "Camera", "pose": pose @ FLIP}]
         np.savez(folder / "Render_info" / "Bunny" / f"{index:04d}.npz", object_poses=objects, depth_map=np.zeros(3))
@@ -277,10 +294,7 @@ def write_own(folder: Path) -> Truth:
     folder.mkdir()
     poses, times = make_poses(), make_times(EPOCH)
     events = make_events(60, 40, EPOCH)
-    with h5py.File(folder / "events.h5", "w") as file:
-        for name, values in events.items():
-            file[f"events/{name}"] = {"t": values - EPOCH, "p": values > 0}.get(name, values)
-        file["t_offset"] = EPOCH
+    event_table_writers.write_dsec(folder / "events.h5", unsigned(events))
     write_poses(folder / "trajectory.txt", poses, seconds(times))
     (folder / "calibration.json").write_text(json.dumps(CALIBRATION))
     write_images(folder / "images", 4, (60, 40))
@@ -319,6 +333,7 @@ def write_colmap(folder: Path, poses: NDArray[np.float64], names: list[str]) -> 
 
 WRITERS: dict[str, Callable[[Path], Truth]] = {
     "robust-enerf-data": write_robust_enerf,
+    "tum-vie-data": write_tum_vie,
     "eds-data": write_eds,
     "enerf-esim-data": write_enerf_esim,
     "eventnerf-data": write_eventnerf,

@@ -96,6 +96,8 @@ def test_peers_train_with_and_without_correction(method: Any, mode: str, data: P
     config = with_options(method.config, "--pipeline.model.camera-optimizer.mode", mode)
     history, pipeline = train(shrunk(config), data, 3)
     assert len({losses["reconstruction_loss"] for losses in history}) == 3
+    # Ev-NeRF also learns the thresholds, which begin as the dataset's.
+    assert pipeline.model.supervision.learned_values().get("positive_threshold") != pytest.approx(0.3, abs=1e-3)
     correction = dict(pipeline.model.camera_optimizer.named_parameters())
     assert list(correction) == ([] if mode == "off" else ["twists.control_twists"])
     assert all(parameter.any() for parameter in correction.values())

@@ -18,8 +18,6 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.sorted_events import sort_events
-from aenerf_ns.events.stream import EventStream
-from aenerf_ns.simulator.esim import EventSimulator
 from aenerf_ns.supervision.base import SupervisionConfig
 from aenerf_ns.supervision.peers.windows import (
     EventNeRFSupervisionConfig,
@@ -259,42 +257,3 @@ def test_gradients_are_finite_where_events_cancel_or_come_in_crowds(config: Supe
     assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
     # A single pixel, as in the smallest batch.
     assert all(loss.isfinite() for loss in compare(supervision, predicted[:1], [1.0], [0.0]).values())
-
-
-def true_log_radiance(times: np.ndarray, pixel: int) -> np.ndarray:
-    """Log-radiance that an ideal pixel sees, at times in seconds."""
-    return np.sin((3 + pixel) * times) + 0.3 * np.cos(17 * times + pixel)
-
-
-def test_the_events_of_a_window_tell_the_true_change_to_within_a_threshold_at_either_end() -> None:
-    sensor = SensorModel(0.2, 0.15)
-    simulator, pixels = EventSimulator(4, 3, sensor, log_epsilon=0.0), np.arange(12)
-    stream = EventStream.concatenate(
-        [
-            EventStream(*simulator(np.exp(true_log_radiance(time * 1e-9, pixels)).reshape(3, 4), time), 4, 3)
-            for time in range(0, 1_200_000_000, 1_000_000)
-        ]
-    )
-    events = sort_events([stream], window=TimeWindow(0, 1_200_000_000), usable=np.ones((3, 4), bool))
-    eventnerf = make_supervision(EventNeRFSupervisionConfig(), sensor)
-    evnerf = make_supervision(EvNeRFSupervisionConfig(), sensor)
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        start, end = np.sort(rng.integers(0, 1_200_000_001, 2))
-        counts = events.counts(int(start), int(end))
-        truth = true_log_radiance(end * 1e-9, pixels) - true_log_radiance(start * 1e-9, pixels)
-        told = counts[0] * 0.2 - counts[1] * 0.15
-        assert np.abs(truth - told).max() < 0.35 + 1e-3
-        losses = compare(eventnerf, torch.from_numpy(truth), *counts.astype(float).tolist())
-        assert losses["reconstruction_loss"] < (0.35 / 0.175) ** 2
-        # The zone of a threshold leaves at most the other one.
-        losses = compare(evnerf, torch.from_numpy(truth), *counts.astype(float).tolist())
-        assert losses["reconstruction_loss"] < 0.2 / 0.175
-    # From an event of a pixel on, the truth is inside the dead zone.
-    for pixel in range(12):
-        times = stream.t[4 * stream.y.astype(int) + stream.x == pixel]
-        start, end = int(times[1]), int(times[-1]) - 10_000_000
-        counts = events.counts(start, end)[:, pixel : pixel + 1]
-        truth = torch.from_numpy(true_log_radiance(np.array([end, start]) * 1e-9, pixel)).diff().neg()
-        losses = compare(evnerf, truth, *counts.astype(float).tolist())
-        assert losses["reconstruction_loss"] < 5e-3

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from aenerf_ns.method.kernels.cpu import as_array, compiled, run_ranges
+from aenerf_ns.method.kernels.cpu import as_array, compiled
+from aenerf_ns.threads import run_ranges
 
 # Values that one thread computes at least.
 _BLOCK = 4096

@@ -12,14 +12,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from aenerf_ns.method.kernels.cpu import as_array, compiled, run, run_ranges
+from aenerf_ns.method.kernels.cpu import as_array, compiled
+from aenerf_ns.threads import run, run_ranges
 
 # A block of points is encoded level by level: its outputs and the level's table then stay in the cache.
 _BLOCK = 256
 
 
 def features(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Return features (N, 2 levels), and their rates where the positions move. See :class:`.hash_grid.Kernels`."""
+    """Return features (N, 2 levels), and their rates (N, 2 levels) where there are tangents.
+
+    All tensors are float32, contiguous and on one device.
+
+    Args:
+        positions: (N, 3) in [0, 1], where N is not 0.
+        tangents: (N, 3), the rates of the positions, or None where the positions do not move.
+        table: (levels x size, 2), level after level.
+        scales: (levels,), the cells along an axis.
+    """
     num_points, num_levels = len(positions), len(scales)
     out = positions.new_empty(num_points, 2 * num_levels)
     rates = None if tangents is None else torch.empty_like(out)
@@ -44,7 +54,11 @@ def gradients(
     grad_rates: Tensor | None,
     of_positions: bool,
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Return the gradients of table, positions and tangents. See :class:`.hash_grid.Kernels`."""
+    """Return the gradients of the table, and with ``of_positions`` those of positions and tangents.
+
+    The first four arguments are those of :func:`features`. ``grad`` and ``grad_rates`` (N, 2 levels) are the gradients
+    of features and rates.
+    """
     num_levels = len(scales)
     to_table = torch.zeros_like(table)
     # A part for each level, because the levels are summed at the same time.

@@ -18,7 +18,7 @@ _BLOCK = 128
 
 
 def features(positions: Tensor, tangents: Tensor | None, table: Tensor, scales: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Return features (N, 2 levels), and their rates where the positions move. See :class:`.hash_grid.Kernels`."""
+    """Return features (N, 2 levels), and their rates; see :func:`.hash_grid_numba.features`."""
     num_points, num_levels = len(positions), len(scales)
     # Level after level, as the programs run; a warp then writes to neighboring addresses.
     out = positions.new_empty(num_levels, num_points, 2)
@@ -40,7 +40,7 @@ def gradients(
     grad_rates: Tensor | None,
     of_positions: bool,
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Return the gradients of table, positions and tangents. See :class:`.hash_grid.Kernels`."""
+    """Return the gradients of table, positions and tangents; see :func:`.hash_grid_numba.gradients`."""
     num_points, num_levels = len(positions), len(scales)
     to_table = torch.zeros_like(table)
     # A part for each level: the sum over levels needs no atomic additions.

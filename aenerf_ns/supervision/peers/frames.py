@@ -12,12 +12,11 @@ import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
-from PIL import Image
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.recording.images import check_image
+from aenerf_ns.recording.images import check_image, read_image
 from aenerf_ns.supervision.base import Batch, Sampler, SamplerConfig, Supervision, SupervisionConfig
 from aenerf_ns.supervision.pixel_rays import PixelRays
 
@@ -99,8 +98,7 @@ class FrameSampler(Sampler):
         values = []
         for _, file in scene.frames:
             check_image(file, scene.event_camera)
-            with Image.open(file) as image:
-                values.append(np.asarray(image.convert(mode)).reshape(-1, scene.sensor.num_channels))
+            values.append(np.asarray(read_image(file).convert(mode)).reshape(-1, scene.sensor.num_channels))
         line = f"Training on {len(values)} images, the first of them {scene.frames[0][1]}."
         CONSOLE.print(line, markup=False, soft_wrap=True)
         times = torch.tensor([time for time, _ in scene.frames], device=self.device)

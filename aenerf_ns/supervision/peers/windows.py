@@ -27,7 +27,7 @@ from aenerf_ns.supervision.base import (
     Supervision,
     SupervisionConfig,
 )
-from aenerf_ns.supervision.losses import dead_zone_excess, reconstruction_loss
+from aenerf_ns.supervision.losses import reconstruction_loss
 from aenerf_ns.supervision.pixel_rays import PixelRays
 
 # The inverse of softplus at 1.
@@ -117,7 +117,9 @@ class EvNeRFSupervision(WindowSupervision):
     def losses(self, outputs: Mapping[str, Any], batch: WindowBatch) -> dict[str, Tensor]:
         """Return how far changes are outside the dead zone, and thresholds below the sensor's, in units of C̄."""
         thresholds = outputs["thresholds"]
-        excess = dead_zone_excess(*self.changes(outputs, batch), *thresholds)
+        rendered, change = self.changes(outputs, batch)
+        error = rendered - change
+        excess = F.relu(error - thresholds[0]) + F.relu(-thresholds[1] - error)
         return {
             "reconstruction_loss": excess.mean() / self.loss_unit(outputs),
             "threshold_bound_loss": F.relu(self._minimum - thresholds).sum() / self.loss_unit(outputs),
