@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.commands import simulate
 from helpers.dataset_faults import edit_json, set_in
 from helpers.own_recordings import random_events, write_calibration, write_poses
 from helpers.small_datasets import write_native
@@ -25,14 +26,12 @@ from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.hypotheses import clock_hypothesis
 from aenerf_ns.checking.report import _check_contrast, _check_depth, check
 from aenerf_ns.cli.check import Check
-from aenerf_ns.cli.simulate import Simulate
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_hdf5 import Hdf5EventWriter
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.recording.recording import Recording
-from aenerf_ns.simulator import shapes, simulation
 from benchmarks.check_windows import MISTAKES as PLANTED
 from benchmarks.check_windows import shift_clock
 
@@ -42,14 +41,9 @@ PART = 1_300_000_000
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated room, in light that is computed at few points, and seen by few rays."""
-    folder, mesh_of = tmp_path_factory.mktemp("check") / "room", shapes.mesh_of
-    pictures = {"train_images": 12, "validation_views": 1, "test_views": 1}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shapes, "mesh_of", lambda a, b, spacing, gloss: mesh_of(a, b, 4 * spacing, gloss))
-        patch.setattr(simulation, "RAYS_PER_PIXEL", 4)
-        Simulate(folder, width=64, height=48, max_displacement=1.0, **pictures).main()
-    return folder
+    views = ("--train-images", "12", "--validation-views", "1", "--test-views", "1")
+    options = ("--width", "64", "--height", "48", "--max-displacement", "1", *views)
+    return simulate(tmp_path_factory.mktemp("check") / "room", *options)
 
 
 def all_events(recording: Recording) -> EventStream:

@@ -8,9 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import tyro
 
 from aenerf_ns.cli.simulate import Simulate
+from aenerf_ns.simulator import shapes, simulation
 
 CPU = ("--machine.device-type", "cpu")
 TIMEOUT = 1200
@@ -32,9 +34,16 @@ def run(*command: str | Path, cwd: Path, gpu: bool = False) -> str:
 
 
 def simulate(folder: Path, *options: str) -> Path:
-    """Simulates a small recording in this process, of few frames: for tests in which exact events do not matter."""
+    """Simulates a small recording in this process, for tests in which exact events do not matter.
+
+    It has few frames, seen by few rays, in light that is computed at few points.
+    """
     size = ("--width", "48", "--height", "36", "--train-images", "4", "--validation-views", "4", "--test-views", "3")
-    tyro.cli(Simulate, args=["--output", str(folder), "--max-displacement", "2", *size, *options]).main()
+    mesh_of = shapes.mesh_of
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shapes, "mesh_of", lambda a, b, spacing, gloss: mesh_of(a, b, 4 * spacing, gloss))
+        patch.setattr(simulation, "RAYS_PER_PIXEL", 4)
+        tyro.cli(Simulate, args=["--output", str(folder), "--max-displacement", "2", *size, *options]).main()
     return folder
 
 
