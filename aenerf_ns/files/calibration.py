@@ -31,6 +31,9 @@ class _CameraInfo(msgspec.Struct):
     distortion_coefficients: _Values
     distortion_model: str | None = None
     fisheye_model: int = 0
+    binning_x: int = 0
+    binning_y: int = 0
+    roi: dict[str, Any] = {}
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,8 @@ def _require_no_names(path: Path, *names: str | None) -> None:
 
 def _as_file(message: dict[str, Any]) -> dict[str, Any]:
     """Return a message camera_info of ROS 1 or 2 with the names of the file."""
-    names = {"width": "image_width", "height": "image_height", "distortion_model": "distortion_model"}
+    names = {"width": "image_width", "height": "image_height"}
+    names |= {name: name for name in ("distortion_model", "binning_x", "binning_y", "roi")}
     matrices = {"k": "camera_matrix", "d": "distortion_coefficients"}
     values = {name.lower(): value for name, value in message.items() if isinstance(name, str)}
     return {names[name]: values[name] for name in names if name in values} | {
@@ -122,6 +126,8 @@ def _camera_info(path: Path, content: dict[str, Any]) -> CameraIntrinsics:
     with value_errors_as_data_error(path, "correct it there, or calibrate again with plumb_bob or equidistant"):
         if len(matrix) != 9:
             raise ValueError(f"its camera_matrix has {len(matrix)} numbers, not 9")
+        if max(info.binning_x, info.binning_y) > 1 or info.roi.get("x_offset") or info.roi.get("y_offset"):
+            raise ValueError("its matrix is that of the whole sensor, but its pixels are binned or cropped")
         pinhole = (matrix[0], matrix[4], matrix[2], matrix[5])
         size = (info.image_width, info.image_height)
         # OpenCV's own file names no model.

@@ -273,8 +273,21 @@ def test_read_the_camera_info_of_ros(text: str, tmp_path: Path) -> None:
     assert recording.event_camera == CameraIntrinsics(96, 72, 90.0, 91.0, 48.0, 36.0, *lens)
 
 
-def test_refuse_a_rational_lens(tmp_path: Path) -> None:
-    text = CAMERA_INFO.replace("plumb_bob", "rational_polynomial").replace("0.0]", "0.0, 0.1, 0.0, 0.0]")
+MESSAGE = f"height: 72\nwidth: 96\nD: []\nK: {[90, 0, 47, 0, 90, 35, 0, 0, 1]}\nbinning_x: 0\nroi: {{x_offset: 0, width: 0}}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (
+            CAMERA_INFO.replace("plumb_bob", "rational_polynomial").replace("0.0]", "0.0, 0.1, 0.0, 0.0]"),
+            r"is 'rational_polynomial', .* calibrate again with plumb_bob or equidistant",
+        ),
+        (MESSAGE.replace("binning_x: 0", "binning_x: 2"), "the whole sensor, but its pixels are binned or cropped"),
+        (MESSAGE.replace("x_offset: 0", "x_offset: 8"), "the whole sensor, but its pixels are binned or cropped"),
+    ],
+)
+def test_refuse_a_lens_of_ros(text: str, problem: str, tmp_path: Path) -> None:
     (tmp_path / "camera_info.yaml").write_text(text)
-    with pytest.raises(DataError, match=r"is 'rational_polynomial', .* calibrate again with plumb_bob or equidistant"):
+    with pytest.raises(DataError, match=problem):
         read_calibration(tmp_path / "camera_info.yaml")
