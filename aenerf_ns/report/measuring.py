@@ -19,7 +19,7 @@ from aenerf_ns.report.run_files import TrainingRecord, read_record, read_scalars
 from aenerf_ns.report.view_pictures import ViewPictures, choose_views, picture_views
 
 if TYPE_CHECKING:
-    from aenerf_ns.checking.report import CheckResult
+    from aenerf_ns.checking.result import CheckResult
     from aenerf_ns.events.polarity_drift import PolarityDrift
 
 

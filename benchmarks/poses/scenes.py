@@ -48,7 +48,8 @@ _NOISE = "--pose-noise-degrees 1.5 --pose-noise-translation 0.04"
 _SLOW_NOISE = f"{_NOISE} --pose-noise-correlation-time 0.5"
 _SMALL = "--width 96 --height 72"
 _MIDDLE = "--width 160 --height 120"
-_SENSOR_240 = "--width 240 --height 180 --max-displacement 1 --validation-views 4 --test-views 10"
+_FEW_FRAMES = "--max-displacement 1"
+_SENSOR_240 = f"--width 240 --height 180 {_FEW_FRAMES} --validation-views 4 --test-views 10"
 _RGGB = "--bayer-pattern RGGB"
 _LARGE_NOISE = "--pose-noise-degrees 3 --pose-noise-translation 0.08"
 SCENES = {
@@ -65,13 +66,14 @@ SCENES = {
         ("room large noise", "report", "room", "easy", "large noise, middle size",
          f"{_MIDDLE} {_LARGE_NOISE} --seed 15"),
         ("object large noise", "events", "object", "hard", "large noise, middle size",
-         f"{_MIDDLE} {_LARGE_NOISE} --seed 18"),
+         f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} --seed 18"),
         ("room large noise davis346", "events", "room", "easy", "large noise, a real sensor",
-         f"{_MIDDLE} {_LARGE_NOISE} --sensor davis346 --seed 15"),
+         f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} --sensor davis346 --seed 15"),
         ("object large noise davis346", "events", "object", "hard", "large noise, a real sensor",
-         f"{_MIDDLE} {_LARGE_NOISE} --sensor davis346 --seed 18"),
+         f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} --sensor davis346 --seed 18"),
         ("room Gauss-Markov", "events", "room", "hard", "noise that jumps from pose to pose",
-         f"{_MIDDLE} {_NOISE} --pose-noise-kind gauss-markov --pose-noise-correlation-time 0.078 --seed 19"),
+         f"{_MIDDLE} {_FEW_FRAMES} {_NOISE} --pose-noise-kind gauss-markov --pose-noise-correlation-time 0.078 "
+         "--seed 19"),
         ("object COLMAP 25 Hz", "report", "object", "hard", "COLMAP's own errors",
          f"{_MIDDLE} --poses colmap --frame-rate 25 --seed 16"),
         ("room COLMAP 125 Hz", "report", "room", "hard", "COLMAP's own errors",

@@ -23,8 +23,9 @@ from PIL import Image
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents
+from aenerf_ns.checking.contrast_checks import check_contrast, check_depth
 from aenerf_ns.checking.hypotheses import clock_hypothesis
-from aenerf_ns.checking.report import _check_contrast, _check_depth, check
+from aenerf_ns.checking.report import check
 from aenerf_ns.cli.check import Check
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
@@ -398,7 +399,7 @@ def test_a_clock_is_named_where_four_slices_fit_it(in_favor: list[set[int]], pro
         shuffled_contrasts=lambda: np.array([0.1, 0.1]),
     )
     result = SimpleNamespace(figures=[], problems=[])
-    assert _check_contrast(result, warped, is_simple=False) == (problem is None)
+    assert check_contrast(result, warped, is_simple=False) == (problem is None)
     assert [problem in found for found in result.problems] == [True] * (problem is not None)
 
 
@@ -408,6 +409,6 @@ def test_a_scene_of_another_unit_is_a_problem(scale: float) -> None:
         energy=np.ones(1), brightness=np.ones(1), depth=np.array([1950.0]), points=np.array([[0.0, 0.0, 1950.0]])
     )
     result = SimpleNamespace(figures=[], problems=[])
-    _check_depth(result, SimpleNamespace(given=[tile]), SimpleNamespace(scene_box=None), scale)
+    check_depth(result, SimpleNamespace(given=[tile]), SimpleNamespace(scene_box=None), scale)
     named = [f"is {1950 * scale:.2g} scene units away", "--auto-scale-poses False --scale-factor 0.0005,"]
     assert [all(words in found for words in named) for found in result.problems] == [True] * (scale != 1e-3)

@@ -273,7 +273,9 @@ def test_read_the_camera_info_of_ros(text: str, tmp_path: Path) -> None:
     assert recording.event_camera == CameraIntrinsics(96, 72, 90.0, 91.0, 48.0, 36.0, *lens)
 
 
-MESSAGE = f"height: 72\nwidth: 96\nD: []\nK: {[90, 0, 47, 0, 90, 35, 0, 0, 1]}\nbinning_x: 0\nroi: {{x_offset: 0, width: 0}}\n"
+MESSAGE = (
+    "height: 72\nwidth: 96\nD: []\nK: [90, 0, 47, 0, 90, 35, 0, 0, 1]\nbinning_x: 0\nroi: {x_offset: 0, width: 0}\n"
+)
 
 
 @pytest.mark.parametrize(

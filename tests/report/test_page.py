@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from aenerf_ns.checking.report import CheckResult
+from aenerf_ns.checking.result import CheckResult
 from aenerf_ns.events.polarity_drift import PolarityDrift
 from aenerf_ns.events.statistics import EventStatistics
 from aenerf_ns.recording.poses_report import PosesReport
