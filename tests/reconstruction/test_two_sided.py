@@ -48,6 +48,16 @@ def test_states_are_sums_of_exponentials() -> None:
     assert np.count_nonzero(state) == 2
 
 
+def test_what_a_blind_pixel_misses_is_added() -> None:
+    # Single events of one polarity, 10, 30 and 11 ns apart, and one of the other.
+    rows = [(0, 0, t, 1) for t in (0, 10, 40, 51)] + [(0, 0, 81, -1)]
+    reversed_rows = [(x, y, 81 - t, -p) for x, y, t, p in reversed(rows)]
+    sensor, seen = SensorModel(0.3, 0.2, refractory_period=10), 4 + 10 / (30 - 10) + 7 / 8
+    for stream, expected in ((rows, 0.3 * seen - 0.2), (reversed_rows, 0.3 - 0.2 * seen)):
+        ((_, state),) = log_intensities(batches_of([make_stream(stream, 1, 1)], 5), sensor, 1e-6)
+        assert state[0, 0] == pytest.approx(expected, rel=1e-4)
+
+
 def test_both_directions_of_time_count_alike(events: EventStream) -> None:
     last = int(events.t[-1])
     reversed_events = EventStream(
