@@ -129,7 +129,7 @@ def check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording,
             "pipeline.model.far-plane": f"{10 * far * scale:.2g}",
         }
         result.figures.append(f"Scene units: {scale:.3g} times those of the poses")
-        if not 1 / _MAX_DISTANCE < median * scale < _MAX_DISTANCE:
+        if not 1 / _MAX_DISTANCE < median * scale < _MAX_DISTANCE and len(warped.given) >= _MIN_SLICES:
             result.problems.append(
                 f"what is seen is {median * scale:.2g} scene units away, where training resolves little: give the "
                 f"format --auto-scale-poses False --scale-factor {1 / median:.1g}, which brings it to about 1, and let "

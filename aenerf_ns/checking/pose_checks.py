@@ -72,7 +72,7 @@ def check_poses(result: CheckResult, recording: Recording, window: TimeWindow, n
         if share > _MAX_GAP_SHARE:
             where = f"{share:.1%} of the events fall in gaps between poses"
         elif empty_share > _MAX_GAP_SHARE:
-            where = f"{empty_share:.1%} of the time are in gaps between poses without events, as of joined recordings"
+            where = f"{empty_share:.1%} of the time is in gaps between poses without events, as of joined recordings"
         if where:
             problems.append(
                 f"{where}, where poses are interpolated: give the missing poses, or leave the gaps out "

@@ -139,7 +139,8 @@ def views_to_copy(recording: Recording, window: TimeWindow) -> dict[Split, list[
 
     if recording.max_views is not None:
         first, last = recording.event_file.time_span()
-        window = TimeWindow(max(first, window.start), min(last, window.end))
+        gaps = recording.trajectory.known_time(recording.max_pose_gap).gaps
+        window = TimeWindow(max(first, window.start), min(last, window.end), gaps)
     return {
         split: thin_views(
             [view for view in views if view.time is None or window.contains(view.time)], recording.max_views

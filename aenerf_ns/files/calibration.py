@@ -122,12 +122,13 @@ def _as_file(message: dict[str, Any]) -> dict[str, Any]:
 def _camera_info(path: Path, content: dict[str, Any]) -> CameraIntrinsics:
     """Return the lens of ROS's camera_info, with the names of camera_calibration_parsers."""
     info = convert(path, content, _CameraInfo, "give the file that ROS's camera calibration wrote")
+    if max(info.binning_x, info.binning_y) > 1 or info.roi.get("x_offset") or info.roi.get("y_offset"):
+        problem = "its matrix is that of the whole sensor, but its pixels are binned or cropped"
+        raise DataError(path, problem, "give size and matrix of the events' pixels, without binning and roi")
     matrix = info.camera_matrix.data
     with value_errors_as_data_error(path, "correct it there, or calibrate again with plumb_bob or equidistant"):
         if len(matrix) != 9:
             raise ValueError(f"its camera_matrix has {len(matrix)} numbers, not 9")
-        if max(info.binning_x, info.binning_y) > 1 or info.roi.get("x_offset") or info.roi.get("y_offset"):
-            raise ValueError("its matrix is that of the whole sensor, but its pixels are binned or cropped")
         pinhole = (matrix[0], matrix[4], matrix[2], matrix[5])
         size = (info.image_width, info.image_height)
         # OpenCV's own file names no model.

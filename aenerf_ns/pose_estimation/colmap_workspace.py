@@ -153,7 +153,7 @@ class ColmapWorkspace:
     def find_features(self, camera: CameraIntrinsics | None) -> None:
         """Find the features of the frames, unless earlier work on the same frames found them. Other work is removed."""
         versions = f"aenerf-ns {version('aenerf-ns')}, pycolmap {pycolmap.__version__}"
-        inputs = f"{versions}, seed {self._seed}, {camera}, {self._content.hexdigest()}"
+        inputs = f"{versions}, seed {self._seed}, motion {self._min_motion}, {camera}, {self._content.hexdigest()}"
         stated = self._folder / _INPUTS
         if not stated.exists() or stated.read_text("utf8") != inputs:
             self._database.unlink(missing_ok=True)

@@ -74,22 +74,23 @@ class EventDataset(InputDataset):
         # Imported lazily: every ns-* command imports this module, and numba is slow to import.
         from aenerf_ns.events.pairing import EVENTS_IN_MEMORY, pair_events
 
-        # Several processes read a short recording side by side.
-        with file.making(alone=count is None or count > EVENTS_IN_MEMORY):
-            pairs = file.find()
-            if pairs is not None:
-                CONSOLE.print(f"{file.path.name}: {pairs.summary()}.", markup=False)
-            else:
-                pairs = pair_events(
-                    self._chunks(),
-                    refractory_period=scene.sensor.refractory_period,
-                    window=scene.window,
-                    usable=usable,
-                    open_file=file.open,
-                )
-                CONSOLE.print(f"{events.path.name}: {pairs.summary()}.", markup=False)
-                if len(pairs) > 0:
-                    file.keep(pairs)
+        pairs, read = file.find(), file.path
+        if pairs is None:
+            # Several processes read a short recording side by side.
+            with file.making(alone=count is None or count > EVENTS_IN_MEMORY):
+                pairs = file.find_newer()
+                if pairs is None:
+                    read = events.path
+                    pairs = pair_events(
+                        self._chunks(),
+                        refractory_period=scene.sensor.refractory_period,
+                        window=scene.window,
+                        usable=usable,
+                        open_file=file.open,
+                    )
+                    if len(pairs) > 0:
+                        file.keep(pairs)
+        CONSOLE.print(f"{read.name}: {pairs.summary()}.", markup=False)
         self._require_covered(pairs.num_events, pairs.num_outside)
         if len(pairs) == 0:
             raise DataError(events.path, "no pixel has two events", "record longer, or widen the time window")

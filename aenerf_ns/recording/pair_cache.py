@@ -63,6 +63,10 @@ class PairFile:
             CONSOLE.print(f"{self.path} {problem}: it is made again.", style="yellow", markup=False)
         return found
 
+    def find_newer(self) -> EventPairs | None:
+        """Find the pairs that another process has made since the last look."""
+        return None if _stamps(self.path) == self._looked_at else self.find()
+
     def _read(self, file: BinaryIO) -> EventPairs | None:
         """Read the pairs, None if they are of other events or options.
 

@@ -71,7 +71,7 @@ class TrainingState(nn.Module):
             raise DataError(
                 str(trainer.config.load_checkpoint),
                 "its scene is scaled, turned or moved otherwise (scene units to a unit of the recording: "
-                f"{_length(before):.5g}, here {_length(now):.5g})",
+                f"{_scale_of(before):.5g}, here {_scale_of(now):.5g})",
                 "give the dataset, time window, scale and other options of the format of the first run, or train again",
             )
         for group, gradients in state["gradients"].items():
@@ -96,7 +96,7 @@ def _scene_frame(trainer: Trainer) -> torch.Tensor:
     return torch.cat([frame.scale * frame.rotation, frame.translation[:, None]], -1)
 
 
-def _length(scene_frame: torch.Tensor) -> float:
+def _scale_of(scene_frame: torch.Tensor) -> float:
     return float(scene_frame[:, 0].norm())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import tempfile
 from functools import cached_property
 from pathlib import Path
@@ -118,7 +119,7 @@ class RecordingView:
 
         An event lies on the surface that its pixel sees from the corrected pose of its time, 1 % nearer to the camera.
         """
-        shown = events[:: len(events) // _MAX_POINTS + 1]
+        shown = events[:: max(math.ceil(len(events) / _MAX_POINTS), 1)]
         device = self._model.device
         seconds = self._model.camera_optimizer.trajectory.seconds(torch.from_numpy(shown.t).to(device))
         pixels = torch.from_numpy(shown.y.astype(np.int64) * self.camera.width + shown.x).to(device)

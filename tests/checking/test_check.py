@@ -263,7 +263,7 @@ def test_a_gap_between_joined_recordings_is_a_problem(tmp_path: Path) -> None:
     assert "gaps between poses" not in run(tmp_path)[1]
     lines = (tmp_path / "trajectory.txt").read_text().splitlines(keepends=True)
     (tmp_path / "trajectory.txt").write_text("".join(lines[:101] + lines[900:]))
-    assert "80.0% of the time are in gaps between poses without events" in run(tmp_path)[1]
+    assert "80.0% of the time is in gaps between poses without events" in run(tmp_path)[1]
     assert "gaps between poses" not in run(tmp_path, format_options=("max-pose-gap-ns=100000000",))[1]
     # Nor is a rest a problem, in which poses from events have a gap.
     poses = [line.split(maxsplit=1)[1] for line in lines[101:202]]
@@ -409,6 +409,6 @@ def test_a_scene_of_another_unit_is_a_problem(scale: float) -> None:
         energy=np.ones(1), brightness=np.ones(1), depth=np.array([1950.0]), points=np.array([[0.0, 0.0, 1950.0]])
     )
     result = SimpleNamespace(figures=[], problems=[])
-    check_depth(result, SimpleNamespace(given=[tile]), SimpleNamespace(scene_box=None), scale)
+    check_depth(result, SimpleNamespace(given=[tile, tile]), SimpleNamespace(scene_box=None), scale)
     named = [f"is {1950 * scale:.2g} scene units away", "--auto-scale-poses False --scale-factor 0.0005,"]
     assert [all(words in found for words in named) for found in result.problems] == [True] * (scale != 1e-3)

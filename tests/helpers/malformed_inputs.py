@@ -18,6 +18,7 @@ from PIL import Image
 from helpers.dataset_faults import (
     Change,
     all_of,
+    edit_bytes,
     edit_hdf5,
     edit_json,
     edit_npz,
@@ -96,6 +97,21 @@ _COLUMNS = {"x": "u2", "y": "u2", "t": "i8", "p": "i1"}
 def chunk(kind: bytes, data: bytes) -> bytes:
     """A part of a PNG."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def with_chunks(name: str, make_chunks: Callable[[], bytes]) -> Change:
+    """Put further parts behind the header of a PNG."""
+    return edit_bytes(name, lambda content: content[:33] + make_chunks() + content[33:])
+
+
+def animation() -> bytes:
+    """A claim to be the first of 2^32 pictures. The next picture has no size."""
+    return chunk(b"acTL", struct.pack(">II", 2**32 - 1, 0)) + chunk(b"fcTL", bytes(26))
+
+
+def text_bomb() -> bytes:
+    """A comment of 64 MB of zeros."""
+    return chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(64 << 20)))
 
 
 def black(name: str, side: int) -> Change:
@@ -243,6 +259,8 @@ _CHANGES: dict[str, dict[str, Change]] = {
         "a sensor of 16000 x 16000": camera(width=16000, height=16000),
         "HDF5 of 10^12 rows": unallocated("events.h5", _COLUMNS, "events/"),
         "png of 30000 x 30000 among views": black(_VAL_IMAGE, 30000),
+        "png comment of 64 MB": with_chunks(_VAL_IMAGE, text_bomb),
+        "an animation of 2^32 pictures": with_chunks(_VAL_IMAGE, animation),
         "poses of 8 GB": sparse("trajectory_estimated.txt"),
         "pose time of 1e30": poses("0 0 0 0 0 0 0 1\n1e30 0 0 0 0 0 0 1\n"),
         "pose at 1e300": poses("1600000000 1e300 0 0 0 0 0 1\n1600000009 0 0 0 0 0 0 1\n"),

@@ -219,7 +219,7 @@ def compute_light(
     direct = sharp + sky_light + np.float32(ambient)
     # The mean over a point's rays of the light at their ends, as a matrix.
     ends_in_sight = links >= 0
-    row_starts = np.append(0, ends_in_sight.sum(axis=1).cumsum())
+    row_starts = np.append(0, ends_in_sight.sum(axis=1).cumsum()).astype(links.dtype)
     gathering = csr_array((np.ones(row_starts[-1]), links[ends_in_sight], row_starts), shape=(2 * count, 2 * count))
     light = direct
     for _ in range(_BOUNCES):
