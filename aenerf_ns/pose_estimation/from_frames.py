@@ -82,6 +82,15 @@ class EstimatedPoses:
         times = self.frame_times
         return [(int(times[first]), int(times[end - 1]), end - first) for first, end in runs_of(lost)]
 
+    def max_pose_gap(self) -> int | None:
+        """Return the longest interval between two poses in nanoseconds that at most two lost frames lie in.
+
+        None if nowhere more frames in a row are lost.
+        """
+        placed = np.flatnonzero(np.isin(self.frame_times, self.trajectory.times.numpy()))
+        num_lost, intervals = np.diff(placed) - 1, np.diff(self.frame_times[placed])
+        return int(intervals[num_lost <= _MAX_LOST].max(initial=1)) if (num_lost > _MAX_LOST).any() else None
+
     def report(self) -> dict[str, Any]:
         """Return the figures as plain values for JSON."""
         registered, frames = len(self.trajectory), len(self.frame_times)
