@@ -339,8 +339,14 @@ def _with_poses(
                 f"Compared with the given poses, which are kept as ground truth: mean errors "
                 f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units."
             )
-            # The dataset's scene box is in the world of the given poses, and the longest gap is about these poses.
-            recording = replace(capture, trajectory=trajectory, ground_truth=truth, scene_box=box, max_pose_gap=None)
+            # The dataset's scene box is in the world of the given poses, and its longest gap is about these poses.
+            recording = replace(
+                capture,
+                trajectory=trajectory,
+                ground_truth=truth,
+                scene_box=box,
+                max_pose_gap=found.max_pose_gap(),
+            )
             return recording, report, found.draw and found.draw(paths)
         say(
             f"The given poses, from {truth.start} to {truth.end} ns, are of another time than the estimated ones, from "
@@ -352,6 +358,7 @@ def _with_poses(
         **{field.name: getattr(capture, field.name) for field in fields(Capture)},
         trajectory=trajectory,
         scene_box=box,
+        max_pose_gap=found.max_pose_gap(),
         reference_views=views,
         max_views=MAX_VIEWS,
     )

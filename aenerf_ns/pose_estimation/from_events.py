@@ -20,6 +20,9 @@ _HELD_OUT = 0.05
 # Share of these matches by which the incremental mapper must be better: where both agree alike, the global one's poses
 # come out better (benchmarks/LOG.md).
 _GLOBAL_LEAD = 0.03
+# Images without a pose in a row across which poses are interpolated. Images follow each other as the picture moves, so
+# poses across many of them are wrong, and so is what their events are trained on.
+_MAX_LOST = 2
 # Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, iterations, and pixels beyond
 # which an observation counts less. At first, most are off by more.
 _ROUNDS = ((12.0, 8.0, 30, 1.0), (8.0, 5.0, 30, 1.0), (5.0, 3.0, 30, 1.0), (4.0, 2.0, 60, 0.5), (4.0, 2.0, 60, 0.5))
@@ -93,5 +96,6 @@ def estimate_poses_from_events(
         images="images of the events",
         mapper=mapper,
         agreement=agreement,
+        max_lost=_MAX_LOST,
         draw=partial(draw_poses, pictures, observations_of(model, len(times))),
     )

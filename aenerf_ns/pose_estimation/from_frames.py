@@ -58,6 +58,7 @@ class EstimatedPoses:
         images: what the frames are, for people to read.
         mapper: COLMAP's mapper whose model was taken, incremental or global.
         agreement: share of the matches kept apart that fit the poses; None where none were kept apart.
+        max_lost: frames in a row without a pose across which poses are interpolated; None for any number.
         draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
             the paths; None where the images were not kept.
     """
@@ -74,6 +75,7 @@ class EstimatedPoses:
     images: str = "frames"
     mapper: str = "incremental"
     agreement: float | None = None
+    max_lost: int | None = None
     draw: Callable[[Mapping[str, NDArray[np.float64]]], Image.Image] | None = None
 
     def gaps(self) -> list[tuple[int, int, int]]:
@@ -83,13 +85,15 @@ class EstimatedPoses:
         return [(int(times[first]), int(times[end - 1]), end - first) for first, end in runs_of(lost)]
 
     def max_pose_gap(self) -> int | None:
-        """Return the longest interval between two poses in nanoseconds that at most two lost frames lie in.
+        """Return the nanoseconds between two poses beyond which none are known between them; None for no limit.
 
-        None if nowhere more frames in a row are lost.
+        It is the longest interval with at most ``max_lost`` lost frames, if there are intervals with more.
         """
         placed = np.flatnonzero(np.isin(self.frame_times, self.trajectory.times.numpy()))
         num_lost, intervals = np.diff(placed) - 1, np.diff(self.frame_times[placed])
-        return int(intervals[num_lost <= _MAX_LOST].max(initial=1)) if (num_lost > _MAX_LOST).any() else None
+        if self.max_lost is None or (num_lost <= self.max_lost).all():
+            return None
+        return int(intervals[num_lost <= self.max_lost].max(initial=1))
 
     def report(self) -> dict[str, Any]:
         """Return the figures as plain values for JSON."""
@@ -122,9 +126,11 @@ class EstimatedPoses:
         if len(gaps) > _MAX_GAPS_SHOWN:
             gaps = [*gaps[:_MAX_GAPS_SHOWN], f"and {len(gaps) - _MAX_GAPS_SHOWN} more runs"]
         if gaps:
+            longest = self.max_pose_gap()
+            near = "" if longest is None else f" at most {longest * 1e-9:.3g} s apart"
             line += (
-                f"\nFrames without a pose: {', '.join(gaps)}. Between registered frames poses are interpolated; before "
-                "the first and after the last events are not used."
+                f"\nFrames without a pose: {', '.join(gaps)}. Between registered frames{near} poses are interpolated; "
+                "other events are not used."
             )
         return line
 

@@ -452,6 +452,11 @@ def test_report_lost_frames_and_fragments(truth: torch.Tensor) -> None:
     assert report["model_sizes"] == [5, 3]
     assert "5 of 10 frames registered in the largest of 2 models" in found.summary()
     assert "0.120 to 0.160 s (2)" in found.summary()
+    # Across one lost frame poses are interpolated: two poses are then two frames apart.
+    strict = dataclasses.replace(found, max_lost=1)
+    assert [estimated.max_pose_gap() for estimated in (found, strict)] == [None, 2 * FRAME]
+    assert f"at most {2 * FRAME * 1e-9:.3g} s apart poses are interpolated" in strict.summary()
+    assert dataclasses.replace(found, max_lost=2).max_pose_gap() is None
     many = Trajectory(FRAME * np.arange(0, 40, 2), truth[:20])
     told = dataclasses.replace(found, frame_times=FRAME * np.arange(40), trajectory=many).summary()
     assert told.count("(1)") == 10
