@@ -57,17 +57,19 @@ def check_poses(result: CheckResult, recording: Recording, window: TimeWindow, n
     gaps = np.flatnonzero((intervals > _GAP_FACTOR * median) & ~known)
     if len(gaps):
         # The shares are those of the sampled pairs, each counted at its later event.
-        segment = np.searchsorted(times, statistics.pair_times[:, 1]) - 1
-        shares = np.bincount(segment + 1, minlength=len(times) + 1)[gaps + 1] / max(len(segment), 1)
+        later = np.searchsorted(times, statistics.pair_times[:, 1])
+        all_shares = np.bincount(later, minlength=len(times) + 1)[1 : len(times)] / max(len(later), 1)
+        shares = all_shares[gaps]
         time_shares = np.diff(times.clip(window.start, window.end))[gaps] / (window.end - window.start)
-        share = shares.sum()
+        # Poses of images of events are further apart where the camera is slow, with as many events in between.
+        share = shares[shares > _GAP_FACTOR * np.median(all_shares)].sum()
         # Pairs of events span what lies between two recordings that were joined. A slow camera has some events, and a
         # camera that rests goes on from where it was.
         has_moved = ((steps > _JUMP_FACTOR * steps.median()) | (degrees > _JUMP_FACTOR * degrees.median())).numpy()
         empty_share = time_shares[(shares < _MIN_GAP_RATE * time_shares) & has_moved[gaps]].sum()
         longest = gaps[np.argsort(-intervals[gaps], kind="stable")[:_MAX_GAPS_SHOWN]]
         named = ", ".join(f"{intervals[i] * 1e-9:.3f} s after {times[i]} ns" for i in longest)
-        figures.append(f"Gaps between poses: {len(gaps)}, with {share:.1%} of the events; the longest: {named}")
+        figures.append(f"Gaps between poses: {len(gaps)}, with {shares.sum():.1%} of the events; the longest: {named}")
         where = ""
         if share > _MAX_GAP_SHARE:
             where = f"{share:.1%} of the events fall in gaps between poses"

@@ -25,6 +25,7 @@ from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
 from aenerf_ns.checking.contrast import WarpedEvents
 from aenerf_ns.checking.contrast_checks import check_contrast, check_depth
 from aenerf_ns.checking.hypotheses import clock_hypothesis
+from aenerf_ns.checking.pose_checks import check_poses
 from aenerf_ns.checking.report import check
 from aenerf_ns.cli.check import Check
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
@@ -252,6 +253,23 @@ def test_command_reports_gaps_and_missing_poses(shorter: Path) -> None:
     assert "of the events fall in gaps" in output
     assert "of the events have a pose, the others are not used" in output
     assert "100.0% of the events are positive" in output
+
+
+@pytest.mark.parametrize("is_slow", [True, False])
+def test_poses_of_a_slow_camera_are_no_gaps(is_slow: bool) -> None:
+    """Give 50 poses every 10 ms, then 5 every 100 ms, and as many events between each two, or all evenly in time."""
+    times = np.cumsum([0] + [10_000_000] * 50 + [100_000_000] * 5)
+    ends = np.linspace(0, 55, 5500, endpoint=False) if is_slow else np.linspace(0, times[-1], 5500, endpoint=False)
+    ends = np.interp(ends, np.arange(56), times) if is_slow else ends
+    poses = torch.eye(4, dtype=torch.float64)[:3].repeat(56, 1, 1)
+    poses[:, 0, 3] = torch.arange(56)
+    trajectory = Trajectory(torch.from_numpy(times), poses, "made")
+    recording = SimpleNamespace(trajectory=trajectory, intrinsics_origin="given", ground_truth=None)
+    statistics = SimpleNamespace(pair_times=np.stack([ends, ends], 1), num_events=5500)
+    result = SimpleNamespace(statistics=statistics, figures=[], problems=[])
+    check_poses(result, recording, trajectory.known_time(), 5500)
+    assert "Gaps between poses: 5" in result.figures[-1]
+    assert ["50.0% of the events fall in gaps" in problem for problem in result.problems] == [True] * (not is_slow)
 
 
 def test_a_gap_between_joined_recordings_is_a_problem(tmp_path: Path) -> None:
