@@ -10,7 +10,7 @@ from aenerf_ns.events.statistics import EventStatistics
 
 @dataclass
 class CheckResult:
-    """What a check finds.
+    """Collect what a check finds.
 
     Attributes:
         statistics: of all events.

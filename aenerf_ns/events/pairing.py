@@ -319,6 +319,15 @@ def _sort_into(entries, first_pixel, next_rows, rows):
 
 
 @numba.njit(cache=True)
+def missed_thresholds(interval, refractory_period):
+    """Return the thresholds, at most 7/8, that a pixel misses while it is blind, between two events of one polarity.
+
+    See :func:`aenerf_ns.events.pair_store.event_counts`. The interval in nanoseconds is longer than the period.
+    """
+    return min(refractory_period / (interval - refractory_period), (COUNT_UNIT - 1) / COUNT_UNIT)
+
+
+@numba.njit(cache=True)
 def _finish(rows, row, num_chains, refractory_period, block_ends):
     """Put maximum span and sums into the next rows, which hold each event's own counts, and add up the ends of blocks.
 
@@ -350,7 +359,7 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
             block_ends[block + 1] += interval
         if refractory_period > 0 and own == last_own and (own == 1 or own == 1 << NEGATIVE_SHIFT):
             # Rounding down leaves a rest, which is added at the next event.
-            rest += min(COUNT_UNIT * refractory_period / (interval - refractory_period), COUNT_UNIT - 1)
+            rest += COUNT_UNIT * missed_thresholds(interval, refractory_period)
             missed = int(rest)
             rest -= missed
             positive = (positive + missed * (own == 1)) & COUNT_MASK

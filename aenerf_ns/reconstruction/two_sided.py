@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from aenerf_ns.events.pairing import missed_thresholds
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 
@@ -18,8 +19,6 @@ _LOOK_AHEAD, _MAX_IMAGES_AHEAD = 25.0, 200
 # Events per pixel by which an image shows the past. Light that has changed by less than a threshold has no event yet. A
 # time in place of a number of events would depend on the camera's speed.
 _LAG = 0.1
-# Thresholds that a pixel misses after an event, at most.
-_MAX_MISSED = 7 / 8
 
 
 def log_intensities(
@@ -136,7 +135,7 @@ def _integrate(state, last, time, polarity, x, y, t, p, count, decay, rise, fall
         change = rise[row, column] if p[event] > 0 else fall[row, column]
         interval = abs(t[event] - time[row, column])
         if polarity[row, column] == p[event] and interval > refractory_period:
-            change *= 1 + min(refractory_period / (interval - refractory_period), _MAX_MISSED)
+            change *= 1 + missed_thresholds(interval, refractory_period)
         kept = np.exp(-decay * (count + event - last[row, column])) * state[row, column]
         state[row, column] = kept + change
         last[row, column] = count + event
