@@ -18,7 +18,8 @@ import yaml
 from helpers.bounded_reading import MAX_SECONDS, refusal
 from helpers.dataset_faults import dump_raw, load_raw
 from helpers.event_file_checks import EDITS, edited
-from helpers.malformed_inputs import FAULTS, MALFORMED
+from helpers.faulty_datasets import FAULTS
+from helpers.malformed_inputs import MALFORMED
 from helpers.streams import FUZZ_EXAMPLES
 from helpers.vendor_recordings import BOMBS, DATASETS, read_dataset
 from hypothesis import HealthCheck, given, settings
