@@ -251,8 +251,13 @@ class ColmapWorkspace:
                 database.delete_matches(*images)
         return HeldOutMatches(matches, camera.mean_focal_length())
 
-    def reconstruct(self, refine_intrinsics: bool = False) -> list[Any]:
-        """Return the models of the incremental mapper, in the order of the number of frames, the largest first."""
+    def reconstruct(self, refine_intrinsics: bool = False, start: Any = None) -> list[Any]:
+        """Return the models of the incremental mapper, in the order of the number of frames, the largest first.
+
+        Args:
+            refine_intrinsics: whether to estimate focal length and distortion too.
+            start: a model that gets the frames that it lacks, and is the only one returned.
+        """
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self._seed
         options.num_threads = options.mapper.num_threads = 1
@@ -260,10 +265,13 @@ class ColmapWorkspace:
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
         options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = _MIN_POINTS, 50
         options.extract_colors = False
-        output = self._new_folder()
+        output, begun = self._new_folder(), ""
+        if start is not None:
+            options.multiple_models, begun = False, self._new_folder()
+            start.write(begun)
         with self._step("Placing frames", len(self._names)) as task:
             models = pycolmap.incremental_mapping(
-                self._database, self._images, output, options, next_image_callback=lambda: self._progress.advance(task)
+                self._database, self._images, output, options, begun, lambda: None, lambda: self._progress.advance(task)
             )
         return _largest_first(models)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import is_placed, stand_upright, trajectory_of
-from aenerf_ns.pose_estimation.event_images import match_event_images
+from aenerf_ns.pose_estimation.colmap_workspace import is_placed, poses_of, stand_upright, trajectory_of
+from aenerf_ns.pose_estimation.event_images import MIN_IMAGES, match_event_images
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
 from aenerf_ns.pose_estimation.scene_box import box_of
@@ -26,6 +26,8 @@ _MAX_LOST = 2
 # Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, iterations, and pixels beyond
 # which an observation counts less. At first, most are off by more.
 _ROUNDS = ((12.0, 8.0, 30, 1.0), (8.0, 5.0, 30, 1.0), (5.0, 3.0, 30, 1.0), (4.0, 2.0, 60, 0.5), (4.0, 2.0, 60, 0.5))
+# The round before which images that have no pose are placed again. Where some are lost, the model may have a bend.
+_SECOND_CHANCE = 3
 
 
 def estimate_poses_from_events(
@@ -68,7 +70,11 @@ def estimate_poses_from_events(
         model = None
         for mapper in sorted(models, key=fit, reverse=True):
             model = models[mapper]
-            for limits in _ROUNDS:
+            for number, limits in enumerate(_ROUNDS):
+                poses = poses_of(model)
+                if number == _SECOND_CHANCE and MIN_IMAGES <= len(poses) < len(times):
+                    start = workspace.triangulate(poses, *limits[:2])
+                    model = (workspace.reconstruct(start=start) or [model])[0]
                 model = workspace.adjust(model, *limits) if is_placed(model) else model
             if is_placed(model):
                 break
@@ -87,7 +93,7 @@ def estimate_poses_from_events(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),
         camera=camera,
-        model_sizes=[model.num_reg_images() for model in found[mapper]],
+        model_sizes=[other.num_reg_images() for other in (model, *found[mapper][1:])],
         num_points=model.num_points3D(),
         reprojection_error=error,
         features=features,
