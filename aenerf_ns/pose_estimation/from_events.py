@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.colmap_workspace import is_placed, poses_of, stand_upright, trajectory_of
-from aenerf_ns.pose_estimation.event_images import MIN_IMAGES, match_event_images
+from aenerf_ns.pose_estimation.event_images import match_event_images
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
 from aenerf_ns.pose_estimation.scene_box import box_of
@@ -25,9 +27,8 @@ _GLOBAL_LEAD = 0.03
 _MAX_LOST = 2
 # Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, iterations, and pixels beyond
 # which an observation counts less. At first, most are off by more.
-_ROUNDS = ((12.0, 8.0, 30, 1.0), (8.0, 5.0, 30, 1.0), (5.0, 3.0, 30, 1.0), (4.0, 2.0, 60, 0.5), (4.0, 2.0, 60, 0.5))
-# The round before which images that have no pose are placed again. Where some are lost, the model may have a bend.
-_SECOND_CHANCE = 3
+_LAST_ROUNDS = ((4.0, 2.0, 60, 0.5), (4.0, 2.0, 60, 0.5))
+_ROUNDS = ((12.0, 8.0, 30, 1.0), (8.0, 5.0, 30, 1.0), (5.0, 3.0, 30, 1.0), *_LAST_ROUNDS)
 
 
 def estimate_poses_from_events(
@@ -41,10 +42,10 @@ def estimate_poses_from_events(
     """Estimate the poses of an event camera from its events, on the CPU.
 
     COLMAP matches images that are made of the events (:func:`match_event_images`). Its incremental and its global
-    mapper place the images. The model that more of the matches kept apart fit is adjusted in some rounds, and its poses
-    are taken; where both fit alike, the global mapper's. Intrinsics stay as they are; where they are only guessed, one
-    focal length and the radial distortion k1 are estimated first. A seed gives the same poses again, to the last bit on
-    one machine with one version of COLMAP.
+    mapper place the images. The model that more of the matches kept apart fit is adjusted in some rounds, the images
+    that it lacks are placed again, and its poses are taken; where both fit alike, the global mapper's. Intrinsics stay
+    as they are; where they are only guessed, one focal length and the radial distortion k1 are estimated first. A seed
+    gives the same poses again, to the last bit on one machine with one version of COLMAP.
 
     Args:
         capture, window, source, seed, weights, folder: see :func:`match_event_images`.
@@ -67,15 +68,19 @@ def estimate_poses_from_events(
             is_near = models[mapper].compute_mean_reprojection_error() < _ROUNDS[-1][0]
             return is_near, (held_out.agreement(models[mapper]) or 0.0) + _GLOBAL_LEAD * (mapper == "global")
 
+        def adjust(model: Any, rounds: Iterable[tuple[float, float, int, float]]) -> Any:
+            for limits in rounds:
+                model = workspace.adjust(model, *limits) if is_placed(model) else model
+            return model
+
         model = None
         for mapper in sorted(models, key=fit, reverse=True):
             model = models[mapper]
-            for number, limits in enumerate(_ROUNDS):
-                poses = poses_of(model)
-                if number == _SECOND_CHANCE and MIN_IMAGES <= len(poses) < len(times):
-                    start = workspace.triangulate(poses, *limits[:2])
-                    model = (workspace.reconstruct(start=start) or [model])[0]
-                model = workspace.adjust(model, *limits) if is_placed(model) else model
+            model = adjust(model, _ROUNDS)
+            # Where images are lost, the model often has a bend. Now that it is better, more of them find their place.
+            if is_placed(model) and len(poses_of(model)) < len(times):
+                start = workspace.triangulate(poses_of(model), *_LAST_ROUNDS[0][:2])
+                model = adjust((workspace.reconstruct(start=start) or [model])[0], _LAST_ROUNDS)
             if is_placed(model):
                 break
         if camera is None or model is None or not is_placed(model):
@@ -87,13 +92,15 @@ def estimate_poses_from_events(
                 + ("check the calibration too" if is_calibrated else "a calibration helps"),
             )
 
+        placed = poses_of(model).keys()
+        others = [other for other in found[mapper][1:] if not poses_of(other).keys() <= placed]
         agreement, error = held_out.agreement(model), model.compute_mean_reprojection_error()
         stand_upright(model)
     return EstimatedPoses(
         frame_times=times,
         trajectory=trajectory_of(model, times, source),
         camera=camera,
-        model_sizes=[other.num_reg_images() for other in (model, *found[mapper][1:])],
+        model_sizes=[one.num_reg_images() for one in (model, *others)],
         num_points=model.num_points3D(),
         reprojection_error=error,
         features=features,

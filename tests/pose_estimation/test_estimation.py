@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -22,6 +23,7 @@ from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.rotation import rotation_from_vector
+from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
@@ -32,6 +34,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, poses_of, stand_upright, work_folder
+from aenerf_ns.pose_estimation.from_events import estimate_poses_from_events
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses, compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
 from aenerf_ns.recording.recording import ReferenceView
@@ -159,6 +162,29 @@ def test_find_poses_and_lens_of_a_bare_recording(found: Path, dataset: Path, roo
     assert outputs.cameras.camera_to_worlds[..., 3].abs().max() == pytest.approx(1, rel=0.1)
     scene = outputs.metadata[SCENE_KEY]
     assert (scene.window.start, scene.window.end) == (trajectory.start, trajectory.end)
+
+
+def test_images_that_a_mapper_lost_are_placed_again(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reconstruct = ColmapWorkspace.reconstruct
+
+    def lose_images(workspace: ColmapWorkspace, start: object = None) -> list[Any]:
+        models = reconstruct(workspace, start=start)
+        if start is None:
+            models.append(pycolmap.Reconstruction(models[0]))
+            for image in list(models[0].images.values())[3:6]:
+                models[0].deregister_frame(image.frame_id)
+        return models
+
+    monkeypatch.setattr(ColmapWorkspace, "reconstruct", lose_images)
+    monkeypatch.setattr(ColmapWorkspace, "reconstruct_globally", lambda _: [])
+    recording = NativeDataParserConfig(data=dataset).setup().read_recording()
+    found = estimate_poses_from_events(recording, TimeWindow(end=280_000_000), dataset)
+    assert found.model_sizes == [len(found.frame_times)]
+    assert found.trajectory.times.tolist() == found.frame_times.tolist()
+    assert recording.ground_truth is not None
+    errors = pose_errors(found.trajectory.camera_to_worlds, recording.ground_truth.interpolate(found.frame_times))
+    # Measured: 0.6 degrees, on half of the path.
+    assert errors["rotation_error_degrees"] < 2
 
 
 def test_an_interrupted_search_goes_on(
