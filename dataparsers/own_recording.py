@@ -44,7 +44,8 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     )
     _target: type = field(default_factory=lambda: OwnRecordingDataParser)
     events: Path | None = None
-    """The file of events. By default the file in the folder that is named "events", with the suffix of any format."""
+    """The file of events. By default the one that is given in place of the folder, or the file in the folder that is
+    named "events", with the suffix of any format."""
     event_topic: str | None = None
     """Topic of a bag, or number of the stream of an AEDAT4 file, where several hold events."""
     event_time_unit: TimeUnit | None = None
@@ -74,11 +75,13 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
         # Poses and calibration may be missing: they can be estimated. Events may, where a trained run is opened.
         has_poses = (data / "trajectory.txt").is_file() or (data / "colmap").is_dir()
         has_calibration = any((data / name).is_file() for name in _CALIBRATIONS)
-        return any((data / f"events{suffix}").is_file() for suffix in SUFFIXES) or (has_calibration and has_poses)
+        has_events = any((data / f"events{suffix}").is_file() for suffix in SUFFIXES)
+        return has_events or (has_calibration and has_poses) or (data.suffix in SUFFIXES and data.is_file())
 
 
 class OwnRecordingDataParser(EventDataParser):
-    """Read a recording from the files that the options name, or from the files of the default names in a folder."""
+    """Read a recording from the files that the options name, or from the files of the default names in a folder, which
+    may be given by its file of events."""
 
     config: OwnRecordingDataParserConfig
 
@@ -86,7 +89,7 @@ class OwnRecordingDataParser(EventDataParser):
         config = self.config
         capture, frame_from_event, timed = self._read_all_but_poses()
         poses = self.poses_path()
-        if poses in (self.data / "colmap", config.colmap):
+        if poses in (self._folder / "colmap", config.colmap):
             if not timed:
                 remedy = "write a line for each: time[s] file"
                 raise DataError(self._image_list, "there is no such list of images", remedy)
@@ -106,7 +109,7 @@ class OwnRecordingDataParser(EventDataParser):
         if stated is not None and not stated.exists():
             option = "--colmap" if config.colmap else "--poses"
             raise DataError(stated, "there is no such file of poses", f"correct {option}, or leave it out")
-        trajectory, model = self.data / "trajectory.txt", self.data / "colmap"
+        trajectory, model = self._folder / "trajectory.txt", self._folder / "colmap"
         return stated or (model if model.is_dir() and not trajectory.is_file() else trajectory)
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
@@ -117,7 +120,7 @@ class OwnRecordingDataParser(EventDataParser):
         """Read the cameras, the (4, 4) motion from the event camera's to the frame camera's coordinates, and the times
         in nanoseconds and the files of the images."""
         config = self.config
-        if not self.data.is_dir():
+        if not self.data.exists():
             raise DataError(self.data, "there is no such folder", "give the folder of the recording as --data")
         images = self._image_list
         timed = read_image_list(images) if config.images is not None or images.is_file() else []
@@ -134,21 +137,27 @@ class OwnRecordingDataParser(EventDataParser):
         return capture, calibration.frame_from_event, timed
 
     @property
+    def _folder(self) -> Path:
+        return self.data.parent if self.data.is_file() else self.data
+
+    @property
     def _image_list(self) -> Path:
-        return self.config.images or self.data / IMAGE_LIST
+        return self.config.images or self._folder / IMAGE_LIST
 
     def _read_calibration(self, has_images: bool) -> Calibration:
         config, file = self.config, self.config.calibration
         if file is None:
-            found = [self.data / name for name in _CALIBRATIONS if (self.data / name).is_file()]
+            found = [self._folder / name for name in _CALIBRATIONS if (self._folder / name).is_file()]
             if not found:
                 return _guess_calibration(self._event_file())
-            file = require_one(found, self.data, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
+            file = require_one(found, self._folder, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
         return read_calibration(file, config.event_camera, config.frame_camera, has_images)
 
     def _event_file(self, width: int | None = None, height: int | None = None) -> EventFile:
         config = self.config
-        if config.events is None:
+        if config.events is None and self.data.is_file():
+            config.events = self.data
+        elif config.events is None:
             files = sorted(file for suffix in SUFFIXES if (file := self.data / f"events{suffix}").is_file())
             what = f"files events{{{','.join(SUFFIXES)}}}"
             # Stored, so that opening a trained run needs no events.

@@ -13,7 +13,7 @@ from aenerf_ns.checking.noise import NoiseRate
 from aenerf_ns.checking.result import CheckResult
 from aenerf_ns.checking.thresholds import PolarityBalance
 from aenerf_ns.events.filters import find_hot_pixels, hot_pixel_summary
-from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.recording import Capture
 
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _MILLISECOND = 1_000_000
@@ -94,16 +94,16 @@ def check_polarity(result: CheckResult, correlation: float | None) -> None:
 
 
 def check_thresholds(
-    result: CheckResult, recording: Recording, changes: FrameChanges, balance: PolarityBalance, correlation: float
+    result: CheckResult, capture: Capture, changes: FrameChanges, balance: PolarityBalance, correlation: float
 ) -> None:
     """Estimate the contrast thresholds."""
-    estimate, sensor = balance.ratio(), recording.sensor
+    estimate, sensor = balance.ratio(), capture.sensor
     if estimate is None:
         return
     ratio, uncertainty = estimate
     used = sensor.positive_contrast_threshold / sensor.negative_contrast_threshold
     figure = f"Contrast thresholds: C+/C- is {ratio:.2f} +/- {uncertainty:.2f} by the balance of the polarities"
-    figure += f" ({'assumed' if recording.has_assumed_thresholds else 'given'}: {used:.2f})"
+    figure += f" ({'assumed' if capture.has_assumed_thresholds else 'given'}: {used:.2f})"
     if correlation > 0:
         size, low, high = changes.negative_threshold(ratio)
         figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
@@ -111,7 +111,7 @@ def check_thresholds(
     is_reversed = correlation < _MIN_CORRELATION
     if abs(ratio - used) > _THRESHOLD_DEVIATIONS * uncertainty and not is_reversed:
         value = f"{ratio * sensor.negative_contrast_threshold:.3g}"
-        if recording.has_assumed_thresholds:
+        if capture.has_assumed_thresholds:
             result.sensor_options = {"positive-contrast-threshold": value}
         else:
             figure += f". If the given ones were a guess, give the format --positive-contrast-threshold {value}"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +12,7 @@ from aenerf_ns.camera.image_encoding import decode
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.recording.images import check_image, read_image
-from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.recording import Capture
 
 # Pairs of frames that are compared. More do not change the result.
 _MAX_PAIRS = 8
@@ -25,16 +28,20 @@ class FrameChanges:
     Only frames that the event camera's own lens took, at known times within the window, are compared. Between two of
     them, the sum of a pixel's polarities is the change of its log-radiance in contrast thresholds, however far the
     camera moved.
+
+    Args:
+        capture: the cameras.
+        frames: times in nanoseconds and files.
+        window: the time of the frames that are compared.
     """
 
-    def __init__(self, recording: Recording, window: TimeWindow) -> None:
-        views = [view for split in recording.reference_views.values() for view in split]
-        files = {view.time: view.file for view in views if view.time is not None and window.contains(view.time)}
-        times = sorted(files) if recording.frame_camera == recording.event_camera else []
+    def __init__(self, capture: Capture, frames: Iterable[tuple[int, Path]], window: TimeWindow) -> None:
+        files = {time: file for time, file in frames if window.contains(time)}
+        times = sorted(files) if capture.frame_camera == capture.event_camera else []
         starts = np.unique(np.linspace(0, len(times) - 2, _MAX_PAIRS).astype(int)) if len(times) > 1 else []
         self._spans = [(times[i], times[i + 1]) for i in starts]
-        self._files, self._camera = files, recording.event_camera
-        self._encoding = recording.image_encoding
+        self._files, self._camera = files, capture.event_camera
+        self._encoding = capture.image_encoding
         # Of the frames that were read, by their times.
         self._levels: dict[int, NDArray[np.uint8]] = {}
         # Of the positive and of the negative events.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from aenerf_ns.checking.result import CheckResult
 from aenerf_ns.checking.thresholds import PolarityBalance
 from aenerf_ns.events.statistics import EventStatistics, event_statistics
 from aenerf_ns.events.stream import EventStream
+from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.progress import progress_bar, tracked
-from aenerf_ns.recording.recording import Recording
+from aenerf_ns.recording.recording import Capture, Recording
 
 _RATE_PARTS = 60
 # Fewer events give no contrast.
@@ -36,15 +38,7 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     Raises:
         DataError: the events cannot be read.
     """
-    changes = FrameChanges(recording, window)
-    balance = PolarityBalance(recording.event_file, recording.sensor.refractory_period)
-    noise = NoiseRate(recording.event_file.width, recording.event_file.height)
-    statistics, num_covered = _count_events(recording, window, changes, balance, noise)
-    result = CheckResult(statistics)
-    check_events(result, noise, recording.sensor.bayer_pattern)
-    correlation = changes.correlation()
-    check_polarity(result, correlation)
-    check_thresholds(result, recording, changes, balance, correlation or 0.0)
+    result, num_covered = _check_events(recording, recording.frames, window)
     check_poses(result, recording, window, num_covered)
     num_problems = len(result.problems)
     check_lens(result, recording.event_camera)
@@ -68,11 +62,40 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     return result
 
 
+def check_without_poses(capture: Capture, frames: Iterable[tuple[int, Path]]) -> CheckResult:
+    """Check the events of a recording without poses, and its lens.
+
+    Args:
+        capture: the recording.
+        frames: times in nanoseconds and files.
+
+    Raises:
+        DataError: the events cannot be read.
+    """
+    result, _ = _check_events(capture, frames, TimeWindow())
+    if capture.intrinsics_origin != "guessed":
+        check_lens(result, capture.event_camera)
+    return result
+
+
+def _check_events(capture: Capture, frames: Iterable[tuple[int, Path]], window: TimeWindow) -> tuple[CheckResult, int]:
+    """Check the events, and count those in the window."""
+    changes = FrameChanges(capture, frames, window)
+    balance = PolarityBalance(capture.event_file, capture.sensor.refractory_period)
+    noise = NoiseRate(capture.event_file.width, capture.event_file.height)
+    statistics, num_covered = _count_events(capture.event_file, window, changes, balance, noise)
+    result = CheckResult(statistics)
+    check_events(result, noise, capture.sensor.bayer_pattern)
+    correlation = changes.correlation()
+    check_polarity(result, correlation)
+    check_thresholds(result, capture, changes, balance, correlation or 0.0)
+    return result, num_covered
+
+
 def _count_events(
-    recording: Recording, window: TimeWindow, changes: FrameChanges, balance: PolarityBalance, noise: NoiseRate
+    file: EventFile, window: TimeWindow, changes: FrameChanges, balance: PolarityBalance, noise: NoiseRate
 ) -> tuple[EventStatistics, int]:
     """Return statistics of the events, and the number of events that have a pose; hand all on to the other three."""
-    file = recording.event_file
     num_covered = 0
 
     def chunks() -> Iterator[EventStream]:

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from aenerf_ns.cli.console import say
 from aenerf_ns.cli.dataset import DatasetCommand, training_command
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import creating, require_writable
 
+if TYPE_CHECKING:
+    from aenerf_ns.checking.result import CheckResult
+    from aenerf_ns.recording.dataparser import EventDataParser
+
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass
 class Check(DatasetCommand):
-    """Check the events of a dataset, its poses, and whether the two fit each other. Exit status 0 if all is well, 1
-    if there are problems, 2 if the dataset cannot be read."""
+    """Check the events of a dataset, its poses if it has any, and whether the two fit each other. Exit status 0 if all
+    is well, 1 if there are problems, 2 if the dataset cannot be read."""
 
     picture: Path | None = None
     """PNG file to write: events as they came, and warped to one view by the poses."""
@@ -48,14 +53,38 @@ class Check(DatasetCommand):
         parser = self.open_dataset()
         from PIL import Image
 
-        from aenerf_ns.checking.report import check
+        from aenerf_ns.checking.report import check, check_without_poses
+        from aenerf_ns.recording.recording import Recording
         from aenerf_ns.recording.scene import SCENE_KEY
 
-        # Training and evaluation will ask for all three splits.
-        outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
-        result = check(parser.recording, outputs[0].metadata[SCENE_KEY].window, outputs[0].dataparser_scale)
+        capture, frames = parser.read_frames()
+        if isinstance(capture, Recording):
+            # Training and evaluation will ask for all three splits.
+            outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
+            result = check(parser.recording, outputs[0].metadata[SCENE_KEY].window, outputs[0].dataparser_scale)
+        else:
+            result = check_without_poses(capture, frames)
         for figure in result.figures:
             say(figure)
+        if isinstance(capture, Recording):
+            self._say_training_command(parser, result)
+        else:
+            words = ["aenerf", "convert", str(self.data), "--output", "FOLDER", "--poses", "events"]
+            if self.format != "auto":
+                words += ["--format", self.format]
+            options = [*self.format_options, *map("=".join, result.sensor_options.items())]
+            if options:
+                words += ["--format-options", *options]
+            say(f"It has no poses. Find them with: {shlex.join(words)}")
+        if self.picture is not None and result.warped is not None:
+            with creating(self.picture, "--picture") as file:
+                Image.fromarray(result.warped.picture()).save(file)
+            say(f"{self.picture}: events as they came, and warped")
+        elif self.picture is not None:
+            say(f"{self.picture}: not written, because too few events have a pose")
+        return result.problems
+
+    def _say_training_command(self, parser: EventDataParser, result: CheckResult) -> None:
         format_words: list[str] = []
         if self.format != "auto" or self.format_options or result.sensor_options:
             format_words = [parser.guessed_format or self.format]
@@ -66,10 +95,3 @@ class Check(DatasetCommand):
         command = training_command(self.data, options=result.planes, format_words=format_words)
         remark = " (near and far plane for a camera that stays that close)" if result.planes else ""
         say(f"Train with{remark}: {command}")
-        if self.picture is not None and result.warped is not None:
-            with creating(self.picture, "--picture") as file:
-                Image.fromarray(result.warped.picture()).save(file)
-            say(f"{self.picture}: events as they came, and warped")
-        elif self.picture is not None:
-            say(f"{self.picture}: not written, because too few events have a pose")
-        return result.problems

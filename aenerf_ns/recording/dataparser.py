@@ -86,9 +86,7 @@ class EventDataParser(DataParser):
                 capture, frames = self.read_capture()
                 capture.event_file.drop_malformed = self.config.drop_malformed
                 return capture, frames
-        views = [view for split in self._recording.reference_views.values() for view in split]
-        timed = {view.time: view.file for view in views if view.time is not None}
-        return self._recording, sorted(timed.items())
+        return self._recording, self._recording.frames
 
     @property
     def recording(self) -> Recording:

@@ -90,3 +90,9 @@ class Recording(Capture):
     def reference_trajectory(self) -> Trajectory:
         """The trajectory to compare with: the true one where it is known, else the estimated one."""
         return self.trajectory if self.ground_truth is None else self.ground_truth
+
+    @property
+    def frames(self) -> list[tuple[int, Path]]:
+        """The times in nanoseconds and the files of the reference views that have a time, in the order of time."""
+        views = [view for split in self.reference_views.values() for view in split]
+        return sorted({view.time: view.file for view in views if view.time is not None}.items())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -296,6 +297,28 @@ def test_few_events_are_not_warped(tmp_path: Path) -> None:
     assert "Contrast of warped events: not computed, because no 2000 events have poses without" in output
     assert f"{picture}: not written" in output
     assert not picture.exists()
+
+
+def test_the_events_of_a_bare_file_are_checked(room: Path, tmp_path: Path) -> None:
+    file = tmp_path / "my recording.h5"
+    shutil.copy(room / "events.h5", file)
+    camera = json.loads((room / "transforms.json").read_text())["event_camera"]
+    (tmp_path / "calibration.json").write_text(json.dumps({"event_camera": camera}))
+    status, output = run(file, format_options=("negative-contrast-threshold=0.5",), picture=tmp_path / "no.png")
+    assert status == 0, output
+    assert "Events: " in output
+    assert "no.png: not written" in output
+    command = f"aenerf convert '{file}' --output FOLDER --poses events --format-options negative-contrast-threshold=0.5"
+    assert f"It has no poses. Find them with: {command}" in output
+    # What lies beside the file belongs to it.
+    (tmp_path / "calibration.json").write_text(
+        json.dumps({"event_camera": {**camera, "cx": camera["cy"], "cy": camera["cx"]}})
+    )
+    status, output = run(file)
+    assert status == 1
+    assert "x and y swapped" in output
+    shutil.copy(room / "trajectory_estimated.txt", tmp_path / "trajectory.txt")
+    assert "Events with a pose: 100.0%" in run(file)[1]
 
 
 def test_unreadable_data_is_one_line_and_status_2(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
