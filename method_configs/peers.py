@@ -13,12 +13,12 @@ from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf, small
 from aenerf_ns.supervision.base import LossCoefficients, SamplerConfig, SupervisionConfig
 from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSamplerConfig, PairSupervisionConfig
-from aenerf_ns.supervision.peers.frames import FrameSamplerConfig, FrameSupervisionConfig
-from aenerf_ns.supervision.peers.paev3d import FlowPatchSamplerConfig, PAEv3DLossCoefficients, PAEv3DSupervisionConfig
+from aenerf_ns.supervision.peers.frames import FrameSampler, FrameSupervision
+from aenerf_ns.supervision.peers.paev3d import FlowPatchSampler, PAEv3DLossCoefficients, PAEv3DSupervision
 from aenerf_ns.supervision.peers.windows import (
-    EventNeRFSupervisionConfig,
+    EventNeRFSupervision,
     EvNeRFLossCoefficients,
-    EvNeRFSupervisionConfig,
+    EvNeRFSupervision,
     WindowSamplerConfig,
 )
 
@@ -77,7 +77,7 @@ eventnerf, eventnerf_small = peer(
     "EventNeRF's supervision",
     "events summed over windows of random length",
     WindowSamplerConfig(),
-    EventNeRFSupervisionConfig(),
+    SupervisionConfig(_target=EventNeRFSupervision),
     LossCoefficients(),
 )
 """V. Rudnev et al., CVPR 2023."""
@@ -87,7 +87,7 @@ evnerf, evnerf_small = peer(
     "Ev-NeRF's supervision",
     "slices of events, a dead zone and learned thresholds",
     WindowSamplerConfig(shortest_window=0.02, longest_window=0.02, share_of_all_pixels=1.0),
-    EvNeRFSupervisionConfig(),
+    SupervisionConfig(_target=EvNeRFSupervision),
     EvNeRFLossCoefficients(),
 )
 """I. Hwang et al., WACV 2023."""
@@ -96,8 +96,8 @@ paev3d, paev3d_small = peer(
     "paev3d",
     "PAEv3D's supervision",
     "patches in windows, with priors from optical flow",
-    FlowPatchSamplerConfig(),
-    PAEv3DSupervisionConfig(),
+    WindowSamplerConfig(_target=FlowPatchSampler, longest_window=0.01),
+    SupervisionConfig(_target=PAEv3DSupervision),
     PAEv3DLossCoefficients(),
     unbounded_init_density=0.3,
 )
@@ -107,8 +107,8 @@ e2vid_nerf, e2vid_nerf_small = peer(
     "e2vid-nerf",
     "E2VID + NeRF",
     "trains on the images of aenerf reconstruct",
-    FrameSamplerConfig(),
-    FrameSupervisionConfig(),
+    SamplerConfig(_target=FrameSampler),
+    SupervisionConfig(_target=FrameSupervision),
     LossCoefficients(),
 )
 """H. Rebecq et al., PAMI 2021, with NeRF."""

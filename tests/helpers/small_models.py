@@ -27,7 +27,7 @@ from aenerf_ns.method.model import AENeRFModel, AENeRFModelConfig
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
-from aenerf_ns.supervision.base import LossCoefficients, SamplerConfig, SupervisionConfig
+from aenerf_ns.supervision.base import LossCoefficients, SamplerConfig, Supervision, SupervisionConfig
 from aenerf_ns.supervision.event_pairs import (
     PairBatch,
     PairLossCoefficients,
@@ -65,14 +65,14 @@ def make_scene(
     )
 
 
-def make_supervision(config: SupervisionConfig, sensor: SensorModel | None = None) -> Any:
+def make_supervision(kind: type[Supervision], sensor: SensorModel | None = None) -> Any:
     """Another paper's supervision, with the usual weights."""
-    return config.setup(sensor=sensor or SensorModel(), loss_coefficients=LossCoefficients())
+    return SupervisionConfig(_target=kind).setup(sensor=sensor or SensorModel(), loss_coefficients=LossCoefficients())
 
 
 def make_window_sampler(
     config: SamplerConfig,
-    supervision: SupervisionConfig,
+    supervision: type[Supervision],
     events: EventStream,
     end: int,
     poses: torch.Tensor,

@@ -25,10 +25,10 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.hash_grid import HashEncoding
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf
-from aenerf_ns.supervision.base import SupervisionConfig
+from aenerf_ns.supervision.base import Supervision, SupervisionConfig
 from aenerf_ns.supervision.event_pairs import PairSupervisionConfig
-from aenerf_ns.supervision.peers.paev3d import PAEv3DSupervisionConfig, PatchBatch
-from aenerf_ns.supervision.peers.windows import EventNeRFSupervisionConfig, EvNeRFSupervisionConfig
+from aenerf_ns.supervision.peers.paev3d import PAEv3DSupervision, PatchBatch
+from aenerf_ns.supervision.peers.windows import EventNeRFSupervision, EvNeRFSupervision
 from benchmarks.step.worker import train_steps
 
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -70,11 +70,10 @@ def test_a_step_computes_on_the_device_alone(backbone: str, bounded: bool, corre
 
 
 @NEEDS_SIMULATION
-@pytest.mark.parametrize(
-    "supervision", [EventNeRFSupervisionConfig(), EvNeRFSupervisionConfig(), PAEv3DSupervisionConfig()]
-)
-def test_a_step_on_windows_computes_on_the_device_alone(supervision: SupervisionConfig) -> None:
-    model = make_model(camera_optimizer=PoseCorrectionConfig(mode="spline"), supervision=supervision)
+@pytest.mark.parametrize("supervision", [EventNeRFSupervision, EvNeRFSupervision, PAEv3DSupervision])
+def test_a_step_on_windows_computes_on_the_device_alone(supervision: type[Supervision]) -> None:
+    config = SupervisionConfig(_target=supervision)
+    model = make_model(camera_optimizer=PoseCorrectionConfig(mode="spline"), supervision=config)
     with SimulatedCuda() as gpu:
         to_device(model)
         one, zero = torch.ones(4), torch.zeros(4, dtype=torch.long)

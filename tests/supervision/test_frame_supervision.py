@@ -19,11 +19,11 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.recording.scene import SCENE_KEY
+from aenerf_ns.supervision.base import SamplerConfig
 from aenerf_ns.supervision.peers.frames import (
     FrameBatch,
     FrameSampler,
-    FrameSamplerConfig,
-    FrameSupervisionConfig,
+    FrameSupervision,
 )
 
 SECONDS = (0.0, 0.25, 0.7)
@@ -39,8 +39,8 @@ def make_sampler(folder: Path, poses: torch.Tensor, pattern: BayerPattern = "", 
         frames.append((EPOCH + round(seconds * 1e9), folder / f"{index}.png"))
     scene = make_scene(SensorModel(bayer_pattern=pattern), Trajectory(KNOTS, poses))
     dataset = SimpleNamespace(scene=replace(scene, frames=tuple(frames)))
-    supervision = make_supervision(FrameSupervisionConfig(), scene.sensor)
-    return FrameSamplerConfig().setup(dataset=dataset, supervision=supervision, device="cpu")
+    supervision = make_supervision(FrameSupervision, scene.sensor)
+    return SamplerConfig(_target=FrameSampler).setup(dataset=dataset, supervision=supervision, device="cpu")
 
 
 @pytest.mark.parametrize(("pattern", "gray"), [("", True), ("RGGB", True), ("RGGB", False)])
@@ -63,7 +63,7 @@ def test_a_pixel_has_the_value_of_its_image_and_the_ray_of_its_time(
 
 
 def test_the_loss_is_the_squared_error_of_display_values() -> None:
-    supervision = make_supervision(FrameSupervisionConfig(), SensorModel())
+    supervision = make_supervision(FrameSupervision, SensorModel())
     values = torch.tensor([[0.2], [0.5], [0.0]])
     log_radiance = torch.tensor([[0.3], [0.5], [0.1]]).log().requires_grad_()
     loss = supervision.losses({"log_radiance": log_radiance}, FrameBatch(values))["reconstruction_loss"]

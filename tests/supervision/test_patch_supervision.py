@@ -17,13 +17,13 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.supervision.peers.paev3d import (
     FlowPatchSampler,
-    FlowPatchSamplerConfig,
-    PAEv3DSupervisionConfig,
+    PAEv3DSupervision,
     PatchBatch,
     change_by_flow,
     depth_loss,
     mask_loss,
 )
+from aenerf_ns.supervision.peers.windows import WindowSamplerConfig
 
 WIDTH, HEIGHT = 9, 7
 CAMERA = CameraIntrinsics(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (0.0, 0.0, 0.0, 0.0, 0.0))
@@ -80,7 +80,7 @@ class Samples:
 def losses_of(
     predicted: torch.Tensor, net: list[float], threshold: float, training: bool = False, **batch: torch.Tensor
 ) -> dict[str, torch.Tensor]:
-    supervision = make_supervision(PAEv3DSupervisionConfig(), SensorModel(threshold, threshold))
+    supervision = make_supervision(PAEv3DSupervision, SensorModel(threshold, threshold))
     supervision.train(training)
     count = len(predicted)
     weights = batch.pop("weights", torch.full((count, 1), 0.5))
@@ -151,8 +151,8 @@ def make_events() -> EventStream:
 def make_sampler(
     random_poses: torch.Tensor, camera: CameraIntrinsics = CAMERA, events: EventStream | None = None, **options: Any
 ) -> FlowPatchSampler:
-    config, supervision = FlowPatchSamplerConfig(**{"longest_window": 0.0, **options}), PAEv3DSupervisionConfig()
-    return make_window_sampler(config, supervision, events or make_events(), int(KNOTS[-1]), random_poses, camera)
+    config = WindowSamplerConfig(_target=FlowPatchSampler, **{"longest_window": 0.0, **options})
+    return make_window_sampler(config, PAEv3DSupervision, events or make_events(), int(KNOTS[-1]), random_poses, camera)
 
 
 def patches_of(rays: RayBundle) -> np.ndarray:

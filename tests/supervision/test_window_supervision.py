@@ -18,10 +18,10 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.sorted_events import sort_events
-from aenerf_ns.supervision.base import SupervisionConfig
+from aenerf_ns.supervision.base import Supervision
 from aenerf_ns.supervision.peers.windows import (
-    EventNeRFSupervisionConfig,
-    EvNeRFSupervisionConfig,
+    EventNeRFSupervision,
+    EvNeRFSupervision,
     WindowBatch,
     WindowSampler,
     WindowSamplerConfig,
@@ -45,7 +45,7 @@ def make_sampler(
     random_poses: torch.Tensor, sensor: SensorModel | None = None, camera: CameraIntrinsics = CAMERA, **options: Any
 ) -> WindowSampler:
     config, end = WindowSamplerConfig(**options), int(KNOTS[-1]) - 50_000_000
-    return make_window_sampler(config, EventNeRFSupervisionConfig(), EVENTS, end, random_poses, camera, sensor)
+    return make_window_sampler(config, EventNeRFSupervision, EVENTS, end, random_poses, camera, sensor)
 
 
 def windows_of(rays: Any) -> list[tuple[int, int]]:
@@ -201,7 +201,7 @@ def log_change(start: list[float], end: list[float], epsilon: float) -> torch.Te
 def test_the_loss_of_eventnerf_is_the_releases_in_units_of_the_threshold(
     start: list[float], end: list[float], net: list[float], epsilon: float, expected: float
 ) -> None:
-    supervision = make_supervision(EventNeRFSupervisionConfig(), SensorModel(0.25, 0.25))
+    supervision = make_supervision(EventNeRFSupervision, SensorModel(0.25, 0.25))
     counts = [max(n, 0.0) for n in net], [max(-n, 0.0) for n in net]
     (loss,) = compare(supervision, log_change(start, end, epsilon), *counts).values()
     assert loss.item() == pytest.approx(expected / 0.25**2, rel=1e-5)
@@ -217,7 +217,7 @@ def test_the_loss_of_eventnerf_is_the_releases_in_units_of_the_threshold(
 def test_the_loss_of_evnerf_by_hand(
     predicted: list[float], positive: list[float], negative: list[float], excess: list[float]
 ) -> None:
-    supervision = make_supervision(EvNeRFSupervisionConfig(), SensorModel(0.3, 0.25))
+    supervision = make_supervision(EvNeRFSupervision, SensorModel(0.3, 0.25))
     losses = compare(supervision, torch.tensor(predicted), positive, negative)
     assert losses["reconstruction_loss"].item() == pytest.approx(np.mean(excess) / 0.275, rel=1e-5)
     assert losses["threshold_bound_loss"].item() == pytest.approx(0, abs=1e-6)
@@ -225,7 +225,7 @@ def test_the_loss_of_evnerf_by_hand(
 
 @pytest.mark.parametrize(("learned", "expected"), [((0.2, 0.25), 0.15), ((0.35, 0.4), 0.0)])
 def test_the_bound_holds_thresholds_at_the_sensors(learned: tuple[float, float], expected: float) -> None:
-    supervision = make_supervision(EvNeRFSupervisionConfig(), SensorModel(0.3, 0.3))
+    supervision = make_supervision(EvNeRFSupervision, SensorModel(0.3, 0.3))
     factors = torch.tensor(learned) / 0.3
     supervision.raw_factors.data = factors.expm1().log()
     assert supervision.learned_values() == pytest.approx(
@@ -238,7 +238,7 @@ def test_the_bound_holds_thresholds_at_the_sensors(learned: tuple[float, float],
 
 
 def test_learned_thresholds_have_gradients_from_both_losses() -> None:
-    supervision = make_supervision(EvNeRFSupervisionConfig(), SensorModel(0.3, 0.25))
+    supervision = make_supervision(EvNeRFSupervision, SensorModel(0.3, 0.25))
     supervision.raw_factors.data -= 0.1
     # Outside at the upper edge with two positive events, outside at the lower edge with three negative ones.
     losses = compare(supervision, torch.tensor([1.5, -0.2]), [2.0, 0.0], [0.0, 3.0])
@@ -247,9 +247,9 @@ def test_learned_thresholds_have_gradients_from_both_losses() -> None:
         assert gradient.sign().tolist() == signs, name
 
 
-@pytest.mark.parametrize("config", [EventNeRFSupervisionConfig(), EvNeRFSupervisionConfig()])
-def test_gradients_are_finite_where_events_cancel_or_come_in_crowds(config: SupervisionConfig) -> None:
-    supervision = make_supervision(config, SensorModel(0.3, 0.25))
+@pytest.mark.parametrize("kind", [EventNeRFSupervision, EvNeRFSupervision])
+def test_gradients_are_finite_where_events_cancel_or_come_in_crowds(kind: type[Supervision]) -> None:
+    supervision = make_supervision(kind, SensorModel(0.3, 0.25))
     predicted = torch.tensor([0.0, 0.0, 40.0, -0.25], requires_grad=True)
     losses = compare(supervision, predicted, [0.0, 3.0, 1000.0, 0.0], [0.0, 3.0, 0.0, 1.0])
     inputs = [predicted, *supervision.parameters()]

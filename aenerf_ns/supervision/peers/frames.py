@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.images import check_image, read_image
-from aenerf_ns.supervision.base import Batch, Sampler, SamplerConfig, Supervision, SupervisionConfig
+from aenerf_ns.supervision.base import Batch, Sampler, SamplerConfig, Supervision
 from aenerf_ns.supervision.pixel_rays import PixelRays
 
 
@@ -30,13 +30,6 @@ class FrameBatch(Batch):
     """
 
     values: Tensor
-
-
-@dataclass
-class FrameSupervisionConfig(SupervisionConfig):
-    """Squared error of rendered radiance and the values of images."""
-
-    _target: type = field(default_factory=lambda: FrameSupervision)
 
 
 class FrameSupervision(Supervision):
@@ -57,20 +50,13 @@ class FrameSupervision(Supervision):
         return {"reconstruction_loss": F.mse_loss(outputs["log_radiance"].exp(), batch.values)}
 
 
-@dataclass
-class FrameSamplerConfig(SamplerConfig):
-    """Pixels of the training images, drawn uniformly."""
-
-    _target: type = field(default_factory=lambda: FrameSampler)
-
-
 class FrameSampler(Sampler):
     """Draws pixels of the dataset's timed training images, at the poses of the trajectory at their times."""
 
     batch_type = FrameBatch
 
     def __init__(
-        self, config: FrameSamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
+        self, config: SamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
     ) -> None:
         super().__init__(config, dataset, supervision, device)
         self._pixel_rays = PixelRays(dataset.scene, device)

@@ -24,7 +24,7 @@ Mercerai/PAEv3d, read at 97f6a2b. The release has no license, so nothing of it w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,7 @@ from torch import Tensor
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.supervision.base import LossCoefficients, Supervision, SupervisionConfig
+from aenerf_ns.supervision.base import LossCoefficients, Supervision
 from aenerf_ns.supervision.peers.windows import (
     DrawnWindow,
     WindowBatch,
@@ -132,13 +132,6 @@ class PAEv3DLossCoefficients(LossCoefficients):
     """Weight of the prior that what is near moves fast."""
 
 
-@dataclass
-class PAEv3DSupervisionConfig(SupervisionConfig):
-    """PAEv3D's losses on patches in windows."""
-
-    _target: type = field(default_factory=lambda: PAEv3DSupervision)
-
-
 class PAEv3DSupervision(WindowSupervision):
     """Compares changes by their mean absolute error, and opacity, depth and gradients with the optical flow."""
 
@@ -160,14 +153,6 @@ class PAEv3DSupervision(WindowSupervision):
             losses["depth_loss"] = depth_loss(depth, opacity, speed, batch.window)
             losses["flow_loss"] = F.l1_loss(by_flow.gather(1, batch.channel[:, None])[:, 0], change)
         return {name: loss / self.loss_unit(outputs) for name, loss in losses.items()}
-
-
-@dataclass
-class FlowPatchSamplerConfig(WindowSamplerConfig):
-    """Windows of time, and in them patches of 2 x 2 pixels with their optical flow."""
-
-    _target: type = field(default_factory=lambda: FlowPatchSampler)
-    longest_window: float = 0.01
 
 
 class FlowPatchSampler(WindowSampler):

@@ -54,13 +54,6 @@ class WindowSupervision(ChangeSupervision):
         return sum(self.sensor_thresholds) / 2
 
 
-@dataclass
-class EventNeRFSupervisionConfig(SupervisionConfig):
-    """EventNeRF's loss on windows."""
-
-    _target: type = field(default_factory=lambda: EventNeRFSupervision)
-
-
 class EventNeRFSupervision(WindowSupervision):
     """Compares changes by their mean squared error, as EventNeRF does (Rudnev et al., CVPR 2023)."""
 
@@ -79,13 +72,6 @@ class EvNeRFLossCoefficients(LossCoefficients):
     """Weight of the loss that holds the learned thresholds at the sensor's or above."""
 
 
-@dataclass
-class EvNeRFSupervisionConfig(SupervisionConfig):
-    """Ev-NeRF's loss on windows, with learned thresholds."""
-
-    _target: type = field(default_factory=lambda: EvNeRFSupervision)
-
-
 class EvNeRFSupervision(WindowSupervision):
     """Compares changes with a dead zone of one threshold, as Ev-NeRF does (Hwang et al., WACV 2023).
 
@@ -97,9 +83,7 @@ class EvNeRFSupervision(WindowSupervision):
     batch_type = WindowBatch
     _minimum: Tensor
 
-    def __init__(
-        self, config: EvNeRFSupervisionConfig, sensor: SensorModel, loss_coefficients: LossCoefficients
-    ) -> None:
+    def __init__(self, config: SupervisionConfig, sensor: SensorModel, loss_coefficients: LossCoefficients) -> None:
         super().__init__(config, sensor, loss_coefficients)
         # Softplus keeps the thresholds positive.
         self.raw_factors = nn.Parameter(torch.full((2,), _RAW_ONE))
