@@ -151,6 +151,10 @@ class ChangeSupervision(Supervision):
         """Return the changes of log-radiance that a positive and a negative event stand for, both positive."""
         return self.sensor_thresholds
 
+    def loss_unit(self, outputs: Mapping[str, Any]) -> Tensor | float:
+        """Return C̄, the mean of the two contrast thresholds."""
+        return sum(self.thresholds(outputs)) / 2
+
     def changes(self, outputs: Mapping[str, Any], batch: Any) -> tuple[Tensor, Tensor]:
         """Return the (N,) changes Δ between the two times: as rendered in the pixel's channel, and as the events say.
 

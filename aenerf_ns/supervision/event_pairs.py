@@ -163,11 +163,6 @@ class PairSupervision(ChangeSupervision):
         positive = outputs.get("positive_contrast_threshold", self.sensor.positive_contrast_threshold)
         return positive, self.sensor.negative_contrast_threshold
 
-    def loss_unit(self, outputs: Mapping[str, Any]) -> Tensor | float:
-        """Return C̄, the mean of the two contrast thresholds."""
-        positive, negative = self.thresholds(outputs)
-        return (positive + negative) / 2
-
     def changes(self, outputs: Mapping[str, Any], batch: PairBatch) -> tuple[Tensor, Tensor]:
         """Return the (N,) changes as rendered, and as the events say, less the drift of their pixels."""
         rendered, change = super().changes(outputs, batch)

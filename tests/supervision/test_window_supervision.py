@@ -18,14 +18,12 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.sorted_events import sort_events
-from aenerf_ns.supervision.base import Supervision
+from aenerf_ns.supervision.base import ChangeBatch, ChangeSupervision, Supervision
 from aenerf_ns.supervision.peers.windows import (
     EventNeRFSupervision,
     EvNeRFSupervision,
-    WindowBatch,
     WindowSampler,
     WindowSamplerConfig,
-    WindowSupervision,
 )
 from aenerf_ns.supervision.pixel_rays import PixelRays
 
@@ -174,13 +172,13 @@ def test_poses_with_gaps_alone_are_refused(random_poses: torch.Tensor) -> None:
 
 
 def compare(
-    supervision: WindowSupervision, predicted: torch.Tensor, positive: list[float], negative: list[float]
+    supervision: ChangeSupervision, predicted: torch.Tensor, positive: list[float], negative: list[float]
 ) -> dict[str, torch.Tensor]:
     """The losses for rendered changes of a gray sensor's pixels."""
     outputs = {"log_radiance": torch.cat([torch.zeros_like(predicted), predicted])[:, None]}
     outputs |= supervision.shift_ray_times(make_rays(2 * len(predicted), with_times=True))
     channel = torch.zeros(len(predicted), dtype=torch.long)
-    return supervision.losses(outputs, WindowBatch(torch.tensor(positive), torch.tensor(negative), channel))
+    return supervision.losses(outputs, ChangeBatch(torch.tensor(positive), torch.tensor(negative), channel))
 
 
 def log_change(start: list[float], end: list[float], epsilon: float) -> torch.Tensor:

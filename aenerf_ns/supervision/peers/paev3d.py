@@ -37,13 +37,11 @@ from torch import Tensor
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.supervision.base import LossCoefficients, Supervision
+from aenerf_ns.supervision.base import ChangeBatch, ChangeSupervision, LossCoefficients, Supervision
 from aenerf_ns.supervision.peers.windows import (
     DrawnWindow,
-    WindowBatch,
     WindowSampler,
     WindowSamplerConfig,
-    WindowSupervision,
     draw,
 )
 
@@ -107,7 +105,7 @@ def _mean(values: Tensor, counts: Tensor) -> Tensor:
 
 
 @dataclass
-class PatchBatch(WindowBatch):
+class PatchBatch(ChangeBatch):
     """Patches of 2 x 2 pixels in windows of time: the four pixels of a patch one after another, row by row.
 
     Attributes:
@@ -132,7 +130,7 @@ class PAEv3DLossCoefficients(LossCoefficients):
     """Weight of the prior that what is near moves fast."""
 
 
-class PAEv3DSupervision(WindowSupervision):
+class PAEv3DSupervision(ChangeSupervision):
     """Compares changes by their mean absolute error, and opacity, depth and gradients with the optical flow."""
 
     batch_type = PatchBatch

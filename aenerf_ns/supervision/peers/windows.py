@@ -1,4 +1,8 @@
-"""Supervision by windows of time, in which the events of a pixel are counted: EventNeRF's and Ev-NeRF's."""
+"""Supervision by windows of time, in which the events of a pixel are counted: EventNeRF's and Ev-NeRF's.
+
+A window begins and ends anywhere between two events of a pixel. So the events give the change only to within a contrast
+threshold at either end, which is why methods differ in how they compare the two.
+"""
 
 from __future__ import annotations
 
@@ -34,32 +38,12 @@ from aenerf_ns.supervision.pixel_rays import PixelRays
 _RAW_ONE = math.log(math.expm1(1))
 
 
-@dataclass
-class WindowBatch(ChangeBatch):
-    """Pixels in windows of time, with the events between the start and the end of the window."""
-
-
-class WindowSupervision(ChangeSupervision):
-    """Compares the rendered change of log-radiance over a window with the events of the pixel in the window.
-
-    A window begins and ends anywhere between two events of a pixel. So the events give the change only to within a
-    contrast threshold at either end, which is why methods differ in how they compare the two.
-    """
-
-    def loss_unit(self, outputs: Mapping[str, Any]) -> float:
-        """Return C̄, the mean of the sensor's contrast thresholds, also where other thresholds are learned.
-
-        With a learned unit, thresholds would rise only because every loss is divided by it.
-        """
-        return sum(self.sensor_thresholds) / 2
-
-
-class EventNeRFSupervision(WindowSupervision):
+class EventNeRFSupervision(ChangeSupervision):
     """Compares changes by their mean squared error, as EventNeRF does (Rudnev et al., CVPR 2023)."""
 
-    batch_type = WindowBatch
+    batch_type = ChangeBatch
 
-    def losses(self, outputs: Mapping[str, Any], batch: WindowBatch) -> dict[str, Tensor]:
+    def losses(self, outputs: Mapping[str, Any], batch: ChangeBatch) -> dict[str, Tensor]:
         """Return the mean squared error of the changes, in units of C̄²."""
         return {"reconstruction_loss": reconstruction_loss(*self.changes(outputs, batch), self.loss_unit(outputs))}
 
@@ -72,7 +56,7 @@ class EvNeRFLossCoefficients(LossCoefficients):
     """Weight of the loss that holds the learned thresholds at the sensor's or above."""
 
 
-class EvNeRFSupervision(WindowSupervision):
+class EvNeRFSupervision(ChangeSupervision):
     """Compares changes with a dead zone of one threshold, as Ev-NeRF does (Hwang et al., WACV 2023).
 
     The thresholds B₊ and B₋ are learned, one pair for the whole recording. They begin as the sensor's. The smaller they
@@ -80,7 +64,7 @@ class EvNeRFSupervision(WindowSupervision):
     sensor's or above.
     """
 
-    batch_type = WindowBatch
+    batch_type = ChangeBatch
     _minimum: Tensor
 
     def __init__(self, config: SupervisionConfig, sensor: SensorModel, loss_coefficients: LossCoefficients) -> None:
@@ -98,7 +82,11 @@ class EvNeRFSupervision(WindowSupervision):
         positive, negative = outputs["thresholds"]
         return positive, negative
 
-    def losses(self, outputs: Mapping[str, Any], batch: WindowBatch) -> dict[str, Tensor]:
+    def loss_unit(self, outputs: Mapping[str, Any]) -> float:
+        """Return the mean of the sensor's thresholds: learned ones would rise, because losses are divided by it."""
+        return sum(self.sensor_thresholds) / 2
+
+    def losses(self, outputs: Mapping[str, Any], batch: ChangeBatch) -> dict[str, Tensor]:
         """Return how far changes are outside the dead zone, and thresholds below the sensor's, in units of C̄."""
         thresholds = outputs["thresholds"]
         rendered, change = self.changes(outputs, batch)
@@ -168,13 +156,13 @@ class WindowSampler(Sampler):
 
     Args:
         config, dataset, device: see :class:`Sampler`.
-        supervision: a :class:`WindowSupervision`.
+        supervision: compares a :class:`~aenerf_ns.supervision.base.ChangeBatch`.
 
     Raises:
         DataError: an option is out of range.
     """
 
-    batch_type = WindowBatch
+    batch_type = ChangeBatch
     config: WindowSamplerConfig
     pixels_per_draw = 1
     """Pixels that are drawn together."""
@@ -250,14 +238,14 @@ class WindowSampler(Sampler):
             drawn.append(DrawnWindow(start, end, pixels, counts[:, pixels]))
         return drawn
 
-    def rays_and_batch(self, drawn: Sequence[DrawnWindow]) -> tuple[RayBundle, WindowBatch]:
+    def rays_and_batch(self, drawn: Sequence[DrawnWindow]) -> tuple[RayBundle, ChangeBatch]:
         """Return the rays of windows, and what the sensor recorded of them."""
         # In one piece, because every copy to a GPU takes its time.
         rows = torch.from_numpy(np.concatenate([window.rows() for window in drawn], 1)).to(self.device)
         pixel, positive, negative, *times = rows
         rays = self.pixel_rays.rays(pixel, [self.pixel_rays.trajectory.seconds(time) for time in times])
         channel = self.pixel_rays.channels.index_select(0, pixel)
-        return rays, WindowBatch(positive.float(), negative.float(), channel)
+        return rays, ChangeBatch(positive.float(), negative.float(), channel)
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, ChangeBatch]:
         """Draw a batch of pixels in windows.
