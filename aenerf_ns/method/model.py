@@ -17,6 +17,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import interlevel_loss
+from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
@@ -36,7 +37,7 @@ from aenerf_ns.method.networks import Backbone, FieldConfig, ProposalConfig, mak
 from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfig
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 from aenerf_ns.method.ray_losses import distortion_loss
-from aenerf_ns.method.ray_samplers import EvenSampler, EvenThenDisparitySampler, ProposalSampler
+from aenerf_ns.method.ray_samplers import ProposalSampler
 from aenerf_ns.method.temporal import log_radiance_rate
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.supervision.base import Batch, LossCoefficients, Supervision, SupervisionConfig
@@ -162,7 +163,8 @@ class AENeRFModel(Model):
             num_proposal_samples_per_ray=config.proposal.num_samples_per_ray,
             num_proposal_network_iterations=len(self.density_fns),
             single_jitter=True,
-            initial_sampler=(EvenSampler if distortion is None else EvenThenDisparitySampler)(single_jitter=True),
+            # By default evenly up to a distance of 1, and then evenly in disparity.
+            initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
         )
         background = config.background if config.background != "auto" else ("learned" if scene.bounded else "none")
         # softplus(0.54) = 1: of the size of the radiance before training.

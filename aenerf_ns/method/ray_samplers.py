@@ -1,4 +1,4 @@
-"""The framework's samplers of the points along a ray, without a copy from the CPU, and with a state to keep."""
+"""The framework's sampler of the points along a ray, without a copy from the CPU, and with a state to keep."""
 
 from __future__ import annotations
 
@@ -7,33 +7,8 @@ from contextlib import nullcontext
 
 import torch
 from nerfstudio.cameras.rays import RayBundle, RaySamples
-from nerfstudio.model_components.ray_samplers import (
-    ProposalNetworkSampler,
-    SpacedSampler,
-    UniformLinDispPiecewiseSampler,
-    UniformSampler,
-)
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from torch import Tensor
-
-
-class _OnDevice(SpacedSampler):
-    """Make the bins on the rays' device. The framework makes them on the CPU, and the copy waits for the GPU."""
-
-    def generate_ray_samples(self, ray_bundle: RayBundle | None = None, num_samples: int | None = None) -> RaySamples:
-        """Return samples along rays that have ``nears`` and ``fars``."""
-        assert ray_bundle is not None
-        device = ray_bundle.origins.device
-        # Torch is slower as long as a device is set, and the CPU is set already.
-        with nullcontext() if device.type == "cpu" else device:
-            return super().generate_ray_samples(ray_bundle, num_samples)
-
-
-class EvenSampler(_OnDevice, UniformSampler):
-    """Spread samples evenly."""
-
-
-class EvenThenDisparitySampler(_OnDevice, UniformLinDispPiecewiseSampler):
-    """Spread samples evenly up to a distance of 1, and then evenly in disparity."""
 
 
 class ProposalSampler(ProposalNetworkSampler):
@@ -58,7 +33,11 @@ class ProposalSampler(ProposalNetworkSampler):
         # As in the framework: the proposal networks are trained at every step at first, and then at some.
         updated = self._steps_since_update > self.update_sched(self._step) or self._step < 10
         first, *others = self.num_proposal_samples_per_ray
-        samples = self.initial_sampler(ray_bundle, num_samples=first)
+        device = ray_bundle.origins.device
+        # The framework makes the bins on the default device, and a copy from the CPU waits for the GPU. Torch is slower
+        # as long as a device is set, and the CPU is set already.
+        with nullcontext() if device.type == "cpu" else device:
+            samples = self.initial_sampler(ray_bundle, num_samples=first)
         for density_fn, count in zip(density_fns, (*others, self.num_nerf_samples_per_ray), strict=True):
             with torch.set_grad_enabled(updated and torch.is_grad_enabled()):
                 weights = samples.get_weights(density_fn(samples)[0])
