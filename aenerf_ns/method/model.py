@@ -6,7 +6,7 @@ import dataclasses
 import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -62,16 +62,10 @@ class AENeRFModelConfig(ModelConfig):
     """AE-NeRF."""
 
     _target: type = dataclasses.field(default_factory=lambda: AENeRFModel)
-    scene_contraction: Literal["auto", "l2", "linf", "none"] = "auto"
-    """How unbounded space is contracted (paper, eq. 7: l2). "auto": "none" for a dataset that states a scene box, "l2"
-    for others."""
     near_plane: float = 0.05
     """Distance at which rays start, in scene units."""
     far_plane: float = 1000.0
     """Distance at which rays end in an unbounded scene, in scene units."""
-    background: Literal["auto", "learned", "none"] = "auto"
-    """Whether rays that pass the scene see a uniform background of learned radiance. "auto": "learned" for a dataset
-    that states a scene box, "none" for others."""
     backbone: Backbone = "hash"
     """Kind of field and proposal networks. "hash": small networks on hash grids, with exponential density. "mlp": the
     paper's large networks on integrated sinusoidal encodings, with softplus density."""
@@ -120,10 +114,8 @@ class AENeRFModel(Model):
         _require_possible(config, scene.trajectory.duration)
         self.sensor = scene.sensor
         self.image_encoding = scene.image_encoding
-        contraction = config.scene_contraction
-        if contraction == "auto":
-            contraction = "none" if scene.bounded else "l2"
-        distortion = {"l2": SceneContraction(), "linf": SceneContraction(order=float("inf")), "none": None}[contraction]
+        # By the Euclidean norm (paper, eq. 7).
+        distortion = None if scene.bounded else SceneContraction()
         self.collider: nn.Module
         if distortion is None:
             self.collider = BoxCollider(self.scene_box, near_plane=config.near_plane)
@@ -166,11 +158,8 @@ class AENeRFModel(Model):
             # By default evenly up to a distance of 1, and then evenly in disparity.
             initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
         )
-        background = config.background if config.background != "auto" else ("learned" if scene.bounded else "none")
-        # softplus(0.54) = 1: of the size of the radiance before training.
-        self.raw_background = (
-            Parameter(torch.full((self.sensor.num_channels,), 0.54)) if background == "learned" else None
-        )
+        # What rays that pass a bounded scene see. softplus(0.54) = 1: of the size of the radiance before training.
+        self.raw_background = Parameter(torch.full((self.sensor.num_channels,), 0.54)) if scene.bounded else None
         self.supervision: Supervision = config.supervision.setup(
             sensor=self.sensor, loss_coefficients=config.loss_coefficients
         )

@@ -22,11 +22,11 @@ from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervis
 
 
 @pytest.mark.parametrize("backbone", ["hash", "mlp"])
-@pytest.mark.parametrize("contraction", ["l2", "linf", "none"])
+@pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("bayer_pattern", ["", "RGGB"])
-def test_outputs_have_their_shapes_and_ranges(backbone: str, contraction: str, bayer_pattern: str) -> None:
+def test_outputs_have_their_shapes_and_ranges(backbone: str, bounded: bool, bayer_pattern: str) -> None:
     sensor = SensorModel(bayer_pattern=bayer_pattern)
-    model = make_model(sensor, scene_contraction=contraction, backbone=backbone).eval()
+    model = make_model(sensor, bounded=bounded, backbone=backbone).eval()
     outputs = model(make_rays())
     channels = 3 if bayer_pattern else 1
     assert outputs["log_radiance"].shape == (10, channels)
@@ -38,12 +38,9 @@ def test_outputs_have_their_shapes_and_ranges(backbone: str, contraction: str, b
 
 
 def test_unbounded_scenes_may_start_from_another_density() -> None:
-    of = {
-        contraction: make_model(scene_contraction=contraction, unbounded_init_density=0.3)
-        for contraction in ("l2", "none")
-    }
-    assert {name: model.field.average_init_density for name, model in of.items()} == {"l2": 0.3, "none": 10.0}
-    assert of["l2"].proposal_networks[0].average_init_density == 0.3
+    bounded, unbounded = (make_model(bounded=bounded, unbounded_init_density=0.3) for bounded in (True, False))
+    assert (bounded.field.average_init_density, unbounded.field.average_init_density) == (10.0, 0.3)
+    assert unbounded.proposal_networks[0].average_init_density == 0.3
 
 
 def test_between_events_changes_within_the_thresholds_are_right() -> None:
@@ -136,9 +133,9 @@ def test_the_mlps_are_those_of_the_paper() -> None:
     assert len(model.density_fns) == 2
 
 
-@pytest.mark.parametrize("contraction", ["l2", "linf", "none"])
-def test_the_mlp_sees_the_mean_of_the_encoding_over_a_sample(contraction: str) -> None:
-    model = make_model(backbone="mlp", scene_contraction=contraction, field={"num_frequencies": 5})
+@pytest.mark.parametrize("bounded", [False, True])
+def test_the_mlp_sees_the_mean_of_the_encoding_over_a_sample(bounded: bool) -> None:
+    model = make_model(backbone="mlp", bounded=bounded, field={"num_frequencies": 5})
     origin, direction = torch.tensor([-0.5, 0.2, -0.7]), torch.tensor([0.6, 0.0, 0.8])
     across = torch.tensor([[0.0, 1.0, 0.0], [0.8, 0.0, -0.6]])
     edges = torch.tensor([0.5, 0.7, 0.9, 1.3, 1.9])[:, None]
@@ -164,16 +161,16 @@ def test_the_mlp_sees_the_mean_of_the_encoding_over_a_sample(contraction: str) -
     assert (plain - within.mean(1)).abs().max() > 0.7
 
 
-@pytest.mark.parametrize("contraction", ["l2", "linf", "none"])
-def test_the_mlp_density_is_softplus_and_ends_at_the_box(contraction: str) -> None:
-    model = make_model(backbone="mlp", scene_contraction=contraction, average_init_density=0.3)
+@pytest.mark.parametrize("bounded", [False, True])
+def test_the_mlp_density_is_softplus_and_ends_at_the_box(bounded: bool) -> None:
+    model = make_model(backbone="mlp", bounded=bounded, average_init_density=0.3)
     with torch.no_grad():
         model.field.density_network.layers[-1].weight.zero_()
         model.field.density_network.layers[-1].bias.fill_(2.0)
     positions = torch.tensor([[0.5, -0.2, 0.9], [0.5, -0.2, 1.1]])
     # softplus(log(exp(d) - 1)) = d: the density where the network gives 0.
     inside = torch.log1p(torch.exp(torch.tensor(2.0)) * torch.expm1(torch.tensor(0.3)))
-    expected = torch.stack([inside, inside * (contraction != "none")])[:, None]
+    expected = torch.stack([inside, inside * (not bounded)])[:, None]
     torch.testing.assert_close(model.field.density_fn(positions), expected)
 
 
