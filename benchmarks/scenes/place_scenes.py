@@ -21,7 +21,7 @@ from benchmarks.scenes.furnishings import (
     window,
 )
 from benchmarks.scenes.meshes import Material, Model, paint
-from benchmarks.scenes.shapes import box, disc, rectangle, revolved, top
+from benchmarks.scenes.shapes import box, disc, rectangle, revolved
 
 
 def _canvas(number: int) -> Material:
@@ -55,7 +55,7 @@ def living_room(library: Library) -> Model:
     scene += bars.moved((high[0] + 0.06, high[1] - opening[0], opening[2]), -90)
     rug = paint("living room rug", tx.rug, ["7a4a40", "5f728a", "c2a574", "cfc5b0"], size=512)
     scene += box((-1.3, -0.95, 0), (1.3, 0.95, 0.012), rug, 2.4, without="zZ")
-    scene += top((-1.3, -0.95, 0), (1.3, 0.95, 0.012), rug)
+    scene += box((-1.3, -0.95, 0), (1.3, 0.95, 0.012), rug, None, without="xXyYz")
     case = bookcase(1.7, 0.32, (0.1, 0.46, 0.82, 1.14, 1.44, 1.72), oak(), 11, fill=0.9, columns=2)
     scene += case.moved((-1.7, 2.52, 0))
     for number, x, y, turn, width, height in (

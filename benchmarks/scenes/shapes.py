@@ -19,7 +19,7 @@ def rectangle(origin: ArrayLike, u: ArrayLike, v: ArrayLike, material: Material,
     return Model((Part(points, corner * np.array(repeats), material),))
 
 
-def box(low: ArrayLike, high: ArrayLike, material: Material, tile: float = 0.5, without: str = "") -> Model:
+def box(low: ArrayLike, high: ArrayLike, material: Material, tile: float | None = 0.5, without: str = "") -> Model:
     """Make a box between two corners, ``without`` the sides of some letters: "x" at low x, "X" at high x, and so on."""
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     x, y, z = np.diag(high - low)
@@ -32,12 +32,6 @@ def box(low: ArrayLike, high: ArrayLike, material: Material, tile: float = 0.5, 
         "Z": (high - x - y, x, y),
     }
     return join(rectangle(*side, material, tile) for name, side in sides.items() if name not in without)
-
-
-def top(low: ArrayLike, high: ArrayLike, material: Material, tile: float | None = None) -> Model:
-    """Make the upper side of a box between two corners."""
-    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    return rectangle((*low[:2], high[2]), (high[0] - low[0], 0, 0), (0, high[1] - low[1], 0), material, tile)
 
 
 def revolved(profile: Sequence[tuple[float, float]], material: Material, tile: float = 0.5, sides: int = 48) -> Model:
