@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import sys
+
 from aenerf_ns.errors import errors_as_one_line
 from aenerf_ns.open3d_import import load_open3d
 
@@ -15,6 +17,8 @@ def main() -> None:
         load_open3d()
     from nerfstudio.scripts import exporter
 
+    # A run's configuration knows by the name of the command that the run is opened, and then finds its folder.
+    sys.argv[0] = "ns-export"
     exporter.entrypoint()
 
 

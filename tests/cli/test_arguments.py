@@ -232,6 +232,8 @@ def test_exporter_of_nerfstudio_starts_without_libusb() -> None:
     command = [sys.executable, "-m", "aenerf_ns.cli.ns_export", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "{pointcloud," in done.stdout
+    # The name by which a run's configuration knows that the run is opened.
+    assert done.stdout.startswith("usage: ns-export ")
 
 
 if __name__ == "__main__":
