@@ -75,6 +75,8 @@ class Runner:
         # Taken first, because the checkout may change during the run.
         origin = provenance()
         data = self._dataset(run.dataset)
+        # Of the dataset as it was simulated, because a conversion may give it a scene box.
+        kind = "object" if "scene_box" in json.loads((data / "transforms.json").read_text("utf8")) else "large"
         # A training that was killed leaves files.
         shutil.rmtree(self._folder / "outputs" / run.name, ignore_errors=True)
         for command, options in (("reconstruct", run.images), ("convert", run.convert)):
@@ -90,7 +92,7 @@ class Runner:
             "table": run.table,
             "row": run.row,
             "scene": scene_name(run.dataset.scene),
-            "kind": "object" if "scene_box" in json.loads((data / "transforms.json").read_text("utf8")) else "large",
+            "kind": kind,
             "speed": run.dataset.speed,
             "poses": "true" if run.true_poses else run.dataset.poses,
             "method": run.method,
