@@ -111,12 +111,14 @@ def observe_points(run: TrainedRun, images: Sequence[PlacedImage], max_points: i
     to_recording = run.scene.frame.inverse()
     generator = torch.Generator().manual_seed(0)
     parts: list[tuple[NDArray, ...]] = []
-    per_image = -(-max_points // len(images))
-    for index, image in enumerate(track(images, "Rendering points")):
+    # Where there are fewer points than images, some images in between have none.
+    counts = np.diff(np.arange(len(images) + 1) * max_points // len(images))
+    for index in track(np.flatnonzero(counts).tolist(), "Rendering points"):
+        image, count = images[index], int(counts[index])
         size = torch.tensor([image.camera.height, image.camera.width])
-        coordinates = (torch.rand(per_image, 2, generator=generator) * size).floor() + 0.5
+        coordinates = (torch.rand(count, 2, generator=generator) * size).floor() + 0.5
         rays = _make_cameras(run, image.camera, torch.from_numpy(image.camera_to_world)[None]).generate_rays(
-            torch.zeros(per_image, 1, dtype=torch.long, device=run.device), coords=coordinates.to(run.device)
+            torch.zeros(count, 1, dtype=torch.long, device=run.device), coords=coordinates.to(run.device)
         )
         rgb, depth, accumulation = run.model.render_rays(rays, "rgb", "depth", "accumulation")
         seen = (accumulation > _MIN_OPACITY)[:, 0]
@@ -124,4 +126,4 @@ def observe_points(run: TrainedRun, images: Sequence[PlacedImage], max_points: i
         colors = (255 * rgb[seen].clamp(0, 1)).round().byte().cpu()
         pixels = coordinates.flip(-1)[seen.cpu()].double()
         parts.append((positions.numpy(), colors.numpy(), np.full(len(pixels), index), pixels.numpy()))
-    return ObservedPoints(*(np.concatenate(column)[:max_points] for column in zip(*parts, strict=True)))
+    return ObservedPoints(*(np.concatenate(column) for column in zip(*parts, strict=True)))

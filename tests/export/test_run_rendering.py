@@ -77,6 +77,14 @@ def test_points_lie_on_their_rays(run: TrainedRun) -> None:
         assert (lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy) == pytest.approx((column, row), abs=1e-3)
 
 
+def test_fewer_points_than_images_are_spread_over_them(run: TrainedRun) -> None:
+    run.model.field.average_init_density = 1e3
+    images = [image for image, _ in place_views(run)] * 20
+    points = observe_points(run, images, 10)
+    assert 5 <= len(points.images) <= 10
+    assert points.images.max() > 80
+
+
 def test_depths_too_far_to_be_written_are_counted(
     run: TrainedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
