@@ -32,8 +32,8 @@ def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]
     """Render the pictures (height, width, 3) of a video, one for each of the (N,) times in nanoseconds but the first.
 
     The panels are the recorded events since the time before, the events that the rendering triggers meanwhile, the
-    rendering, its depth, and the last image that was taken until then, where there are images on the trajectory.
-    The run is in evaluation mode.
+    rendering, its depth, and the last image that was taken until then (black before the first), where there are images
+    on the trajectory. The run is in evaluation mode.
     """
     recording = run.recording
     camera = recording.event_camera
@@ -70,8 +70,10 @@ def _timed_images(run: TrainedRun) -> list[tuple[int, Path]]:
 
 def _image_panel(run: TrainedRun, images: list[tuple[int, Path]], time: int) -> NDArray[np.uint8]:
     camera = run.recording.event_camera
-    last = max(int(np.searchsorted([taken for taken, _ in images], time, side="right")) - 1, 0)
-    image = torch.from_numpy(np.array(read_image(images[last][1]).convert("RGB"))) / 255
+    until = [file for taken, file in images if taken <= time]
+    if not until:
+        return np.zeros((camera.height, camera.width, 3), np.uint8)
+    image = torch.from_numpy(np.array(read_image(until[-1]).convert("RGB"))) / 255
     shown = to_image(run.model.reference_display(image))
     if shown.size != (camera.width, camera.height):
         # The image is of another camera than the events.

@@ -21,6 +21,7 @@ from aenerf_ns.export import frames, mesh
 from aenerf_ns.export.camera_model_files import PlacedImage
 from aenerf_ns.export.rendering import corrected_poses, observe_points, place_views
 from aenerf_ns.export.times import spread_times, times_at_rate, times_from_seconds
+from aenerf_ns.export.video import render_panels
 
 SECOND = 10**9
 
@@ -83,6 +84,14 @@ def test_fewer_points_than_images_are_spread_over_them(run: TrainedRun) -> None:
     points = observe_points(run, images, 10)
     assert 5 <= len(points.images) <= 10
     assert points.images.max() > 80
+
+
+def test_a_video_shows_an_image_from_when_it_was_taken(run: TrainedRun) -> None:
+    # The image is the last of five panels, below a line of text. It was taken at 0.25 s.
+    pictures = render_panels(run, torch.tensor([0, 2, 3]) * SECOND // 10)
+    before, after = (picture[16:, 4 * picture.shape[1] // 5 : -4] for picture in pictures)
+    assert (before == 0).all()
+    assert (after > 0).any()
 
 
 def test_depths_too_far_to_be_written_are_counted(
