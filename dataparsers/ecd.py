@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -78,8 +77,3 @@ def _read_calibration(path: Path, size: tuple[int, int]) -> CameraIntrinsics:
     values = parse_numbers(path, rows)[0].tolist()
     with value_errors_as_data_error(path, "it must hold fx fy cx cy k1 k2 p1 p2 k3"):
         return CameraIntrinsics.from_opencv(size, values[:4], values[4:])
-
-
-ecd_dataparser = DataParserSpecification(
-    config=EcdDataParserConfig(), description="Event Camera Dataset text files: events, images, ground truth, calib"
-)

@@ -7,7 +7,6 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -81,8 +80,3 @@ class EdsDataParser(EventDataParser):
             return _EVENT_CAMERA, _FRAME_CAMERA, torch.tensor(_EVENT_FROM_FRAME, dtype=torch.float64)
         read = read_calibration(path, "cam1", "cam0")
         return read.event_camera, read.frame_camera, torch.linalg.inv(read.frame_from_event)
-
-
-eds_dataparser = DataParserSpecification(
-    config=EdsDataParserConfig(), description="EDS as downloaded: events.h5 and stamped_groundtruth.txt"
-)

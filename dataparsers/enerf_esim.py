@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError, value_errors_as_data_error
@@ -90,8 +89,3 @@ def _read_camera(path: Path) -> CameraIntrinsics:
     height, width, focal = np.asarray(bounds[0, :15], dtype=np.float64).reshape(3, 5)[:, 4].tolist()
     with value_errors_as_data_error(path, "its fifth column must hold height, width and focal length"):
         return CameraIntrinsics.from_opencv((width, height), (focal, focal, width / 2, height / 2))
-
-
-enerf_esim_dataparser = DataParserSpecification(
-    config=ENeRFEsimDataParserConfig(), description="E-NeRF's ESIM scenes: events/*.npy and poses_all.txt"
-)

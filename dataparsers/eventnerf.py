@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -184,8 +183,3 @@ def read_intrinsics(folder: Path, width: int, height: int) -> CameraIntrinsics:
         # NeRF++ counts pixels from the edge of the image, as CameraIntrinsics does.
         pinhole = matrix[0][0], matrix[1][1], matrix[0][2], matrix[1][2]
         return CameraIntrinsics(width, height, *pinhole, distortion=(k1, k2, 0.0, 0.0, 0.0))
-
-
-eventnerf_dataparser = DataParserSpecification(
-    config=EventNeRFDataParserConfig(), description="EventNeRF: train/events/*.npz, pose and intrinsics"
-)

@@ -19,16 +19,28 @@ from aenerf_ns.recording.options import EventDataParserConfig
 
 # All formats by registered name. Where a folder has several formats, the first one here is taken.
 FORMATS: dict[str, EventDataParserConfig] = {
-    "aenerf-data": native.native_dataparser.config,
-    "ecd-data": ecd.ecd_dataparser.config,
-    "robust-enerf-data": robust_enerf.robust_enerf_dataparser.config,
-    "tum-vie-data": tum_vie.tum_vie_dataparser.config,
-    "eds-data": eds.eds_dataparser.config,
-    "enerf-esim-data": enerf_esim.enerf_esim_dataparser.config,
-    "eventnerf-data": eventnerf.eventnerf_dataparser.config,
-    "paev3d-data": paev3d.paev3d_dataparser.config,
-    "event-recording-data": own_recording.own_recording_dataparser.config,
+    "aenerf-data": native.NativeDataParserConfig(),
+    "ecd-data": ecd.EcdDataParserConfig(),
+    "robust-enerf-data": robust_enerf.RobustENeRFDataParserConfig(),
+    "tum-vie-data": tum_vie.TumVieDataParserConfig(),
+    "eds-data": eds.EdsDataParserConfig(),
+    "enerf-esim-data": enerf_esim.ENeRFEsimDataParserConfig(),
+    "eventnerf-data": eventnerf.EventNeRFDataParserConfig(),
+    "paev3d-data": paev3d.PAEv3DDataParserConfig(),
+    "event-recording-data": own_recording.OwnRecordingDataParserConfig(),
 }
+# What the entry points in pyproject.toml name, in the order of FORMATS.
+(
+    aenerf_data,
+    ecd_data,
+    robust_enerf_data,
+    tum_vie_data,
+    eds_data,
+    enerf_esim_data,
+    eventnerf_data,
+    paev3d_data,
+    event_recording_data,
+) = map(DataParserSpecification, FORMATS.values())
 
 
 def recognize(data: Path) -> str:
@@ -67,6 +79,4 @@ class AutomaticDataParserConfig(DataParserConfig):
         return parser
 
 
-automatic_dataparser = DataParserSpecification(
-    config=AutomaticDataParserConfig(), description="event camera recordings in any known format"
-)
+event_data = DataParserSpecification(AutomaticDataParserConfig())

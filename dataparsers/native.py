@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -142,6 +141,3 @@ def _read_views(
             )
         splits[split] = [view for name in names if (view := views[name]) is not None]
     return splits
-
-
-native_dataparser = DataParserSpecification(config=NativeDataParserConfig(), description="aenerf-ns dataset folder")

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -209,8 +208,3 @@ def _read_colmap(
     frames = torch.stack([known[time] for time in order])
     # Errors about times name the list of images, which holds the times.
     return Trajectory(order, frames @ frame_from_event, images)
-
-
-own_recording_dataparser = DataParserSpecification(
-    config=OwnRecordingDataParserConfig(), description="your own recording: events, calibration and poses"
-)

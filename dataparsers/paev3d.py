@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, require_rigid
@@ -139,8 +138,3 @@ def _read_camera_pose(path: Path) -> Tensor:
 def _is_camera(item: dict) -> bool:
     # Not by ==, which compares arrays value by value.
     return isinstance(item.get("name"), str) and item["name"] == "Camera"
-
-
-paev3d_dataparser = DataParserSpecification(
-    config=PAEv3DDataParserConfig(), description="PAEv3D: H5_Files, Render_info and Intrinsics"
-)

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory
@@ -189,8 +188,3 @@ def _view_camera(path: Path, meta: _Views, image: Path) -> CameraIntrinsics:
         if meta.intrinsics is None:
             raise DataError(path, "it has neither camera_angle_x nor intrinsics", "give one of them")
         return CameraIntrinsics.from_opencv((width, height), _pinhole(meta.intrinsics))
-
-
-robust_enerf_dataparser = DataParserSpecification(
-    config=RobustENeRFDataParserConfig(), description="Robust e-NeRF: raw_events.npz, camera poses and calibration"
-)

@@ -10,7 +10,6 @@ from typing import Generic, Literal, TypeVar
 import msgspec
 import numpy as np
 import torch
-from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -194,8 +193,3 @@ def _read_camera(path: Path, cameras: _Cameras, index: int) -> tuple[CameraIntri
     with value_errors_as_data_error(path):
         camera = CameraIntrinsics.from_opencv(cameras.resolution[index], lens[:4], lens[4:], "kb4")
     return camera, cameras.T_imu_cam[index].matrix(path)
-
-
-tum_vie_dataparser = DataParserSpecification(
-    config=TumVieDataParserConfig(), description="TUM-VIE as downloaded: events, vi_gt_data and calibration"
-)

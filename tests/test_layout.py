@@ -100,9 +100,9 @@ def test_benchmarks_are_not_imported() -> None:
 
 
 def test_dataparsers_holds_formats_only() -> None:
-    for path in (ROOT / "dataparsers").glob("*.py"):
-        if path.stem != "__init__":
-            assert "DataParserSpecification(" in path.read_text(encoding="utf-8"), path
+    files = {f"aenerf_ns.dataparsers.{path.stem}" for path in (ROOT / "dataparsers").glob("*.py")}
+    others = {"aenerf_ns.dataparsers.__init__", "aenerf_ns.dataparsers.formats"}
+    assert files - others == files & imported_names(ROOT / "dataparsers/formats.py")
 
 
 def test_method_configs_holds_registered_methods_only() -> None:

@@ -103,8 +103,9 @@ def test_version_is_stated_alike(wheel: zipfile.ZipFile) -> None:
 
 
 def test_dataparsers_are_registered() -> None:
-    names = {point.name for point in entry_points(group="nerfstudio.dataparser_configs")}
-    assert {"event-data", *FORMATS} <= names
+    points = entry_points(group="nerfstudio.dataparser_configs")
+    assert "event-data" in points.names
+    assert all(points[name].load().config is config for name, config in FORMATS.items())
 
 
 def test_importing_costs_nothing() -> None:
