@@ -31,7 +31,7 @@ from aenerf_ns.checking.hypotheses import (
     Hypothesis,
     clock_hypothesis,
 )
-from aenerf_ns.events.event_images import TILE, accumulate, best_of, image_size, tile_contrast
+from aenerf_ns.events.event_images import TILE, accumulate, image_size, sharpest
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.stream import EventStream
 
@@ -250,30 +250,19 @@ class WarpedEvents:
     def _warp(self, events: EventStream, hypothesis: Hypothesis) -> WarpedSlice:
         """Warp a slice at every depth, and keep the depth of most contrast in each tile."""
         lines, baseline, reference, (fx, fy, cx, cy) = self._geometry(events, hypothesis)
-        polarity = events.p.astype(np.float32)
         inverse_depths = np.zeros(1)
         if baseline > 0:
             steps = np.arange(0, self._width / _DEPTH_STEP + 1)
             inverse_depths = steps * _DEPTH_STEP / (fx * baseline)
-        net, total = np.zeros((2, self._height, self._width), np.float32)
-        measured = []
-        for inverse_depth in inverse_depths:
-            accumulate(lines, polarity, np.float32(inverse_depth), net, total)
-            measured.append(tile_contrast(net, total))
-        energy, brightness = map(np.array, zip(*measured, strict=True))
-        best = best_of(energy, brightness)
+        warps = ((lines, inverse_depth) for inverse_depth in inverse_depths)
+        best, energy, brightness = sharpest(warps, events.p.astype(np.float32), self._height, self._width)
         rows, columns = (np.arange(n) * TILE + TILE / 2 for n in best.shape)
         x, y = np.meshgrid((columns - cx) / fx, (rows - cy) / fy)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = 1 / inverse_depths[best]
             in_camera = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None]
             points = in_camera @ reference[:3, :3].T + reference[:3, 3]
-        return WarpedSlice(
-            energy=np.take_along_axis(energy, best[None], 0)[0],
-            brightness=np.take_along_axis(brightness, best[None], 0)[0],
-            depth=depth,
-            points=points,
-        )
+        return WarpedSlice(energy, brightness, depth, points)
 
     def picture(self) -> NDArray[np.uint8]:
         """Draw the slice with the most contrast as it came and, to the right of it, warped to one view.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
 
 import cv2
@@ -28,29 +29,32 @@ def image_size(width: int, height: int) -> tuple[int, int, int]:
     return width, height, binning
 
 
-def tile_contrast(net: NDArray[np.float32], total: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
-    """Return the (R, C) squared contrasts of the tiles, less that of noise, and their (R, C) squared brightness.
+def sharpest(
+    warps: Iterable[tuple[NDArray[np.float32], float]], polarity: NDArray[np.float32], height: int, width: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return for each (R, C) tile which of several warps gives it the most contrast.
 
     Args:
-        net: (height, width) sums of polarities.
-        total: (height, width) numbers of events.
-    """
-    coarse, edges = _smooth(total), _edges(net)
-    return _tile_sums(edges * edges - _noise_energy() * coarse), _tile_sums(coarse * coarse)
-
-
-def best_of(energies: NDArray[np.float64], brightnesses: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return for each tile which of several warps gives it the most contrast.
-
-    Args:
-        energies: (warps, R, C) squared contrasts.
-        brightnesses: (warps, R, C) squared brightnesses.
+        warps: lines and inverse depth of each, for :func:`accumulate`.
+        polarity: (N,) polarities of the events.
+        height: of the images in pixels, a whole number of tiles.
+        width: likewise.
 
     Returns:
-        (R, C) indices. The first of equally good warps is taken.
+        (R, C) indices of the warps, the first of equally good ones; the tiles' squared contrasts under these, less that
+        of noise; and their squared brightness.
     """
+    net, total = np.zeros((2, height, width), np.float32)
+    measured = []
+    for lines, inverse_depth in warps:
+        accumulate(lines, polarity, np.float32(inverse_depth), net, total)
+        coarse, edges = _smooth(total), _edges(net)
+        measured.append((_tile_sums(edges * edges - _noise_energy() * coarse), _tile_sums(coarse * coarse)))
+    energy, brightness = map(np.array, zip(*measured, strict=True))
     # With the ratio alone, tiles would choose the warp that leaves them empty.
-    return (energies / (brightnesses + brightnesses.mean() + 1e-12)).argmax(0)
+    best = (energy / (brightness + brightness.mean() + 1e-12)).argmax(0)
+    energy, brightness = (np.take_along_axis(values, best[None], 0)[0] for values in (energy, brightness))
+    return best, energy, brightness
 
 
 def _smooth(image: NDArray) -> NDArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.events.event_images import TILE, accumulate, best_of, image_size, tile_contrast
+from aenerf_ns.events.event_images import TILE, image_size, sharpest
 from aenerf_ns.events.stream import EventStream
 
 # The image moves by at most this many pixels of the images of warped events from the first event to the last. From one
@@ -33,18 +33,15 @@ def optical_flow(events: EventStream) -> tuple[NDArray[np.float64], int]:
     # An event is anywhere within its pixel.
     jitter = np.random.default_rng(0).uniform(0, 1, (2, len(events)))
     x, y = (np.stack([events.x, events.y]) + jitter) / binning
-    polarity = events.p.astype(np.float32)
 
     along = np.arange(-_MAX_DISPLACEMENT, _MAX_DISPLACEMENT + _STEP / 2, _STEP)
     tried = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
     length = np.hypot(*tried.T)
     # Slow ones first, because the first of equally good ones is taken.
     tried = tried[np.argsort(length, kind="stable")][: (length <= _MAX_DISPLACEMENT).sum()]
-    net, total = np.zeros((2, height, width), np.float32)
-    measured = []
-    for across, down in tried:
-        lines = np.stack([x, -part * across, y, -part * down, np.zeros_like(x)]).astype(np.float32)
-        accumulate(lines, polarity, np.float32(1), net, total)
-        measured.append(tile_contrast(net, total))
-    energy, brightness = map(np.array, zip(*measured, strict=True))
-    return tried[best_of(energy, brightness)] * (binning * 1e9 / duration), TILE * binning
+    warps = (
+        (np.stack([x, -part * across, y, -part * down, np.zeros_like(x)]).astype(np.float32), 1)
+        for across, down in tried
+    )
+    best, _, _ = sharpest(warps, events.p.astype(np.float32), height, width)
+    return tried[best] * (binning * 1e9 / duration), TILE * binning
