@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -238,14 +237,20 @@ class WarpedEvents:
             self._meant[hypothesis.poses] = self._trajectory.transform(hypothesis.poses)
         poses = homogeneous(self._meant[hypothesis.poses].interpolate(times + hypothesis.clock_offset))
         reference = poses[num_poses // 2]
-        relative = np.ascontiguousarray((torch.linalg.inv(reference) @ poses)[:, :3].numpy())
+        relative = (torch.linalg.inv(reference) @ poses)[:, :3].numpy()
         duration = max(int(events.t[-1] - events.t[0]), 1)
         indices = np.rint((events.t - events.t[0]) / duration * (num_poses - 1)).astype(np.int64)
         points = (hypothesis.plane(self._plane)[events.y, events.x] + self._jitter[: len(events)]) / focal_factor
         focal = camera.fx * focal_factor, camera.fy * focal_factor
-        intrinsics = np.array([*focal, camera.cx, camera.cy]) / self._binning
+        fx, fy, cx, cy = intrinsics = np.array([*focal, camera.cx, camera.cy]) / self._binning
+        right, down, forward, (p, q, w) = np.take(relative.T, indices, -1)
+        x, y, z = right * points[:, 0] + down * points[:, 1] + forward
+        # The reference view does not see what is behind it.
+        x, y = [x, y] / np.where(z > 1e-3, z, np.nan)
+        # The ray (x, y, 1) from the camera's position (p, q, w) at the event meets the plane at depth - w along it.
+        lines = np.stack([fx * x + cx, fx * (p - w * x), fy * y + cy, fy * (q - w * y), w]).astype(np.float32)
         baseline = float(np.linalg.norm(relative[:, :, 3], axis=1).max())
-        return _lines(points, indices, relative, intrinsics), baseline, reference.numpy(), intrinsics
+        return lines, baseline, reference.numpy(), intrinsics
 
     def _warp(self, events: EventStream, hypothesis: Hypothesis) -> WarpedSlice:
         """Warp a slice at every depth, and keep the depth of most contrast in each tile."""
@@ -306,32 +311,3 @@ def _compare(hypothesis: Hypothesis, given: list[WarpedSlice], alternative: list
 def _residuals(one: WarpedSlice, slices: Sequence[WarpedSlice]) -> NDArray[np.float64]:
     """Return by how much each (R, C) tile of one slice raises the contrast of all slices, to first order."""
     return (one.energy - contrast_of(slices) * one.brightness) / max(sum(s.brightness.sum() for s in slices), 1e-30)
-
-
-@numba.njit(cache=True)
-def _lines(points, index, relative, intrinsics):
-    """Return where the reference view sees the events on a plane, as a function of the depth of the plane.
-
-    The event is seen at u = u0 + u1 / depth, v = v0 + v1 / depth if w / depth < 1.
-
-    Returns:
-        (5, N) float32 of u0, u1, v0, v1, w; NaN where an event is behind the reference view.
-    """
-    lines = np.empty((5, points.shape[0]), np.float32)
-    fx, fy, cx, cy = intrinsics
-    for i in range(points.shape[0]):
-        k = index[i]
-        a, b = points[i, 0], points[i, 1]
-        x = relative[k, 0, 0] * a + relative[k, 0, 1] * b + relative[k, 0, 2]
-        y = relative[k, 1, 0] * a + relative[k, 1, 1] * b + relative[k, 1, 2]
-        z = relative[k, 2, 0] * a + relative[k, 2, 1] * b + relative[k, 2, 2]
-        if z > 1e-3:
-            # The ray (x, y, z) from the camera's position at the event meets the plane at depth / z (1 - w / depth).
-            lines[0, i] = fx * x / z + cx
-            lines[1, i] = fx * (relative[k, 0, 3] - relative[k, 2, 3] * x / z)
-            lines[2, i] = fy * y / z + cy
-            lines[3, i] = fy * (relative[k, 1, 3] - relative[k, 2, 3] * y / z)
-            lines[4, i] = relative[k, 2, 3]
-        else:
-            lines[:, i] = np.nan
-    return lines

@@ -84,6 +84,14 @@ def accumulate(lines, polarity, inverse_depth, net, total):
 
     Each event goes to one pixel: spreading an event over its four nearest pixels would smooth the image by an amount
     that depends on the motion.
+
+    Args:
+        lines: (5, N) float32 of u0, u1, v0, v1, w: the reference view sees the event at u = u0 + u1 / depth and
+            v = v0 + v1 / depth if w / depth < 1; NaN where it is behind the view.
+        polarity: (N,) float32 polarities of the events.
+        inverse_depth: float32, of the plane.
+        net: (height, width) float32, which gets the sums of polarities.
+        total: (height, width) float32, which gets the numbers of events.
     """
     net[:] = 0
     total[:] = 0
