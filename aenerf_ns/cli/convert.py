@@ -271,8 +271,6 @@ def _cut(recording: Recording, window: TimeWindow) -> Trajectory:
 
 def _copy_events(recording: Recording, events: EventSelection, writer: NativeDatasetWriter) -> tuple[int, int, int]:
     """Write the kept events, and count the events that were read, those that were written, and those with a pose."""
-    from aenerf_ns.events.filters import hot_pixel_summary
-
     source, known = recording.event_file, recording.trajectory.known_time()
     num_read = num_written = num_covered = 0
 
@@ -283,7 +281,7 @@ def _copy_events(recording: Recording, events: EventSelection, writer: NativeDat
             yield chunk
             num_read += len(chunk)
 
-    events.find_hot_pixels(read("Looking for hot pixels"))
+    hot_pixels = events.find_hot_pixels(read("Looking for hot pixels"))
     for chunk in events.filtered(read("Converting events")):
         writer.events.append(chunk)
         num_written += len(chunk)
@@ -291,8 +289,8 @@ def _copy_events(recording: Recording, events: EventSelection, writer: NativeDat
     if num_written == 0:
         remedy = "widen the time window, the region of interest or the share"
         raise DataError(source.path, "no event is left", remedy)
-    if events.hot_pixels is not None and events.counts is not None:
-        say(hot_pixel_summary(events.hot_pixels, events.counts))
+    if hot_pixels:
+        say(hot_pixels)
     return num_read, num_written, num_covered
 
 

@@ -151,11 +151,6 @@ class EventSelection:
 
     Raises:
         DataError: the region of interest is not on the sensor.
-
-    Attributes:
-        hot_pixels: (height, width) bool, whether a pixel of the source is hot; None before :meth:`find_hot_pixels`, and
-            if the filters keep hot pixels.
-        counts: (height, width) number of events of every pixel of the source; None when ``hot_pixels`` is None.
     """
 
     def __init__(
@@ -169,30 +164,33 @@ class EventSelection:
                 f"the region of interest {region} (x, y, width, height) reaches beyond its {width} x {height} pixels",
                 "give one on the sensor",
             )
-        self._shape = (height, width)
         self._filters, self._bayer_pattern = filters, bayer_pattern
-        self.hot_pixels: NDArray[np.bool_] | None = None
-        self.counts: NDArray[np.int64] | None = None
+        x, y, columns, rows = self._region
+        self._keep = np.zeros((height, width), bool)
+        self._keep[y : y + rows, x : x + columns] = True
+        if filters.pixel_share < 1:
+            self._keep &= np.random.default_rng(filters.seed).random(self._keep.shape) < filters.pixel_share
 
-    def find_hot_pixels(self, chunks: Iterable[EventStream]) -> None:
-        """Find the hot pixels in all chunks of the source, if the filters leave them out."""
-        if self._filters.hot_pixels:
-            self.counts = count_events(self._within(chunks), *self._shape)
-            self.hot_pixels = find_hot_pixels(self.counts, self._bayer_pattern)
+    def find_hot_pixels(self, chunks: Iterable[EventStream]) -> str:
+        """Find the hot pixels in all chunks of the source, if the filters leave them out, and describe them in a line.
+
+        Returns:
+            The line, which is empty if the filters keep hot pixels.
+        """
+        if not self._filters.hot_pixels:
+            return ""
+        counts = count_events(self._within(chunks), *self._keep.shape)
+        hot = find_hot_pixels(counts, self._bayer_pattern)
+        self._keep &= ~hot
+        return hot_pixel_summary(hot, counts)
 
     def filtered(self, chunks: Iterable[EventStream]) -> Iterator[EventStream]:
         """Yield the kept events of each chunk. Pass every chunk of the source, in order. Find the hot pixels before."""
         x, y, width, height = self._region
-        keep = np.zeros(self._shape, bool)
-        keep[y : y + height, x : x + width] = True
-        if self._filters.pixel_share < 1:
-            keep &= np.random.default_rng(self._filters.seed).random(self._shape) < self._filters.pixel_share
-        if self.hot_pixels is not None:
-            keep &= ~self.hot_pixels
-        last_kept = np.full(keep.size, _NEVER, np.int64)
+        last_kept = np.full(self._keep.size, _NEVER, np.int64)
         for chunk in self._within(chunks):
             kept = _select(
-                chunk.x, chunk.y, chunk.t, keep.ravel(), chunk.width, self._filters.shortest_interval, last_kept
+                chunk.x, chunk.y, chunk.t, self._keep.ravel(), chunk.width, self._filters.shortest_interval, last_kept
             )
             part = chunk[kept]
             yield replace(part, x=part.x - np.uint16(x), y=part.y - np.uint16(y), width=width, height=height)

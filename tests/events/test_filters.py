@@ -134,12 +134,9 @@ def test_hot_pixels_are_left_out_and_told() -> None:
     rows.sort(key=lambda row: row[2])
     file, filters = file_of(rows, 100, 0, 200), EventFilters(hot_pixels=True)
     assert kept_of(file, filters) == [row for row in rows if row[:2] != (4, 2)]
-    filtered = EventSelection(file.path, WIDTH, HEIGHT, filters)
-    filtered.find_hot_pixels(file.chunks())
-    assert filtered.hot_pixels is not None
-    assert filtered.counts is not None
-    assert np.argwhere(filtered.hot_pixels).tolist() == [[2, 4]]
-    np.testing.assert_array_equal(filtered.counts, count_events([make_stream(rows, WIDTH, HEIGHT)], HEIGHT, WIDTH))
+    selection, count = EventSelection(file.path, WIDTH, HEIGHT, filters), sum(row[:2] == (4, 2) for row in rows)
+    told = f"Hot pixels: 1, with {count / 600:.2%} of the events. (x, y) and events: (4, 2) {count}."
+    assert selection.find_hot_pixels(file.chunks()) == told
     # Only the time window counts: within it the pixel is as the others.
     quiet = [row for row in rows if row[:2] != (4, 2) or row[2] < 300]
     filters = EventFilters(start=301, hot_pixels=True)
