@@ -55,9 +55,9 @@ class EventFilters:
     def __post_init__(self) -> None:
         if not 0 < self.pixel_share <= 1:
             raise ValueError(f"the share of pixels must be above 0 and at most 1, not {self.pixel_share}")
-        for time in (self.start, self.end):
+        for what, time in (("begins", self.start), ("ends", self.end)):
             if time is not None and not FIRST_TIME <= time <= LAST_TIME:
-                raise ValueError(f"the time window ends at {time} ns, which must fit in 64 bits")
+                raise ValueError(f"the time window {what} at {time} ns, which must fit in 64 bits")
         if not 0 <= self.shortest_interval <= LAST_TIME:
             raise ValueError(f"the shortest interval must be from 0 to {LAST_TIME} ns, not {self.shortest_interval}")
         if self.start is not None and self.end is not None and self.start > self.end:

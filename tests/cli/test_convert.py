@@ -295,6 +295,7 @@ def test_frames_of_another_camera_give_no_poses(tmp_path: Path) -> None:
         ({"region": (0, 0, 7, 4)}, "region of interest 0 0 7 4 .* beyond its 6 x 4 pixels"),
         ({"region": (1, 0, 4, 4)}, "from pixel 1 0 of a color sensor; begin it at an even"),
         ({"end_time_ns": START - 1}, "events are from .* all outside the time window; widen"),
+        ({"start_time_ns": 2**63}, "time window begins at 9223372036854775808 ns, which must fit in 64 bits"),
         ({"start_time_ns": 5, "end_time_ns": 4}, "time window ends at 4 ns, before"),
         ({"pixel_share": 1e-9}, "no event is left; widen"),
         ({"poses": "events", "region": (0, 0, 7, 4)}, "region of interest 0 0 7 4 .* beyond its 6 x 4 pixels"),
