@@ -38,7 +38,9 @@ class TwistExponential(nn.Module):
         super().__init__()
         generators = torch.zeros(6, 4, 4, dtype=torch.float64)
         generators[:3, :3, 3] = torch.eye(3)
-        generators[3:, :3, :3] = cross_matrix(torch.eye(3, dtype=torch.float64))
+        axes = torch.eye(3, dtype=torch.float64)
+        # The matrices whose product with a vector is the cross product of an axis and the vector.
+        generators[3:, :3, :3] = torch.linalg.cross(axes[None], axes[:, None])
         # X with its rate, as [X, Ẋ; 0, X]. From the left, [B, Ḃ] becomes [B X, B Ẋ + Ḃ X]: a product with its rate.
         moving = torch.zeros(12, 8, 8, dtype=torch.float64)
         moving[:6, :4, :4] = moving[:6, 4:, 4:] = moving[6:, :4, 4:] = generators
@@ -140,13 +142,6 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
         (..., 3, 3) rotation matrices. Both the value and all derivatives are finite at zero.
     """
     return motion_from_twist(nn.functional.pad(vector, (3, 0)))[..., :3, :3]
-
-
-def cross_matrix(vector: Tensor) -> Tensor:
-    """Return the (..., 3, 3) matrices [v]ₓ of vectors v (..., 3): [v]ₓ w is the cross product of v and w."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
 def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
