@@ -56,12 +56,8 @@ def read_camchain(path: Path) -> dict[str, ChainCamera]:
     for name in sorted(chain, key=lambda name: (len(name), name)):
         cameras[name] = convert(path, chain[name], ChainCamera, _REMEDY, name)
         if cameras[name].T_cn_cnm1 is not None:
-            _motion_from_previous(path, cameras, name)
+            rigid_motion(path, f"{name}.T_cn_cnm1", cameras[name].T_cn_cnm1)
     return cameras
-
-
-def _motion_from_previous(path: Path, cameras: dict[str, ChainCamera], name: str) -> Tensor:
-    return rigid_motion(path, f"{name}.T_cn_cnm1", cameras[name].T_cn_cnm1)
 
 
 def motion_between(path: Path, cameras: dict[str, ChainCamera], source: str, target: str) -> Tensor:
@@ -76,5 +72,5 @@ def motion_between(path: Path, cameras: dict[str, ChainCamera], source: str, tar
     for name in names[first + 1 : last + 1]:
         if cameras[name].T_cn_cnm1 is None:
             raise DataError(path, f"{name} has no T_cn_cnm1", "calibrate both cameras in one run of Kalibr, or add it")
-        motion = _motion_from_previous(path, cameras, name) @ motion
+        motion = rigid_motion(path, f"{name}.T_cn_cnm1", cameras[name].T_cn_cnm1) @ motion
     return motion if names.index(source) == first else torch.linalg.inv(motion)
