@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import torch
+from nerfstudio.cameras.camera_utils import get_distortion_params
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from numpy.typing import NDArray
 from torch import Tensor
@@ -157,16 +157,12 @@ class CameraIntrinsics:
             "fl_y": self.fy,
             "cx": self.cx,
             "cy": self.cy,
-            **dict(zip(_PARAMETERS[self.lens_model], self.distortion, strict=True)),
+            **self._named_distortion,
         }
 
     def summary(self) -> str:
         """Return focal length and distortion for people to read."""
-        distortion = ", ".join(
-            f"{name} {value:.3g}"
-            for name, value in zip(_PARAMETERS[self.lens_model], self.distortion, strict=True)
-            if value
-        )
+        distortion = ", ".join(f"{name} {value:.3g}" for name, value in self._named_distortion.items() if value)
         return f"focal length {self.fx:.1f} px, {distortion or 'no distortion'}"
 
     def to_colmap(self) -> tuple[str, list[float]]:
@@ -181,6 +177,10 @@ class CameraIntrinsics:
             return "OPENCV", pinhole + distortion[:4]
         # The last three are those of a denominator.
         return "FULL_OPENCV", [*pinhole, *distortion, 0.0, 0.0, 0.0]
+
+    @property
+    def _named_distortion(self) -> dict[str, float]:
+        return dict(zip(_PARAMETERS[self.lens_model], self.distortion, strict=True))
 
     @property
     def _opencv_matrix(self) -> NDArray[np.float64]:
@@ -238,12 +238,6 @@ class CameraIntrinsics:
         Args:
             camera_to_worlds: (N, 3, 4) poses, OpenGL camera axes.
         """
-        if self.lens_model == "fisheye":
-            k1, k2, k3, k4 = self.distortion
-            distortion, camera_type = [k1, k2, k3, k4, 0.0, 0.0], CameraType.FISHEYE
-        else:
-            k1, k2, p1, p2, k3 = self.distortion
-            distortion, camera_type = [k1, k2, k3, 0.0, p1, p2], CameraType.PERSPECTIVE
         return Cameras(
             camera_to_worlds=camera_to_worlds.float(),
             fx=self.fx,
@@ -252,8 +246,8 @@ class CameraIntrinsics:
             cy=self.cy,
             width=self.width,
             height=self.height,
-            distortion_params=torch.tensor(distortion) if any(distortion) else None,
-            camera_type=camera_type,
+            distortion_params=get_distortion_params(**self._named_distortion) if any(self.distortion) else None,
+            camera_type=CameraType.FISHEYE if self.lens_model == "fisheye" else CameraType.PERSPECTIVE,
             # Nerfstudio's renderers write into it.
             metadata={},
         )
