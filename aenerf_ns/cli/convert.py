@@ -170,12 +170,13 @@ class Convert(DatasetCommand):
             if picture is not None:
                 picture.quantize().save(writer.other_file(POSES_PICTURE))
             copy_images(writer, recording, views)
-            num_read, num_written, num_covered = _copy_events(recording, events, writer)
+            num_read, num_covered = _copy_events(recording, events, writer)
             if has_given_poses and self.start_time_ns is None and self.end_time_ns is None:
-                require_covered(recording.event_file.path, num_written, num_covered)
+                require_covered(recording.event_file.path, writer.events.num_events, num_covered)
         counts = ", ".join(f"{len(views[split])} {split}" for split in ("train", "val", "test"))
         say(
-            f"{self.output}: {num_written:,} of {num_read:,} events, {len(trajectory)} poses, images: {counts}.\n"
+            f"{self.output}: {writer.events.num_events:,} of {num_read:,} events, {len(trajectory)} poses, "
+            f"images: {counts}.\n"
             f"Look it over with: aenerf check {shlex.quote(str(self.output))}\n"
             f"Train with: {training_command(self.output)}"
         )
@@ -269,10 +270,10 @@ def _cut(recording: Recording, window: TimeWindow) -> Trajectory:
     return recording.trajectory if window == TimeWindow() else covered
 
 
-def _copy_events(recording: Recording, events: EventSelection, writer: NativeDatasetWriter) -> tuple[int, int, int]:
-    """Write the kept events, and count the events that were read, those that were written, and those with a pose."""
+def _copy_events(recording: Recording, events: EventSelection, writer: NativeDatasetWriter) -> tuple[int, int]:
+    """Write the kept events, and count the events that were read, and those of the kept ones that have a pose."""
     source, known = recording.event_file, recording.trajectory.known_time()
-    num_read = num_written = num_covered = 0
+    num_read = num_covered = 0
 
     def read(description: str) -> Iterator[EventStream]:
         nonlocal num_read
@@ -284,14 +285,13 @@ def _copy_events(recording: Recording, events: EventSelection, writer: NativeDat
     hot_pixels = events.find_hot_pixels(read("Looking for hot pixels"))
     for chunk in events.filtered(read("Converting events")):
         writer.events.append(chunk)
-        num_written += len(chunk)
         num_covered += int(known.contains(chunk.t).sum())
-    if num_written == 0:
+    if writer.events.num_events == 0:
         remedy = "widen the time window, the region of interest or the share"
         raise DataError(source.path, "no event is left", remedy)
     if hot_pixels:
         say(hot_pixels)
-    return num_read, num_written, num_covered
+    return num_read, num_covered
 
 
 def _scene_box(found: NDArray[np.float64] | None) -> Tensor | None:

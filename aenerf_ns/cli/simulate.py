@@ -104,7 +104,6 @@ class Simulate(SimulationCommand):
             else:
                 estimated, report, summary = simulation.estimate_poses(truth, self.frame_rate, self.exposure, self.seed)
                 say(summary)
-        num_events = 0
         with NativeDatasetWriter(lock, camera, sensor, "srgb", scene.aabb) as writer:
             writer.add_trajectories(estimated, truth)
             simulator = simulation.simulator
@@ -113,8 +112,7 @@ class Simulate(SimulationCommand):
                 writer.add_poses_report(report)
             for events in simulation.events():
                 writer.events.append(events)
-                num_events += len(events)
-            if num_events == 0:
+            if writer.events.num_events == 0:
                 remedy = "give lower thresholds, or a scene with more contrast"
                 raise DataError(self.scene, "no pixel changes by a contrast threshold", remedy)
             for time in np.linspace(estimated.start, estimated.end, self.train_images, dtype=np.int64).tolist():
@@ -129,7 +127,7 @@ class Simulate(SimulationCommand):
         if simulator.num_lost_events:
             say(simulator.readout_note())
         say(
-            f"{self.output}: {num_events:,} events in {truth.duration:.2f} s, {len(estimated)} poses, "
+            f"{self.output}: {writer.events.num_events:,} events in {truth.duration:.2f} s, {len(estimated)} poses, "
             f"{self.train_images} train, {self.validation_views} validation and {self.test_views} test images.\n"
             f"Train with: {training_command(self.output)}"
         )

@@ -191,16 +191,14 @@ class SimulateVideo(SimulationCommand):
             writer.add_trajectories(poses.estimated, poses.truth)
             if poses.report is not None:
                 writer.add_poses_report(poses.report)
-            num_events = 0
-            for frame, time, events in self._write_events(writer, video, simulator):
-                num_events += len(events)
+            for frame, time, _ in self._write_events(writer, video, simulator):
                 for split, times in chosen.items():
                     if time in times:
                         writer.add_image(split, frame, homogeneous(reference.interpolate(time)), time)
         counts = ", ".join(f"{len(times)} {split}" for split, times in chosen.items())
         return (
-            f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(poses.estimated)} poses, images: "
-            f"{counts}.\nTrain with: {training_command(self.output)}"
+            f"{self.output}: {writer.events.num_events:,} events of {len(video.times)} frames, "
+            f"{len(poses.estimated)} poses, images: {counts}.\nTrain with: {training_command(self.output)}"
         )
 
     def _write_poseless(
@@ -212,17 +210,15 @@ class SimulateVideo(SimulationCommand):
 
         kept = spread_evenly(video.times.tolist(), self.train_images + self.validation_views + self.test_views)
         with PoselessRecordingWriter(lock, camera, simulator.sensor) as writer:
-            num_events = 0
-            for frame, time, events in self._write_events(writer, video, simulator):
-                num_events += len(events)
+            for frame, time, _ in self._write_events(writer, video, simulator):
                 if time in kept:
                     writer.add_image(frame, time)
         missing = (
             "" if camera else 'calibration.json (with "image_encoding": "srgb" and the thresholds of this command) and '
         )
         return (
-            f"{self.output}: {num_events:,} events of {len(video.times)} frames, {len(kept)} images, no poses.\n"
-            f"To train on them, add {missing}trajectory.txt (docs/your_data.md)."
+            f"{self.output}: {writer.events.num_events:,} events of {len(video.times)} frames, {len(kept)} images, "
+            f"no poses.\nTo train on them, add {missing}trajectory.txt (docs/your_data.md)."
         )
 
     def _write_events(
@@ -232,12 +228,10 @@ class SimulateVideo(SimulationCommand):
         from aenerf_ns.simulator.video_events import video_events
 
         writer.add_contrast_thresholds(simulator.positive_contrast_threshold, simulator.negative_contrast_threshold)
-        has_events = False
         for interval in video_events(video, simulator, self.interpolation, self.max_displacement):
             writer.events.append(interval.events)
-            has_events |= len(interval.events) > 0
             yield interval
-        if not has_events:
+        if writer.events.num_events == 0:
             raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")
 
 

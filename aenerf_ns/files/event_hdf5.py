@@ -213,6 +213,9 @@ class Hdf5EventWriter:
 
     Raises:
         OSError: the file cannot be written, such as on a full disk.
+
+    Attributes:
+        num_events: events that were appended.
     """
 
     def __init__(self, path: Path) -> None:
@@ -222,7 +225,7 @@ class Hdf5EventWriter:
         self._file = h5py.File(path, "w")
         self._reserved = 0
         self._waiting: list[EventStream] = []
-        self._num_waiting = 0
+        self.num_events = 0
         self._last_time: int | None = None
         try:
             self._reserve(0)
@@ -293,16 +296,16 @@ class Hdf5EventWriter:
             )
         self._last_time = int(events.t[-1])
         self._waiting.append(events)
-        self._num_waiting += len(events)
-        if self._num_waiting >= _WRITE_CHUNK:
+        self.num_events += len(events)
+        if self.num_events - len(self._columns["t"]) >= _WRITE_CHUNK:
             self._flush()
 
     def _flush(self) -> None:
         if not self._waiting:
             return
-        self._reserve(self._num_waiting * sum(np.dtype(dtype).itemsize for dtype in _DTYPES.values()))
+        num_written = len(self._columns["t"])
+        self._reserve((self.num_events - num_written) * sum(np.dtype(dtype).itemsize for dtype in _DTYPES.values()))
         for name, column in self._columns.items():
-            values = np.concatenate([getattr(events, name) for events in self._waiting])
-            column.resize(len(column) + len(values), axis=0)
-            column[len(column) - len(values) :] = values
-        self._waiting, self._num_waiting = [], 0
+            column.resize(self.num_events, axis=0)
+            column[num_written:] = np.concatenate([getattr(events, name) for events in self._waiting])
+        self._waiting = []
