@@ -91,6 +91,15 @@ def test_poses_without_times_take_a_unit(tmp_path: Path) -> None:
     assert recording.trajectory.times.tolist() == list(range(5, 106, 5))
 
 
+def test_the_last_pose_is_at_the_last_event_that_is_kept(tmp_path: Path) -> None:
+    truth = write_eventnerf(tmp_path / "made")
+    events = {name: np.append(np.repeat(column, 6), column[-1]) for name, column in truth.events.items()}
+    events["x"][-1], events["t"][-1] = truth.width, 2 * DURATION
+    np.savez(truth.data / "train" / "events" / "test_lego.npz", **events)
+    recording = recording_of(config_of("eventnerf-data", truth.data, drop_malformed=True))
+    assert recording.trajectory.end == recording.event_file.time_span()[1] == DURATION * 1_000
+
+
 def test_poses_run_no_code(tmp_path: Path) -> None:
     truth = write_paev3d(tmp_path / "made")
     file = truth.data / "Render_info" / "Bunny" / "0003.npz"
