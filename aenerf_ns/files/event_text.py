@@ -37,8 +37,6 @@ BLOCK = 1 << 22
 _SAMPLE_BYTES = 1 << 16
 # Share of the events there that fit the order of the columns, where malformed events are left out.
 _LEFT_OUT_FITS = 0.99
-# Longer than any line of a file of events.
-_TAIL_BYTES = 4096
 # The size of the sensor, as E2VID and Metavision write it.
 _SIZE = re.compile(rb"\s*(\d{1,9})[\s,]+(\d{1,9})\s*(?:#.*)?$|%\s*geometry\W+(\d{1,9})\D+(\d{1,9})", re.IGNORECASE)
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -208,8 +206,15 @@ class TextEventFile(EventFile):
         return start, end
 
     def _last_line(self, file: BinaryIO, names: list[str]) -> _Lines:
-        file.seek(max(self.path.stat().st_size - _TAIL_BYTES, 0))
-        row = next((line for line in reversed(file.read().splitlines()) if _is_row(line)), b"")
+        """Parse the last event, which many comments and empty lines may follow."""
+        end, row = self.path.stat().st_size, b""
+        while end > 0 and not row:
+            begin = max(end - MAX_LINE, 0)
+            file.seek(begin)
+            # A line that begins ahead of this piece of the file is looked at with the piece before.
+            begin += len(self._line(file)) if begin > 0 else 0
+            lines = file.read(end - begin).splitlines()
+            row, end = next((line for line in reversed(lines) if _is_row(line)), b""), begin
         return self._parse_block(row + b"\n", None, names)
 
     def _lines(self, file: BinaryIO, names: list[str]) -> Iterator[_Lines]:

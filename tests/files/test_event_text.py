@@ -56,6 +56,12 @@ def test_skip_blanks_comments_and_empty_lines(tmp_path: Path) -> None:
     assert (events.x[0], events.y[0], events.t[0], events.p[0]) == (3, 4, 8000, 1)
 
 
+@pytest.mark.parametrize("end", ["\n" * 200_000, f"#{'x' * 5_000}\n", f"\n#{'x' * 60_000}" * 3])
+def test_what_follows_the_last_event_may_be_long(end: str, tmp_path: Path) -> None:
+    file = open_events(written(tmp_path / "events.txt", f"1 2 3 1\n5 2 3 1\n{end}"))
+    assert file.time_span() == (1_000, 5_000)
+
+
 def test_real_recording_is_exact(slider_depth: Path) -> None:
     events = next(TextEventFile(slider_depth / "events.txt", 240, 180).chunks())
     lines = (slider_depth / "events.txt").read_text().splitlines()[: len(events)]
