@@ -236,35 +236,29 @@ def _smooth(
 
     ``edges`` (M, 2) are pairs of neighboring points.
     """
-    count = len(light) // 2
-    neighbors = np.concatenate([edges, edges[:, ::-1]])
-    neighbors = np.concatenate([neighbors, neighbors + count])
+    # The points that are averaged on either side of each point: its neighbors and itself.
+    near = np.concatenate([edges, edges[:, ::-1], np.arange(len(light) // 2).repeat(2).reshape(-1, 2)])
+    near = np.concatenate([near, near + len(light) // 2])
+    matrix = csr_array((np.ones(len(near)), near.T), shape=(len(light), len(light)))
+
+    def means(values: NDArray[np.float32], known: NDArray[np.bool_]) -> tuple[NDArray, NDArray[np.bool_]]:
+        """Return the means (2 G, 3) over each point and its neighbors, of those that are known, and where any is."""
+        weight = matrix @ known
+        total = (matrix @ np.where(known[:, None], values, 0)).astype(np.float32)
+        return (total / np.maximum(weight, 1)[:, None]).astype(np.float32), weight > 0
+
     soft = light - sharp
     for _ in range(_SMOOTHING):
-        soft = _neighbor_means(neighbors, soft, ~buried)
+        smooth, found = means(soft, ~buried)
+        soft = np.where(found[:, None], smooth, soft)
     light = sharp + soft
     for _ in range(2):
         # A point inside or beneath another object has no light of its own. It takes the mean of its neighbors' light.
-        known = ~buried
-        around_buried = neighbors[buried[neighbors[:, 0]]]
-        filled = _neighbor_means(around_buried, light, known)
-        found = np.zeros(2 * count, np.bool_)
-        found[around_buried[known[around_buried[:, 1]], 0]] = True
+        filled, found = means(light, ~buried)
+        found &= buried
         light[found] = filled[found]
         buried = buried & ~found
     return light
-
-
-def _neighbor_means(neighbors: NDArray[np.int64], values: NDArray, known: NDArray[np.bool_]) -> NDArray:
-    """Return the mean (N, C) over each point and its neighbors, of those that are known; the point's value if none is.
-
-    ``neighbors`` (M, 2) are pairs of points.
-    """
-    to, of = neighbors[known[neighbors[:, 1]]].T
-    weight = known + np.bincount(to, minlength=len(values))
-    total = values * known[:, None]
-    total += np.stack([np.bincount(to, column[of], len(values)) for column in values.T], axis=1)
-    return np.where(weight[:, None] > 0, total / np.maximum(weight, 1)[:, None], values).astype(np.float32)
 
 
 def _mean_albedo(surface: Surface, count: int) -> NDArray[np.float32]:
