@@ -265,13 +265,18 @@ class ColmapWorkspace:
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
         options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = _MIN_POINTS, 50
         options.extract_colors = False
-        output, begun = self._new_folder(), ""
+        output, begun = self._new_folder(), None
         if start is not None:
             options.multiple_models, begun = False, self._new_folder()
             start.write(begun)
         with self._step("Placing frames", len(self._names)) as task:
             models = pycolmap.incremental_mapping(
-                self._database, self._images, output, options, begun, lambda: None, lambda: self._progress.advance(task)
+                self._database,
+                self._images,
+                output,
+                options,
+                begun or "",
+                next_image_callback=lambda: self._progress.advance(task),
             )
         return _largest_first(models)
 
