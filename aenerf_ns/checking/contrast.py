@@ -284,10 +284,12 @@ class WarpedEvents:
         for value in np.unique(depth):
             accumulate(lines, polarity, np.float32(1 / value), net, total)
             warped[depth_of_pixel == value] = net[depth_of_pixel == value]
-        both = np.rint(np.concatenate([unwarped, warped], 1)).astype(np.int64)
+        # The tiles reach beyond the sensor.
+        width, height = -(-self._camera.width // self._binning), -(-self._camera.height // self._binning)
+        both = np.rint(np.concatenate([unwarped[:height, :width], warped[:height, :width]], 1)).astype(np.int64)
         rows, columns = np.nonzero(both)
         picture = polarity_picture(columns, rows, both[rows, columns], both.shape[1], both.shape[0])
-        factor = max(_PICTURE_HEIGHT // self._height, 1)
+        factor = max(_PICTURE_HEIGHT // height, 1)
         return picture.repeat(factor, 0).repeat(factor, 1)
 
 
