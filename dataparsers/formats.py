@@ -47,15 +47,23 @@ def recognize(data: Path) -> str:
     """Name the format of a dataset, judged by the names of its files.
 
     Raises:
-        DataError: the folder does not exist, or has none of the formats.
+        DataError: the folder does not exist, or has none of the formats, or one of its files is given for all.
     """
     with reading(data):
-        for name, config in FORMATS.items():
-            if config.recognizes(data):
-                return name
+        name = _format_of(data)
+        if name == "event-recording-data" and data.is_file() and _format_of(data.parent) not in (None, name):
+            # The other files of the format say what an event file does not.
+            problem = f"it belongs to a recording in the format {_format_of(data.parent)}"
+            raise DataError(data, problem, "give the folder, or name a --format")
+    if name is not None:
+        return name
     require_dataset(data)
     known = "; ".join(f"{name}: {' with '.join(config.markers)}" for name, config in FORMATS.items())
     raise DataError(data, "no known format of recordings", f"looked for {known}")
+
+
+def _format_of(data: Path) -> str | None:
+    return next((name for name, config in FORMATS.items() if config.recognizes(data)), None)
 
 
 @dataclass

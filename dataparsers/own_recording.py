@@ -37,7 +37,7 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
     """A recording of your own."""
 
     markers = (
-        f"events{{{','.join(SUFFIXES)}}}",
+        f"events{{{','.join(SUFFIXES)}}} (or such a file of any name in place of the folder)",
         f"{' or '.join(_CALIBRATIONS)}, where there is one",
         "poses in trajectory.txt or a COLMAP model in colmap, where there are any",
     )
@@ -75,7 +75,7 @@ class OwnRecordingDataParserConfig(PublishedDataParserConfig):
         has_poses = (data / "trajectory.txt").is_file() or (data / "colmap").is_dir()
         has_calibration = any((data / name).is_file() for name in _CALIBRATIONS)
         has_events = any((data / f"events{suffix}").is_file() for suffix in SUFFIXES)
-        return has_events or (has_calibration and has_poses) or (data.suffix in SUFFIXES and data.is_file())
+        return has_events or (has_calibration and has_poses) or (_is_event_file(data) and data.is_file())
 
 
 class OwnRecordingDataParser(EventDataParser):
@@ -119,8 +119,8 @@ class OwnRecordingDataParser(EventDataParser):
         """Read the cameras, the (4, 4) motion from the event camera's to the frame camera's coordinates, and the times
         in nanoseconds and the files of the images."""
         config = self.config
-        if not self.data.exists():
-            raise DataError(self.data, "there is no such folder", "give the folder of the recording as --data")
+        if not self._folder.is_dir():
+            raise DataError(self._folder, "there is no such folder", "give the folder of the recording as --data")
         images = self._image_list
         timed = read_image_list(images) if config.images is not None or images.is_file() else []
         calibration = self._read_calibration(bool(timed))
@@ -137,7 +137,7 @@ class OwnRecordingDataParser(EventDataParser):
 
     @property
     def _folder(self) -> Path:
-        return self.data.parent if self.data.is_file() else self.data
+        return self.data.parent if _is_event_file(self.data) else self.data
 
     @property
     def _image_list(self) -> Path:
@@ -154,7 +154,7 @@ class OwnRecordingDataParser(EventDataParser):
 
     def _event_file(self, width: int | None = None, height: int | None = None) -> EventFile:
         config = self.config
-        if config.events is None and self.data.is_file():
+        if config.events is None and _is_event_file(self.data):
             config.events = self.data
         elif config.events is None:
             files = sorted(file for suffix in SUFFIXES if (file := self.data / f"events{suffix}").is_file())
@@ -162,6 +162,11 @@ class OwnRecordingDataParser(EventDataParser):
             # Stored, so that opening a trained run needs no events.
             config.events = require_one(files, self.data, what, "give one as --events")
         return open_event_file(config.events, width, height, config.event_topic, config.event_time_unit)
+
+
+def _is_event_file(data: Path) -> bool:
+    # It may be gone when a trained run is opened.
+    return data.suffix.lower() in SUFFIXES and not data.is_dir()
 
 
 def _guess_calibration(events: EventFile) -> Calibration:

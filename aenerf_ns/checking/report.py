@@ -73,8 +73,7 @@ def check_without_poses(capture: Capture, frames: Iterable[tuple[int, Path]]) ->
         DataError: the events cannot be read.
     """
     result, _ = _check_events(capture, frames, TimeWindow())
-    if capture.intrinsics_origin != "guessed":
-        check_lens(result, capture.event_camera)
+    check_lens(result, capture.event_camera)
     return result
 
 

@@ -72,10 +72,15 @@ class Check(DatasetCommand):
             words = ["aenerf", "convert", str(self.data), "--output", "FOLDER", "--poses", "events"]
             if self.format != "auto":
                 words += ["--format", self.format]
-            options = [*self.format_options, *map("=".join, result.sensor_options.items())]
+            for name in ("start_time_ns", "end_time_ns"):
+                if (time := getattr(parser.config, name)) is not None:
+                    words += [f"--{name.replace('_', '-')}", str(time)]
+            placing = [name.replace("_", "-") for name in self.placing_options]
+            options = [one for one in self.format_options if one.split("=")[0].replace("_", "-") not in placing]
+            options += map("=".join, result.sensor_options.items())
             if options:
                 words += ["--format-options", *options]
-            say(f"It has no poses. Find them with: {shlex.join(words)}")
+            say(f"There are no poses at {parser.poses_path()}. Find them with: {shlex.join(words)}")
         if self.picture is not None and result.warped is not None:
             with creating(self.picture, "--picture") as file:
                 Image.fromarray(result.warped.picture()).save(file)

@@ -91,13 +91,18 @@ def _at_its_place(config: TrainerConfig, path: Path, data: Path | None) -> Train
         return config
     before = Path(dataparser.data)
     config.__dict__["data_at_training"] = before.absolute()
-    if data is None and not before.exists():
+    # A run opens without its events, also where their file stands for the recording.
+    if data is None and not before.exists() and getattr(dataparser, "events", None) != before:
         raise DataError(before, "the dataset of the run is not there", "say where it is now with --data")
     if data is not None:
         require_dataset(data)
         # It would take the place of the dataparser's.
         config.pipeline.datamanager.data = None
+        # What lies beside a recording that is given by its event file belongs to it.
+        old, new = (path.parent if data.is_file() else path for path in (before, data.absolute()))
         for option, value in list(vars(dataparser).items()):
-            if isinstance(value, Path) and value.is_relative_to(before):
-                setattr(dataparser, option, data.absolute() / value.relative_to(before))
+            if value == before:
+                setattr(dataparser, option, data.absolute())
+            elif isinstance(value, Path) and value.is_relative_to(old):
+                setattr(dataparser, option, new / value.relative_to(old))
     return config

@@ -80,7 +80,8 @@ def estimate_poses_from_events(
             # Where images are lost, the model often has a bend. Now that it is better, more of them find their place.
             if is_placed(model) and len(poses_of(model)) < len(times):
                 start = workspace.triangulate(poses_of(model), *_LAST_ROUNDS[0][:2])
-                model = adjust((workspace.reconstruct(start=start) or [model])[0], _LAST_ROUNDS)
+                more = adjust((workspace.reconstruct(start=start) or [model])[0], _LAST_ROUNDS)
+                model = more if is_placed(more) else model
             if is_placed(model):
                 break
         if camera is None or model is None or not is_placed(model):

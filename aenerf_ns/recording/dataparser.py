@@ -85,6 +85,7 @@ class EventDataParser(DataParser):
             if self._lacks_poses():
                 capture, frames = self.read_capture()
                 capture.event_file.drop_malformed = self.config.drop_malformed
+                self._check_lens(capture.event_camera, "event camera")
                 return capture, frames
         return self._recording, self._recording.frames
 

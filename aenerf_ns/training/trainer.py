@@ -45,6 +45,14 @@ class AENeRFTrainerConfig(TrainerConfig):
             if isinstance(group["scheduler"], (RelativeMultiStepSchedulerConfig, RelativeCosineSchedulerConfig)):
                 group["scheduler"].max_steps = self.schedule_length or self.max_num_iterations
 
+    def set_experiment_name(self) -> None:
+        """Name the run after the event file, where one is given in place of a folder. Nerfstudio names it after the
+        file's folder, whose name is empty for a relative path."""
+        data = self.pipeline.datamanager.data
+        if self.experiment_name is None and data is not None and data.is_file():
+            self.experiment_name = data.stem
+        super().set_experiment_name()
+
     def get_base_dir(self) -> Path:
         """Return the folder of the run: where its config.yml is, for commands that open it, wherever it was trained."""
         return self.__dict__.get("opened_folder") or _folder_of_opened_run() or super().get_base_dir()

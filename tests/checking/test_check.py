@@ -304,12 +304,15 @@ def test_the_events_of_a_bare_file_are_checked(room: Path, tmp_path: Path) -> No
     shutil.copy(room / "events.h5", file)
     camera = json.loads((room / "transforms.json").read_text())["event_camera"]
     (tmp_path / "calibration.json").write_text(json.dumps({"event_camera": camera}))
-    status, output = run(file, format_options=("negative-contrast-threshold=0.5",), picture=tmp_path / "no.png")
+    options = ("negative-contrast-threshold=0.5", "scale-factor=2", "start-time-ns=1")
+    status, output = run(file, format_options=options, picture=tmp_path / "no.png")
     assert status == 0, output
     assert "Events: " in output
     assert "no.png: not written" in output
-    command = f"aenerf convert '{file}' --output FOLDER --poses events --format-options negative-contrast-threshold=0.5"
-    assert f"It has no poses. Find them with: {command}" in output
+    command = (
+        f"aenerf convert '{file}' --output FOLDER --poses events --start-time-ns 1 --format-options negative-contrast"
+    )
+    assert f"There are no poses at {tmp_path / 'trajectory.txt'}. Find them with: {command}-threshold=0.5\n" in output
     # What lies beside the file belongs to it.
     (tmp_path / "calibration.json").write_text(
         json.dumps({"event_camera": {**camera, "cx": camera["cy"], "cy": camera["cx"]}})
@@ -336,11 +339,14 @@ def number_after(words: str, output: str) -> float:
 
 
 def test_real_recording_prefers_its_poses_and_is_compared_with_frames(
-    slider_depth: Path, monkeypatch: pytest.MonkeyPatch
+    slider_depth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compare, found = WarpedEvents.compare_alternatives, []
     monkeypatch.setattr(WarpedEvents, "compare_alternatives", lambda warped: found.extend(compare(warped)) or found)
-    status, output = run(slider_depth)
+    status, output = run(slider_depth, picture=tmp_path / "warped.png")
+    # Twice 240 x 180, twice enlarged: its tiles reach beyond the sensor.
+    with Image.open(tmp_path / "warped.png") as picture:
+        assert picture.size == (960, 360)
     # So the poses sharpen the events, and no alternative fits better.
     assert status == 0, output
     # The camera moves along its x axis and does not turn, so that mistakes that keep this axis do not show.

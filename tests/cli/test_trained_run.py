@@ -17,8 +17,9 @@ from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export import ExportCameras, ExportFrames, ExportMesh, ExportTrajectory, ExportVideo
 from aenerf_ns.cli.main import main
 from aenerf_ns.cli.report import ReportCommand
-from aenerf_ns.cli.trained_run import open_run
+from aenerf_ns.cli.trained_run import _at_its_place, open_run
 from aenerf_ns.dataparsers.formats import FORMATS
+from aenerf_ns.dataparsers.own_recording import OwnRecordingDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
@@ -191,6 +192,14 @@ def test_a_run_opens_wherever_it_and_its_data_are(tmp_path: Path, monkeypatch: p
     (other / "config.yml").write_text(text.replace(f"- {data.name}\n", "- another\n"))
     with pytest.raises(DataError, match="--data names one dataset, but the runs were trained on several"):
         ReportCommand((renamed, other), tmp_path / "report", data=moved).main()
+    # Files beside an event file that stands for a recording move with it.
+    before, now = tmp_path / "before", tmp_path / "now"
+    now.mkdir()
+    (now / "new.h5").touch()
+    recording = OwnRecordingDataParserConfig(data=before / "my.h5", events=before / "my.h5", poses=before / "odo.txt")
+    config.pipeline.datamanager.dataparser = recording
+    _at_its_place(config, renamed / "config.yml", now / "new.h5")
+    assert (recording.data, recording.events, recording.poses) == (now / "new.h5", now / "new.h5", now / "odo.txt")
 
 
 def not_finite(key: str, value: object) -> object:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from helpers.event_file_writers import HEIGHT, WIDTH, evt3
 from helpers.own_recordings import random_events, write_poses
@@ -114,6 +115,29 @@ def test_intrinsics_may_be_missing(truth: Truth) -> None:
     file.write_text(json.dumps(meta))
     with pytest.raises(DataError, match="missing required field `fl_y`"):
         parser.read_recording()
+
+
+def test_a_recording_may_be_given_by_its_event_file(truth: Truth) -> None:
+    known = opened(truth)
+    file = known.event_file.path.rename(truth.data / f"MY{known.event_file.path.suffix.upper()}")
+    assert recognize(file) == "event-recording-data"
+    config = OwnRecordingDataParserConfig(data=file)
+    found = recording_of(config)
+    assert found.event_file.path == file
+    assert (found.event_camera, found.sensor, found.frames) == (known.event_camera, known.sensor, known.frames)
+    assert torch.equal(found.trajectory.camera_to_worlds, known.trajectory.camera_to_worlds)
+    # As where a trained run is opened.
+    file.unlink()
+    assert recording_of(config).event_file.path == file
+
+
+def test_refuse_the_event_file_of_another_format(tmp_path: Path) -> None:
+    for name in ("events.txt", "calib.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(
+        DataError, match=r"events.txt: it belongs to a recording in the format ecd-data; give the folder"
+    ):
+        recognize(tmp_path / "events.txt")
 
 
 def test_an_event_file_that_states_its_size_is_enough(tmp_path: Path) -> None:
