@@ -21,6 +21,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress, TaskID
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
@@ -409,7 +411,20 @@ def _placed(model: Any, min_points: int | None = None) -> list[Any]:
     if min_points is None:
         typical = statistics.median([image.num_points3D for image in images] or [0])
         min_points = min(max(round(_SHARE * typical), _MIN_POINTS), _ENOUGH_POINTS)
+        return _linked([image for image in images if image.num_points3D >= min_points])
     return [image for image in images if image.num_points3D >= min_points]
+
+
+def _linked(images: list[Any]) -> list[Any]:
+    """Return the largest group of images in which each shares enough points with another: it holds together."""
+    if not images:
+        return images
+    points = [[point.point3D_id for point in image.points2D if point.has_point3D()] for image in images]
+    rows = np.repeat(np.arange(len(images)), [len(seen) for seen in points])
+    columns = np.unique(np.concatenate(points), return_inverse=True)[1]
+    sees = csr_array((np.ones(len(rows)), (rows, columns)))
+    groups = connected_components(sees @ sees.T >= _MIN_POINTS)[1]
+    return [images[i] for i in np.flatnonzero(groups == np.bincount(groups).argmax())]
 
 
 def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.float64]]:
@@ -418,7 +433,8 @@ def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.
     Args:
         model: COLMAP's.
         min_points: frames that see fewer points have no pose. By default, those that see far fewer than most: their
-            poses are off by degrees, and those between their neighbors are better.
+            poses are off by degrees, and those between their neighbors are better. By default, neither have frames
+            that share too few points with the rest: their group may lie anywhere.
     """
     return {
         int(Path(image.name).stem): image.cam_from_world().inverse().matrix() for image in _placed(model, min_points)

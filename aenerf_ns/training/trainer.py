@@ -50,7 +50,7 @@ class AENeRFTrainerConfig(TrainerConfig):
         file's folder, whose name is empty for a relative path."""
         data = self.pipeline.datamanager.data
         if self.experiment_name is None and data is not None and data.is_file():
-            self.experiment_name = data.stem
+            self.experiment_name: str | None = data.stem
         super().set_experiment_name()
 
     def get_base_dir(self) -> Path:

@@ -246,18 +246,34 @@ def test_errors_leave_what_was_kept(
     assert (sorted(path.name for path in kept.iterdir()) if kept.exists() else None) == left
 
 
+def model_of(*seen: range) -> SimpleNamespace:
+    """A model of frames that see ranges of points."""
+    images = {
+        index: SimpleNamespace(
+            name=f"{index:08d}.png",
+            has_pose=True,
+            num_points3D=len(points),
+            points2D=[SimpleNamespace(point3D_id=point, has_point3D=lambda: True) for point in points],
+            cam_from_world=lambda: pycolmap.Rigid3d(np.eye(4)[:3]),
+        )
+        for index, points in enumerate(seen)
+    }
+    return SimpleNamespace(images=images)
+
+
 @pytest.mark.parametrize(("typical", "placed"), [(20, 15), (100, 25), (400, 30)])
 def test_frames_that_see_few_points_have_no_pose(typical: int, placed: int) -> None:
-    def frame(index: int, num_points: int) -> SimpleNamespace:
-        pose = pycolmap.Rigid3d(np.eye(4)[:3])
-        return SimpleNamespace(
-            name=f"{index:08d}.png", has_pose=True, num_points3D=num_points, cam_from_world=lambda: pose
-        )
-
-    counts = [placed - 1, placed, *[typical] * 5]
-    model = SimpleNamespace(images={index: frame(index, count) for index, count in enumerate(counts)})
+    model = model_of(*map(range, [placed - 1, placed, *[typical] * 5]))
     assert list(poses_of(model)) == [1, 2, 3, 4, 5, 6]
     assert list(poses_of(model, 1)) == [0, 1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(("num_shared", "placed"), [(14, [0, 1, 2]), (15, [0, 1, 2, 3, 4])])
+def test_a_group_of_frames_that_hangs_by_few_points_has_no_pose(num_shared: int, placed: list[int]) -> None:
+    beside = range(100 - num_shared, 200 - num_shared)
+    model = model_of(*[range(100)] * 3, *[beside] * 2)
+    assert list(poses_of(model)) == placed
+    assert list(poses_of(model, 15)) == [0, 1, 2, 3, 4]
 
 
 def test_worlds_stand_upright() -> None:

@@ -24,6 +24,7 @@ def model(radius: float, turn: float, num_wrong: int = 0, num_points: int = 2000
             name=f"{index}.png",
             has_pose=True,
             num_points3D=100,
+            points2D=[SimpleNamespace(point3D_id=point, has_point3D=lambda: True) for point in range(100)],
             cam_from_world=pycolmap.Rigid3d(pose).inverse,
         )
         for index, pose in enumerate(poses)
