@@ -58,8 +58,6 @@ class EvenPosesDataParserConfig(ObjectDataParserConfig):
             images: folder of an image for each pose, or of none.
             first: default time of the first pose in nanoseconds. None: the time of the first event.
         """
-        # The span depends on it.
-        capture.event_file.drop_malformed = self.drop_malformed
         if self.first_pose_time_ns is None:
             self.first_pose_time_ns = capture.event_file.time_span()[0] if first is None else first
         if self.last_pose_time_ns is None:

@@ -105,6 +105,8 @@ class PublishedDataParserConfig(SensorOptions, EventDataParserConfig):
         """
         defaults = {"frame_camera": content["event_camera"], "image_encoding": "linear"}
         is_assumed = has_assumed_thresholds and not states_thresholds(self)
+        # Formats ask for the time span of the events, which depends on this, before the recording is made.
+        content["event_file"].drop_malformed = self.drop_malformed
         with value_errors_as_data_error(str(self.data), "correct it among the options"):
             sensor = replace(sensor, **sensor_values(self))
         return Capture(sensor=sensor, has_assumed_thresholds=is_assumed, **{**defaults, **content})
