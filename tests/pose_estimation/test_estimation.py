@@ -8,7 +8,6 @@ import json
 import shutil
 import sqlite3
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
-from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, poses_of, stand_upright, work_folder
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_folder
 from aenerf_ns.pose_estimation.from_events import estimate_poses_from_events
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses, compare_with_truth, estimate_poses
 from aenerf_ns.pose_estimation.picture import draw_poses
@@ -244,51 +243,6 @@ def test_errors_leave_what_was_kept(
     with pytest.raises(type(error)):
         fail()
     assert (sorted(path.name for path in kept.iterdir()) if kept.exists() else None) == left
-
-
-def model_of(*seen: range) -> SimpleNamespace:
-    """A model of frames that see ranges of points."""
-    images = {
-        index: SimpleNamespace(
-            name=f"{index:08d}.png",
-            has_pose=True,
-            num_points3D=len(points),
-            points2D=[SimpleNamespace(point3D_id=point, has_point3D=lambda: True) for point in points],
-            cam_from_world=lambda: pycolmap.Rigid3d(np.eye(4)[:3]),
-        )
-        for index, points in enumerate(seen)
-    }
-    return SimpleNamespace(images=images)
-
-
-@pytest.mark.parametrize(("typical", "placed"), [(20, 15), (100, 25), (400, 30)])
-def test_frames_that_see_few_points_have_no_pose(typical: int, placed: int) -> None:
-    model = model_of(*map(range, [placed - 1, placed, *[typical] * 5]))
-    assert list(poses_of(model)) == [1, 2, 3, 4, 5, 6]
-    assert list(poses_of(model, 1)) == [0, 1, 2, 3, 4, 5, 6]
-
-
-@pytest.mark.parametrize(("num_shared", "placed"), [(14, [0, 1, 2]), (15, [0, 1, 2, 3, 4])])
-def test_a_group_of_frames_that_hangs_by_few_points_has_no_pose(num_shared: int, placed: list[int]) -> None:
-    beside = range(100 - num_shared, 200 - num_shared)
-    model = model_of(*[range(100)] * 3, *[beside] * 2)
-    assert list(poses_of(model)) == placed
-    assert list(poses_of(model, 15)) == [0, 1, 2, 3, 4]
-
-
-def test_worlds_stand_upright() -> None:
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
-    model = pycolmap.synthesize_dataset(options)
-    for image in model.images.values():
-        image.name = f"{image.image_id}.png"
-    stand_upright(model)
-    poses = np.stack(list(poses_of(model, 0).values()))
-    np.testing.assert_allclose(poses[:, :, 3].mean(0), 0, atol=1e-5)
-    # The direction that the pictures' rows are most level to.
-    assert np.square(poses[:, 2, 0]).sum() == pytest.approx(np.linalg.svd(poses[:, :, 0])[1][-1] ** 2, rel=1e-4)
-    assert poses[:, 2, 1].mean() < 0
-    assert model.compute_mean_reprojection_error() < 1e-3
 
 
 @pytest.mark.parametrize(("degrees", "offset", "images"), [(0.0, 15_000_000, "filter"), (2.0, 0, "network")])

@@ -1,0 +1,56 @@
+"""Which frames of a COLMAP model have a pose, and how its world lies."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from aenerf_ns.pose_estimation.colmap_workspace import poses_of, stand_upright
+
+
+def model_of(*seen: range) -> SimpleNamespace:
+    """A model of frames that see ranges of points."""
+    images = {
+        index: SimpleNamespace(
+            name=f"{index:08d}.png",
+            has_pose=True,
+            num_points3D=len(points),
+            points2D=[SimpleNamespace(point3D_id=point, has_point3D=lambda: True) for point in points],
+            cam_from_world=lambda: pycolmap.Rigid3d(np.eye(4)[:3]),
+        )
+        for index, points in enumerate(seen)
+    }
+    return SimpleNamespace(images=images)
+
+
+@pytest.mark.parametrize(("typical", "placed"), [(20, 15), (100, 25), (400, 30)])
+def test_frames_that_see_few_points_have_no_pose(typical: int, placed: int) -> None:
+    model = model_of(*map(range, [placed - 1, placed, *[typical] * 5]))
+    assert list(poses_of(model)) == [1, 2, 3, 4, 5, 6]
+    assert list(poses_of(model, 1)) == [0, 1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(("num_shared", "placed"), [(14, [0, 1, 2]), (15, [0, 1, 2, 3, 4])])
+def test_a_group_of_frames_that_hangs_by_few_points_has_no_pose(num_shared: int, placed: list[int]) -> None:
+    beside = range(100 - num_shared, 200 - num_shared)
+    model = model_of(*[range(100)] * 3, *[beside] * 2)
+    assert list(poses_of(model)) == placed
+    assert list(poses_of(model, 15)) == [0, 1, 2, 3, 4]
+
+
+def test_worlds_stand_upright() -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
+    model = pycolmap.synthesize_dataset(options)
+    for image in model.images.values():
+        image.name = f"{image.image_id}.png"
+    stand_upright(model)
+    poses = np.stack(list(poses_of(model, 0).values()))
+    np.testing.assert_allclose(poses[:, :, 3].mean(0), 0, atol=1e-5)
+    # The direction that the pictures' rows are most level to.
+    assert np.square(poses[:, 2, 0]).sum() == pytest.approx(np.linalg.svd(poses[:, :, 0])[1][-1] ** 2, rel=1e-4)
+    assert poses[:, 2, 1].mean() < 0
+    assert model.compute_mean_reprojection_error() < 1e-3
