@@ -29,7 +29,7 @@ FORMATS: dict[str, EventDataParserConfig] = {
     "paev3d-data": paev3d.PAEv3DDataParserConfig(),
     "event-recording-data": own_recording.OwnRecordingDataParserConfig(),
 }
-# What the entry points in pyproject.toml name, in the order of FORMATS.
+# The entry points in pyproject.toml name these variables. They have the order of FORMATS.
 (
     aenerf_data,
     ecd_data,

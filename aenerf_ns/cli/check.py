@@ -69,18 +69,7 @@ class Check(DatasetCommand):
         if isinstance(capture, Recording):
             self._say_training_command(parser, result)
         else:
-            words = ["aenerf", "convert", str(self.data), "--output", "FOLDER", "--poses", "events"]
-            if self.format != "auto":
-                words += ["--format", self.format]
-            for name in ("start_time_ns", "end_time_ns"):
-                if (time := getattr(parser.config, name)) is not None:
-                    words += [f"--{name.replace('_', '-')}", str(time)]
-            placing = [name.replace("_", "-") for name in self.placing_options]
-            options = [one for one in self.format_options if one.split("=")[0].replace("_", "-") not in placing]
-            options += map("=".join, result.sensor_options.items())
-            if options:
-                words += ["--format-options", *options]
-            say(f"There are no poses at {parser.poses_path()}. Find them with: {shlex.join(words)}")
+            self._say_command_that_finds_poses(parser, result)
         if self.picture is not None and result.warped is not None:
             with creating(self.picture, "--picture") as file:
                 Image.fromarray(result.warped.picture()).save(file)
@@ -100,3 +89,19 @@ class Check(DatasetCommand):
         command = training_command(self.data, options=result.planes, format_words=format_words)
         remark = " (near and far plane for a camera that stays that close)" if result.planes else ""
         say(f"Train with{remark}: {command}")
+
+    def _say_command_that_finds_poses(self, parser: EventDataParser, result: CheckResult) -> None:
+        words = ["aenerf", "convert", str(self.data), "--output", "FOLDER", "--poses", "events"]
+        if self.format != "auto":
+            words += ["--format", self.format]
+        for name in ("start_time_ns", "end_time_ns"):
+            if (time := getattr(parser.config, name)) is not None:
+                words += [f"--{name.replace('_', '-')}", str(time)]
+        # The command keeps the world of the recording, and refuses options that place it in a scene.
+        options = [
+            one for one in self.format_options if one.split("=")[0].replace("-", "_") not in self.placing_options
+        ]
+        options += map("=".join, result.sensor_options.items())
+        if options:
+            words += ["--format-options", *options]
+        say(f"There are no poses at {parser.poses_path()}. Find them with: {shlex.join(words)}")

@@ -98,7 +98,7 @@ def _at_its_place(config: TrainerConfig, path: Path, data: Path | None) -> Train
         require_dataset(data)
         # It would take the place of the dataparser's.
         config.pipeline.datamanager.data = None
-        # What lies beside a recording that is given by its event file belongs to it.
+        # Where the event file stands for the recording, the files beside the event file are parts of the recording.
         old, new = (path.parent if data.is_file() else path for path in (before, data.absolute()))
         for option, value in list(vars(dataparser).items()):
             if value == before:

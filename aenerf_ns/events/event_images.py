@@ -37,8 +37,7 @@ def sharpest(
     Args:
         warps: lines and inverse depth of each, for :func:`accumulate`.
         polarity: (N,) polarities of the events.
-        height: of the images in pixels, a whole number of tiles.
-        width: likewise.
+        height, width: of the images in pixels, whole numbers of tiles.
 
     Returns:
         (R, C) indices of the warps, the first of equally good ones; the tiles' squared contrasts under these, less that

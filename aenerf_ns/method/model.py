@@ -158,7 +158,7 @@ class AENeRFModel(Model):
             # By default evenly up to a distance of 1, and then evenly in disparity.
             initial_sampler=UniformSampler(single_jitter=True) if distortion is None else None,
         )
-        # What rays that pass a bounded scene see. softplus(0.54) = 1: of the size of the radiance before training.
+        # The radiance that rays see behind a bounded scene. softplus(0.54) = 1 is near the radiance before training.
         self.raw_background = Parameter(torch.full((self.sensor.num_channels,), 0.54)) if scene.bounded else None
         self.supervision: Supervision = config.supervision.setup(
             sensor=self.sensor, loss_coefficients=config.loss_coefficients

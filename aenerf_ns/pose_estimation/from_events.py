@@ -77,9 +77,10 @@ def estimate_poses_from_events(
         for mapper in sorted(models, key=fit, reverse=True):
             model = models[mapper]
             model = adjust(model, _ROUNDS)
-            # Where images are lost, the model often has a bend. Now that it is better, more of them find their place.
-            if is_placed(model) and len(poses_of(model)) < len(times):
-                start = workspace.triangulate(poses_of(model), *_LAST_ROUNDS[0][:2])
+            # Where images are lost, the model often has a bend. Now that the model is better, more of them find their
+            # place (benchmarks/LOG.md).
+            if is_placed(model) and len(poses := poses_of(model)) < len(times):
+                start = workspace.triangulate(poses, *_LAST_ROUNDS[0][:2])
                 more = adjust((workspace.reconstruct(start=start) or [model])[0], _LAST_ROUNDS)
                 model = more if is_placed(more) else model
             if is_placed(model):

@@ -313,7 +313,7 @@ def test_the_events_of_a_bare_file_are_checked(room: Path, tmp_path: Path) -> No
         f"aenerf convert '{file}' --output FOLDER --poses events --start-time-ns 1 --format-options negative-contrast"
     )
     assert f"There are no poses at {tmp_path / 'trajectory.txt'}. Find them with: {command}-threshold=0.5\n" in output
-    # What lies beside the file belongs to it.
+    # The files beside the event file are parts of the recording.
     (tmp_path / "calibration.json").write_text(
         json.dumps({"event_camera": {**camera, "cx": camera["cy"], "cy": camera["cx"]}})
     )
