@@ -37,8 +37,12 @@ _NUM_KEY_FRAMES = 100
 # Points that a frame is placed by, at least, and that it keeps its pose by: a share of the median of all frames, within
 # limits.
 _MIN_POINTS, _ENOUGH_POINTS, _SHARE = 15, 30, 0.25
+# Other frames with which a frame shares _MIN_POINTS, at least: the same share of the median, but no more than this.
+_ENOUGH_PARTNERS = 5
 # Files that are kept if a command is interrupted.
 _DATABASE, _INPUTS = "database.db", "inputs.txt"
+# Relative change of the cost at which an adjustment ends.
+_TOLERANCE = 1e-4
 # Pixels that a match may be off.
 _MAX_EPIPOLAR_ERROR = 1.0
 
@@ -195,7 +199,7 @@ class ColmapWorkspace:
         # Later steps change the database. An interrupted command goes on from the one without their changes.
         self._database = Path(shutil.copy(self._database, self._folder / "models.db"))
 
-    def estimate_intrinsics(self, rounds: Iterable[tuple[float, float, int, float]]) -> CameraIntrinsics | None:
+    def estimate_intrinsics(self, rounds: Iterable[tuple[float, float, float]]) -> CameraIntrinsics | None:
         """Estimate one focal length and the radial distortion k1 from all matches, and use them from here on.
 
         Args:
@@ -337,7 +341,6 @@ class ColmapWorkspace:
         model: Any,
         max_pixels: float,
         max_degrees: float,
-        max_iterations: int,
         loss_scale: float,
         refine_intrinsics: bool = False,
     ) -> Any:
@@ -346,7 +349,6 @@ class ColmapWorkspace:
         Args:
             model: its poses.
             max_pixels, max_degrees: see :meth:`triangulate`.
-            max_iterations: of the bundle adjustment.
             loss_scale: pixels beyond which an observation counts less, as tracks of images of events are often wrong.
             refine_intrinsics: whether to adjust focal length and distortion too.
         """
@@ -356,7 +358,6 @@ class ColmapWorkspace:
         adjustment.refine_focal_length = adjustment.refine_extra_params = refine_intrinsics
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         adjustment.ceres.loss_function_scale = loss_scale
-        adjustment.ceres.solver_options.max_num_iterations = max_iterations
         config = pycolmap.BundleAdjustmentConfig()
         for image in posed.images:
             config.add_image(image)
@@ -400,10 +401,12 @@ def _largest_first(models: dict[int, Any]) -> list[Any]:
 
 
 def _keep_intrinsics(adjustment: Any) -> None:
-    """Let a bundle adjustment leave the intrinsics as they are, and run on one thread of the CPU."""
+    """Let a bundle adjustment leave the intrinsics as they are, run on one thread of the CPU, and end when it is done."""
     adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
     adjustment.ceres.use_gpu = adjustment.print_summary = False
     adjustment.ceres.solver_options.num_threads = 1
+    # With COLMAP's own tolerance of 0, each adjustment takes all its iterations.
+    adjustment.ceres.solver_options.function_tolerance = _TOLERANCE
 
 
 def _placed(model: Any, min_points: int | None = None) -> list[Any]:
@@ -416,15 +419,19 @@ def _placed(model: Any, min_points: int | None = None) -> list[Any]:
 
 
 def _linked(images: list[Any]) -> list[Any]:
-    """Return the largest group of images in which each shares enough points with another: it holds together."""
+    """Return the largest group of images that holds together: each shares enough points with another, and not with far
+    fewer than most do."""
     if not images:
         return images
     points = [[point.point3D_id for point in image.points2D if point.has_point3D()] for image in images]
     rows = np.repeat(np.arange(len(images)), [len(seen) for seen in points])
     columns = np.unique(np.concatenate(points), return_inverse=True)[1]
     sees = csr_array((np.ones(len(rows)), (rows, columns)))
-    groups = connected_components(sees @ sees.T >= _MIN_POINTS)[1]
-    return [images[i] for i in np.flatnonzero(groups == np.bincount(groups).argmax())]
+    links = sees @ sees.T >= _MIN_POINTS
+    partners = np.asarray(links.sum(1)).ravel() - 1
+    held = np.flatnonzero(partners >= min(_SHARE * np.median(partners), _ENOUGH_PARTNERS))
+    groups = connected_components(links[held][:, held])[1]
+    return [images[i] for i in held[groups == np.bincount(groups).argmax()]]
 
 
 def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.float64]]:
@@ -434,7 +441,7 @@ def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.
         model: COLMAP's.
         min_points: frames that see fewer points have no pose. By default, those that see far fewer than most: their
             poses are off by degrees, and those between their neighbors are better. By default, neither have frames
-            that share too few points with the rest: their group may lie anywhere.
+            that share enough points with too few others: they, or their group, may lie anywhere.
     """
     return {
         int(Path(image.name).stem): image.cam_from_world().inverse().matrix() for image in _placed(model, min_points)

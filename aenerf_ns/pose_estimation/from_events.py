@@ -22,13 +22,15 @@ _HELD_OUT = 0.05
 # Share of these matches by which the incremental mapper must be better: where both agree alike, the global one's poses
 # come out better (benchmarks/LOG.md).
 _GLOBAL_LEAD = 0.03
+# A fit, with this lead, from which on the incremental mapper, which takes longest, is not asked: it fits 93 % at most.
+_GOOD_FIT = 0.93
 # Images without a pose in a row across which poses are interpolated. Images follow each other as the picture moves, so
 # poses across many of them are wrong, and so is what their events are trained on.
 _MAX_LOST = 2
-# Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, iterations, and pixels beyond
-# which an observation counts less. At first, most are off by more.
-_LAST_ROUNDS = ((4.0, 2.0, 60, 0.5), (4.0, 2.0, 60, 0.5))
-_ROUNDS = ((12.0, 8.0, 30, 1.0), (8.0, 5.0, 30, 1.0), (5.0, 3.0, 30, 1.0), *_LAST_ROUNDS)
+# Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, and pixels beyond which an
+# observation counts less. At first, most are off by more.
+_LAST_ROUNDS = ((4.0, 2.0, 0.5), (4.0, 2.0, 0.5))
+_ROUNDS = ((12.0, 8.0, 1.0), (8.0, 5.0, 1.0), (5.0, 3.0, 1.0), *_LAST_ROUNDS)
 
 
 def estimate_poses_from_events(
@@ -41,9 +43,10 @@ def estimate_poses_from_events(
 ) -> EstimatedPoses:
     """Estimate the poses of an event camera from its events, on the CPU.
 
-    COLMAP matches images that are made of the events (:func:`match_event_images`). Its incremental and its global
-    mapper place the images. The model that more of the matches kept apart fit is adjusted in some rounds, the images
-    that it lacks are placed again, and its poses are taken; where both fit alike, the global mapper's. Intrinsics stay
+    COLMAP matches images that are made of the events (:func:`match_event_images`). Its global mapper places the images,
+    and its incremental mapper where few of the matches kept apart fit the global one's model. The model that more of
+    them fit is adjusted in some rounds, the images that it lacks are placed again, and its poses are taken; where both
+    fit alike, the global mapper's. Intrinsics stay
     as they are; where they are only guessed, one focal length and the radial distortion k1 are estimated first. A seed
     gives the same poses again, to the last bit on one machine with one version of COLMAP.
 
@@ -59,16 +62,24 @@ def estimate_poses_from_events(
         camera = capture.event_camera if is_calibrated else workspace.estimate_intrinsics(_ROUNDS)
         features, pairs = workspace.count_features_and_pairs()
         held_out = workspace.hold_out_matches(_HELD_OUT)
-        # Not side by side: the global mapper then gives other poses each time.
-        found = {"incremental": workspace.reconstruct(), "global": workspace.reconstruct_globally()} if camera else {}
-        models = {mapper: models[0] for mapper, models in found.items() if models}
 
         def fit(mapper: str) -> tuple[bool, float]:
             # The global mapper may throw images far out where it sees nothing.
             is_near = models[mapper].compute_mean_reprojection_error() < _ROUNDS[-1][0]
             return is_near, (held_out.agreement(models[mapper]) or 0.0) + _GLOBAL_LEAD * (mapper == "global")
 
-        def adjust(model: Any, rounds: Iterable[tuple[float, float, int, float]]) -> Any:
+        found: dict[str, list[Any]] = {}
+        models: dict[str, Any] = {}
+        # Not side by side: the global mapper then gives other poses each time.
+        mappers = {"global": workspace.reconstruct_globally, "incremental": workspace.reconstruct}
+        for mapper, place in mappers.items() if camera else ():
+            found[mapper] = place()
+            if found[mapper]:
+                models[mapper] = found[mapper][0]
+                if fit(mapper) >= (True, _GOOD_FIT):
+                    break
+
+        def adjust(model: Any, rounds: Iterable[tuple[float, float, float]]) -> Any:
             for limits in rounds:
                 model = workspace.adjust(model, *limits) if is_placed(model) else model
             return model

@@ -2,7 +2,7 @@
 
     python -m benchmarks.scenes.build --output scenes
     python -m benchmarks.poses --scenes-folder scenes --work work --output benchmarks/results/poses_cpu2.json
-    python -m benchmarks.poses --split choose --variants density="--pipeline.model.average-init-density 3" ...
+    python -m benchmarks.poses --split choose --variants density " --pipeline.model.average-init-density 3" ...
 
 Each recording is trained with its wrong poses, with these refined by its events, with poses found from its events alone
 and, as a control, with its true poses. Every variant of the settings is trained on the same recordings with the same

@@ -41,6 +41,14 @@ def test_a_group_of_frames_that_hangs_by_few_points_has_no_pose(num_shared: int,
     assert list(poses_of(model, 15)) == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.parametrize(("num_frames", "num_partners", "is_placed"), [(30, 4, False), (30, 5, True), (7, 2, True)])
+def test_a_frame_that_shares_points_with_few_others_has_no_pose(
+    num_frames: int, num_partners: int, is_placed: bool
+) -> None:
+    frames = [range(115)] * num_partners + [range(100)] * (num_frames - num_partners)
+    assert len(poses_of(model_of(*frames, range(100, 200)))) == num_frames + is_placed
+
+
 def test_worlds_stand_upright() -> None:
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 12
