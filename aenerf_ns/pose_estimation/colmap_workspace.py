@@ -23,6 +23,7 @@ from PIL import Image
 from rich.progress import Progress, TaskID
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
@@ -39,6 +40,8 @@ _NUM_KEY_FRAMES = 100
 _MIN_POINTS, _ENOUGH_POINTS, _SHARE = 15, 30, 0.25
 # Other frames with which a frame shares _MIN_POINTS, at least: the same share of the median, but no more than this.
 _ENOUGH_PARTNERS = 5
+# Degrees that a camera turns from one frame to the next, at most.
+_MAX_TURN = 30.0
 # Files that are kept if a command is interrupted.
 _DATABASE, _INPUTS = "database.db", "inputs.txt"
 # Relative change of the cost at which an adjustment ends.
@@ -401,7 +404,7 @@ def _largest_first(models: dict[int, Any]) -> list[Any]:
 
 
 def _keep_intrinsics(adjustment: Any) -> None:
-    """Let a bundle adjustment leave the intrinsics as they are, run on one thread of the CPU, and end when it is done."""
+    """Let a bundle adjustment leave the intrinsics as they are, and run on one thread of the CPU until it is done."""
     adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
     adjustment.ceres.use_gpu = adjustment.print_summary = False
     adjustment.ceres.solver_options.num_threads = 1
@@ -451,6 +454,18 @@ def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.
 def is_placed(model: Any) -> bool:
     """Return whether a model places three frames or more: fewer have no world."""
     return len(_placed(model)) > 2
+
+
+def is_sound(model: Any, max_pixels: float) -> bool:
+    """Return whether a model's mean error of reprojection is small, and its path turns little from frame to frame.
+
+    A mapper may throw frames far out where it sees nothing, and join parts that look alike the wrong way round. Where
+    one ends and the next begins, the camera would turn at once.
+    """
+    poses = poses_of(model)
+    turns = [poses[i][:, :3].T @ poses[i + 1][:, :3] for i in poses if i + 1 in poses]
+    is_near = model.compute_mean_reprojection_error() < max_pixels
+    return bool(is_near and turns and Rotation.from_matrix(turns).magnitude().max() < np.deg2rad(_MAX_TURN))
 
 
 def stand_upright(model: Any) -> None:

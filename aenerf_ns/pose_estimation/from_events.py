@@ -10,7 +10,7 @@ from typing import Any
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import is_placed, poses_of, stand_upright, trajectory_of
+from aenerf_ns.pose_estimation.colmap_workspace import is_placed, is_sound, poses_of, stand_upright, trajectory_of
 from aenerf_ns.pose_estimation.event_images import match_event_images
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
@@ -64,9 +64,8 @@ def estimate_poses_from_events(
         held_out = workspace.hold_out_matches(_HELD_OUT)
 
         def fit(mapper: str) -> tuple[bool, float]:
-            # The global mapper may throw images far out where it sees nothing.
-            is_near = models[mapper].compute_mean_reprojection_error() < _ROUNDS[-1][0]
-            return is_near, (held_out.agreement(models[mapper]) or 0.0) + _GLOBAL_LEAD * (mapper == "global")
+            share = held_out.agreement(models[mapper]) or 0.0
+            return is_sound(models[mapper], _ROUNDS[-1][0]), share + _GLOBAL_LEAD * (mapper == "global")
 
         found: dict[str, list[Any]] = {}
         models: dict[str, Any] = {}

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from aenerf_ns.pose_estimation.colmap_workspace import poses_of, stand_upright
+from aenerf_ns.pose_estimation.colmap_workspace import is_sound, poses_of, stand_upright
 
 
 def model_of(*seen: range) -> SimpleNamespace:
@@ -47,6 +47,19 @@ def test_a_frame_that_shares_points_with_few_others_has_no_pose(
 ) -> None:
     frames = [range(115)] * num_partners + [range(100)] * (num_frames - num_partners)
     assert len(poses_of(model_of(*frames, range(100, 200)))) == num_frames + is_placed
+
+
+@pytest.mark.parametrize(
+    ("turn", "pixels", "sound"), [(2.0, 0.7, True), (29.0, 0.7, True), (31.0, 0.7, False), (2.0, 5.0, False)]
+)
+def test_a_model_is_sound(turn: float, pixels: float, sound: bool) -> None:
+    model = model_of(*[range(100)] * 6)
+    model.compute_mean_reprojection_error = lambda: pixels
+    # The second half looks another way.
+    turned = pycolmap.Rigid3d(pycolmap.Rotation3d([0, np.deg2rad(turn), 0]), [0, 0, 0])
+    for image in list(model.images.values())[3:]:
+        image.cam_from_world = lambda: turned
+    assert is_sound(model, 4.0) is sound
 
 
 def test_worlds_stand_upright() -> None:
