@@ -469,10 +469,22 @@ def is_sound(model: Any, max_pixels: float) -> bool:
 
 
 def stand_upright(model: Any) -> None:
-    """Turn and move the world of a model: z is up if its frames were held level, and the origin is amid them."""
+    """Turn and move the world of a model: z is up if its frames were held level, and the origin is amid them.
+
+    The axes run along the scene: from above, the rectangle along x and y that holds nearly all points is the smallest.
+    Hash grids have these axes, and a scene along them needs fewer of their cells (benchmarks/LOG.md).
+    """
     poses = torch.from_numpy(np.stack(list(poses_of(model).values())))
     transform = auto_orient_and_center_poses((homogeneous(poses) @ OPENCV_TO_OPENGL).float(), "vertical", "poses")[1]
     model.transform(pycolmap.Sim3d(transform.double().numpy()))
+    points = np.stack([point.xyz for point in model.points3D.values()])
+
+    def area(turn: Rotation) -> float:
+        low, high = np.quantile(turn.apply(points)[:, :2], [0.01, 0.99], axis=0)
+        return float(np.prod(high - low))
+
+    turn = min((Rotation.from_euler("z", angle, degrees=True) for angle in range(90)), key=area)
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn.as_matrix()), np.zeros(3)))
 
 
 def intrinsics_of(model: Any) -> CameraIntrinsics:

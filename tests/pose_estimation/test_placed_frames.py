@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from aenerf_ns.pose_estimation.colmap_workspace import is_sound, poses_of, stand_upright
 
@@ -74,4 +75,9 @@ def test_worlds_stand_upright() -> None:
     # The direction that the pictures' rows are most level to.
     assert np.square(poses[:, 2, 0]).sum() == pytest.approx(np.linalg.svd(poses[:, :, 0])[1][-1] ** 2, rel=1e-4)
     assert poses[:, 2, 1].mean() < 0
+    # From above, no other heading holds the points in a smaller rectangle.
+    points = np.stack([point.xyz for point in model.points3D.values()])
+    turned = [Rotation.from_euler("z", angle, degrees=True).apply(points)[:, :2] for angle in range(90)]
+    areas = [np.ptp(np.quantile(seen, [0.01, 0.99], axis=0), axis=0).prod() for seen in turned]
+    assert areas[0] == pytest.approx(min(areas))
     assert model.compute_mean_reprojection_error() < 1e-3
