@@ -15,19 +15,14 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-import torch
-from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress, TaskID
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
 from aenerf_ns.errors import DataError
+from aenerf_ns.pose_estimation.colmap_model import MIN_POINTS, intrinsics_of, is_placed, placed_images, poses_of
 from aenerf_ns.recording.images import read_image, require_8_bits
 
 # Each frame is matched with this number of frames after it, and with the frames 16, 32, ... 1024 after it.
@@ -35,13 +30,6 @@ _NUM_NEIGHBORS = 10
 # This number of frames, evenly spread, are matched with each other. Without them errors add up along the path, and a
 # loop stays open.
 _NUM_KEY_FRAMES = 100
-# Points that a frame is placed by, at least, and that it keeps its pose by: a share of the median of all frames, within
-# limits.
-_MIN_POINTS, _ENOUGH_POINTS, _SHARE = 15, 30, 0.25
-# Other frames with which a frame shares _MIN_POINTS, at least: the same share of the median, but no more than this.
-_ENOUGH_PARTNERS = 5
-# Degrees that a camera turns from one frame to the next, at most.
-_MAX_TURN = 30.0
 # Files that are kept if a command is interrupted.
 _DATABASE, _INPUTS = "database.db", "inputs.txt"
 # Relative change of the cost at which an adjustment ends.
@@ -70,7 +58,7 @@ class HeldOutMatches:
 
         A match fits if its epipolar error (Sampson's distance) is less than a pixel.
         """
-        poses = {image.image_id: image.cam_from_world() for image in _placed(model)}
+        poses = {image.image_id: image.cam_from_world() for image in placed_images(model)}
         fitting = total = 0
         for (first, second), rays in self.pairs:
             total += len(rays[0])
@@ -272,7 +260,7 @@ class ColmapWorkspace:
         options.num_threads = options.mapper.num_threads = 1
         options.ba_refine_focal_length = options.ba_refine_extra_params = refine_intrinsics
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_intrinsics
-        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = _MIN_POINTS, 50
+        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = MIN_POINTS, 50
         options.extract_colors = False
         output, begun = self._new_folder(), None
         if start is not None:
@@ -355,7 +343,7 @@ class ColmapWorkspace:
             loss_scale: pixels beyond which an observation counts less, as tracks of images of events are often wrong.
             refine_intrinsics: whether to adjust focal length and distortion too.
         """
-        posed = self.triangulate(poses_of(model, _MIN_POINTS), max_pixels, max_degrees)
+        posed = self.triangulate(poses_of(model, MIN_POINTS), max_pixels, max_degrees)
         adjustment = pycolmap.BundleAdjustmentOptions()
         _keep_intrinsics(adjustment)
         adjustment.refine_focal_length = adjustment.refine_extra_params = refine_intrinsics
@@ -410,99 +398,3 @@ def _keep_intrinsics(adjustment: Any) -> None:
     adjustment.ceres.solver_options.num_threads = 1
     # With COLMAP's own tolerance of 0, each adjustment takes all its iterations.
     adjustment.ceres.solver_options.function_tolerance = _TOLERANCE
-
-
-def _placed(model: Any, min_points: int | None = None) -> list[Any]:
-    images = [image for image in model.images.values() if image.has_pose]
-    if min_points is None:
-        typical = statistics.median([image.num_points3D for image in images] or [0])
-        min_points = min(max(round(_SHARE * typical), _MIN_POINTS), _ENOUGH_POINTS)
-        return _linked([image for image in images if image.num_points3D >= min_points])
-    return [image for image in images if image.num_points3D >= min_points]
-
-
-def _linked(images: list[Any]) -> list[Any]:
-    """Return the largest group of images that holds together: each shares enough points with another, and not with far
-    fewer than most do."""
-    if not images:
-        return images
-    points = [[point.point3D_id for point in image.points2D if point.has_point3D()] for image in images]
-    rows = np.repeat(np.arange(len(images)), [len(seen) for seen in points])
-    columns = np.unique(np.concatenate(points), return_inverse=True)[1]
-    sees = csr_array((np.ones(len(rows)), (rows, columns)))
-    links = sees @ sees.T >= _MIN_POINTS
-    partners = np.asarray(links.sum(1)).ravel() - 1
-    held = np.flatnonzero(partners >= min(_SHARE * np.median(partners), _ENOUGH_PARTNERS))
-    groups = connected_components(links[held][:, held])[1]
-    return [images[i] for i in held[groups == np.bincount(groups).argmax()]]
-
-
-def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.float64]]:
-    """Return the (3, 4) camera-to-world poses, with OpenCV camera axes, by the index of the frame.
-
-    Args:
-        model: COLMAP's.
-        min_points: frames that see fewer points have no pose. By default, those that see far fewer than most: their
-            poses are off by degrees, and those between their neighbors are better. By default, neither have frames
-            that share enough points with too few others: they, or their group, may lie anywhere.
-    """
-    return {
-        int(Path(image.name).stem): image.cam_from_world().inverse().matrix() for image in _placed(model, min_points)
-    }
-
-
-def is_placed(model: Any) -> bool:
-    """Return whether a model places three frames or more: fewer have no world."""
-    return len(_placed(model)) > 2
-
-
-def is_sound(model: Any, max_pixels: float) -> bool:
-    """Return whether a model's mean error of reprojection is small, and its path turns little from frame to frame.
-
-    A mapper may throw frames far out where it sees nothing, and join parts that look alike the wrong way round. Where
-    one ends and the next begins, the camera would turn at once.
-    """
-    poses = poses_of(model)
-    turns = [poses[i][:, :3].T @ poses[i + 1][:, :3] for i in poses if i + 1 in poses]
-    is_near = model.compute_mean_reprojection_error() < max_pixels
-    return bool(is_near and turns and Rotation.from_matrix(turns).magnitude().max() < np.deg2rad(_MAX_TURN))
-
-
-def stand_upright(model: Any) -> None:
-    """Turn and move the world of a model: z is up if its frames were held level, and the origin is amid them.
-
-    The axes run along the scene: from above, the rectangle along x and y that holds nearly all points is the smallest.
-    Hash grids have these axes, and a scene along them needs fewer of their cells (benchmarks/LOG.md).
-    """
-    poses = torch.from_numpy(np.stack(list(poses_of(model).values())))
-    transform = auto_orient_and_center_poses((homogeneous(poses) @ OPENCV_TO_OPENGL).float(), "vertical", "poses")[1]
-    model.transform(pycolmap.Sim3d(transform.double().numpy()))
-    points = np.stack([point.xyz for point in model.points3D.values()])
-
-    def area(turn: Rotation) -> float:
-        low, high = np.quantile(turn.apply(points)[:, :2], [0.01, 0.99], axis=0)
-        return float(np.prod(high - low))
-
-    turn = min((Rotation.from_euler("z", angle, degrees=True) for angle in range(90)), key=area)
-    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn.as_matrix()), np.zeros(3)))
-
-
-def intrinsics_of(model: Any) -> CameraIntrinsics:
-    """Return the intrinsics that a model has: those of COLMAP's SIMPLE_RADIAL, which it estimates."""
-    (camera,) = model.cameras.values()
-    focal_length, cx, cy, k1 = (float(value) for value in camera.params)
-    distortion = (k1, 0.0, 0.0, 0.0, 0.0)
-    return CameraIntrinsics(camera.width, camera.height, focal_length, focal_length, cx, cy, distortion=distortion)
-
-
-def trajectory_of(model: Any, times: NDArray[np.int64], source: str | Path) -> Trajectory:
-    """Return the camera-to-world poses of the frames that :func:`poses_of` a model has, with OpenCV camera axes.
-
-    Args:
-        model: COLMAP's.
-        times: (N,) of all frames in nanoseconds.
-        source: the file or folder of the frames, for messages.
-    """
-    poses = poses_of(model)
-    indices = sorted(poses)
-    return Trajectory(times[indices], torch.from_numpy(np.stack([poses[i] for i in indices])), source)

@@ -10,7 +10,7 @@ from typing import Any
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import is_placed, is_sound, poses_of, stand_upright, trajectory_of
+from aenerf_ns.pose_estimation.colmap_model import is_placed, is_sound, poses_of, stand_upright, trajectory_of
 from aenerf_ns.pose_estimation.event_images import match_event_images
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
@@ -46,9 +46,9 @@ def estimate_poses_from_events(
     COLMAP matches images that are made of the events (:func:`match_event_images`). Its global mapper places the images,
     and its incremental mapper where few of the matches kept apart fit the global one's model. The model that more of
     them fit is adjusted in some rounds, the images that it lacks are placed again, and its poses are taken; where both
-    fit alike, the global mapper's. Intrinsics stay
-    as they are; where they are only guessed, one focal length and the radial distortion k1 are estimated first. A seed
-    gives the same poses again, to the last bit on one machine with one version of COLMAP.
+    fit alike, the global mapper's. Intrinsics stay as they are; where they are only guessed, one focal length and the
+    radial distortion k1 are estimated first. A seed gives the same poses again, to the last bit on one machine with one
+    version of COLMAP.
 
     Args:
         capture, window, source, seed, weights, folder: see :func:`match_event_images`.
@@ -63,19 +63,17 @@ def estimate_poses_from_events(
         features, pairs = workspace.count_features_and_pairs()
         held_out = workspace.hold_out_matches(_HELD_OUT)
 
-        def fit(mapper: str) -> tuple[bool, float]:
-            share = held_out.agreement(models[mapper]) or 0.0
-            return is_sound(models[mapper], _ROUNDS[-1][0]), share + _GLOBAL_LEAD * (mapper == "global")
-
         found: dict[str, list[Any]] = {}
-        models: dict[str, Any] = {}
+        fits: dict[str, tuple[bool, float]] = {}
         # Not side by side: the global mapper then gives other poses each time.
         mappers = {"global": workspace.reconstruct_globally, "incremental": workspace.reconstruct}
         for mapper, place in mappers.items() if camera else ():
             found[mapper] = place()
             if found[mapper]:
-                models[mapper] = found[mapper][0]
-                if fit(mapper) >= (True, _GOOD_FIT):
+                share = held_out.agreement(found[mapper][0]) or 0.0
+                lead = _GLOBAL_LEAD if mapper == "global" else 0.0
+                fits[mapper] = is_sound(found[mapper][0], _ROUNDS[-1][0]), share + lead
+                if fits[mapper] >= (True, _GOOD_FIT):
                     break
 
         def adjust(model: Any, rounds: Iterable[tuple[float, float, float]]) -> Any:
@@ -84,9 +82,8 @@ def estimate_poses_from_events(
             return model
 
         model = None
-        for mapper in sorted(models, key=fit, reverse=True):
-            model = models[mapper]
-            model = adjust(model, _ROUNDS)
+        for mapper in sorted(fits, key=fits.__getitem__, reverse=True):
+            model = adjust(found[mapper][0], _ROUNDS)
             # Where images are lost, the model often has a bend. Now that the model is better, more of them find their
             # place (benchmarks/LOG.md).
             if is_placed(model) and len(poses := poses_of(model)) < len(times):

@@ -19,13 +19,8 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.time_window import runs_of
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
-from aenerf_ns.pose_estimation.colmap_workspace import (
-    ColmapWorkspace,
-    intrinsics_of,
-    stand_upright,
-    trajectory_of,
-    work_folder,
-)
+from aenerf_ns.pose_estimation.colmap_model import intrinsics_of, stand_upright, trajectory_of
+from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_folder
 from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.progress import progress_bar
 

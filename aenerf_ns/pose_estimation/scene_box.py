@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.pose_estimation.colmap_workspace import poses_of
+from aenerf_ns.pose_estimation.colmap_model import poses_of
 
 # Shorter tracks are often wrong, and a few tell of no box.
 _MIN_LENGTH, _MIN_TRACKS = 4, 50

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aenerf_ns.pose_estimation.colmap_workspace import is_sound, poses_of, stand_upright
+from aenerf_ns.pose_estimation.colmap_model import is_sound, poses_of, stand_upright
 
 
 def model_of(*seen: range) -> SimpleNamespace:
