@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +19,16 @@ from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneou
 
 MIN_POINTS = 15
 """Points that a frame is placed by, at least."""
-# Points that a frame keeps its pose by: a share of the median of all frames, from MIN_POINTS to this limit.
-_ENOUGH_POINTS, _SHARE = 30, 0.25
-# Other frames with which a frame shares MIN_POINTS, at least: the same share of the median, but no more than this.
-_ENOUGH_PARTNERS = 5
+# Other frames with which a frame shares MIN_POINTS, at least: a share of the median, but no more than this.
+_SHARE, _ENOUGH_PARTNERS = 0.25, 5
 # Degrees that a camera turns from one frame to the next, at most.
 _MAX_TURN = 30.0
 
 
-def placed_images(model: Any, min_points: int | None = None) -> list[Any]:
+def placed_images(model: Any, only_linked: bool = True) -> list[Any]:
     """Return the images that have a pose. See :func:`poses_of`."""
-    images = [image for image in model.images.values() if image.has_pose]
-    if min_points is None:
-        typical = statistics.median([image.num_points3D for image in images] or [0])
-        min_points = min(max(round(_SHARE * typical), MIN_POINTS), _ENOUGH_POINTS)
-        return _linked([image for image in images if image.num_points3D >= min_points])
-    return [image for image in images if image.num_points3D >= min_points]
+    images = [image for image in model.images.values() if image.has_pose and image.num_points3D >= MIN_POINTS]
+    return _linked(images) if only_linked else images
 
 
 def _linked(images: list[Any]) -> list[Any]:
@@ -54,18 +47,16 @@ def _linked(images: list[Any]) -> list[Any]:
     return [images[i] for i in held[groups == np.bincount(groups).argmax()]]
 
 
-def poses_of(model: Any, min_points: int | None = None) -> dict[int, NDArray[np.float64]]:
+def poses_of(model: Any, only_linked: bool = True) -> dict[int, NDArray[np.float64]]:
     """Return the (3, 4) camera-to-world poses, with OpenCV camera axes, by the index of the frame.
 
     Args:
-        model: COLMAP's.
-        min_points: frames that see fewer points have no pose. By default, those that see far fewer than most: their
-            poses are off by degrees, and those between their neighbors are better. By default, neither have frames
-            that share enough points with too few others: they, or their group, may lie anywhere.
+        model: COLMAP's. Frames that see fewer than MIN_POINTS points have no pose.
+        only_linked: neither have frames that share as many with too few others: they, or their group, may lie anywhere.
     """
     return {
         int(Path(image.name).stem): image.cam_from_world().inverse().matrix()
-        for image in placed_images(model, min_points)
+        for image in placed_images(model, only_linked)
     }
 
 

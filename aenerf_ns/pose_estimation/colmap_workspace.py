@@ -343,7 +343,7 @@ class ColmapWorkspace:
             loss_scale: pixels beyond which an observation counts less, as tracks of images of events are often wrong.
             refine_intrinsics: whether to adjust focal length and distortion too.
         """
-        posed = self.triangulate(poses_of(model, MIN_POINTS), max_pixels, max_degrees)
+        posed = self.triangulate(poses_of(model, only_linked=False), max_pixels, max_degrees)
         adjustment = pycolmap.BundleAdjustmentOptions()
         _keep_intrinsics(adjustment)
         adjustment.refine_focal_length = adjustment.refine_extra_params = refine_intrinsics

@@ -27,11 +27,8 @@ def model_of(*seen: range) -> SimpleNamespace:
     return SimpleNamespace(images=images)
 
 
-@pytest.mark.parametrize(("typical", "placed"), [(20, 15), (100, 25), (400, 30)])
-def test_frames_that_see_few_points_have_no_pose(typical: int, placed: int) -> None:
-    model = model_of(*map(range, [placed - 1, placed, *[typical] * 5]))
-    assert list(poses_of(model)) == [1, 2, 3, 4, 5, 6]
-    assert list(poses_of(model, 1)) == [0, 1, 2, 3, 4, 5, 6]
+def test_frames_that_see_few_points_have_no_pose() -> None:
+    assert list(poses_of(model_of(*map(range, [14, 15, 15, 15])))) == [1, 2, 3]
 
 
 @pytest.mark.parametrize(("num_shared", "placed"), [(14, [0, 1, 2]), (15, [0, 1, 2, 3, 4])])
@@ -39,7 +36,7 @@ def test_a_group_of_frames_that_hangs_by_few_points_has_no_pose(num_shared: int,
     beside = range(100 - num_shared, 200 - num_shared)
     model = model_of(*[range(100)] * 3, *[beside] * 2)
     assert list(poses_of(model)) == placed
-    assert list(poses_of(model, 15)) == [0, 1, 2, 3, 4]
+    assert list(poses_of(model, only_linked=False)) == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(("num_frames", "num_partners", "is_placed"), [(30, 4, False), (30, 5, True), (7, 2, True)])
@@ -70,7 +67,7 @@ def test_worlds_stand_upright() -> None:
     for image in model.images.values():
         image.name = f"{image.image_id}.png"
     stand_upright(model)
-    poses = np.stack(list(poses_of(model, 0).values()))
+    poses = np.stack(list(poses_of(model).values()))
     np.testing.assert_allclose(poses[:, :, 3].mean(0), 0, atol=1e-5)
     # The direction that the pictures' rows are most level to.
     assert np.square(poses[:, 2, 0]).sum() == pytest.approx(np.linalg.svd(poses[:, :, 0])[1][-1] ** 2, rel=1e-4)
