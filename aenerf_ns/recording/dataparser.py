@@ -106,9 +106,6 @@ class EventDataParser(DataParser):
 
     @cached_property
     def _recording(self) -> Recording:
-        longest = self.config.max_pose_gap_ns
-        if longest is not None and longest <= 0:
-            raise DataError(self.data, f"max_pose_gap_ns is {longest}", "give a positive number")
         try:
             with reading(self.data):
                 if self._lacks_poses():
@@ -123,8 +120,8 @@ class EventDataParser(DataParser):
                 raise
             hint = f"the format {self.guessed_format} was guessed: where it is another, name it, in aenerf as --format"
             raise DataError(error.source, error.problem, f"{error.remedy} ({hint})") from None
-        if longest is not None:
-            recording = replace(recording, max_pose_gap=longest)
+        if self.config.max_pose_gap_ns is not None:
+            recording = replace(recording, max_pose_gap=self.config.max_pose_gap_ns)
         recording.event_file.drop_malformed = self.config.drop_malformed
         self._check_lens(recording.event_camera, "event camera")
         if any(recording.reference_views.values()):
