@@ -29,8 +29,7 @@ _GOOD_FIT = 0.93
 _MAX_LOST = 2
 # Rounds of adjustment to all tracks: pixels and degrees that an observation may be off, and pixels beyond which an
 # observation counts less. At first, most are off by more.
-_LAST_ROUNDS = ((4.0, 2.0, 0.5), (4.0, 2.0, 0.5))
-_ROUNDS = ((12.0, 8.0, 1.0), (8.0, 5.0, 1.0), (5.0, 3.0, 1.0), *_LAST_ROUNDS)
+_ROUNDS = ((12.0, 8.0, 1.0), (4.0, 2.0, 0.5))
 
 
 def estimate_poses_from_events(
@@ -45,7 +44,7 @@ def estimate_poses_from_events(
 
     COLMAP matches images that are made of the events (:func:`match_event_images`). Its global mapper places the images,
     and its incremental mapper where few of the matches kept apart fit the global one's model. The model that more of
-    them fit is adjusted in some rounds, the images that it lacks are placed again, and its poses are taken; where both
+    them fit is adjusted in two rounds, the images that it lacks are placed again, and its poses are taken; where both
     fit alike, the global mapper's. Intrinsics stay as they are; where they are only guessed, one focal length and the
     radial distortion k1 are estimated first. A seed gives the same poses again, to the last bit on one machine with one
     version of COLMAP.
@@ -87,8 +86,8 @@ def estimate_poses_from_events(
             # Where images are lost, the model often has a bend. Now that the model is better, more of them find their
             # place (benchmarks/LOG.md).
             if is_placed(model) and len(poses := poses_of(model)) < len(times):
-                start = workspace.triangulate(poses, *_LAST_ROUNDS[0][:2])
-                more = adjust((workspace.reconstruct(start=start) or [model])[0], _LAST_ROUNDS)
+                start = workspace.triangulate(poses, *_ROUNDS[-1][:2])
+                more = adjust((workspace.reconstruct(start=start) or [model])[0], _ROUNDS[1:])
                 model = more if is_placed(more) else model
             if is_placed(model):
                 break
