@@ -1,4 +1,4 @@
-"""What a model of COLMAP says: which frames have a pose, whether it can be right, and how its world lies."""
+"""Read the poses of a COLMAP model, judge whether the model is sound, and turn its world upright."""
 
 from __future__ import annotations
 
