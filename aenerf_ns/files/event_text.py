@@ -87,6 +87,18 @@ def _parse_names(line: bytes) -> tuple[list[str], TimeUnit | None] | None:
     return (names, match[1]) if match and set(_COLUMNS) <= set(names) else None  # type: ignore[return-value]
 
 
+def _size(line: bytes) -> tuple[int, int] | None:
+    """Return the width and height of the sensor that a line states."""
+    size = _SIZE.match(line)
+    return (int(size[1] or size[3]), int(size[2] or size[4])) if size else None
+
+
+def stated_size(beginning: bytes) -> tuple[int, int] | None:
+    """Return the width and height of the sensor that lines ahead of the first event state, or None."""
+    lines = beginning.removeprefix(_BYTE_ORDER_MARK).split(b"\n")
+    return next((_size(line) for line in lines if _size(line) or _is_row(line)), None)
+
+
 def _line_name(line: int, num_before: int | None) -> str:
     return "the last line" if num_before is None else f"line {num_before + line + 1}"
 
@@ -121,10 +133,8 @@ class TextEventFile(EventFile):
         file.seek(begin)
         named = None
         while line := self._line(file):
-            size = _SIZE.match(line)
-            if size:
-                stated = int(size[1] or size[3]), int(size[2] or size[4])
-                resolve_sensor_size(self.path, stated, self.width, self.height)
+            if size := _size(line):
+                resolve_sensor_size(self.path, size, self.width, self.height)
             elif _is_row(line):
                 break
             else:

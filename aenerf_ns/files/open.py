@@ -10,7 +10,7 @@ from aenerf_ns.files.aedat4 import Aedat4File
 from aenerf_ns.files.event_arrays import open_array_events
 from aenerf_ns.files.event_hdf5 import open_hdf5_events
 from aenerf_ns.files.event_reader import EventFile, resolve_sensor_size
-from aenerf_ns.files.event_text import TextEventFile
+from aenerf_ns.files.event_text import TextEventFile, stated_size
 from aenerf_ns.files.limits import bounded
 from aenerf_ns.files.prophesee import HEADER_BYTES, PropheseeDatFile, PropheseeHeader, PropheseeRawFile
 from aenerf_ns.files.rosbag import BAG_MAGIC, RosbagEventFile
@@ -84,10 +84,8 @@ def open_event_file(
             return (PropheseeRawFile if is_raw else PropheseeDatFile)(path, header, width, height)
         if name == "HDF5":
             return open_hdf5_events(path, width, height, time_unit)
-        size = resolve_sensor_size(path, None, width, height)
-        if name == "NumPy":
-            return open_array_events(path, *size, time_unit)
-        return TextEventFile(path, *size, time_unit)
+        size = resolve_sensor_size(path, None if name == "NumPy" else stated_size(beginning), width, height)
+        return (open_array_events if name == "NumPy" else TextEventFile)(path, *size, time_unit)
 
 
 def _read_beginning(path: Path) -> bytes:

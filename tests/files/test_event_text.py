@@ -154,6 +154,15 @@ def test_read_the_spellings_that_are_unambiguous(name: str, tmp_path: Path) -> N
     assert file.time_span() == (expected[0][2], expected[-1][2])
 
 
+@pytest.mark.parametrize("name", ["format.csv", "geometry.csv", "e2vid.txt"])
+def test_take_the_size_that_the_file_states(name: str, tmp_path: Path) -> None:
+    path = written(tmp_path / name, SPELLINGS[name])
+    file = open_event_file(path)
+    assert (file.width, file.height) == (96, 72)
+    with pytest.raises(DataError, match="its sensor has 96 x 72 pixels, but 346 x 260 were given"):
+        open_event_file(path, 346, 260)
+
+
 def test_refuse_another_unit_than_that_in_the_names(tmp_path: Path) -> None:
     path = written(tmp_path / "events.txt", SPELLINGS["unit_in_comment.txt"])
     assert open_event_file(path, 96, 72, time_unit="ns").assumed_unit() is None
