@@ -94,7 +94,8 @@ class Reconstruct(DatasetCommand):
         """Write the events and an image of each batch of them that ends at a time with a pose. Yield the images."""
         from aenerf_ns.camera.trajectory import homogeneous
 
-        events = recording.event_file
+        # The views of a dataset are in the world of its true poses where it has these, whatever poses are trained on.
+        events, reference = recording.event_file, recording.reference_trajectory
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
 
         def copied() -> Iterator[EventStream]:
@@ -105,9 +106,9 @@ class Reconstruct(DatasetCommand):
         num_images = num_posed = 0
         for time, image in source(batches_of(copied(), num_events)):
             num_images += 1
-            if known.contains(time):
+            if known.contains(time) and reference.start <= time <= reference.end:
                 num_posed += 1
-                writer.add_image("train", image, homogeneous(recording.trajectory.interpolate(time)), time)
+                writer.add_image("train", image, homogeneous(reference.interpolate(time)), time)
                 yield image
         if num_posed == 0:
             raise DataError(

@@ -77,7 +77,6 @@ class Simulate(SimulationCommand):
         import torch
 
         from aenerf_ns.camera.intrinsics import CameraIntrinsics
-        from aenerf_ns.camera.trajectory import homogeneous
         from aenerf_ns.recording.recording import Split
         from aenerf_ns.recording.writer import NativeDatasetWriter
         from aenerf_ns.simulator.open_scene import open_scene
@@ -116,9 +115,8 @@ class Simulate(SimulationCommand):
                 remedy = "give lower thresholds, or a scene with more contrast"
                 raise DataError(self.scene, "no pixel changes by a contrast threshold", remedy)
             for time in np.linspace(estimated.start, estimated.end, self.train_images, dtype=np.int64).tolist():
-                # The picture is taken from the true pose. The dataset stores the estimated pose beside it.
-                pose = homogeneous(estimated.interpolate(time))
-                seen = simulation.reference_picture(simulation.pose(time))
+                pose = simulation.pose(time)
+                seen = simulation.reference_picture(pose)
                 writer.add_image("train", seen.display, pose, time, linear=seen.linear, depth=seen.depth)
             for split, poses in held_out.items():
                 for pose in poses:

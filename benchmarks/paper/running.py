@@ -14,20 +14,16 @@ Several processes can work on the folder at once, or one after the other. Each s
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import shutil
 import sys
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 from filelock import Timeout
 
 from aenerf_ns.atomic_write import atomic_write
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.training.provenance import provenance
 from benchmarks.paper.plan import CEILING, Dataset, Run, digest, scene_name
 from benchmarks.runs import exclusive, run_command
@@ -157,7 +153,7 @@ class Runner:
             if self._device == "cpu":
                 # Renders the same pictures faster, because a small chunk fits the cache.
                 words += ["--pipeline.model.eval-num-rays-per-chunk", "1024"]
-            words += [*run.options, "nerfstudio-data", "--data", str(_with_true_poses(data).resolve())]
+            words += [*run.options, "nerfstudio-data", "--data", str(data.resolve())]
         else:
             # LPIPS is reported as for nerfacto, where its network can be downloaded.
             words += ["--pipeline.model.lpips", "True", *run.options]
@@ -170,21 +166,6 @@ class Runner:
 
 def _read(file: Path) -> dict[str, Any] | None:
     return json.loads(file.read_text("utf8")) if file.exists() else None
-
-
-def _with_true_poses(data: Path) -> Path:
-    """Write a transforms.json in which the train images have their true poses, for image methods. Return its path."""
-    file = data / "transforms_ground_truth.json"
-    truth = read_tum_trajectory(data / "trajectory_ground_truth.txt")
-    meta = json.loads((data / "transforms.json").read_text("utf8"), parse_float=Decimal)
-    for frame in meta["frames"]:
-        if frame["file_path"] in meta["train_filenames"]:
-            pose = homogeneous(truth.interpolate(int(frame["timestamp"] * 10**9))) @ OPENCV_TO_OPENGL
-            frame["transform_matrix"] = pose.tolist()
-    # Another process may write the same at the same time.
-    with atomic_write(file, file.with_suffix(f".{os.getpid()}")) as partial:
-        partial.write_text(json.dumps(meta, default=float), "utf8")
-    return file
 
 
 def _curve(run: Path) -> list[tuple[int, float]]:

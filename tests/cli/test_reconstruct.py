@@ -45,7 +45,7 @@ def test_images_have_poses_of_their_times(data: Path, tmp_path: Path) -> None:
     # A tenth of an event per pixel ahead of the end of the batch.
     assert [view.time for view in views] == events.t[5::8].tolist()
     for view in views:
-        pose = homogeneous(before.trajectory.interpolate(view.time))
+        pose = homogeneous(before.reference_trajectory.interpolate(view.time))
         torch.testing.assert_close(view.camera_to_world, pose, rtol=0, atol=1e-9)
         with Image.open(view.file) as image:
             assert (image.size, image.mode) == ((6, 4), "RGB")

@@ -197,6 +197,11 @@ def test_cameras_frames_and_a_mesh_go_on_to_other_tools(
     assert model.num_points3D() > 400
     meta = json.loads((workspace / "room" / "transforms.json").read_text())
     given = {frame["file_path"]: np.array(frame["transform_matrix"]) for frame in meta["frames"]}
+    # Noise of the poses is no offset of the images on the rig.
+    truth = read_tum_trajectory(workspace / "room" / "trajectory_ground_truth.txt")
+    times = torch.tensor([round(frame["timestamp"] * 1e9) for frame in meta["frames"] if "timestamp" in frame])
+    stored = [pose[:3, 3] for name, pose in given.items() if "/train/" in name]
+    np.testing.assert_allclose(stored, truth.interpolate(times)[:, :, 3], atol=1e-3)
     for name, image in names.items():
         assert (workspace / "cameras" / "images" / name).is_symlink()
         center = image.cam_from_world().inverse().matrix()[:, 3]
