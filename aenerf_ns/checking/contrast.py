@@ -31,7 +31,7 @@ from aenerf_ns.checking.hypotheses import (
     clock_hypothesis,
 )
 from aenerf_ns.events.event_images import TILE, accumulate, image_size, sharpest
-from aenerf_ns.events.picture import polarity_picture
+from aenerf_ns.events.picture import net_picture
 from aenerf_ns.events.stream import EventStream
 
 # Permuted together, these columns lose their order within a slice.
@@ -287,8 +287,7 @@ class WarpedEvents:
         # The tiles reach beyond the sensor.
         width, height = -(-self._camera.width // self._binning), -(-self._camera.height // self._binning)
         both = np.rint(np.concatenate([unwarped[:height, :width], warped[:height, :width]], 1)).astype(np.int64)
-        rows, columns = np.nonzero(both)
-        picture = polarity_picture(columns, rows, both[rows, columns], both.shape[1], both.shape[0])
+        picture = net_picture(both)
         factor = max(_PICTURE_HEIGHT // height, 1)
         return picture.repeat(factor, 0).repeat(factor, 1)
 

@@ -16,9 +16,8 @@ from aenerf_ns.checking.noise import NoiseRate
 from aenerf_ns.checking.pose_checks import check_poses, check_steps, describe_motion
 from aenerf_ns.checking.result import CheckResult
 from aenerf_ns.checking.thresholds import PolarityBalance
-from aenerf_ns.events.statistics import EventStatistics, event_statistics
+from aenerf_ns.events.statistics import event_statistics
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.progress import progress_bar, tracked
 from aenerf_ns.recording.recording import Capture, Recording
 
@@ -79,23 +78,9 @@ def check_without_poses(capture: Capture, frames: Iterable[tuple[int, Path]]) ->
 
 def _check_events(capture: Capture, frames: Iterable[tuple[int, Path]], window: TimeWindow) -> tuple[CheckResult, int]:
     """Check the events, and count those in the window."""
+    file, num_covered = capture.event_file, 0
     changes = FrameChanges(capture, frames, window)
-    balance = PolarityBalance(capture.event_file, capture.sensor.refractory_period)
-    noise = NoiseRate(capture.event_file.width, capture.event_file.height)
-    statistics, num_covered = _count_events(capture.event_file, window, changes, balance, noise)
-    result = CheckResult(statistics)
-    check_events(result, noise, capture.sensor.bayer_pattern)
-    correlation = changes.correlation()
-    check_polarity(result, correlation)
-    check_thresholds(result, capture, changes, balance, correlation or 0.0)
-    return result, num_covered
-
-
-def _count_events(
-    file: EventFile, window: TimeWindow, changes: FrameChanges, balance: PolarityBalance, noise: NoiseRate
-) -> tuple[EventStatistics, int]:
-    """Return statistics of the events, and the number of events that have a pose; hand all on to the other three."""
-    num_covered = 0
+    balance, noise = PolarityBalance(file, capture.sensor.refractory_period), NoiseRate(file.width, file.height)
 
     def chunks() -> Iterator[EventStream]:
         nonlocal num_covered
@@ -105,8 +90,12 @@ def _count_events(
             noise.add(chunk)
             yield chunk
 
-    statistics = event_statistics(chunks(), file.width, file.height, file.time_span(), _RATE_PARTS)
-    return statistics, num_covered
+    result = CheckResult(event_statistics(chunks(), file.width, file.height, file.time_span(), _RATE_PARTS))
+    check_events(result, noise, capture.sensor.bayer_pattern)
+    correlation = changes.correlation()
+    check_polarity(result, correlation)
+    check_thresholds(result, capture, changes, balance, correlation or 0.0)
+    return result, num_covered
 
 
 def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> list[EventStream]:

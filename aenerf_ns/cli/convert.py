@@ -27,10 +27,7 @@ from aenerf_ns.progress import tracked
 from aenerf_ns.reconstruction.weights import require_weights
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from PIL.Image import Image
-    from torch import Tensor
 
     from aenerf_ns.camera.time_window import TimeWindow
     from aenerf_ns.camera.trajectory import Trajectory
@@ -250,7 +247,8 @@ class Convert(DatasetCommand):
             )
         # Near and far planes of poses that training does not scale are in the units of these.
         if recording.scene_box is None and parser.scales_poses(recording):
-            recording = replace(recording, scene_box=_scene_box(found.scene_box))
+            say_scene_box(found.scene_box)
+            recording = replace(recording, scene_box=found.scene_box)
         return replace(recording, trajectory=found.trajectory), report, found.draw(paths)
 
 
@@ -294,14 +292,6 @@ def _copy_events(recording: Recording, events: EventSelection, writer: NativeDat
     return num_read, num_covered
 
 
-def _scene_box(found: NDArray[np.float64] | None) -> Tensor | None:
-    """Return a box that was found as a tensor, and say that the dataset gets it."""
-    import torch
-
-    say_scene_box(found)
-    return None if found is None else torch.from_numpy(found)
-
-
 def _with_poses(
     found: EstimatedPoses, capture: Capture, images: list[tuple[int, Path]]
 ) -> tuple[Recording, dict[str, Any], Image | None]:
@@ -324,7 +314,7 @@ def _with_poses(
         "The poses are in a world of their own: z is up if the camera was held level, and the scale is arbitrary, as "
         "images of one camera tell no lengths."
     )
-    box = _scene_box(found.scene_box)
+    say_scene_box(found.scene_box)
     if isinstance(capture, Recording):
         truth = capture.reference_trajectory
         knots = trajectory.knots_known_to(truth)
@@ -342,7 +332,7 @@ def _with_poses(
                 capture,
                 trajectory=trajectory,
                 ground_truth=truth,
-                scene_box=box,
+                scene_box=found.scene_box,
                 max_pose_gap=found.max_pose_gap(),
             )
             return recording, report, found.draw and found.draw(paths)
@@ -355,7 +345,7 @@ def _with_poses(
     recording = Recording(
         **{field.name: getattr(capture, field.name) for field in fields(Capture)},
         trajectory=trajectory,
-        scene_box=box,
+        scene_box=found.scene_box,
         max_pose_gap=found.max_pose_gap(),
         reference_views=views,
         max_views=MAX_VIEWS,

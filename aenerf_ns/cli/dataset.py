@@ -17,8 +17,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import require_dataset
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from torch import Tensor
 
     from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.camera.time_window import TimeWindow
@@ -119,7 +118,7 @@ def open_writer(
         event_camera,
         recording.sensor,
         recording.image_encoding,
-        scene_box=None if recording.scene_box is None else recording.scene_box.numpy(),
+        scene_box=recording.scene_box,
         max_pose_gap=recording.max_pose_gap,
         frame_camera=frame_camera,
         # Near and far planes keep their units.
@@ -175,10 +174,10 @@ def training_command(
     return shlex.join([*words, "--data", str(data), *format_words])
 
 
-def say_scene_box(box: NDArray[np.float64] | None) -> None:
+def say_scene_box(box: Tensor | None) -> None:
     """Say that a dataset gets the box that its camera was found to go around, if there is one."""
     if box is not None:
         say(
-            f"The camera goes around what it sees, so the dataset gets a scene box, {box.round(3).tolist()}. Where "
-            "more is to be seen, delete scene_box from transforms.json."
+            "The camera goes around what it sees, so the dataset gets a scene box, "
+            f"{box.round(decimals=3).tolist()}. Where more is to be seen, delete scene_box from transforms.json."
         )

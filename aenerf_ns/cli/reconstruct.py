@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -78,13 +79,14 @@ class Reconstruct(DatasetCommand):
         import torch
 
         from aenerf_ns.events.polarity_drift import drift_of_events
-        from aenerf_ns.reconstruction.images import FilteredImages, NetworkImages
+        from aenerf_ns.reconstruction.images import NetworkImages, filtered_images
         from aenerf_ns.reconstruction.weights import load_network
 
         if self.weights is None:
             events = recording.event_file
             chunks = tracked(events.chunks(), "Comparing the pixels", events.count())
-            return FilteredImages(recording.sensor, drift_of_events(chunks, recording.sensor.refractory_period))
+            drift = drift_of_events(chunks, recording.sensor.refractory_period)
+            return partial(filtered_images, sensor=recording.sensor, drift=drift)
         device = "cuda" if torch.cuda.is_available() else "cpu"
         return NetworkImages(load_network(self.weights), recording.sensor, device)
 

@@ -18,8 +18,7 @@ from aenerf_ns.events.sensor import SensorModel, require_event_sensor_size
 from aenerf_ns.simulator.options import Interpolation, SensorNoise
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from torch import Tensor
 
     from aenerf_ns.camera.intrinsics import CameraIntrinsics
     from aenerf_ns.camera.trajectory import Trajectory
@@ -243,5 +242,5 @@ class _VideoPoses:
     estimated: Trajectory
     truth: Trajectory | None = None
     report: dict[str, Any] | None = None
-    scene_box: NDArray[np.float64] | None = None
+    scene_box: Tensor | None = None
     has_estimated_lens: bool = False

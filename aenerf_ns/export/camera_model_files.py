@@ -57,7 +57,7 @@ class ObservedPoints:
 
 
 def write_cameras(folder: Path, images: Sequence[PlacedImage], points: ObservedPoints) -> None:
-    """Write images' cameras as a COLMAP model and as a transforms.json, with points of the scene."""
+    """Write the cameras of images of one lens as a COLMAP model and as a transforms.json, with points of the scene."""
     _write_colmap_model(folder, images, points)
     _write_transforms(folder, images, points)
 
@@ -70,28 +70,16 @@ def _write_colmap_model(folder: Path, images: Sequence[PlacedImage], points: Obs
     # Imported lazily, because few commands need it.
     import pycolmap
 
-    model = pycolmap.Reconstruction()
-    numbers: dict[CameraIntrinsics, int] = {}
-    for image in images:
-        if image.camera not in numbers:
-            camera = image.camera
-            numbers[camera] = len(numbers) + 1
-            name, parameters = camera.to_colmap()
-            model.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    camera_id=numbers[camera], model=name, width=camera.width, height=camera.height, params=parameters
-                )
-            )
+    model, camera = pycolmap.Reconstruction(), images[0].camera
+    name, parameters = camera.to_colmap()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model=name, width=camera.width, height=camera.height, params=parameters)
+    )
     for index, image in enumerate(images):
-        world_to_camera = np.linalg.inv(image.camera_to_world)
+        keypoints = points.pixels[points.images == index]
         model.add_image_with_trivial_frame(
-            pycolmap.Image(
-                name=image.name,
-                keypoints=points.pixels[points.images == index],
-                camera_id=numbers[image.camera],
-                image_id=index + 1,
-            ),
-            pycolmap.Rigid3d(world_to_camera[:3]),
+            pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=1, image_id=index + 1),
+            pycolmap.Rigid3d(np.linalg.inv(image.camera_to_world)[:3]),
         )
     num_earlier = np.zeros(len(images), np.int64)
     for position, color, index in zip(points.positions, points.colors, points.images, strict=True):

@@ -15,7 +15,7 @@ from torch import Tensor
 from aenerf_ns.camera.trajectory import homogeneous
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import to_image
-from aenerf_ns.events.picture import polarity_picture
+from aenerf_ns.events.picture import net_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.export.rendering import corrected_poses, render
 from aenerf_ns.files.event_reader import EventFile
@@ -52,8 +52,8 @@ def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]
             near, far = torch.quantile(seen.float(), torch.tensor([0.02, 0.98], device=run.device)).tolist()
             depth_range = near, far
         panels = {
-            "events, recorded": _event_panel(net),
-            "events, rendered": _event_panel(trigger(outputs["log_radiance"].cpu().numpy())),
+            "events, recorded": net_picture(net),
+            "events, rendered": net_picture(trigger(outputs["log_radiance"].cpu().numpy())),
             "rendering": np.asarray(to_image(outputs["rgb"])),
             "depth": _depth_panel(depth, depth_range),
         }
@@ -79,11 +79,6 @@ def _image_panel(run: TrainedRun, images: list[tuple[int, Path]], time: int) -> 
         # The image is of another camera than the events.
         shown = shown.resize((camera.width, camera.height))
     return np.asarray(shown)
-
-
-def _event_panel(net: NDArray[np.int64]) -> NDArray[np.uint8]:
-    rows, columns = np.nonzero(net)
-    return polarity_picture(columns, rows, net[rows, columns], net.shape[1], net.shape[0])
 
 
 def _depth_panel(depth: Tensor, depth_range: tuple[float, float] | None) -> NDArray[np.uint8]:

@@ -66,7 +66,7 @@ class EstimatedPoses:
     reprojection_error: float
     features: float
     seconds: float
-    scene_box: NDArray[np.float64] | None = None
+    scene_box: Tensor | None = None
     images: str = "frames"
     mapper: str = "incremental"
     agreement: float | None = None

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 from aenerf_ns.camera.time_window import TimeWindow, runs_of
 from aenerf_ns.camera.trajectory import Trajectory
@@ -56,7 +57,7 @@ class RefinedPoses:
     twists: Array
     shared_error: SharedError
     is_weak: NDArray[np.bool_]
-    scene_box: Array | None
+    scene_box: Tensor | None
     seconds: float
     draw: Callable[[Mapping[str, Array]], Image.Image]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
+from torch import Tensor
 
 from aenerf_ns.pose_estimation.colmap_model import poses_of
 
@@ -17,7 +18,7 @@ _MAX_BEYOND, _MARGIN = 0.01, 0.1
 _MAX_COMPARED = 2000
 
 
-def box_of(model: Any) -> NDArray[np.float64] | None:
+def box_of(model: Any) -> Tensor | None:
     """Return the (2, 3) corners of a box that holds what the camera goes around, or None if it does not.
 
     A camera goes around a scene if it stays outside the box, and sees it from directions more than 90 degrees apart.
@@ -38,4 +39,4 @@ def box_of(model: Any) -> NDArray[np.float64] | None:
     # Of many cameras, some are looked at: each is compared with each.
     directions = cameras[:: -(-len(cameras) // _MAX_COMPARED)] - (low + high) / 2
     is_inside = ((low < cameras) & (cameras < high)).all(1).any()
-    return None if is_inside or (directions @ directions.T).min() > 0 else np.stack([low, high])
+    return None if is_inside or (directions @ directions.T).min() > 0 else torch.from_numpy(np.stack([low, high]))

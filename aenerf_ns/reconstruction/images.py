@@ -32,28 +32,25 @@ ImageSource = Callable[[Iterable[EventStream]], Iterator[tuple[int, NDArray[np.u
 monochrome sensor."""
 
 
-class FilteredImages:
-    """Images without a network.
+def filtered_images(
+    batches: Iterable[EventStream], sensor: SensorModel, drift: NDArray[np.float32] | None = None
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield images without a network; see :data:`ImageSource`.
 
     A display value is (0.18 exp(s))^(1 / 2.2), clipped to [0, 1], times 255, of a change of log-intensity s
     (:func:`~aenerf_ns.reconstruction.two_sided.log_intensities`).
 
     Args:
+        batches: the stream in consecutive pieces.
         sensor: contrast thresholds and Bayer pattern.
         drift: (height, width), how the thresholds of the pixels differ.
     """
-
-    def __init__(self, sensor: SensorModel, drift: NDArray[np.float32] | None = None) -> None:
-        self._sensor, self._drift = sensor, drift
-
-    def __call__(self, batches: Iterable[EventStream]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield the images; see :data:`ImageSource`."""
-        pattern = self._sensor.bayer_pattern
-        for time, state in log_intensities(batches, self._sensor, _DECAY, self._drift):
-            # Not above display white, where the exponential of a hot pixel would overflow.
-            log_radiance = np.minimum(state + math.log(_MIDDLE_GRAY), 0)
-            values = np.rint(np.exp(_DISPLAY_POWER * log_radiance) * 255).astype(np.uint8)
-            yield time, demosaic(values, pattern) if pattern else _gray_to_rgb(values)
+    pattern = sensor.bayer_pattern
+    for time, state in log_intensities(batches, sensor, _DECAY, drift):
+        # Not above display white, where the exponential of a hot pixel would overflow.
+        log_radiance = np.minimum(state + math.log(_MIDDLE_GRAY), 0)
+        values = np.rint(np.exp(_DISPLAY_POWER * log_radiance) * 255).astype(np.uint8)
+        yield time, demosaic(values, pattern) if pattern else _gray_to_rgb(values)
 
 
 class NetworkImages:

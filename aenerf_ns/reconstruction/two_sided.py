@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 
 import numba
 import numpy as np
@@ -47,10 +48,7 @@ def log_intensities(
     """
     surplus = np.zeros(()) if drift is None else drift.astype(np.float64)
     rise, fall = sensor.positive_contrast_threshold * (1 - surplus), -sensor.negative_contrast_threshold * (1 + surplus)
-
-    def filter_of(batch: EventStream) -> _Filter:
-        return _Filter(batch.width, batch.height, rise, fall, decay, sensor.refractory_period)
-
+    filter_of = partial(_Filter, changes=(rise, fall), decay=decay, refractory_period=sensor.refractory_period)
     held: list[tuple[EventStream, NDArray[np.float32], float]] = []
     forward: _Filter | None = None
     # The latest batches whose images wait for what follows: as many again are yielded at a time.
@@ -93,21 +91,16 @@ class _Filter:
     """
 
     def __init__(
-        self,
-        width: int,
-        height: int,
-        rise: NDArray[np.float64],
-        fall: NDArray[np.float64],
-        decay: float,
-        refractory_period: int,
+        self, batch: EventStream, changes: Sequence[NDArray[np.float64]], decay: float, refractory_period: int
     ) -> None:
+        shape = batch.height, batch.width
         # The change of log-intensity with a positive and with a negative event of each pixel, or of any.
-        self._rise, self._fall = (np.broadcast_to(change, (height, width)) for change in (rise, fall))
-        self._decay = decay / (width * height)
+        self._rise, self._fall = (np.broadcast_to(change, shape) for change in changes)
+        self._decay = decay / math.prod(shape)
         self._refractory_period = refractory_period
-        self._state, self._last = np.zeros((height, width)), np.zeros((height, width), np.int64)
+        self._state, self._last = np.zeros(shape), np.zeros(shape, np.int64)
         # Of the last event of each pixel. A polarity of 0 stands for none.
-        self._time, self._polarity = np.zeros((height, width), np.int64), np.zeros((height, width), np.int8)
+        self._time, self._polarity = np.zeros(shape, np.int64), np.zeros(shape, np.int8)
         self._count = 0
 
     def add(self, events: EventStream, step: int = 1) -> None:

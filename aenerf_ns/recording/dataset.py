@@ -127,7 +127,7 @@ class EventDataset(InputDataset):
         if scene.has_image[image_idx]:
             return super().get_numpy_image(image_idx)
         events = self.events_around(int(scene.camera_times[image_idx]), self.usual_number_of_events)
-        return polarity_picture(events.x, events.y, events.p, events.width, events.height)
+        return polarity_picture(events)
 
     @property
     def usual_number_of_events(self) -> int:

@@ -110,7 +110,7 @@ class NativeDatasetWriter(_FolderWriter):
         event_camera: CameraIntrinsics,
         sensor: SensorModel,
         image_encoding: ImageEncoding,
-        scene_box: NDArray[np.float64] | None = None,
+        scene_box: NDArray[np.float64] | Tensor | None = None,
         max_pose_gap: int | None = None,
         frame_camera: CameraIntrinsics | None = None,
         auto_scale_poses: bool = True,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -73,8 +72,8 @@ def views_left_out(reports: Sequence[RunReport], shared: Sequence[str]) -> dict[
 def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> list[dict[str, Any]]:
     """Compare the metrics of each later run with the first run's on the views that all runs have.
 
-    Each row holds the mean difference of a metric from ``placed`` or ``refined`` test poses, and its
-    :func:`confidence_interval` over the views.
+    Each row holds the mean difference of a metric from ``placed`` or ``refined`` test poses, and the
+    confidence interval of the mean over the views, none for one view.
     """
     first, *others = reports
     ours = {view["file"]: view for view in first.views}
@@ -91,6 +90,8 @@ def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> l
                     ]
                 )
                 if len(differences):
+                    # 95 %, by Student's t.
+                    interval = stats.ttest_1samp(differences, 0).confidence_interval() if len(differences) > 1 else None
                     rows.append(
                         {
                             "run": other.name,
@@ -99,22 +100,7 @@ def paired_differences(reports: Sequence[RunReport], shared: Sequence[str]) -> l
                             "metric": metric,
                             "num_views": len(differences),
                             "mean": float(differences.mean()),
-                            "interval": confidence_interval(differences),
+                            "interval": interval,
                         }
                     )
     return rows
-
-
-def confidence_interval(values: np.ndarray) -> tuple[float, float] | None:
-    """Compute the 95 % confidence interval of the mean of (N,) values by Student's t, None with fewer than two.
-
-    Example:
-        >>> low, high = confidence_interval(np.array([1.0, 2.0, 3.0]))
-        >>> round(low, 3), round(high, 3)
-        (-0.484, 4.484)
-    """
-    if len(values) < 2:
-        return None
-    half = float(stats.t.ppf(0.975, len(values) - 1)) * float(values.std(ddof=1)) / math.sqrt(len(values))
-    mean = float(values.mean())
-    return mean - half, mean + half

@@ -16,16 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from aenerf_ns.report import plots
+from aenerf_ns.report import plots, sections
 from aenerf_ns.report.measuring import RunReport
-from aenerf_ns.report.sections import (
-    METRIC_DIGITS,
-    VIEW_COLUMNS,
-    describe_events,
-    describe_run,
-    state_verdict,
-    view_rows,
-)
+from aenerf_ns.report.sections import VIEW_COLUMNS, describe_run, view_rows
 from aenerf_ns.report.view_pictures import ERROR_RANGE
 
 # Maximum width of a picture in pixels, and JPEG quality.
@@ -69,9 +62,7 @@ def make_page(
         left_out=left_out,
         mixed=mixed,
         shared=shared,
-        describe_events=describe_events,
-        state_verdict=state_verdict,
-        metric_digits=METRIC_DIGITS,
+        words=sections,
         error_range=ERROR_RANGE,
         plots=plots,
         plotly=Markup(get_plotlyjs()),

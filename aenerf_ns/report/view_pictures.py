@@ -81,7 +81,8 @@ def picture_views(run: TrainedRun, indices: Sequence[int]) -> tuple[list[ViewPic
 def _pictures(outputs: dict[str, Any], truth: torch.Tensor, scale: float) -> ViewPictures:
     rendering, depth = outputs["rgb"], outputs["depth"] / scale
     error = (rendering - truth).abs().mean(-1, keepdim=True)
-    seen = depth[outputs["accumulation"] > 0.5]
+    # torch.quantile takes at most 2^24 values.
+    seen = depth[outputs["accumulation"] > 0.5][:: -(-depth.numel() // 2**24)]
     near, far = (
         torch.quantile(seen, seen.new_tensor([_MAX_BEYOND, 1 - _MAX_BEYOND])).tolist() if len(seen) else (0.0, 1.0)
     )

@@ -126,9 +126,9 @@ def open_scene(name: str, seed: int = 0) -> SimulationScene:
     if name not in BUILT_IN:
         return _load_scene(Path(name), seed)
     if name == "room":
-        return SimulationScene(name, room_scene(seed), RoomPath(), focal_ratio=0.62, aabb=None, background=None)
+        return SimulationScene(room_scene(seed), RoomPath(), focal_ratio=0.62, aabb=None, background=None)
     renderer, box = locomotive_scene(seed, shiny=name == "shiny_object"), np.array([[-1.2] * 3, [1.2] * 3])
-    return SimulationScene(name, renderer, ObjectPath(), focal_ratio=1.2, aabb=box, background=BACKGROUND)
+    return SimulationScene(renderer, ObjectPath(), focal_ratio=1.2, aabb=box, background=BACKGROUND)
 
 
 def _load_scene(path: Path, seed: int) -> SimulationScene:
@@ -181,7 +181,6 @@ def _load_scene(path: Path, seed: int) -> SimulationScene:
         lamps = [AreaLight(*astuple(lamp)) for lamp in values.light.lamps]
         renderer = light_mesh(mesh, caster, environment, lamps, behind, show_environment=background is None, seed=seed)
     scene = SimulationScene(
-        path.stem,
         renderer,
         camera_path,
         focal_ratio=values.focal_ratio or _focal_ratio(route),
@@ -190,7 +189,7 @@ def _load_scene(path: Path, seed: int) -> SimulationScene:
         duration=route.duration,
         notes=tuple(notes),
     )
-    return scene if environment is None else _with_exposure(scene, renderer)
+    return scene if environment is None else _with_exposure(path, scene, renderer)
 
 
 def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> SimulationScene:
@@ -213,7 +212,6 @@ def _load_blend(path: Path, file: Path, values: _SceneFile, seed: int) -> Simula
         route = route or _Around()
         camera_path, duration = _make_path(path, route, renderer.bounds, renderer.obstacles), route.duration
     scene = SimulationScene(
-        path.stem,
         renderer,
         camera_path,
         focal_ratio,
@@ -252,7 +250,7 @@ def _make_path(source: Path, route: _Around | _Walk, bounds: Array, obstacles: O
         raise DataError(source, f"path: {error}", "change the path or the scale, see docs/simulator.md") from error
 
 
-def _with_exposure(scene: SimulationScene, renderer: Renderer) -> SimulationScene:
+def _with_exposure(source: Path, scene: SimulationScene, renderer: Renderer) -> SimulationScene:
     """Scale the light so that no diffuse surface clips in the pictures. Clip surroundings and highlights to 1."""
     width, height = 192, 144
     poses = [scene.path((k + 0.5) / 48) for k in range(48)]
@@ -263,5 +261,5 @@ def _with_exposure(scene: SimulationScene, renderer: Renderer) -> SimulationScen
         radiance, depth = without_highlights.render(pose, scene.intrinsics(width, height), width, height, 1)
         brightest = max(brightest, float(radiance[np.isfinite(depth)].max(initial=0.0)))
     if brightest == 0:
-        raise DataError(scene.name, "no light reaches what the camera sees", "give it light, or another path")
+        raise DataError(source, "no light reaches what the camera sees", "give it light, or another path")
     return replace(scene, renderer=replace(renderer.with_gain(_MAX_RADIANCE / brightest), limit=1.0))

@@ -15,7 +15,6 @@ class SimulationScene:
     """A scene and the cameras in it. Poses are camera-to-world, OpenCV axes, z up, meters.
 
     Attributes:
-        name: of a built-in scene or of a file.
         renderer, path: what is seen, and the camera's path with the held-out views around it.
         focal_ratio: focal length divided by image width. Pixels are square, and the principal point is the middle.
         aabb: (2, 3) corners of the box around the scene, or None if the scene surrounds the camera.
@@ -24,7 +23,6 @@ class SimulationScene:
         notes: assumptions that the user should know, a line each.
     """
 
-    name: str
     renderer: Renderer | BlenderRenderer
     path: CameraPath
     focal_ratio: float

@@ -87,12 +87,10 @@ class RecordingView:
 
     def picture(self, events: EventStream) -> NDArray[np.uint8]:
         """Return a picture (height, width, 3) of events, as wide as the viewer's panel: red positive, blue negative."""
-        width, height = self.camera.width, self.camera.height
-        picture = polarity_picture(events.x, events.y, events.p, width, height)
-        scale = _PICTURE_WIDTH / width
+        scale = _PICTURE_WIDTH / events.width
         interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
-        size = (_PICTURE_WIDTH, max(round(scale * height), 1))
-        return cv2.resize(picture, size, interpolation=interpolation).astype(np.uint8, copy=False)
+        size = (_PICTURE_WIDTH, max(round(scale * events.height), 1))
+        return cv2.resize(polarity_picture(events), size, interpolation=interpolation).astype(np.uint8, copy=False)
 
     def described_picture(self, events: EventStream, seconds: float) -> str:
         """Return the picture of events around a time with their span, in Markdown."""

@@ -10,7 +10,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.pose_estimation.from_frames import EstimatedPoses
 
-FOUND_BOX = np.array([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]])
+FOUND_BOX = torch.tensor([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]], dtype=torch.float64)
 
 
 def place_frames(num_placed: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL, batches_of
-from aenerf_ns.reconstruction.images import FilteredImages
+from aenerf_ns.reconstruction.images import filtered_images
 from aenerf_ns.simulator.esim import EventSimulator
 
 SIZE = 32
@@ -39,7 +39,7 @@ def events() -> Iterator[EventStream]:
 
 def test_images_are_those_of_the_light() -> None:
     stream = list(events())
-    images = list(FilteredImages(SENSOR)(batches_of(stream, int(EVENTS_PER_PIXEL * SIZE**2))))
+    images = list(filtered_images(batches_of(stream, int(EVENTS_PER_PIXEL * SIZE**2)), SENSOR))
     assert len(images) == sum(map(len, stream)) // 358 > 200
     for time, image in images[100:-60:10]:
         truth = np.log(radiance(round(time / STEP)))
@@ -49,7 +49,7 @@ def test_images_are_those_of_the_light() -> None:
 
 def test_display_values() -> None:
     stream = make_stream([(0, 0, 1, 1), (1, 0, 2, -1), *[(2, 0, 3, 1)] * 9, *[(3, 0, 4, 1)] * 300], 100, 100)
-    ((_, image),) = FilteredImages(SensorModel(0.5, 0.5))(batches_of([stream], len(stream)))
+    ((_, image),) = filtered_images(batches_of([stream], len(stream)), SensorModel(0.5, 0.5))
     ratios = (image[0, :2, 0] / image[2, 3, 0]) ** 2.2
     np.testing.assert_allclose(ratios, np.exp([0.5, -0.5]), rtol=0.02)
     assert image[0, 2, 0] == 255
@@ -60,7 +60,7 @@ def test_filter_sees_colors() -> None:
     rows = [(x, y, 0, 1 if y % 2 == 0 and x % 2 == 0 else -1) for y in range(6) for x in range(8)]
     stream = make_stream(rows, 8, 6)
     color, gray = (
-        next(FilteredImages(SensorModel(bayer_pattern=pattern))(batches_of([stream], len(stream))))[1]
+        next(filtered_images(batches_of([stream], len(stream)), SensorModel(bayer_pattern=pattern)))[1]
         for pattern in ("RGGB", "")
     )
     assert (color[..., 0] > color[..., 1]).all()

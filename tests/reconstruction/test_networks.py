@@ -14,8 +14,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import BayerPattern, SensorModel
 from aenerf_ns.reconstruction.batches import batches_of
 from aenerf_ns.reconstruction.images import NetworkImages, demosaic
-from aenerf_ns.reconstruction.layers import ConvGRU, ConvLSTM
-from aenerf_ns.reconstruction.networks import FireNet
+from aenerf_ns.reconstruction.networks import ConvGRU, ConvLSTM, FireNet
 from aenerf_ns.reconstruction.weights import load_network
 
 

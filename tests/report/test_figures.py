@@ -22,7 +22,6 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.report.comparison import (
     Protocol,
-    confidence_interval,
     paired_differences,
     protocol_differences,
     shared_views,
@@ -130,7 +129,7 @@ def test_pair_differences_by_file() -> None:
     # Student's t with two degrees of freedom: 4.303 standard errors.
     half = 4.302653 * np.std([1, 2, 1], ddof=1) / 3**0.5
     assert row["interval"] == pytest.approx((4 / 3 - half, 4 / 3 + half), rel=1e-6)
-    assert confidence_interval(np.array([1.0])) is None
+    assert paired_differences([first, second], ["0.png"])[0]["interval"] is None
     shared = ["1.png", "2.png"]
     (row,) = paired_differences([first, second], shared)
     assert (row["num_views"], row["mean"]) == (2, 1.5)
