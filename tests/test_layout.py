@@ -24,7 +24,7 @@ MAY_USE: dict[str, set[str]] = {
     "events": {"errors", "camera"},
     # Events in, images out: where the camera was, and what the images are for, is not its business.
     "reconstruction": {"errors", "events"},
-    "files": {"errors", "atomic_write", "events", "camera"},
+    "files": {"errors", "atomic_write", "progress", "events", "camera"},
     "recording": {"errors", "progress", "events", "camera", "files"},
     # Poses of a recording from its frames: a tool, which only commands and the simulator use.
     "pose_estimation": {"errors", "progress", "events", "reconstruction", "camera", "files", "recording"},

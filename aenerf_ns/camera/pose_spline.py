@@ -9,7 +9,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from aenerf_ns.camera.rotation import quaternion_from_rotation
+from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
 from aenerf_ns.camera.time_window import runs_of
 
 # Four lost frames in a row make a segment five times as long as its neighbors. The errors of the poses at its ends
@@ -68,22 +68,10 @@ def rotation_from_products() -> Tensor:
     maps the products of q and its rate to half of the rotation's rate.
     """
     identity = torch.eye(4, dtype=torch.float64)
-    # The matrix of a quadratic form is (f(a + b) − f(a − b)) / 4.
-    sums, differences = identity[:, None] + identity, identity[:, None] - identity
-    return ((_quadratic_rotation(sums) - _quadratic_rotation(differences)) / 4).flatten(0, 1)
-
-
-def _quadratic_rotation(quaternion: Tensor) -> Tensor:
-    """Return the flattened rotation matrices (..., 9) times |q|² of quaternions (..., 4) of any length."""
-    x, y, z, w = quaternion.unbind(-1)
-    return torch.stack(
-        [
-            w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w),
-            2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w),
-            2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z,
-        ],
-        -1,
-    )  # fmt: skip
+    sums = (identity[:, None] + identity).flatten(0, 1)
+    one, two = (rotation_from_quaternion(q).flatten(1) * q.square().sum(-1, keepdim=True) for q in (identity, sums))
+    # The matrix of a quadratic form f is (f(a + b) − f(a) − f(b)) / 2. Here it holds whole numbers.
+    return ((two.unflatten(0, (4, 4)) - one[:, None] - one) / 2).round().flatten(0, 1)
 
 
 def is_gap(steps: Tensor) -> Tensor:

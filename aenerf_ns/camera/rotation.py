@@ -28,12 +28,6 @@ class TwistExponential(nn.Module):
     All derivatives are finite at zero, too. It is a module so that the constants move to a device once.
     """
 
-    _generators: Tensor
-    _moving_generators: Tensor
-    _powers: Tensor
-    _first_terms: Tensor
-    _further_terms: Tensor
-
     def __init__(self) -> None:
         super().__init__()
         generators = torch.zeros(6, 4, 4, dtype=torch.float64)
@@ -48,14 +42,11 @@ class TwistExponential(nn.Module):
             [[(-1) ** j / math.factorial(k + 2 * j) for k in range(2, 6)] for j in range(_NUM_TERMS)],
             dtype=torch.float64,
         )
-        for name, value in (
-            ("_generators", generators.flatten(1)),
-            ("_moving_generators", moving.flatten(1)),
-            ("_powers", torch.arange(1.0, _NUM_TERMS, dtype=torch.float64)),
-            ("_first_terms", terms[0]),
-            ("_further_terms", terms[1:]),
-        ):
-            self.register_buffer(name, value, persistent=False)
+        self._generators: Tensor = nn.Buffer(generators.flatten(1), persistent=False)
+        self._moving_generators: Tensor = nn.Buffer(moving.flatten(1), persistent=False)
+        self._powers: Tensor = nn.Buffer(torch.arange(1.0, _NUM_TERMS, dtype=torch.float64), persistent=False)
+        self._first_terms: Tensor = nn.Buffer(terms[0], persistent=False)
+        self._further_terms: Tensor = nn.Buffer(terms[1:], persistent=False)
 
     def forward(self, base: Tensor, twist: Tensor) -> Tensor:
         """Return base · exp(X).
@@ -133,14 +124,7 @@ def motion_from_twist(twist: Tensor) -> Tensor:
 
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
-    """Return the exponential of so(3).
-
-    Args:
-        vector: (..., 3) axis times angle in radians.
-
-    Returns:
-        (..., 3, 3) rotation matrices. Both the value and all derivatives are finite at zero.
-    """
+    """Return the (..., 3, 3) rotations by axes times angles in radians (..., 3), with finite derivatives at zero."""
     return motion_from_twist(nn.functional.pad(vector, (3, 0)))[..., :3, :3]
 
 

@@ -53,12 +53,6 @@ class Trajectory(nn.Module):
         tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
     """
 
-    times: Tensor
-    camera_to_worlds: Tensor
-    _knots: Tensor
-    _polynomials: Tensor
-    _products: Tensor
-
     def __init__(self, times: ArrayLike | Tensor, camera_to_worlds: Tensor, source: str | Path = "trajectory") -> None:
         super().__init__()
         self.source = source
@@ -87,14 +81,11 @@ class Trajectory(nn.Module):
         if distance > _MAX_POSITION:
             raise DataError(source, f"a pose is {float(distance):g} away from the origin", "check the columns")
         require_rigid(poses, source)
-        for name, value in (
-            ("times", times),
-            ("camera_to_worlds", poses),
-            ("_knots", seconds),
-            ("_polynomials", pose_polynomials(seconds, poses)),
-            ("_products", rotation_from_products().to(poses.device)),
-        ):
-            self.register_buffer(name, value, persistent=False)
+        self.times: Tensor = nn.Buffer(times, persistent=False)
+        self.camera_to_worlds: Tensor = nn.Buffer(poses, persistent=False)
+        self._knots: Tensor = nn.Buffer(seconds, persistent=False)
+        self._polynomials: Tensor = nn.Buffer(pose_polynomials(seconds, poses), persistent=False)
+        self._products: Tensor = nn.Buffer(rotation_from_products().to(poses.device), persistent=False)
 
     def __len__(self) -> int:
         return len(self.times)

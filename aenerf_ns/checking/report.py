@@ -18,7 +18,7 @@ from aenerf_ns.checking.result import CheckResult
 from aenerf_ns.checking.thresholds import PolarityBalance
 from aenerf_ns.events.statistics import event_statistics
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.progress import progress_bar, tracked
+from aenerf_ns.progress import progress_bar
 from aenerf_ns.recording.recording import Capture, Recording
 
 _RATE_PARTS = 60
@@ -84,7 +84,7 @@ def _check_events(capture: Capture, frames: Iterable[tuple[int, Path]], window: 
 
     def chunks() -> Iterator[EventStream]:
         nonlocal num_covered
-        for chunk in tracked(file.chunks(), "Reading events", file.count()):
+        for chunk in file.tracked("Reading events"):
             num_covered += int(window.contains(chunk.t).sum())
             changes.add(chunk, balance.add(chunk))
             noise.add(chunk)
@@ -104,7 +104,7 @@ def _read_runs(recording: Recording, window: TimeWindow, num_covered: int) -> li
     begins, length = choose_runs(num_covered, camera)
     parts: list[list[EventStream]] = [[] for _ in begins]
     position = 0
-    for chunk in tracked(file.chunks(), "Choosing events", file.count()):
+    for chunk in file.tracked("Choosing events"):
         covered = chunk[window.contains(chunk.t)]
         for part, begin in zip(parts, begins - position, strict=True):
             # Indices make a copy: a slice would keep the whole chunk in memory.

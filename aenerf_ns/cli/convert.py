@@ -23,7 +23,6 @@ from aenerf_ns.cli.ranges import require_seed
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.files.output_paths import require_absent
-from aenerf_ns.progress import tracked
 from aenerf_ns.reconstruction.weights import require_weights
 
 if TYPE_CHECKING:
@@ -276,7 +275,7 @@ def _copy_events(recording: Recording, events: EventSelection, writer: NativeDat
     def read(description: str) -> Iterator[EventStream]:
         nonlocal num_read
         num_read = 0
-        for chunk in tracked(source.chunks(), description, source.count()):
+        for chunk in source.tracked(description):
             yield chunk
             num_read += len(chunk)
 

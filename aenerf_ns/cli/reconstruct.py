@@ -14,7 +14,6 @@ from aenerf_ns.cli.ranges import require_range
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import require_absent
-from aenerf_ns.progress import tracked
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL, batches_of
 from aenerf_ns.reconstruction.weights import require_weights
 
@@ -83,8 +82,7 @@ class Reconstruct(DatasetCommand):
         from aenerf_ns.reconstruction.weights import load_network
 
         if self.weights is None:
-            events = recording.event_file
-            chunks = tracked(events.chunks(), "Comparing the pixels", events.count())
+            chunks = recording.event_file.tracked("Comparing the pixels")
             drift = drift_of_events(chunks, recording.sensor.refractory_period)
             return partial(filtered_images, sensor=recording.sensor, drift=drift)
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -101,7 +99,7 @@ class Reconstruct(DatasetCommand):
         num_events = max(int(self.events_per_pixel * events.width * events.height), 1)
 
         def copied() -> Iterator[EventStream]:
-            for chunk in tracked(events.chunks(), "Reconstructing images", events.count()):
+            for chunk in events.tracked("Reconstructing images"):
                 writer.events.append(chunk)
                 yield chunk
 

@@ -61,24 +61,11 @@ class SensorModel:
         """Number of radiance channels the sensor sees: 1 for a monochrome sensor, 3 for a color one."""
         return 3 if self.bayer_pattern else 1
 
-    @property
-    def color_filter(self) -> NDArray[np.int64]:
-        """The (2, 2) channels (0 red, 1 green, 2 blue) of the filters of a color sensor: [row % 2, column % 2]."""
-        return np.array(["RGB".index(color) for color in self.bayer_pattern]).reshape(2, 2)
-
-    def channel(self, x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the radiance channel that each pixel's filter passes.
-
-        Args:
-            x: (N,) raw integer pixel columns, before any undistortion.
-            y: (N,) raw integer pixel rows.
-
-        Returns:
-            (N,) channel indices: 0 for a monochrome sensor; 0 red, 1 green, 2 blue for a color one.
-        """
-        if not self.bayer_pattern:
-            return np.zeros(len(x), dtype=np.int64)
-        return self.color_filter[y % 2, x % 2]
+    def channels(self, width: int, height: int) -> NDArray[np.int64]:
+        """Return the (height, width) radiance channels that the filters of raw pixels pass: 0 red, 1 green, 2 blue; 0
+        for all pixels of a monochrome sensor."""
+        colors = np.array(["RGB".index(color) for color in self.bayer_pattern or "RRRR"]).reshape(2, 2)
+        return np.tile(colors, (-(-height // 2), -(-width // 2)))[:height, :width]
 
 
 def sensor_values(stated: object) -> dict[str, Any]:

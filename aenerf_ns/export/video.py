@@ -19,9 +19,8 @@ from aenerf_ns.events.picture import net_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.export.rendering import corrected_poses, render
 from aenerf_ns.files.event_reader import EventFile
-from aenerf_ns.progress import track, tracked
+from aenerf_ns.progress import track
 from aenerf_ns.recording.images import read_image
-from aenerf_ns.recording.recording import SPLITS
 
 # Minimum height of a panel, height of the line of text above it, and gap between panels, in pixels.
 _MIN_HEIGHT, _LABEL, _GAP = 240, 16, 4
@@ -38,7 +37,7 @@ def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]
     recording = run.recording
     camera = recording.event_camera
     trigger = RenderedEvents(recording.sensor, camera.width, camera.height)
-    images = _timed_images(run)
+    images = [(time, file) for time, file in recording.frames if file.is_file()]
     poses = homogeneous(corrected_poses(run, times))
     trigger(render(run, camera, poses[0])["log_radiance"].cpu().numpy())
     recorded = sum_recorded_events(recording.event_file, times.numpy())
@@ -60,12 +59,6 @@ def render_panels(run: TrainedRun, times: Tensor) -> Iterator[NDArray[np.uint8]]
         if images:
             panels["image"] = _image_panel(run, images, time)
         yield _join_panels(panels, f"{(time - int(times[0])) * 1e-9:.3f} s")
-
-
-def _timed_images(run: TrainedRun) -> list[tuple[int, Path]]:
-    views = run.recording.reference_views
-    taken = {view.time: view.file for split in SPLITS for view in views[split] if view.time is not None}
-    return sorted((time, file) for time, file in taken.items() if file.is_file())
 
 
 def _image_panel(run: TrainedRun, images: list[tuple[int, Path]], time: int) -> NDArray[np.uint8]:
@@ -111,7 +104,7 @@ def sum_recorded_events(events: EventFile, times: NDArray[np.int64]) -> Iterator
     shape = (events.height, events.width)
     net = np.zeros(shape, np.int64)
     index, last = 0, len(times) - 1
-    for chunk in tracked(events.chunks(), f"Reading {events.path.name}", events.count()):
+    for chunk in events.tracked():
         edges = np.searchsorted(chunk.t, times)
         while index < last:
             inside = slice(edges[index], edges[index + 1])
@@ -134,8 +127,7 @@ class RenderedEvents:
 
     def __init__(self, sensor: SensorModel, width: int, height: int) -> None:
         self._sensor = sensor
-        rows, columns = np.divmod(np.arange(width * height), width)
-        self._channel = sensor.channel(columns, rows).reshape(height, width, 1)
+        self._channel = sensor.channels(width, height)[..., None]
         self._reference: NDArray[np.float64] | None = None
 
     def __call__(self, log_radiance: NDArray[np.floating]) -> NDArray[np.int64]:

@@ -50,9 +50,7 @@ class Aedat4File(EventFile):
     kind = "AEDAT4 file"
     extra = "aedat4"
 
-    def __init__(
-        self, path: Path, width: int | None = None, height: int | None = None, stream: str | None = None
-    ) -> None:
+    def __init__(self, path: Path, width: int | None, height: int | None, stream: str | None) -> None:
         self.path = path
         self._file_size = path.stat().st_size
         with path.open("rb") as file:

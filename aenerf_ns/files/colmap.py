@@ -100,7 +100,7 @@ def read_colmap_focal_shares(model: Path) -> list[float]:
             shares.append(focal / width)
             position += _CAMERA.size + 8 * (_NUM_PARAMETERS[kind] - 1)
         return shares
-    except (struct.error, ValueError, IndexError, ZeroDivisionError) as error:
+    except (struct.error, ValueError, IndexError, ArithmeticError) as error:
         raise _damaged(path, f"a camera cannot be read: {error}") from None
 
 
@@ -132,7 +132,8 @@ def _read_binary(path: Path, file: BinaryIO) -> Iterator[Row]:
 def _read_text(path: Path, file: BinaryIO) -> Iterator[Row]:
     require_at_most(path, _MAX_TEXT_BYTES)
     is_pose = True
-    for number in range(1, 2 * _MAX_IMAGES):
+    # With room for comments.
+    for number in range(1, 2 * _MAX_IMAGES + 100):
         line = file.readline(_MAX_LINE)
         if not line:
             return
@@ -148,9 +149,10 @@ def _read_text(path: Path, file: BinaryIO) -> Iterator[Row]:
             try:
                 _, *values, camera = (float(field) for field in fields[:9])
                 yield fields[9], values, int(camera)
-            except (ValueError, IndexError):
+            except (ValueError, IndexError, OverflowError):
                 raise _damaged(path, f"line {number} is not an image: {line[:40]!r}") from None
         is_pose = not is_pose
+    raise _damaged(path, f"it has more than {_MAX_IMAGES:,} images")
 
 
 def _damaged(path: Path, problem: str) -> DataError:

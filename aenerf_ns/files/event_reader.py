@@ -15,6 +15,7 @@ from aenerf_ns.events.stream import UNSORTED_REMEDY, EventStream, unsorted_error
 from aenerf_ns.files.left_out import LeftOut
 from aenerf_ns.files.limits import bounded, bounded_items
 from aenerf_ns.files.text import TimeUnit
+from aenerf_ns.progress import progress_bar
 
 CHUNK = 1 << 20
 """Events that are read at once: 13 MB."""
@@ -135,6 +136,14 @@ class EventFile(ABC):
         self.left_out.print_once(self.path)
         if total == 0:
             raise self.empty_error()
+
+    def tracked(self, description: str = "") -> Iterator[EventStream]:
+        """Yield :meth:`chunks`, with a progress bar towards the number of events, if that is known."""
+        with progress_bar() as progress:
+            task = progress.add_task(description or f"Reading {self.path.name}", total=self.count())
+            for chunk in self.chunks():
+                yield chunk
+                progress.advance(task, len(chunk))
 
     def _pieces(self) -> Iterator[EventStream]:
         """Yield what :meth:`read_chunks` yields, then the events that wait for a piece behind it."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import OUTSIDE_REMEDY, EventStream
 from aenerf_ns.files.event_reader import CHUNK, Columns, EventFile
-from aenerf_ns.files.left_out import LeftOut
 from aenerf_ns.files.limits import MAX_TIME
 from aenerf_ns.files.text import NANOSECONDS, TimeUnit
 
@@ -133,17 +132,8 @@ class EventTableFile(EventFile):
         return NANOSECONDS[self._stated_unit(arrays) or self._guessed_unit(arrays)]
 
     def _read(self, arrays: Mapping[str, Any], first: int, last: int, tick: int) -> EventStream:
-        columns = events_from_columns(
-            self._columns(arrays, first, last),
-            width=self.width,
-            height=self.height,
-            tick=tick,
-            offset=arrays.get("time_offset", 0),
-            source=self.path,
-            describe_event=lambda index: f"event {first + index}",
-            left_out=self.left_out if self.drop_malformed else None,
-        )
-        return self._stream(columns)
+        columns, offset = self._columns(arrays, first, last), arrays.get("time_offset", 0)
+        return self._stream(events_from_columns(self, columns, tick, lambda index: f"event {first + index}", offset))
 
 
 def guess_time_unit(times: NDArray) -> TimeUnit:
@@ -152,48 +142,44 @@ def guess_time_unit(times: NDArray) -> TimeUnit:
 
 
 def events_from_columns(
+    file: EventFile,
     columns: Mapping[str, NDArray],
-    *,
-    width: int,
-    height: int,
     tick: int,
+    describe_event: Callable[[int], str],
     offset: int = 0,
     fraction: NDArray[np.float64] | None = None,
-    source: str | Path,
-    describe_event: Callable[[int], str] = "event {}".format,
-    left_out: LeftOut | None = None,
 ) -> Columns:
     """Return x, y, t in nanoseconds and p = ±1 of events in columns of any numeric type.
 
     Args:
+        file: the columns are from. Where it is to drop malformed events, it takes those with an impossible value.
         columns: x, y, t and p, (N,) each. Polarities are 0 and 1, or −1 and 1.
-        width, height: size of the sensor in pixels.
         tick: nanoseconds of the unit of the times.
+        describe_event: says which event one is in the file, for messages.
         offset: added to the times, in their unit.
         fraction: (N,) added to the times, in their unit, where the times are integers; between −1 and 1.
-        source: names the origin of the columns, for messages.
-        describe_event: says which event one is in the source, for messages.
-        left_out: takes the events with a value that no event can have, which are then left out.
 
     Raises:
-        DataError: a value is not one that an event can have, and there is no ``left_out``.
+        DataError: a value is not one that an event can have, and these are not to be dropped.
     """
     for name in "xytp":
         if columns[name].dtype.kind not in "iufb":
-            raise DataError(source, f"column {name} has type {columns[name].dtype}", "store numbers")
+            raise DataError(file.path, f"column {name} has type {columns[name].dtype}", "store numbers")
 
     kept = np.ones(len(columns["t"]), bool)
 
     def require(name: str, good: NDArray[np.bool_], remedy: str) -> None:
         if good.all():
             return
-        if left_out is None:
+        if not file.drop_malformed:
             index = int(np.argmin(good))
-            raise DataError(source, f"{describe_event(index)} has {name} = {columns[name][index]:g}", remedy)
-        left_out.add(f"with an impossible {name}", kept & ~good, lambda i: f"{describe_event(i)}, {columns[name][i]:g}")
+            raise DataError(file.path, f"{describe_event(index)} has {name} = {columns[name][index]:g}", remedy)
+        file.left_out.add(
+            f"with an impossible {name}", kept & ~good, lambda i: f"{describe_event(i)}, {columns[name][i]:g}"
+        )
         kept[~good] = False
 
-    for name, size in (("x", width), ("y", height)):
+    for name, size in (("x", file.width), ("y", file.height)):
         values = columns[name]
         good = (values >= 0) & (values < size)
         if values.dtype.kind == "f":
@@ -214,7 +200,7 @@ def events_from_columns(
     if zero.any() and (kept & ~positive & ~zero).any():
         index = int(np.argmax(zero))
         remedy = "there are events of polarity -1 beside it: use 0 and 1, or -1 and 1"
-        raise DataError(source, f"{describe_event(index)} has p = 0", remedy)
+        raise DataError(file.path, f"{describe_event(index)} has p = 0", remedy)
 
     if not kept.all():
         columns = {name: column[kept] for name, column in columns.items()}

@@ -275,17 +275,7 @@ class TextEventFile(EventFile):
         columns = {}
         for name, whole, fraction in zip(_COLUMNS, lines.whole, lines.fraction, strict=True):
             columns[name] = whole + fraction if name != "t" and fraction.any() else whole
-        events = events_from_columns(
-            columns,
-            width=self.width,
-            height=self.height,
-            tick=tick,
-            fraction=lines.fraction[2],
-            source=self.path,
-            describe_event=lines.line_of,
-            left_out=self.left_out if self.drop_malformed else None,
-        )
-        return self._stream(events)
+        return self._stream(events_from_columns(self, columns, tick, lines.line_of, fraction=lines.fraction[2]))
 
 
 def parse_lines(

@@ -80,7 +80,8 @@ def open_event_file(
             return RosbagEventFile(path, width, height, topic)
         if name == "Prophesee":
             header = PropheseeHeader.parse(path, beginning)
-            is_raw = path.suffix.lower() == ".raw" or header.is_raw
+            # Only headers of RAW files name an encoding.
+            is_raw = path.suffix.lower() == ".raw" or not header.fields.keys().isdisjoint(("evt", "format"))
             return (PropheseeRawFile if is_raw else PropheseeDatFile)(path, header, width, height)
         if name == "HDF5":
             return open_hdf5_events(path, width, height, time_unit)

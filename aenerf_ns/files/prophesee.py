@@ -72,11 +72,6 @@ class PropheseeHeader:
         return cls(fields, end)
 
     @property
-    def is_raw(self) -> bool:
-        """Whether the header is that of a RAW file: only these name an encoding."""
-        return bool({"evt", "format"} & set(self.fields))
-
-    @property
     def format_options(self) -> dict[str, str]:
         """The options of ``% format NAME;option=value;…``, and its name in capitals as the option "name"."""
         name, *options = self.fields.get("format", "").split(";")

@@ -42,16 +42,10 @@ _MCAP_MAGIC, _MCAP_FOOTER = BAG_MAGIC[2], 0x02
 _PACKET_TYPES = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 _ARRAY_TYPES = tuple(f"{name}/msg/EventArray" for name in ("dvs_msgs", "dv_ros_msgs", "prophesee_event_msgs"))
 # ROS 1 serializes an event without padding. ROS 2 aligns each number to its size; see `_aligned_events`.
-_EVENT_FIELDS = {"x": "<u2", "y": "<u2", "seconds": "<u4", "nanoseconds": "<u4", "polarity": "?"}
-_PACKED_EVENT = np.dtype(list(_EVENT_FIELDS.items()))
-_ALIGNED_EVENT = np.dtype(
-    {
-        "names": list(_EVENT_FIELDS),
-        "formats": list(_EVENT_FIELDS.values()),
-        "offsets": [0, 2, 6, 10, 14],
-        "itemsize": 16,
-    }
-)
+_PIXEL = [("x", "<u2"), ("y", "<u2")]
+_TIME_AND_POLARITY = [("seconds", "<u4"), ("nanoseconds", "<u4"), ("polarity", "?")]
+_PACKED_EVENT = np.dtype([*_PIXEL, *_TIME_AND_POLARITY])
+_ALIGNED_EVENT = np.dtype([*_PIXEL, ("", "V2"), *_TIME_AND_POLARITY, ("", "V1")])
 # CDR, little-endian: the serialization of ROS 2.
 _CDR_HEADER = b"\0\1"
 _CDR_HEADER_BYTES = 4
@@ -104,9 +98,7 @@ class RosbagEventFile(EventFile):
 
     extra = "rosbag"
 
-    def __init__(
-        self, path: Path, width: int | None = None, height: int | None = None, topic: str | None = None
-    ) -> None:
+    def __init__(self, path: Path, width: int | None, height: int | None, topic: str | None) -> None:
         self.path = path
         self._topic, self._size = topic, (width, height)
         self._is_ros2 = path.is_dir() or not _begins(path, _ROS1_MAGIC)

@@ -6,7 +6,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider
-from torch import Tensor
+from torch import Tensor, nn
 
 # Rays that see less than this length of the box miss it, in scene units.
 _MISSED = 1e-5
@@ -20,12 +20,10 @@ class BoxCollider(AABBBoxCollider):
     near plane outside training, so a camera inside the box would see matter that no training ray has passed.
     """
 
-    _aabb: Tensor
-
     def __init__(self, scene_box: SceneBox, near_plane: float) -> None:
         super().__init__(scene_box, near_plane)
         # A buffer, because copying the box for every batch would wait for the GPU.
-        self.register_buffer("_aabb", scene_box.aabb.clone(), persistent=False)
+        self._aabb: Tensor = nn.Buffer(scene_box.aabb.clone(), persistent=False)
         self._diagonal = float((scene_box.aabb[1] - scene_box.aabb[0]).norm())
 
     def set_nears_and_fars(self, ray_bundle: RayBundle) -> RayBundle:

@@ -70,17 +70,14 @@ class AffineColorCorrection(nn.Module):
     protocol: ClassVar[ColorCorrectionProtocol] = "affine"
     split: ClassVar[Literal["val", "test"]] = "val"
     """The reference views to fit on."""
-    scale: Tensor
-    offset: Tensor
-    num_views: Tensor
 
     def __init__(self, num_channels: int, encoding: ImageEncoding) -> None:
         super().__init__()
         self.encoding = encoding
-        self.register_buffer("scale", torch.ones(num_channels))
-        self.register_buffer("offset", torch.zeros(num_channels))
+        self.scale: Tensor = nn.Buffer(torch.ones(num_channels))
+        self.offset: Tensor = nn.Buffer(torch.zeros(num_channels))
         # Reference views the map was fitted on; 0 for the percentile stretch.
-        self.register_buffer("num_views", torch.zeros((), dtype=torch.int64))
+        self.num_views: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
     def forward(self, log_radiance: Tensor) -> Tensor:
         """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
@@ -163,11 +160,10 @@ class TranslatedGammaColorCorrection(AffineColorCorrection):
     """
 
     protocol = "translated-gamma"
-    black: Tensor
 
     def __init__(self, num_channels: int, encoding: ImageEncoding) -> None:
         super().__init__(num_channels, encoding)
-        self.register_buffer("black", torch.full((num_channels,), _EPSILON))
+        self.black: Tensor = nn.Buffer(torch.full((num_channels,), _EPSILON))
 
     def forward(self, log_radiance: Tensor) -> Tensor:
         """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
@@ -216,11 +212,7 @@ def _fit_translated_gamma(
         with np.errstate(over="ignore"):
             return np.exp(a * log_radiance + log_b) - c - reference
 
-    def jacobian(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        power = np.exp(unknowns[0] * log_radiance + unknowns[1])
-        return np.stack([power * log_radiance, power, -np.ones_like(power)], 1)
-
-    return least_squares(residuals, start, jacobian, method="lm").x
+    return least_squares(residuals, start, method="lm").x
 
 
 class NetworkColorCorrection(AffineColorCorrection):
@@ -232,13 +224,11 @@ class NetworkColorCorrection(AffineColorCorrection):
     """
 
     protocol = "network"
-    input_mean: Tensor
-    input_deviation: Tensor
 
     def __init__(self, num_channels: int, encoding: ImageEncoding) -> None:
         super().__init__(num_channels, encoding)
-        self.register_buffer("input_mean", torch.zeros(num_channels))
-        self.register_buffer("input_deviation", torch.ones(num_channels))
+        self.input_mean: Tensor = nn.Buffer(torch.zeros(num_channels))
+        self.input_deviation: Tensor = nn.Buffer(torch.ones(num_channels))
         widths = (num_channels, *_HIDDEN, num_channels)
         for layer, (num_inputs, num_outputs) in enumerate(pairwise(widths)):
             self.register_buffer(f"weight_{layer}", torch.zeros(num_outputs, num_inputs))

@@ -18,7 +18,7 @@ from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SpatialDistortion
 from nerfstudio.fields.base_field import Field
 from nerfstudio.fields.density_fields import HashMLPDensityField
-from torch import Tensor
+from torch import Tensor, nn
 
 from aenerf_ns.method.activation import SharpSoftplus
 from aenerf_ns.method.hash_grid import HashEncoding, Implementation
@@ -70,7 +70,7 @@ class IntegratedEncoding(NeRFEncoding):
     def __init__(self, num_frequencies: int) -> None:
         super().__init__(3, num_frequencies, 0.0, num_frequencies - 1.0, include_input=True)
         # Checkpoints of fields with a plain encoding fit otherwise, and would show other pictures.
-        self.register_buffer("is_integrated", torch.tensor(True))
+        self.is_integrated: Tensor = nn.Buffer(torch.tensor(True))
 
     def pytorch_fwd(self, in_tensor: Tensor, covs: Tensor | None = None) -> Tensor:
         """Return features (N, 6 num_frequencies) of positions (N, 3), for Gaussians with variances (N, 3) by axis."""
@@ -98,8 +98,6 @@ class DensityField(Field):
         to_field_space: of a :class:`.pose_following_warp.PoseFollowingWarp`; None for a field fixed in the scene.
     """
 
-    aabb: Tensor
-
     def __init__(
         self,
         aabb: Tensor,
@@ -109,7 +107,7 @@ class DensityField(Field):
         to_field_space: ToFieldSpace | None,
     ) -> None:
         super().__init__()
-        self.register_buffer("aabb", aabb)
+        self.aabb: Tensor = nn.Buffer(aabb)
         self.to_field_space = to_field_space
         self.spatial_distortion = spatial_distortion
         self.density_activation = shape.activation
@@ -140,12 +138,6 @@ class DensityField(Field):
         else:
             density = F.softplus(raw_density + math.log(math.expm1(self.average_init_density)))
         return density * inside, feature
-
-    def get_outputs(
-        self, ray_samples: RaySamples, density_embedding: Tensor | None = None
-    ) -> dict[FieldHeadNames, Tensor]:
-        """Return nothing besides the density."""
-        return {}
 
 
 class EventRadianceField(DensityField):

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 import torch.autograd.forward_ad as forward_ad
 from nerfstudio.field_components.encodings import HashEncoding as FrameworkHashEncoding
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from aenerf_ns.method.kernels.loader import is_float_in_memory, try_load
@@ -38,19 +38,13 @@ class HashEncoding(FrameworkHashEncoding):
         options: the other options of the framework's encoding.
     """
 
-    _scales: Tensor
-    _primes: Tensor
-    _offsets: Tensor
-
     def __init__(self, implementation: Implementation = "auto", **options: Any) -> None:
         super().__init__(features_per_level=2, implementation="torch", **options)
         self._implementation = implementation
-        for name, value in (
-            ("_scales", self.scalings[:, None]),
-            ("_primes", torch.tensor(_PRIMES, dtype=torch.int32)[:, None, None]),
-            ("_offsets", self.hash_offset.to(torch.int32)[:, None]),
-        ):
-            self.register_buffer(name, value, persistent=False)
+        primes = torch.tensor(_PRIMES, dtype=torch.int32)[:, None, None]
+        self._primes: Tensor = nn.Buffer(primes, persistent=False)
+        self._scales: Tensor = nn.Buffer(self.scalings[:, None], persistent=False)
+        self._offsets: Tensor = nn.Buffer(self.hash_offset.to(torch.int32)[:, None], persistent=False)
 
     def pytorch_fwd(self, in_tensor: Tensor) -> Tensor:
         """Return features (N, 2 levels) of positions (N, 3) in [0, 1]."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+import torch.autograd.forward_ad as forward_ad
 import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
@@ -38,7 +39,6 @@ from aenerf_ns.method.pose_correction import PoseCorrection, PoseCorrectionConfi
 from aenerf_ns.method.pose_following_warp import PoseFollowingWarp
 from aenerf_ns.method.ray_losses import distortion_loss
 from aenerf_ns.method.ray_samplers import ProposalSampler
-from aenerf_ns.method.temporal import log_radiance_rate
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.supervision.base import Batch, LossCoefficients, Supervision, SupervisionConfig
 from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervisionConfig
@@ -243,14 +243,9 @@ class AENeRFModel(Model):
         num_rates = self.supervision.num_rate_rays(len(ray_bundle)) if is_trained_on else 0
         if num_rates > 0:
             within = slice(len(ray_bundle) - num_rates, None)
-            moving = ray_bundle[within]
             ends, weights_of_ends = self._composite(samples[: within.start])
-            log_radiance, outputs["log_radiance_rate"], weights = log_radiance_rate(
-                self._composite,
-                samples[within],
-                (moving.origins, moving.directions),
-                self.camera_optimizer.ray_rates(moving),
-            )
+            moving = self._composite_with_rate(samples[within], ray_bundle[within])
+            log_radiance, outputs["log_radiance_rate"], weights = moving
             log_radiance, weights = torch.cat([ends, log_radiance]), torch.cat([weights_of_ends, weights])
         else:
             log_radiance, weights = self._composite(samples)
@@ -284,6 +279,28 @@ class AENeRFModel(Model):
         if self.raw_background is not None:
             radiance = radiance + (1 - weights.sum(-2)) * F.softplus(self.raw_background)
         return torch.log(radiance + _RADIANCE_EPSILON), weights
+
+    def _composite_with_rate(self, samples: RaySamples, rays: RayBundle) -> tuple[Tensor, Tensor, Tensor]:
+        """Return log-radiance (N, channels), G_pred of the paper (before eq. 12) and weights (N, samples, 1).
+
+        G_pred is the total derivative d log L̂ / dt, (N, channels) per second, while the rays of a batch move with the
+        corrected poses. Forward-mode automatic differentiation goes through the field and the compositing. The
+        derivative is exact, but for a field that moves along: the place at which it looks up its motion is held
+        constant. One ordinary backward pass then reaches the parameters of the field and of the rays' motion. The
+        samples' distances along the ray are held constant.
+        """
+        rates = self.camera_optimizer.ray_rates(rays)
+        # In full precision, because on a fine grid rates per second exceed the range of half precision.
+        with torch.autocast(rays.origins.device.type, enabled=False), forward_ad.dual_level():
+            origins, directions = (
+                # Cloned, because the tangent of a part of a tensor would get memory for the whole.
+                forward_ad.make_dual(value.clone(), rate)[:, None].expand_as(samples.frustums.origins)
+                for value, rate in zip((rays.origins, rays.directions), rates, strict=True)
+            )
+            moving = replace(samples, frustums=replace(samples.frustums, origins=origins, directions=directions))
+            log_radiance, weights = self._composite(moving)
+            primal, rate = forward_ad.unpack_dual(log_radiance)
+            return primal, rate, forward_ad.unpack_dual(weights).primal
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: Batch, metrics_dict: dict[str, Tensor] | None = None

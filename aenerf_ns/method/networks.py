@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 from nerfstudio.field_components.spatial_distortions import SpatialDistortion
@@ -96,7 +97,7 @@ def make_networks(
         warp: moves the field along with the corrections of the poses, or None where poses are not corrected.
     """
     # The proposal networks only follow the field: gradients reach the motion of space by the field alone.
-    field_warp, proposal_warp = (None, None) if warp is None else (warp.forward, warp.without_gradient)
+    field_warp, proposal_warp = (None, None) if warp is None else (warp.forward, partial(warp.forward, detached=True))
     encoding: HashEncoding | IntegratedEncoding
     activation: Literal["exp", "softplus"]
     if backbone == "hash":

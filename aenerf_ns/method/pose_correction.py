@@ -83,14 +83,7 @@ class PoseCorrection(CameraOptimizer):
     """
 
     config: PoseCorrectionConfig
-    _camera_seconds: Tensor
-    _compared_seconds: Tensor
     _true_poses: Tensor | None
-    _twist_units: Tensor
-    clock_start: Tensor
-    _sampled_seconds: Tensor
-    _sampled_poses: Tensor
-    _penalties: Tensor
 
     def __init__(
         self,
@@ -105,10 +98,10 @@ class PoseCorrection(CameraOptimizer):
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
         self.trajectory = trajectory
-        self.register_buffer("_camera_seconds", trajectory.seconds(camera_times), persistent=False)
+        self._camera_seconds: Tensor = nn.Buffer(trajectory.seconds(camera_times), persistent=False)
         times = _compared_times(trajectory, ground_truth)
         self.has_ground_truth = ground_truth is not None
-        self.register_buffer("_compared_seconds", trajectory.seconds(times), persistent=False)
+        self._compared_seconds: Tensor = nn.Buffer(trajectory.seconds(times), persistent=False)
         true_poses = None if ground_truth is None else ground_truth.interpolate(times)
         self.register_buffer("_true_poses", true_poses, persistent=False)
         # A camera that only turns gives translations no unit. The unit of the scene serves instead.
@@ -116,20 +109,18 @@ class PoseCorrection(CameraOptimizer):
         # Times in every interval of the spline, at which the size of the corrections is taken.
         count = max(64, math.ceil(trajectory.duration / config.knot_interval))
         sampled = torch.linspace(0, trajectory.duration, count, dtype=torch.float64)
-        for name, value in (
-            ("_twist_units", torch.tensor([extent] * 3 + [1.0] * 3, dtype=torch.float64)),
-            ("_sampled_seconds", sampled),
-            ("_sampled_poses", trajectory.pose(sampled)),
-            ("_penalties", torch.tensor([config.trans_l2_penalty] * 3 + [config.rot_l2_penalty] * 3).double()),
-        ):
-            self.register_buffer(name, value, persistent=False)
+        units, penalties = [extent] * 3 + [1.0] * 3, [config.trans_l2_penalty] * 3 + [config.rot_l2_penalty] * 3
+        self._twist_units: Tensor = nn.Buffer(torch.tensor(units, dtype=torch.float64), persistent=False)
+        self._penalties: Tensor = nn.Buffer(torch.tensor(penalties, dtype=torch.float64), persistent=False)
+        self._sampled_seconds: Tensor = nn.Buffer(sampled, persistent=False)
+        self._sampled_poses: Tensor = nn.Buffer(trajectory.pose(sampled), persistent=False)
         self._exponential = TwistExponential()
         self.training_cameras_are_corrected = False
         self.rigid_offset = nn.Parameter(torch.zeros(6)) if config.rigid_offset else None
         self.clock_change: nn.Parameter | None = None
         if config.clock_offset is not None:
             self.clock_change = nn.Parameter(torch.zeros(()))
-            self.register_buffer("clock_start", torch.tensor(config.clock_offset, dtype=torch.float64))
+            self.clock_start: Tensor = nn.Buffer(torch.tensor(config.clock_offset, dtype=torch.float64))
             # The seconds in which the camera moves by a unit of the twists: a step of the optimizer then moves poses
             # about as far by the clock as by a twist.
             _, rate = trajectory.pose_and_rate(sampled)
@@ -176,10 +167,10 @@ class PoseCorrection(CameraOptimizer):
             base_rate = torch.where(self._moves(seconds), base_rate, 0.0)
         pose, rate = base, base_rate
         if self.twists is not None:
-            twist, twist_rate = self.twists.with_rate(seconds, base, base_rate)
-            pose, rate = self._exponential.with_rate(
-                pose, rate, self._twist_units * twist, self._twist_units * twist_rate
-            )
+            with forward_ad.dual_level():
+                moving = forward_ad.make_dual(seconds, torch.ones_like(seconds)), forward_ad.make_dual(base, base_rate)
+                twist, twist_rate = forward_ad.unpack_dual(self._twist_units * self.twists(*moving))
+            pose, rate = self._exponential.with_rate(pose, rate, twist, twist_rate)
         if self.rigid_offset is not None:
             # From the right, a constant motion acts on rates as on poses.
             both = self._exponential(torch.cat([pose, rate], -2), self._rigid_twists(len(pose)))
@@ -416,15 +407,6 @@ class TwistNetwork(nn.Module):
             embedded = F.softplus(pose) + F.softplus(self.time_embedding(time))
             return (_NETWORK_OUTPUT_SCALE * self.output(self.hidden(self.encoding(embedded)))).double()
 
-    def with_rate(self, seconds: Tensor, base: Tensor, base_rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Return float64 twists and their rates per second (N, 6), for estimated poses and their rates (N, 3, 4)."""
-        with forward_ad.dual_level():
-            moving = self(
-                forward_ad.make_dual(seconds, torch.ones_like(seconds)), forward_ad.make_dual(base, base_rate)
-            )
-            twist, rate = forward_ad.unpack_dual(moving)
-        return twist, rate
-
 
 class TwistSpline(nn.Module):
     """A uniform cubic B-spline of twists.
@@ -433,10 +415,6 @@ class TwistSpline(nn.Module):
         duration: seconds it spans.
         knot_interval: seconds between knots.
     """
-
-    _exponents: Tensor
-    _basis: Tensor
-    _near: Tensor
 
     def __init__(self, duration: float, knot_interval: float) -> None:
         super().__init__()
@@ -448,30 +426,15 @@ class TwistSpline(nn.Module):
             [[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]],
             dtype=torch.float64,
         )
-        basis /= 6
-        rate = torch.zeros(4, 4, dtype=torch.float64)
-        rate[:3] = basis[1:] * torch.tensor([[1.0], [2.0], [3.0]]) / self._interval
-        for name, value in (
-            ("_exponents", torch.arange(4, dtype=torch.float64)),
-            ("_basis", torch.cat([basis, rate], -1)),
-            ("_near", torch.arange(4)),
-        ):
-            self.register_buffer(name, value, persistent=False)
+        self._basis: Tensor = nn.Buffer(basis / 6, persistent=False)
+        self._near: Tensor = nn.Buffer(torch.arange(4), persistent=False)
 
     def forward(self, seconds: Tensor, base: Tensor) -> Tensor:
         """Return float64 twists (N, 6) at (N,) seconds. The poses play no part."""
-        return self._evaluate(seconds, self._basis[:, :4])[:, 0]
-
-    def with_rate(self, seconds: Tensor, base: Tensor, base_rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Return float64 twists and their rates per second (N, 6). The poses play no part."""
-        twist, rate = self._evaluate(seconds, self._basis).unbind(1)
-        return twist, rate
-
-    def _evaluate(self, seconds: Tensor, basis: Tensor) -> Tensor:
-        """Return sums (N, count, 6) of control twists by the functions (4, 4 count) of ``basis``."""
         position = seconds / self._interval
         segment = position.detach().long().clamp(0, self._segments - 1)
-        functions = ((position - segment)[:, None] ** self._exponents) @ basis
+        u = position - segment
+        factors = torch.stack([torch.ones_like(u), u, u**2, u**3], -1) @ self._basis
         # In float64, because autocast would round the products of float32.
         near = self.control_twists[segment[:, None] + self._near].double()
-        return functions.unflatten(-1, (-1, 4)) @ near
+        return (factors[:, None] @ near)[:, 0]

@@ -50,28 +50,21 @@ class PoseFollowingWarp(nn.Module):
         accumulating: whether rays are being counted. The model switches it.
     """
 
-    _seconds: Tensor
-    _base_poses: Tensor
-    _seen: Tensor
-    _weights: Tensor
-    _strides: Tensor
-    _aabb: Tensor
-
     def __init__(self, correction: PoseCorrection, spatial_distortion: SpatialDistortion | None, aabb: Tensor) -> None:
         super().__init__()
         self._spatial_distortion = spatial_distortion
-        self.register_buffer("_aabb", aabb, persistent=False)
+        self._aabb: Tensor = nn.Buffer(aabb, persistent=False)
         self.accumulating = False
         duration = correction.trajectory.duration
         count = min(math.ceil(duration / correction.config.knot_interval) + 1, _MAX_TIMES)
         self._interval = duration / (count - 1)
         seconds = torch.linspace(0, duration, count, dtype=torch.float64)
-        self.register_buffer("_seconds", seconds, persistent=False)
+        self._seconds: Tensor = nn.Buffer(seconds, persistent=False)
         base = correction.trajectory.pose(correction.on_clock_of_poses(seconds, at_first=True))
-        self.register_buffer("_base_poses", base, persistent=False)
-        self.register_buffer("_seen", torch.zeros(_RESOLUTION**3, count))
-        self.register_buffer("_weights", torch.full((_RESOLUTION**3, count), 1 / count))
-        self.register_buffer("_strides", torch.tensor([_RESOLUTION**2, _RESOLUTION, 1]), persistent=False)
+        self._base_poses: Tensor = nn.Buffer(base, persistent=False)
+        self._seen: Tensor = nn.Buffer(torch.zeros(_RESOLUTION**3, count))
+        self._weights: Tensor = nn.Buffer(torch.full((_RESOLUTION**3, count), 1 / count))
+        self._strides: Tensor = nn.Buffer(torch.tensor([_RESOLUTION**2, _RESOLUTION, 1]), persistent=False)
         self._twists: Tensor | None = None
 
     def update(self, correction: PoseCorrection) -> None:
@@ -81,17 +74,13 @@ class PoseFollowingWarp(nn.Module):
         with torch.autocast(twists.device.type, enabled=False):
             self._twists = (self._weights @ twists).unflatten(0, [_RESOLUTION] * 3)
 
-    def forward(self, positions: Tensor) -> Tensor:
-        """Return the places (..., 3) in the field's space of positions (..., 3) in the scene."""
-        assert self._twists is not None
-        return self._moved(positions, self._twists)
+    def forward(self, positions: Tensor, detached: bool = False) -> Tensor:
+        """Return the places (..., 3) in the field's space of positions (..., 3) in the scene.
 
-    def without_gradient(self, positions: Tensor) -> Tensor:
-        """Return the places of :meth:`forward`, with a motion that gradients do not reach. They reach the positions."""
+        Gradients reach the positions, and the motion unless it is ``detached``.
+        """
         assert self._twists is not None
-        return self._moved(positions, self._twists.detach())
-
-    def _moved(self, positions: Tensor, grid: Tensor) -> Tensor:
+        grid = self._twists.detach() if detached else self._twists
         with torch.no_grad():
             unit = self._to_unit(forward_ad.unpack_dual(positions).primal.flatten(0, -2)).to(grid.dtype)
         # torch counts the coordinates of a place from the last axis.

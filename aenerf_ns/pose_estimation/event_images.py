@@ -15,9 +15,8 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.filters import EventFilters, EventSelection
 from aenerf_ns.events.polarity_drift import drift_of_events
-from aenerf_ns.events.stream import EventStream
 from aenerf_ns.pose_estimation.colmap_workspace import ColmapWorkspace, work_folder
-from aenerf_ns.progress import progress_bar, tracked
+from aenerf_ns.progress import progress_bar
 from aenerf_ns.reconstruction.batches import EVENTS_PER_PIXEL, batches_of
 from aenerf_ns.reconstruction.images import NetworkImages
 from aenerf_ns.reconstruction.two_sided import log_intensities
@@ -97,13 +96,10 @@ def images_of_events(
     # Pixels that fire by themselves would be features that do not move.
     filters = EventFilters(start=window.start, end=window.end, hot_pixels=True)
     kept = EventSelection(events.path, camera.width, camera.height, filters, capture.sensor.bayer_pattern)
-    kept.find_hot_pixels(tracked(events.chunks(), "Looking for hot pixels", events.count()))
-
-    def filtered(description: str) -> Iterator[EventStream]:
-        return kept.filtered(tracked(events.chunks(), description, events.count()))
+    kept.find_hot_pixels(events.tracked("Looking for hot pixels"))
 
     def make_images(num_events: int, drift: NDArray[np.float32] | None) -> list[tuple[int, NDArray[np.uint8]]]:
-        chunks = filtered("Making images of the events")
+        chunks = kept.filtered(events.tracked("Making images of the events"))
         if weights is not None:
             network = NetworkImages(load_network(weights), capture.sensor, "cpu")
             batches = batches_of(chunks, num_events // _BATCHES)
@@ -123,7 +119,7 @@ def images_of_events(
     share = _MAX_MOTION / max(_motion([image for _, image in images]), _MAX_MOTION)
     drift = None
     if weights is None:
-        drift = drift_of_events(filtered("Comparing the pixels"), capture.sensor.refractory_period)
+        drift = drift_of_events(kept.filtered(events.tracked("Comparing the pixels")), capture.sensor.refractory_period)
     if share < 1 or (drift is not None and drift.any()):
         images = make_images(round(share * num_events), drift)
     times = np.array([moment for moment, _ in images], np.int64)

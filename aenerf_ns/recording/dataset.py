@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ from aenerf_ns.events.pair_store import EventPairs
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sorted_events import SortedEvents, sort_events
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.progress import tracked
 from aenerf_ns.recording.pair_cache import PairFile
 from aenerf_ns.recording.scene import SCENE_KEY, SceneRecording
 from aenerf_ns.recording.time_units import require_covered
@@ -82,7 +80,7 @@ class EventDataset(InputDataset):
                 if pairs is None:
                     read = events.path
                     pairs = pair_events(
-                        self._chunks(),
+                        scene.event_file.tracked(),
                         refractory_period=scene.sensor.refractory_period,
                         window=scene.window,
                         usable=usable,
@@ -106,7 +104,7 @@ class EventDataset(InputDataset):
         scene = self.scene
         scene.event_file.require()
         _, usable = scene.event_camera.pixel_directions()
-        windows = sort_events(self._chunks(), window=scene.window, usable=usable)
+        windows = sort_events(scene.event_file.tracked(), window=scene.window, usable=usable)
         CONSOLE.print(f"{scene.event_file.path.name}: {windows.summary()}.", markup=False)
         self._require_covered(len(windows.times) + windows.num_outside + windows.num_unusable, windows.num_outside)
         return windows
@@ -115,11 +113,6 @@ class EventDataset(InputDataset):
         # Gaps of the poses are left out on purpose, and are most of some recordings.
         if self.scene.is_whole and not self.scene.window.gaps:
             require_covered(self.scene.event_file.path, num_events, num_events - num_outside)
-
-    def _chunks(self) -> Iterable[EventStream]:
-        """Read the events in pieces, with a progress bar towards their number, if that is known."""
-        events = self.scene.event_file
-        return tracked(events.chunks(), f"Reading {events.path.name}", events.count())
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Return the (H, W, 3) image of a camera, or a picture of events around its time if it has no image."""

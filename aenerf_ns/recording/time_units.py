@@ -8,7 +8,6 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.text import UNIT_NAMES
-from aenerf_ns.progress import tracked
 
 Span = tuple[int, int]
 
@@ -106,7 +105,7 @@ def _steps_into(span: Span, poses: Trajectory) -> int | None:
 def _share_within(events: EventFile, span: Span) -> float:
     """Return the share of the events in a span of time."""
     inside = total = 0
-    for chunk in tracked(events.chunks(), "Reading times", events.count()):
+    for chunk in events.tracked("Reading times"):
         inside += int(((chunk.t >= span[0]) & (chunk.t <= span[1])).sum())
         total += len(chunk)
     return inside / total

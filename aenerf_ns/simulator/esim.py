@@ -247,8 +247,7 @@ class EventSimulator:
         self._bits = (width - 1).bit_length(), (height - 1).bit_length()
         self._channel_weights = np.array(LUMINANCE)
         if sensor.bayer_pattern:
-            y, x = np.indices((height, width))
-            self._channel_weights = np.eye(3)[sensor.color_filter[y & 1, x & 1]]
+            self._channel_weights = np.eye(3)[sensor.channels(width, height)]
         self._rng = np.random.default_rng(seed)
         spread = noise.contrast_threshold_spread or 0.0
         self.positive_contrast_threshold = self._draw_thresholds(sensor.positive_contrast_threshold, spread)

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.dataset import EventDataset
+from aenerf_ns.supervision.pixel_rays import PixelRays
 
 
 @dataclass
@@ -198,9 +199,12 @@ class Sampler(ABC):
 
     Attributes:
         batch_type: the batches that are drawn.
+        pixel_rays: the directions of the pixels, and the trajectory that times count from.
+        num_rays_per_batch: the most rays of a training batch.
     """
 
     batch_type: ClassVar[type[Batch]]
+    num_rays_per_batch: int
 
     def __init__(
         self, config: SamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
@@ -215,6 +219,7 @@ class Sampler(ABC):
         self.config = config
         self.dataset = dataset
         self.device = device
+        self.pixel_rays = PixelRays(dataset.scene, device)
 
     @abstractmethod
     def prepare(self) -> None:

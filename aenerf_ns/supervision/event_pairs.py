@@ -37,7 +37,6 @@ from aenerf_ns.supervision.base import (
     SupervisionConfig,
 )
 from aenerf_ns.supervision.losses import reconstruction_loss, temporal_loss
-from aenerf_ns.supervision.pixel_rays import PixelRays
 from aenerf_ns.supervision.sensor_parameters import SensorParameters
 
 # Share of a device's free memory that the table of pairs may take. The rest is for the model and its gradients.
@@ -240,9 +239,6 @@ class PairSampler(Sampler):
 
     Raises:
         DataError: an option is out of range.
-
-    Attributes:
-        trajectory: the estimated trajectory, which times count from; on the device of the batches.
     """
 
     batch_type = PairBatch
@@ -270,15 +266,9 @@ class PairSampler(Sampler):
         self._silent_pair_share = 0.0 if consecutive else config.silent_pair_share
         self._needs_rates = supervision.needs_rates
         self._refractory_period = dataset.scene.sensor.refractory_period
-        self._pixel_rays = PixelRays(dataset.scene, device)
-        self.trajectory = self._pixel_rays.trajectory
 
     def prepare(self) -> None:
-        """Read the events now rather than with the first batch.
-
-        Raises:
-            DataError: the events cannot be used.
-        """
+        """See :meth:`Sampler.prepare`."""
         _ = self._table, self._drift
 
     @cached_property
@@ -288,9 +278,9 @@ class PairSampler(Sampler):
     @cached_property
     def _drift(self) -> tuple[Tensor, Tensor, float]:
         """Each pixel's drift, the variance of its error, and of drifts: none where all pairs are of one event."""
-        device = self._pixel_rays.channels.device
+        device = self.pixel_rays.channels.device
         if self._max_events_per_pair == 1:
-            nothing = torch.zeros(len(self._pixel_rays.channels), device=device)
+            nothing = torch.zeros(len(self.pixel_rays.channels), device=device)
             return nothing, nothing, 0.0
         found = self.dataset.polarity_drift
         if found.spread > 0:
@@ -299,23 +289,15 @@ class PairSampler(Sampler):
         return drift, variance, found.spread**2
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, PairBatch]:
-        """Draw a batch of pairs.
-
-        Args:
-            num_rays: the most rays. A pair takes two, or three when it is trained on and rates are needed.
-            training: see :class:`Sampler`.
-
-        Returns:
-            See :class:`PairBatch`.
-        """
+        """Draw pairs, which take two rays each, or three when trained on with rates; see :meth:`Sampler.sample`."""
         with_time_within = training and self._needs_rates
         num_pairs = max(num_rays // (3 if with_time_within else 2), 1)
-        device = self._pixel_rays.channels.device
+        device = self.pixel_rays.channels.device
         num_silent = round(self._silent_pair_share * num_pairs)
         rows = self._table.draw(num_silent, num_pairs - num_silent, self._max_events_per_pair)
         times, packed = rows.permute(2, 1, 0)
-        end = self.trajectory.seconds(times[0])
-        last_start, start = self.trajectory.seconds(times[1:] + self._refractory_period)
+        end = self.pixel_rays.trajectory.seconds(times[0])
+        last_start, start = self.pixel_rays.trajectory.seconds(times[1:] + self._refractory_period)
         last_interval = end - last_start
         # Given the interval that it lies in, a uniform moment is uniform there.
         part = torch.rand(num_silent, dtype=torch.float64, device=device)
@@ -339,7 +321,7 @@ class PairSampler(Sampler):
         batch = PairBatch(
             num_positive=count[0],
             num_negative=count[1],
-            channel=self._pixel_rays.channels.index_select(0, pixel),
+            channel=self.pixel_rays.channels.index_select(0, pixel),
             ends_between_events=torch.arange(num_pairs, device=device) < num_silent,
             last_num_positive=last_count[0],
             last_num_negative=last_count[1],
@@ -348,7 +330,7 @@ class PairSampler(Sampler):
             drift=drift[pixel] * num_events,
             weight=_RENDERED_VARIANCE / (_RENDERED_VARIANCE + unknown),
         )
-        return self._pixel_rays.rays(pixel, seconds), batch
+        return self.pixel_rays.rays(pixel, seconds), batch
 
     def residual_batch(self, num_rays: int) -> tuple[RayBundle, PairBatch]:
         """Draw a batch to look at, the same in every call, without the random numbers that training would draw next."""

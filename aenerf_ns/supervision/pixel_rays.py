@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import deepcopy
 
-import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -37,8 +36,7 @@ class PixelRays:
                 f"[yellow]The lens model gives {(~self.usable).sum()} pixels no direction; their events are left out"
             )
         self._directions = torch.from_numpy(directions).reshape(-1, 3).to(device)
-        rows, columns = np.divmod(np.arange(camera.width * camera.height), camera.width)
-        self.channels = torch.from_numpy(scene.sensor.channel(columns, rows)).to(device)
+        self.channels = torch.from_numpy(scene.sensor.channels(camera.width, camera.height)).flatten().to(device)
         # Area of a pixel at distance one from the camera.
         self._pixel_area = 1 / (camera.fx * camera.fy)
 

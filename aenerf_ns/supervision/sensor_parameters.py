@@ -24,8 +24,6 @@ class SensorParameters(nn.Module):
         learn_refractory_period: whether τ is learned.
     """
 
-    _longest_refractory_period: Tensor
-
     def __init__(
         self, sensor: SensorModel, learn_contrast_threshold_ratio: bool, learn_refractory_period: bool
     ) -> None:
@@ -40,7 +38,7 @@ class SensorParameters(nn.Module):
         if learn_refractory_period:
             self.raw_refractory_period = nn.Parameter(torch.tensor(0.0))
             # Kept in checkpoints, because events are read for training only.
-            self.register_buffer("_longest_refractory_period", torch.tensor(torch.nan, dtype=torch.float64))
+            self._longest_refractory_period: Tensor = nn.Buffer(torch.tensor(torch.nan, dtype=torch.float64))
 
     @property
     def contrast_threshold_ratio(self) -> Tensor | None:

@@ -9,9 +9,9 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
-from torch import Tensor
 
 from aenerf_ns.errors import errors_as_one_line
+from aenerf_ns.method.pose_correction import PoseCorrection
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import Batch, Sampler, SamplerConfig, Supervision
@@ -93,6 +93,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             self.train_pixel_sampler = self.config.sampler.setup(
                 dataset=self.train_dataset, supervision=supervision, device=self.device
             )
+            # The framework's exporters set it.
+            self.train_pixel_sampler.num_rays_per_batch = self.config.train_num_rays_per_batch
             if self.test_mode == "val":
                 self.train_pixel_sampler.prepare()
                 supervision.prepare(self.train_dataset)
@@ -103,26 +105,21 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**options)
         self.eval_dataloader = RandIndicesEvalDataloader(**options)
 
-    def place_reference_views(self, poses: Tensor) -> None:
-        """Give the reference views the poses (N, 3, 4), camera-to-world in the scene, for good."""
-        _place(self.eval_dataset, poses)
-        if self.test_mode != "inference":
+    def place_cameras(self, correction: PoseCorrection) -> None:
+        """Carry all cameras over to the frame of the corrected poses, for good. Training cameras are only shown."""
+        for dataset in [self.train_dataset, self.eval_dataset] if self.has_reference_views else [self.train_dataset]:
+            poses = correction.apply_to_camera(dataset.cameras.to(self.device)).to(dataset.cameras.device)
+            # Without metadata: these cameras are in the scene's frame, and must not be carried there again.
+            dataset.cameras = replace(dataset.cameras, camera_to_worlds=poses, metadata={})
+        if self.has_reference_views and self.test_mode != "inference":
             # The loaders have copies of the cameras.
             self.setup_eval()
-
-    def place_training_cameras(self, poses: Tensor) -> None:
-        """Give the training cameras, which are only shown, the poses (N, 3, 4), camera-to-world in the scene."""
-        _place(self.train_dataset, poses)
 
     def next_train(self, step: int) -> tuple[RayBundle, Batch]:
         """Draw a batch to train on; see :meth:`Sampler.sample`."""
         self.train_count += 1
         # An exporter asks a trained run for batches too: its events are read only then.
-        return self._sample(self.config.train_num_rays_per_batch, training=self.test_mode == "val")
-
-    def get_train_rays_per_batch(self) -> int:
-        """Return the most rays of a training batch."""
-        return self.config.train_num_rays_per_batch
+        return self._sample(self.get_train_rays_per_batch(), training=self.test_mode == "val")
 
     def next_eval(self, step: int) -> tuple[RayBundle, Batch]:
         """Draw a batch to log the loss on."""
@@ -133,9 +130,3 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         assert self.train_pixel_sampler is not None
         with errors_as_one_line():
             return self.train_pixel_sampler.sample(num_rays, training)
-
-
-def _place(dataset: EventDataset, poses: Tensor) -> None:
-    # Without metadata: these cameras are in the scene's frame, and must not be carried there again.
-    cameras = dataset.cameras
-    dataset.cameras = replace(cameras, camera_to_worlds=poses.to(cameras.device), metadata={})

@@ -88,11 +88,8 @@ class AENeRFPipeline(VanillaPipeline):
         super().load_state_dict(state_dict, strict=True)
         if self.test_mode != "val":
             # The framework's renderers and exporters derive their own cameras from these cameras.
-            data, correction = self.datamanager, self.model.camera_optimizer
-            if data.has_reference_views:
-                data.place_reference_views(correction.apply_to_camera(data.eval_dataset.cameras.to(self.device)))
-            data.place_training_cameras(correction.apply_to_camera(data.train_dataset.cameras.to(self.device)))
-            correction.training_cameras_are_corrected = True
+            self.datamanager.place_cameras(self.model.camera_optimizer)
+            self.model.camera_optimizer.training_cameras_are_corrected = True
 
     def get_extra_state(self) -> dict[str, Any] | None:
         """Return the diagnosis of the pose correction, which checkpoints hold; None before the last step."""

@@ -65,9 +65,10 @@ def _program() -> str:
 
 
 def _portable(argument: str) -> str:
-    """Return an argument without the folders of this machine."""
-    path = Path(argument)
-    return str(Path("...", *path.parts[1:][-3:])) if path.is_absolute() else argument
+    """Return an argument, or --option=argument, without the folders of this machine."""
+    option, sign, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
+    path = Path(value)
+    return option + sign + (str(Path("...", *path.parts[1:][-3:])) if path.is_absolute() else value)
 
 
 def _cpu() -> str:

@@ -187,8 +187,6 @@ class AENeRFTrainer(Trainer):
         if self.world_size > 1 or threading.current_thread() is not threading.main_thread():
             yield
             return
-        numbers = (signal.SIGINT, signal.SIGTERM)
-        before = {number: signal.getsignal(number) for number in numbers}
 
         def stop(number: int, _: object) -> None:
             if self._record is None or self._stopped_by:
@@ -199,13 +197,12 @@ class AENeRFTrainer(Trainer):
             # A training that the viewer paused takes no further step by itself.
             self.training_state = "training"
 
-        for number in numbers:
-            signal.signal(number, stop)
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield
         finally:
-            for number in numbers:
-                signal.signal(number, before[number])
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
     def _stop_if_asked(self, step: int) -> None:
         # A training that is complete ends by itself.
@@ -232,11 +229,7 @@ class AENeRFTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Save a checkpoint whole or not at all. The older ones are removed after that.
-
-        Args:
-            step: the last step of training.
-        """
+        """Save a checkpoint after a step, whole or not at all. The older ones are removed after that."""
         contents = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),

@@ -71,7 +71,7 @@ class TrainingState(nn.Module):
             raise DataError(
                 str(trainer.config.load_checkpoint),
                 "its scene is scaled, turned or moved otherwise (scene units to a unit of the recording: "
-                f"{_scale_of(before):.5g}, here {_scale_of(now):.5g})",
+                f"{before[:, 0].norm():.5g}, here {now[:, 0].norm():.5g})",
                 "give the dataset, time window, scale and other options of the format of the first run, or train again",
             )
         for group, gradients in state["gradients"].items():
@@ -94,10 +94,6 @@ def _scene_frame(trainer: Trainer) -> torch.Tensor:
     assert isinstance(dataset, EventDataset)
     frame = dataset.scene.frame
     return torch.cat([frame.scale * frame.rotation, frame.translation[:, None]], -1)
-
-
-def _scale_of(scene_frame: torch.Tensor) -> float:
-    return float(scene_frame[:, 0].norm())
 
 
 def _is_on_gpu(trainer: Trainer) -> bool:

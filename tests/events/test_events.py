@@ -224,22 +224,6 @@ def test_malformed_streams_are_refused(change: dict[str, np.ndarray], message: s
     assert "\n" not in str(error.value)
 
 
-def test_bayer_channels_follow_the_raw_pixel() -> None:
-    sensor = SensorModel(bayer_pattern="RGGB")
-    x, y = np.array([0, 1, 0, 1, 2, 3], np.uint16), np.array([0, 0, 1, 1, 2, 3], np.uint16)
-    assert sensor.channel(x, y).tolist() == [0, 1, 1, 2, 0, 2]
-    assert sensor.num_channels == 3
-    assert SensorModel().channel(x, y).tolist() == [0] * 6
-
-
-@pytest.mark.parametrize(
-    "values", [(0.0, 0.25), (0.25, -1.0), (float("nan"), 0.25), (0.25, 0.25, -1), (0.25, 0.25, 0, "RGBG")]
-)
-def test_impossible_sensors_are_refused(values: tuple) -> None:
-    with pytest.raises(ValueError, match="must"):
-        SensorModel(*values)
-
-
 def test_polarity_picture_shows_signs() -> None:
     picture = net_picture(np.array([[0, -1], [2, 0]])).astype(int)
     positive, negative, neither = picture[1, 0], picture[0, 1], picture[0, 0]

@@ -24,7 +24,7 @@ from helpers.event_table_writers import (
     write_text,
     write_tum_vie,
 )
-from helpers.streams import FUZZ_EXAMPLES
+from helpers.streams import FUZZ_EXAMPLES, EventsInMemory, make_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -34,6 +34,7 @@ from aenerf_ns.files.event_arrays import ArrayEventFile
 from aenerf_ns.files.event_table import events_from_columns
 from aenerf_ns.files.open import open_event_file
 
+MADE = EventsInMemory(make_stream([]))
 LAYOUTS: dict[str, tuple[str, Callable[[Path, Columns], object]]] = {
     "Robust e-NeRF": ("raw_events.npz", write_robust_enerf),
     "EventNeRF": ("events.npz", lambda path, columns: np.savez(path, **signed(columns))),
@@ -103,7 +104,7 @@ def test_columns_of_any_type_are_read_or_refused(data: st.DataObject) -> None:
             columns[name] = np.array(values).astype(kind)
     tick, offset = data.draw(st.sampled_from([1, 1_000, 10**9])), data.draw(st.integers(-(2**62), 2**62))
     try:
-        x, y, t, p = events_from_columns(columns, width=4, height=3, tick=tick, offset=offset, source="made")
+        x, y, t, p = events_from_columns(MADE, columns, tick, str, offset)
     except DataError:
         return
     np.testing.assert_array_equal(x, columns["x"])
@@ -117,4 +118,4 @@ def test_columns_of_any_type_are_read_or_refused(data: st.DataObject) -> None:
 def test_refuse_offset_beyond_the_limit(kind: type) -> None:
     one = {name: np.zeros(1, kind if name == "t" else np.uint8) for name in "xytp"}
     with pytest.raises(DataError, match="check the unit of the times"):
-        events_from_columns(one, width=4, height=3, tick=10**9, offset=9_223_372_037, source="made")
+        events_from_columns(MADE, one, 10**9, str, 9_223_372_037)

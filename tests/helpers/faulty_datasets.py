@@ -54,6 +54,7 @@ _NATIVE_FAULTS: dict[str, Fault] = {
     "no focal length": (native(lambda m: m["event_camera"].pop("fl_x")), "transforms.json", "event_camera: "),
     "no threshold": (camera(positive_contrast_threshold=None), "transforms.json", "positive_contrast"),
     "negative threshold": (camera(negative_contrast_threshold=-1), "transforms.json", "negative_contrast"),
+    "negative blindness": (camera(refractory_period_ns=-1), "transforms.json", "refractory_period must be from 0"),
     "unknown Bayer pattern": (camera(bayer_pattern="RGBG"), "transforms.json", '"RGBG"'),
     "unknown lens": (camera(camera_model="KB4"), "transforms.json", "event_camera: the lens model is 'KB4'"),
     "p1 of a fisheye": (camera(camera_model="OPENCV_FISHEYE", p1=0.1), "transforms.json", "event_camera: p1 is 0.1"),
@@ -221,6 +222,18 @@ _OWN_FAULTS: dict[str, Fault] = {
     "COLMAP without times": (all_of(remove("images.txt"), colmap()), "images.txt", "no such list"),
     "empty COLMAP": (colmap(), "colmap", "no COLMAP model"),
     "COLMAP of other images": (colmap(other_images), "images.txt", "it lists other.png 0 times"),
+    "COLMAP camera of inf": (
+        colmap(write_text("colmap/images.txt", "1 1 0 0 0 0 0 0 inf a.png\n")),
+        "images.txt",
+        "line 1 is not an image",
+    ),
+    "COLMAP lens of 400 digits": (
+        colmap(
+            all_of(other_images, write_text("colmap/sparse/0/cameras.txt", f"1 PINHOLE {'9' * 400} 40 50 51 30 20\n"))
+        ),
+        "cameras.txt",
+        "a camera cannot be read",
+    ),
     "broken COLMAP": (colmap(write_bytes("colmap/images.bin", b"\1")), "images.bin", "not a COLMAP model"),
     "unknown distortion": (kalibr("cam0", distortion_model="fov", distortion_coeffs=[1]), "camchain.yaml", "is 'fov'"),
     "unknown camera": (kalibr("cam0", camera_model="omni"), "camchain.yaml", "calibrate again with pinhole-radtan or"),

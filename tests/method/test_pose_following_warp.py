@@ -111,7 +111,7 @@ def test_gradients_of_the_proposals_do_not_reach_the_motion(correction: PoseCorr
     warp = PoseFollowingWarp(correction, None, BOX)
     warp.update(correction)
     assert warp(torch.rand(4, 3)).requires_grad
-    assert not warp.without_gradient(torch.rand(4, 3)).requires_grad
+    assert not warp(torch.rand(4, 3), detached=True).requires_grad
 
 
 def test_the_times_of_a_long_recording_are_bounded() -> None:

@@ -179,8 +179,7 @@ def test_padding_is_removed() -> None:
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_demosaic_one_color(pattern: BayerPattern) -> None:
-    rows, columns = np.indices((6, 8)).reshape(2, -1)
-    channels = SensorModel(bayer_pattern=pattern).channel(columns, rows)
-    mosaic = np.array([200, 120, 50], np.uint8)[channels].reshape(6, 8)
-    assert ["RGB"[channel] for channel in channels[[0, 1, 8, 9]]] == list(pattern)
+    channels = SensorModel(bayer_pattern=pattern).channels(8, 6)
+    mosaic = np.array([200, 120, 50], np.uint8)[channels]
+    assert ["RGB"[channel] for channel in channels[:2, :2].flat] == list(pattern)
     assert (demosaic(mosaic, pattern) == [200, 120, 50]).all()

@@ -20,7 +20,7 @@ def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> N
     sensor = SensorModel(refractory_period=1_000)
     sampler = make_sampler(random_poses, sensor)
     rays, batch = sampler.sample(40)
-    make_correction(sampler.trajectory, mode="off").apply_to_raybundle(rays)
+    make_correction(sampler.pixel_rays.trajectory, mode="off").apply_to_raybundle(rays)
     assert rays.origins.shape == (40, 3)
     assert rays.directions.dtype == torch.float32
     starts, ends = (torch.round(rays.times[:, 0] * 1e9).long() + EPOCH).chunk(2)
@@ -36,7 +36,7 @@ def test_rays_lie_at_both_ends_of_each_interval(random_poses: torch.Tensor) -> N
         seen.add(interval)
         assert batch.num_positive[i] - batch.num_negative[i] == polarity
         for ray, time in ((i, interval[0]), (i + 20, interval[1])):
-            pose = sampler.trajectory.interpolate(time)
+            pose = sampler.pixel_rays.trajectory.interpolate(time)
             torch.testing.assert_close(rays.origins[ray], pose[:, 3].float())
             direction = pose[:, :3] @ torch.from_numpy(pixel_directions[y, x])
             torch.testing.assert_close(rays.directions[ray], direction.float(), rtol=0, atol=1e-6)

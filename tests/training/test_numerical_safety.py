@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.model import AENeRFModel
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
-from aenerf_ns.method.temporal import log_radiance_rate
 from aenerf_ns.supervision.event_pairs import PairBatch, PairLossCoefficients
 from aenerf_ns.training.trainer import AENeRFTrainer
 
@@ -186,12 +185,11 @@ def test_the_rate_keeps_full_precision() -> None:
     samples = make_samples(model, rays)
     # So fast that rates of features exceed the range of half precision.
     rates = torch.randn(2, 20, 3) * 1e8
+    model.camera_optimizer.ray_rates = lambda _: tuple(rates)
     values = []
     for enabled in (False, True):
         with torch.autocast("cpu", torch.float16, enabled=enabled):
-            values.append(
-                log_radiance_rate(model._composite, samples, (rays.origins, rays.directions), tuple(rates))[1]
-            )
+            values.append(model._composite_with_rate(samples, rays)[1])
     assert values[0].abs().max() > 1e3
     assert torch.equal(*values)
 

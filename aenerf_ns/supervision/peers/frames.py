@@ -15,10 +15,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.images import check_image, read_image
-from aenerf_ns.supervision.base import Batch, Sampler, SamplerConfig, Supervision
-from aenerf_ns.supervision.pixel_rays import PixelRays
+from aenerf_ns.supervision.base import Batch, Sampler, Supervision
 
 
 @dataclass
@@ -55,24 +53,14 @@ class FrameSampler(Sampler):
 
     batch_type = FrameBatch
 
-    def __init__(
-        self, config: SamplerConfig, dataset: EventDataset, supervision: Supervision, device: torch.device | str
-    ) -> None:
-        super().__init__(config, dataset, supervision, device)
-        self._pixel_rays = PixelRays(dataset.scene, device)
-        self._usable = torch.from_numpy(np.flatnonzero(self._pixel_rays.usable)).to(device)
-
     def prepare(self) -> None:
-        """Read the images now rather than with the first batch.
-
-        Raises:
-            DataError: there are no images to train on, or one cannot be read.
-        """
+        """See :meth:`Sampler.prepare`."""
         _ = self._frames
 
     @cached_property
-    def _frames(self) -> tuple[Tensor, Tensor]:
-        """(M,) float64 times since the trajectory's start, and (M, pixels, channels) uint8 values, on the device."""
+    def _frames(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(M,) float64 times since the trajectory's start, (M, pixels, channels) uint8 values, and the pixels to draw
+        from, on the device."""
         scene = self.dataset.scene
         if not scene.frames:
             raise DataError(
@@ -88,19 +76,13 @@ class FrameSampler(Sampler):
         line = f"Training on {len(values)} images, the first of them {scene.frames[0][1]}."
         CONSOLE.print(line, markup=False, soft_wrap=True)
         times = torch.tensor([time for time, _ in scene.frames], device=self.device)
-        return self._pixel_rays.trajectory.seconds(times), torch.from_numpy(np.stack(values)).to(self.device)
+        usable = torch.from_numpy(np.flatnonzero(self.pixel_rays.usable)).to(self.device)
+        seen = torch.from_numpy(np.stack(values)).to(self.device)
+        return self.pixel_rays.trajectory.seconds(times), seen, usable
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, FrameBatch]:
-        """Draw a batch of pixels.
-
-        Args:
-            num_rays: the number of rays, one for each pixel.
-            training: has no effect.
-
-        Returns:
-            The rays of the N pixels, and their display values.
-        """
-        seconds, values = self._frames
+        """Draw pixels of images, which take a ray each; see :meth:`Sampler.sample`."""
+        seconds, values, usable = self._frames
         frame = torch.randint(len(seconds), (num_rays,), device=self.device)
-        pixel = self._usable[torch.randint(len(self._usable), (num_rays,), device=self.device)]
-        return self._pixel_rays.rays(pixel, [seconds[frame]]), FrameBatch(values[frame, pixel] / 255)
+        pixel = usable[torch.randint(len(usable), (num_rays,), device=self.device)]
+        return self.pixel_rays.rays(pixel, [seconds[frame]]), FrameBatch(values[frame, pixel] / 255)

@@ -39,7 +39,6 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.supervision.base import ChangeBatch, ChangeSupervision, LossCoefficients, Supervision
 from aenerf_ns.supervision.peers.windows import (
-    DrawnWindow,
     WindowSampler,
     WindowSamplerConfig,
     draw,
@@ -199,28 +198,21 @@ class FlowPatchSampler(WindowSampler):
         return self._patches[np.concatenate(drawn)].ravel()
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, PatchBatch]:
-        """Draw a batch of patches in windows.
-
-        Args:
-            num_rays: the most rays. A patch takes eight.
-            training: has no effect.
-
-        Returns:
-            The rays of the N pixels at the starts of their windows, then those at the ends, and the events between.
-        """
+        """Draw patches in windows, which take eight rays each; see :meth:`Sampler.sample`."""
         drawn = self.draw_windows(num_rays // 2)
         rays, batch = self.rays_and_batch(drawn)
-        window = np.repeat(np.arange(len(drawn)), [len(part.pixels) for part in drawn])
+        window = np.repeat(np.arange(len(drawn)), [part.shape[1] for part in drawn])
         displacement = np.concatenate([self._displacement(part) for part in drawn])
         to_device = (torch.from_numpy(array).to(self.device) for array in (window, displacement))
         return rays, PatchBatch(*vars(batch).values(), *to_device)
 
-    def _displacement(self, drawn: DrawnWindow) -> NDArray[np.float32]:
-        """Return the displacements (N, 2) of the pixels of a window."""
-        velocities, side = self._flow(drawn.start)
-        rows, columns = np.divmod(drawn.pixels, self.pixel_rays.usable.shape[1])
-        moved = velocities[rows // side, columns // side] * ((drawn.end - drawn.start) * 1e-9)
-        return (moved * drawn.counts.any(0)[:, None]).astype(np.float32)
+    def _displacement(self, drawn: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the displacements (N, 2) of the pixels of a window (5, N)."""
+        pixels, positive, negative, starts, ends = drawn
+        velocities, side = self._flow(starts[0])
+        rows, columns = np.divmod(pixels, self.pixel_rays.usable.shape[1])
+        moved = velocities[rows // side, columns // side] * ((ends[0] - starts[0]) * 1e-9)
+        return (moved * (positive + negative > 0)[:, None]).astype(np.float32)
 
     def _flow(self, time: int) -> tuple[NDArray[np.float64], int]:
         """Return the velocities of the tiles at a time, and the side of a tile."""

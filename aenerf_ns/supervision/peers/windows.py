@@ -32,7 +32,6 @@ from aenerf_ns.supervision.base import (
     SupervisionConfig,
 )
 from aenerf_ns.supervision.losses import reconstruction_loss
-from aenerf_ns.supervision.pixel_rays import PixelRays
 
 # The inverse of softplus at 1.
 _RAW_ONE = math.log(math.expm1(1))
@@ -65,13 +64,12 @@ class EvNeRFSupervision(ChangeSupervision):
     """
 
     batch_type = ChangeBatch
-    _minimum: Tensor
 
     def __init__(self, config: SupervisionConfig, sensor: SensorModel, loss_coefficients: LossCoefficients) -> None:
         super().__init__(config, sensor, loss_coefficients)
         # Softplus keeps the thresholds positive.
         self.raw_factors = nn.Parameter(torch.full((2,), _RAW_ONE))
-        self.register_buffer("_minimum", torch.tensor(self.sensor_thresholds), persistent=False)
+        self._minimum: Tensor = nn.Buffer(torch.tensor(self.sensor_thresholds), persistent=False)
 
     def shift_ray_times(self, rays: RayBundle) -> dict[str, Tensor]:
         """Return the ``thresholds`` (2,), of positive and of negative events. Rays keep their times."""
@@ -124,27 +122,6 @@ class WindowSamplerConfig(SamplerConfig):
     """Pixels that are drawn in a window. A batch has as many windows as it takes to fill it."""
 
 
-@dataclass(frozen=True)
-class DrawnWindow:
-    """A window of time, and the pixels that were drawn in it.
-
-    Attributes:
-        start: nanoseconds.
-        end: nanoseconds.
-        pixels: (N,) pixels, counted row by row.
-        counts: (2, N) positive and negative events of the pixels.
-    """
-
-    start: int
-    end: int
-    pixels: NDArray[np.int64]
-    counts: NDArray[np.int64]
-
-    def rows(self) -> NDArray[np.int64]:
-        """Return (5, N) of pixel, positive events, negative events, start and end."""
-        return np.stack([self.pixels, *self.counts, *(np.full_like(self.pixels, t) for t in (self.start, self.end))])
-
-
 class WindowSampler(Sampler):
     """Samples windows of time, and in each of them pixels with the events that the pixel had.
 
@@ -183,15 +160,10 @@ class WindowSampler(Sampler):
             )
         if config.pixels_per_window < 1:
             raise DataError("the sampler", f"pixels-per-window is {config.pixels_per_window}", "give at least 1")
-        self.pixel_rays = PixelRays(dataset.scene, device)
         self._usable = np.flatnonzero(self.pixel_rays.usable)
 
     def prepare(self) -> None:
-        """Read the events now rather than with the first batch.
-
-        Raises:
-            DataError: the events cannot be used, or no two poses follow each other without a gap.
-        """
+        """See :meth:`Sampler.prepare`. It is an error, too, if no two poses follow each other without a gap."""
         _ = self.dataset.windows, self._ends
 
     @cached_property
@@ -227,36 +199,33 @@ class WindowSampler(Sampler):
         num_active = int(num_draws * (1 - self.config.share_of_all_pixels)) if len(active) else 0
         return np.concatenate([draw(active, num_active), draw(self._usable, num_draws - num_active)])
 
-    def draw_windows(self, num_pixels: int) -> list[DrawnWindow]:
-        """Return windows with their pixels, ``num_pixels`` in all, or fewer if that is no whole number of draws."""
+    def draw_windows(self, num_pixels: int) -> list[NDArray[np.int64]]:
+        """Return windows with their pixels, ``num_pixels`` in all, or fewer if that is no whole number of draws.
+
+        A window is (5, N): pixel, counted row by row, its positive and negative events, start and end in nanoseconds.
+        """
         drawn = []
-        num_windows = max(round(num_pixels / self.config.pixels_per_window), 1)
-        for part in np.array_split(np.arange(max(num_pixels // self.pixels_per_draw, 1)), num_windows):
+        num_draws = max(num_pixels // self.pixels_per_draw, 1)
+        num_windows = min(max(round(num_pixels / self.config.pixels_per_window), 1), num_draws)
+        for part in np.array_split(np.arange(num_draws), num_windows):
             start, end = self._draw_window()
             counts = self.dataset.windows.counts(start, end)
             pixels = self.draw_pixels(counts, len(part))
-            drawn.append(DrawnWindow(start, end, pixels, counts[:, pixels]))
+            times = (np.full_like(pixels, time) for time in (start, end))
+            drawn.append(np.stack([pixels, *counts[:, pixels], *times]))
         return drawn
 
-    def rays_and_batch(self, drawn: Sequence[DrawnWindow]) -> tuple[RayBundle, ChangeBatch]:
+    def rays_and_batch(self, drawn: Sequence[NDArray[np.int64]]) -> tuple[RayBundle, ChangeBatch]:
         """Return the rays of windows, and what the sensor recorded of them."""
         # In one piece, because every copy to a GPU takes its time.
-        rows = torch.from_numpy(np.concatenate([window.rows() for window in drawn], 1)).to(self.device)
+        rows = torch.from_numpy(np.concatenate(drawn, 1)).to(self.device)
         pixel, positive, negative, *times = rows
         rays = self.pixel_rays.rays(pixel, [self.pixel_rays.trajectory.seconds(time) for time in times])
         channel = self.pixel_rays.channels.index_select(0, pixel)
         return rays, ChangeBatch(positive.float(), negative.float(), channel)
 
     def sample(self, num_rays: int, training: bool = True) -> tuple[RayBundle, ChangeBatch]:
-        """Draw a batch of pixels in windows.
-
-        Args:
-            num_rays: the most rays. A pixel takes two.
-            training: has no effect.
-
-        Returns:
-            The rays of the N pixels at the starts of their windows, then those at the ends, and the events between.
-        """
+        """Draw pixels in windows, which take two rays each; see :meth:`Sampler.sample`."""
         return self.rays_and_batch(self.draw_windows(num_rays // 2))
 
 
