@@ -16,39 +16,18 @@ import tyro
 from tyro._docstrings import get_field_docstring
 
 from aenerf_ns.dataparsers.formats import FORMATS
+from aenerf_ns.method_configs import peers
 from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
 from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp
-from aenerf_ns.method_configs.peers import (
-    e2vid_nerf,
-    e2vid_nerf_small,
-    eventnerf,
-    eventnerf_small,
-    evnerf,
-    evnerf_small,
-    paev3d,
-    paev3d_small,
-    robust_enerf,
-    robust_enerf_small,
-)
 
 PAGE = Path(__file__).parents[1] / "docs" / "options.md"
 
 METHODS = {method.config.method_name: method.config for method in (aenerf, aenerf_small, aenerf_mlp)}
 # Only the options in which they differ from AE-NeRF of the same size are listed.
 PEERS = {
-    method.config.method_name: method.config
-    for method in (
-        robust_enerf,
-        robust_enerf_small,
-        eventnerf,
-        eventnerf_small,
-        evnerf,
-        evnerf_small,
-        paev3d,
-        paev3d_small,
-        e2vid_nerf,
-        e2vid_nerf_small,
-    )
+    f"{name}{size}": getattr(peers, f"{name}{size}".replace("-", "_")).config
+    for name in ("robust-enerf", "eventnerf", "evnerf", "paev3d", "e2vid-nerf")
+    for size in ("", "-small")
 }
 
 # Nerfstudio's options are listed where a method changes their default. These are listed because many runs set them.

@@ -135,7 +135,9 @@ def test_registered_modules_defer_heavy_imports() -> None:
     # What the framework itself imports at every command is no cost of ours.
     code = (
         "import sys, nerfstudio.configs.method_configs as framework, aenerf_ns.files.open;"
+        "from nerfstudio.configs.dataparser_configs import all_dataparsers;"
         "assert {'aenerf', 'aenerf-mlp', 'aenerf-small'} <= set(framework.all_methods);"
+        "assert 'ecd-data' in all_dataparsers;"
         "print({'numba', 'torchmetrics', 'h5py', 'pycolmap', 'rosbags'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd="/")

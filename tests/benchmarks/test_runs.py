@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ Popen(die_with_parent(command)).wait()
 """
 
 
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv of util-linux")
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
 def test_command_dies_with_its_parent(end: signal.Signals) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 from helpers.colmap_stand_in import FOUND_BOX, place_frames
+from helpers.event_file_checks import read
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
 from PIL import Image
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
@@ -26,7 +26,6 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.pose_estimation.video import open_video
-from aenerf_ns.recording.recording import Recording
 from aenerf_ns.simulator.options import SENSORS
 from aenerf_ns.simulator.video_events import video_events, video_simulator
 
@@ -78,10 +77,6 @@ def simulate(output: Path, **options: Any) -> str:
     return printed.get()
 
 
-def times_of(recording: Recording) -> NDArray[np.int64]:
-    return np.concatenate([chunk.t for chunk in recording.event_file.chunks()])
-
-
 def test_video_with_poses_becomes_a_dataset(
     frames: Path, poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,7 +103,7 @@ def test_video_with_poses_becomes_a_dataset(
     intervals = video_events(open_video(frames), simulator, "linear")
     expected = np.concatenate([interval.events.t for interval in intervals])
     assert len(expected) > 500
-    np.testing.assert_array_equal(times_of(recording), expected)
+    np.testing.assert_array_equal(read(recording.event_file)[:, 2], expected)
     thresholds = np.load(output / "thresholds_ground_truth.npz")
     np.testing.assert_array_equal(thresholds["positive"], simulator.positive_contrast_threshold)
     np.testing.assert_array_equal(thresholds["negative"], simulator.negative_contrast_threshold)
@@ -171,7 +166,8 @@ def test_video_without_poses_becomes_a_recording(frames: Path, camchain: Path, t
     assert recording.image_encoding == "srgb"
     assert [view.time for view in recording.reference_views["train"]] == [FRAME * index for index in range(1, 8)]
     intervals = video_events(open_video(frames), video_simulator(open_video(frames), recording.sensor))
-    np.testing.assert_array_equal(times_of(recording), np.concatenate([interval.events.t for interval in intervals]))
+    expected = np.concatenate([interval.events.t for interval in intervals])
+    np.testing.assert_array_equal(read(recording.event_file)[:, 2], expected)
     printed = simulate(tmp_path / "no_lens", video=frames, validation_views=0, test_views=0, train_images=4)
     assert "4 images, no poses" in printed
     assert "add calibration.json (with " in printed
@@ -210,9 +206,8 @@ def test_contradicting_options_are_refused(
     tmp_path: Path,
 ) -> None:  # fmt: skip
     paths = {"trajectory": poses, "calibration": camchain}
-    with pytest.raises(DataError, match=message) as error:
+    with pytest.raises(DataError, match=message):
         simulate(tmp_path / "out", video=frames, **{name: paths[name] for name in files}, **options)
-    assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()
 
 

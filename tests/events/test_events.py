@@ -219,9 +219,8 @@ def test_malformed_streams_are_refused(change: dict[str, np.ndarray], message: s
         "p": np.array([1, -1, 1], np.int8),
     }
     EventStream(**columns, width=WIDTH, height=HEIGHT, source="good.h5")
-    with pytest.raises(DataError, match=f"^bad.h5: .*{message}") as error:
+    with pytest.raises(DataError, match=f"^bad.h5: .*{message}"):
         EventStream(**{**columns, **change}, width=WIDTH, height=HEIGHT, source="bad.h5")
-    assert "\n" not in str(error.value)
 
 
 def test_polarity_picture_shows_signs() -> None:

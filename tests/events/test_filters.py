@@ -152,24 +152,6 @@ def test_a_cropped_camera_sees_the_same_directions() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"pixel_share": 0.0},
-        {"pixel_share": 1.5},
-        {"pixel_share": float("nan")},
-        {"shortest_interval": -1},
-        {"start": 5, "end": 4},
-        {"end": 2**63},
-        {"region": (0, 0, 0, 4)},
-        {"region": (-1, 0, 2, 4)},
-    ],
-)
-def test_impossible_filters_are_refused(values: dict) -> None:
-    with pytest.raises(ValueError, match=r"must|before"):
-        EventFilters(**values)
-
-
 def test_events_are_counted_on_a_sensor_of_more_pixels_than_16_bits_hold() -> None:
     x, y = np.array([1279, 3, 1279], np.uint16), np.array([719, 700, 719], np.uint16)
     events = EventStream(x, y, np.arange(3), np.ones(3, np.int8), 1280, 720)

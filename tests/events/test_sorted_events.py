@@ -68,14 +68,6 @@ def test_sorted_events_are_those_of_the_stream(stream: EventStream) -> None:
     assert as_rows(found.events(slice(None, None, 3))) == as_rows(stream)[::3]
 
 
-def test_nearest_events(stream: EventStream) -> None:
-    around = stream.nearest(10_000, 100)
-    assert len(around) == 100
-    assert (around.t < 10_000).sum() == 50
-    left_out = np.setdiff1d(stream.t, around.t)
-    assert not ((left_out > around.t[0]) & (left_out < around.t[-1])).any()
-
-
 def brute_force(stream: EventStream, start: int, end: int, window: TimeWindow, usable: np.ndarray) -> np.ndarray:
     counts = np.zeros((2, 12), int)
     for x, y, t, p in zip(stream.x, stream.y, stream.t, stream.p, strict=True):

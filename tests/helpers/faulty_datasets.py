@@ -211,6 +211,7 @@ def other_images(folder: Path) -> None:
     write_colmap(folder / "colmap/sparse/0", make_poses(2), ["00000.png", "other.png"])
 
 
+WIDE_LENS = write_text("colmap/sparse/0/cameras.txt", f"1 PINHOLE {'9' * 400} 40 50 51 30 20\n")
 INFINITE = np.full((4, 4), np.inf).tolist()
 _OWN_FAULTS: dict[str, Fault] = {
     "no folder": (shutil.rmtree, "made", "no such folder"),
@@ -223,17 +224,11 @@ _OWN_FAULTS: dict[str, Fault] = {
     "empty COLMAP": (colmap(), "colmap", "no COLMAP model"),
     "COLMAP of other images": (colmap(other_images), "images.txt", "it lists other.png 0 times"),
     "COLMAP camera of inf": (
-        colmap(write_text("colmap/images.txt", "1 1 0 0 0 0 0 0 inf a.png\n")),
+        colmap(write_text("colmap/images.txt", "1 1 0 0 0 0 0 0 inf a\n")),
         "images.txt",
-        "line 1 is not an image",
+        "line 1 is",
     ),
-    "COLMAP lens of 400 digits": (
-        colmap(
-            all_of(other_images, write_text("colmap/sparse/0/cameras.txt", f"1 PINHOLE {'9' * 400} 40 50 51 30 20\n"))
-        ),
-        "cameras.txt",
-        "a camera cannot be read",
-    ),
+    "COLMAP lens of 400 digits": (colmap(all_of(other_images, WIDE_LENS)), "cameras.txt", "a camera cannot be read"),
     "broken COLMAP": (colmap(write_bytes("colmap/images.bin", b"\1")), "images.bin", "not a COLMAP model"),
     "unknown distortion": (kalibr("cam0", distortion_model="fov", distortion_coeffs=[1]), "camchain.yaml", "is 'fov'"),
     "unknown camera": (kalibr("cam0", camera_model="omni"), "camchain.yaml", "calibrate again with pinhole-radtan or"),

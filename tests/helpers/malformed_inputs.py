@@ -253,6 +253,7 @@ _NPY = {
 }
 _CHANGES: dict[str, dict[str, Change]] = {
     _NATIVE: {
+        "transforms of 8 GB": sparse("transforms.json"),
         "a sensor of 16000 x 16000": camera(width=16000, height=16000),
         "HDF5 of 10^12 rows": unallocated("events.h5", _COLUMNS, "events/"),
         "png of 30000 x 30000 among views": black(_VAL_IMAGE, 30000),

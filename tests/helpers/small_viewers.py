@@ -24,7 +24,6 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.recording.writer import NativeDatasetWriter
 from aenerf_ns.training.pipeline import AENeRFPipeline
-from helpers.small_pipelines import make_pipeline_config
 from helpers.streams import random_stream
 
 SIZE, DURATION, NUM_EVENTS = (24, 16), 2.0, 1000
@@ -46,15 +45,6 @@ def make_recording(folder: Path, true_poses: bool = True) -> Path:
         for _ in range(2):
             made.add_image("val", np.full((height, width, 3), 102, np.uint8), poses[0])
     return folder
-
-
-def make_pipeline_of(folder: Path, pose_correction: str = "spline", **options: Any) -> AENeRFPipeline:
-    """A small untrained pipeline on a dataset."""
-    config = make_pipeline_config(folder, pose_correction=pose_correction)
-    for name, value in options.items():
-        setattr(config.model.supervision, name, value)
-    torch.manual_seed(0)
-    return config.setup(device="cpu", test_mode="val")
 
 
 def free_port() -> int:

@@ -27,7 +27,6 @@ from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.cli.check import Check
 from aenerf_ns.cli.convert import Convert
 from aenerf_ns.cli.simulate import Simulate
-from aenerf_ns.dataparsers.formats import FORMATS, recognize
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
@@ -323,16 +322,10 @@ def test_draw_tracks_and_paths() -> None:
         assert (np.abs(paths - color).sum(-1) == 0).sum() > 300
 
 
-def test_name_the_command_that_finds_poses(bare: Path) -> None:
-    with pytest.raises(DataError, match=r"trajectory.txt: there are no such poses; .*aenerf convert .* --poses events"):
-        _ = FORMATS[recognize(bare)].__class__(data=bare).setup().recording
-
-
 def test_refuse_frames_without_texture() -> None:
     frames = np.full((4, 60, 80), 128, np.uint8)
-    with pytest.raises(DataError, match=r"^flat: COLMAP places none of 4 frames: they have 0 .*; .*textured") as told:
+    with pytest.raises(DataError, match=r"^flat: COLMAP places none of 4 frames: they have 0 .*; .*textured"):
         estimate_poses(frames, np.arange(4) * FRAME, CameraIntrinsics(80, 60, 70.0, 70.0, 40.0, 30.0), "flat")
-    assert "\n" not in str(told.value)
 
 
 def test_refuse_unusable_frames(tmp_path: Path) -> None:

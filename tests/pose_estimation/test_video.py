@@ -165,9 +165,8 @@ SMALLER, DEEP = np.zeros((HEIGHT, WIDTH - 1), np.uint8), np.zeros((HEIGHT, WIDTH
 def test_refuse_unusable_video(
     write: Callable[[Path], Path], message: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(DataError, match=message) as told:
+    with pytest.raises(DataError, match=message):
         list(open_video(write(tmp_path)))
-    assert "\n" not in str(told.value)
     # OpenCV and ffmpeg print from C.
     assert not capfd.readouterr().err
 

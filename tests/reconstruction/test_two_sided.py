@@ -31,13 +31,6 @@ def states_of(events: EventStream) -> Iterator[tuple[int, np.ndarray]]:
     return log_intensities(batches_of([events], BATCH), SENSOR, 0.12)
 
 
-def test_an_image_of_each_batch(events: EventStream) -> None:
-    times, states = zip(*states_of(events), strict=True)
-    # A tenth of an event per pixel ahead of the end of the batch.
-    assert list(times) == [BATCH * (k + 1) - 1 - WIDTH * HEIGHT // 10 for k in range(100)]
-    assert {(state.shape, state.dtype.name) for state in states} == {((HEIGHT, WIDTH), "float32")}
-
-
 def test_states_are_sums_of_exponentials() -> None:
     rows = [(2, 1, 0, 1), (3, 1, 1, 1), (2, 1, 2, -1), (2, 1, 3, 1)]
     ((_, state),) = log_intensities(batches_of([make_stream(rows, 4, 3)], 4), SensorModel(0.3, 0.2), 0.12)

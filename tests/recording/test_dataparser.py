@@ -150,9 +150,8 @@ def test_refuse_pose_gap_of_zero(tmp_path: Path) -> None:
 @pytest.mark.parametrize("option", ["start_time_ns", "end_time_ns", "max_pose_gap_ns", "refractory_period_ns"])
 @pytest.mark.parametrize("value", [10**19, -(10**400)])
 def test_refuse_times_beyond_64_bits(option: str, value: int, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=f"--{option.replace('_', '-')} is -?1000.*; give nanoseconds") as refused:
+    with pytest.raises(DataError, match=f"--{option.replace('_', '-')} is -?1000.*; give nanoseconds"):
         config_of("event-recording-data", tmp_path, **{option: value}).setup()
-    assert "\n" not in str(refused.value)
 
 
 def test_windows_read_the_events_once(

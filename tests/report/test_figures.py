@@ -161,9 +161,8 @@ def test_read_what_a_run_wrote(tmp_path: Path) -> None:
     for name, contents in broken.items():
         for content in contents:
             (tmp_path / name).write_text(content)
-            with pytest.raises(DataError, match=name) as raised:
+            with pytest.raises(DataError, match=name):
                 (read_record if name == "run.json" else read_scalars)(tmp_path)
-            assert "\n" not in str(raised.value)
     lines = ["step,name,value", *(f"{step},loss,{step}" for step in range(4001))]
     (tmp_path / "scalars.csv").write_text("\n".join(lines))
     thinned = read_scalars(tmp_path)

@@ -243,15 +243,6 @@ def test_a_run_that_is_killed_while_it_writes_leaves_whole_checkpoints(
     assert eval_setup(run / "config.yml")[3] == 3
 
 
-def test_failed_write_leaves_the_older_file(tmp_path: Path) -> None:
-    path = tmp_path / "config.yml"
-    path.write_text("older")
-    with files_of_at_most(3), pytest.raises(OSError, match="File too large"), atomic_write(path) as partial:
-        partial.write_text("newer")
-    assert path.read_text() == "older"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_a_file_system_that_cannot_sync_a_folder_takes_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sync = os.fsync
 

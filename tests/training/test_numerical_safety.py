@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -225,6 +226,9 @@ def train_and_spoil(
 
     with pytest.raises(SystemExit, match=message):
         train_small_model(folder, "run", 10, prepare=prepare)
+    (file,) = folder.rglob("run.json")
+    record = json.loads(file.read_text())
+    assert (record["state"], record["steps"]) == ("stopped", 7)
     return weights
 
 

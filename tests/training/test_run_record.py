@@ -96,22 +96,6 @@ def test_one_of_several_processes_does_not_wait_for_a_checkpoint() -> None:
         assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_a_training_that_breaks_off_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    step = AENeRFTrainer.train_iteration
-
-    def interrupted(self: AENeRFTrainer, number: int) -> object:
-        if number == 5:
-            raise KeyboardInterrupt
-        return step(self, number)
-
-    monkeypatch.setattr(AENeRFTrainer, "train_iteration", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train_small_model(tmp_path, "broken", 12)
-    (file,) = tmp_path.rglob("run.json")
-    record = json.loads(file.read_text())
-    assert (record["state"], record["steps"]) == ("stopped", 5)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint(
     number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -13,16 +13,13 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-import tyro
 from helpers.commands import CPU, newest_config, run, simulate
 from helpers.small_trainings import own_log
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.scripts import train
 from nerfstudio.scripts.render import RenderInterpolated, SpiralRender
 from nerfstudio.utils import writer
 
 from aenerf_ns.cli.evaluate import Evaluate
-from aenerf_ns.dataparsers.ecd import EcdDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method_configs.aenerf import aenerf_small
 from aenerf_ns.training.trainer import AENeRFTrainerConfig
@@ -151,11 +148,6 @@ def test_two_processes_equal_one_with_twice_the_batch(
         if value.is_floating_point():
             assert (of_halves - value).norm() <= 1e-3 * (value - start).norm(), name
     assert one["weights"]["camera_optimizer.twists.control_twists"].any()
-
-
-def test_methods_of_the_framework_take_our_dataparsers() -> None:
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=["nerfacto", "ecd-data"])
-    assert isinstance(config.pipeline.datamanager.dataparser, EcdDataParserConfig)
 
 
 def test_a_dataset_that_cannot_be_used_ends_training_with_one_line(workspace: Path) -> None:

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.browser import eventually
+from helpers.small_pipelines import make_pipeline, make_pipeline_config
 from helpers.small_viewers import (
     DURATION,
     SIZE,
     Browser,
     browser_of,
-    make_pipeline_of,
     make_recording,
     sent,
     viewer_of,
@@ -40,7 +40,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pipeline(workspace: Path) -> AENeRFPipeline:
-    return make_pipeline_of(make_recording(workspace / "data"))
+    return make_pipeline(make_recording(workspace / "data"), "val", pose_correction="spline")
 
 
 @pytest.fixture(scope="module")
@@ -185,17 +185,19 @@ def test_figures_of_errors_thresholds_and_colors(viewer: Viewer, pipeline: AENeR
 
 def test_figures_without_true_poses(tmp_path: Path) -> None:
     data = make_recording(tmp_path / "data", true_poses=False)
-    pipeline = make_pipeline_of(data, learn_contrast_threshold_ratio=True)
+    config = make_pipeline_config(data, pose_correction="spline")
+    config.model.supervision.learn_contrast_threshold_ratio = True
+    pipeline = config.setup(device="cpu", test_mode="val")
     text = pipeline.recording.view.figures()
     assert "the true ones are not known. pose correction translation 0, pose correction degrees 0." in text
     assert "C⁺ 0.2, C⁻ 0.3; learned: contrast threshold ratio 0.6667" in text
     assert pipeline.recording.view.lines().keys() == {"estimated", "corrected"}
-    off = make_pipeline_of(data, pose_correction="off")
+    off = make_pipeline(data, "val")
     assert "as given" in off.recording.view.figures()
 
 
 def test_run_without_events_names_their_file(tmp_path: Path) -> None:
-    pipeline = make_pipeline_of(make_recording(tmp_path / "data"))
+    pipeline = make_pipeline(make_recording(tmp_path / "data"), "val", pose_correction="spline")
     (tmp_path / "data" / "events.h5").unlink()
     view = pipeline.recording.view
     view.prepare()
@@ -248,7 +250,7 @@ def test_follow_looks_through_the_event_camera(browser: Browser, viewer: Viewer,
 
 
 def test_training_draws_rarely_and_for_a_browser(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pipeline = make_pipeline_of(workspace / "data")
+    pipeline = make_pipeline(workspace / "data", "val", pose_correction="spline")
     panel = pipeline.recording
     # Without a viewer, nothing happens.
     panel.after_step()

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 from helpers.browser import chromium, eventually
-from helpers.small_viewers import DURATION, NUM_EVENTS, make_pipeline_of, make_recording, viewer_of
+from helpers.small_pipelines import make_pipeline
+from helpers.small_viewers import DURATION, NUM_EVENTS, make_recording, viewer_of
 
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 
@@ -25,7 +26,7 @@ def button(text: str) -> str:
 
 
 def test_panel_in_chromium(tmp_path: Path) -> None:
-    pipeline = make_pipeline_of(make_recording(tmp_path / "data"))
+    pipeline = make_pipeline(make_recording(tmp_path / "data"), "val", pose_correction="spline")
     panel = pipeline.recording
     downloads = tmp_path / "downloads"
     with viewer_of(pipeline, tmp_path) as viewer, chromium(tmp_path) as page:
