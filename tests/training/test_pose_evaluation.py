@@ -401,3 +401,10 @@ def test_learned_offsets_are_reported(tmp_path: Path) -> None:
     assert metrics["clock_offset_seconds"] == pytest.approx(0.01)
     assert metrics["rigid_offset_degrees"] == pytest.approx(math.degrees(0.01 * 3**0.5))
     assert metrics["rigid_offset_translation"] == pytest.approx(0.01 * 3**0.5 * correction.trajectory.extent)
+
+
+def test_exporters_of_the_framework_choose_the_rays_of_a_batch(tmp_path: Path) -> None:
+    data = make_pipeline(tmp_path / "made", "test").datamanager
+    assert data.get_train_rays_per_batch() == data.config.train_num_rays_per_batch
+    data.train_pixel_sampler.num_rays_per_batch = 6
+    assert len(data.next_train(0)[0]) == 6

@@ -22,10 +22,10 @@ from aenerf_ns.training.trainer import AENeRFTrainer
 
 
 def test_a_command_is_recorded_as_it_is_typed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["benchmarks/paper/__main__.py", "--output", "bench"])
+    monkeypatch.setattr(sys, "argv", ["benchmarks/paper/__main__.py", "--output", "/home/a/b/c/bench", "--work=/a/b"])
     for name in ("benchmarks.paper.__main__", "benchmarks.paper"):
         monkeypatch.setattr(sys.modules["__main__"], "__spec__", ModuleSpec(name, None))
-        assert provenance.provenance()["command"] == "python -m benchmarks.paper --output bench"
+        assert provenance.provenance()["command"] == "python -m benchmarks.paper --output .../b/c/bench --work=.../a/b"
 
 
 def test_a_commit_is_that_of_this_package_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
