@@ -149,7 +149,7 @@ def find_problems(events: EventStream, recording: Recording, start: int, end: in
         file = _EventsInMemory(recording.event_file.path, events)
         require_one_unit(file, trajectory, "")
         window = TimeWindow(max(int(events.t[0]), trajectory.start), min(int(events.t[-1]), trajectory.end))
-        result = check(replace(recording, trajectory=trajectory, event_file=file), window, 1.0)
+        result = check(replace(recording, trajectory=trajectory, event_file=file), recording.frames, window)
     except DataError as error:
         return [str(error)], True
     return result.problems, not any("too few events" in line or "not computed" in line for line in result.figures)

@@ -26,18 +26,25 @@ _RATE_PARTS = 60
 _MIN_EVENTS = 2_000
 
 
-def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult:
-    """Check a recording: its events, its poses, and whether the poses fit the events.
+def check(
+    recording: Capture, frames: Iterable[tuple[int, Path]], window: TimeWindow | None = None, scale: float = 1.0
+) -> CheckResult:
+    """Check a recording: its events and its lens, and where it has poses, these, and whether they fit the events.
 
     Args:
         recording: the recording.
-        window: the time that training uses.
+        frames: times in nanoseconds and files.
+        window: the time that training uses; None for all.
         scale: scene units in a unit of the poses.
 
     Raises:
         DataError: the events cannot be read.
     """
-    result, num_covered = _check_events(recording, recording.frames, window)
+    window = window or TimeWindow()
+    result, num_covered = _check_events(recording, frames, window)
+    if not isinstance(recording, Recording):
+        check_lens(result, recording.event_camera)
+        return result
     check_poses(result, recording, window, num_covered)
     num_problems = len(result.problems)
     check_lens(result, recording.event_camera)
@@ -58,21 +65,6 @@ def check(recording: Recording, window: TimeWindow, scale: float) -> CheckResult
     # Poses that do not fit give wrong depths.
     depth = check_depth(result, result.warped, recording, scale) if poses_fit else None
     describe_motion(result, recording, depth)
-    return result
-
-
-def check_without_poses(capture: Capture, frames: Iterable[tuple[int, Path]]) -> CheckResult:
-    """Check the events of a recording without poses, and its lens.
-
-    Args:
-        capture: the recording.
-        frames: times in nanoseconds and files.
-
-    Raises:
-        DataError: the events cannot be read.
-    """
-    result, _ = _check_events(capture, frames, TimeWindow())
-    check_lens(result, capture.event_camera)
     return result
 
 

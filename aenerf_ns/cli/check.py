@@ -53,7 +53,7 @@ class Check(DatasetCommand):
         parser = self.open_dataset()
         from PIL import Image
 
-        from aenerf_ns.checking.report import check, check_without_poses
+        from aenerf_ns.checking.report import check
         from aenerf_ns.recording.recording import Recording
         from aenerf_ns.recording.scene import SCENE_KEY
 
@@ -61,9 +61,9 @@ class Check(DatasetCommand):
         if isinstance(capture, Recording):
             # Training and evaluation will ask for all three splits.
             outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val", "test")]
-            result = check(parser.recording, outputs[0].metadata[SCENE_KEY].window, outputs[0].dataparser_scale)
+            result = check(capture, frames, outputs[0].metadata[SCENE_KEY].window, outputs[0].dataparser_scale)
         else:
-            result = check_without_poses(capture, frames)
+            result = check(capture, frames)
         for figure in result.figures:
             say(figure)
         if isinstance(capture, Recording):

@@ -193,7 +193,7 @@ def _measure_data(report: RunReport, run: TrainedRun) -> None:
             f"Rate, polarity, pairs and the check: the events are no longer at {scene.event_file.path}."
         )
         return
-    report.check = check(run.recording, scene.window, scene.scale)
+    report.check = check(run.recording, run.recording.frames, scene.window, scene.scale)
     if report.check.warped is None:
         report.missing.append("The check's picture: too few events have a pose.")
     report.pairs = measure_pair_residuals(run)

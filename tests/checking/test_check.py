@@ -87,7 +87,7 @@ MISTAKES = {
 def test_no_slice_spans_a_gap_of_the_poses(simulated: tuple[Recording, EventStream]) -> None:
     recording, _ = simulated
     gaps = ((PART // 4, PART // 2), (3 * PART // 5, 3 * PART // 4))
-    warped = check(recording, TimeWindow(0, PART, gaps), 1.0).warped
+    warped = check(recording, recording.frames, TimeWindow(0, PART, gaps)).warped
     assert not any(first < end and last > start for first, last in warped.spans for start, end in gaps)
     # From all three stretches.
     assert warped.spans[0][0] < gaps[0][0]
