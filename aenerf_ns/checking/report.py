@@ -34,7 +34,7 @@ def check(
     Args:
         recording: the recording.
         frames: times in nanoseconds and files.
-        window: the time that training uses; None for all.
+        window: the time that training uses; to be given where there are poses.
         scale: scene units in a unit of the poses.
 
     Raises:

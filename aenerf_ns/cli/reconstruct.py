@@ -35,8 +35,8 @@ _VIDEO, _VIDEO_RATE = "reconstruction.mp4", 25
 @dataclass
 class Reconstruct(DatasetCommand):
     """Make images of a recording's events, and write a dataset folder with these images as training images, at the
-    interpolated poses of their times. The events and the other images are those of the recording. reconstruction.mp4
-    in the folder shows the images one after another."""
+    interpolated poses of their times, the true ones where the recording has these. The events and the other images are
+    those of the recording. reconstruction.mp4 in the folder shows the images one after another."""
 
     output: Path
     """Dataset folder to create."""
@@ -117,7 +117,8 @@ class Reconstruct(DatasetCommand):
                 "give a smaller --events-per-pixel, or poses that cover the events",
             )
         if num_posed < num_images:
-            say(f"{num_images - num_posed} of {num_images} images are left out: no pose is known at their times.")
+            left_out = num_images - num_posed
+            say(f"{left_out} of {num_images} images are left out: no pose, or no true pose, is known at their times.")
 
 
 def _add_reference_views(recording: Recording, writer: NativeDatasetWriter) -> None:

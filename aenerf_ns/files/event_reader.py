@@ -139,8 +139,9 @@ class EventFile(ABC):
 
     def tracked(self, description: str = "") -> Iterator[EventStream]:
         """Yield :meth:`chunks`, with a progress bar towards the number of events, if that is known."""
+        total = self.count()
         with progress_bar() as progress:
-            task = progress.add_task(description or f"Reading {self.path.name}", total=self.count())
+            task = progress.add_task(description or f"Reading {self.path.name}", total=total)
             for chunk in self.chunks():
                 yield chunk
                 progress.advance(task, len(chunk))

@@ -152,7 +152,8 @@ def events_from_columns(
     """Return x, y, t in nanoseconds and p = ±1 of events in columns of any numeric type.
 
     Args:
-        file: the columns are from. Where it is to drop malformed events, it takes those with an impossible value.
+        file: from which the columns are. Where it drops malformed events, its ``left_out`` takes those with an
+            impossible value.
         columns: x, y, t and p, (N,) each. Polarities are 0 and 1, or −1 and 1.
         tick: nanoseconds of the unit of the times.
         describe_event: says which event one is in the file, for messages.

@@ -244,8 +244,9 @@ class AENeRFModel(Model):
         if num_rates > 0:
             within = slice(len(ray_bundle) - num_rates, None)
             ends, weights_of_ends = self._composite(samples[: within.start])
-            moving = self._composite_with_rate(samples[within], ray_bundle[within])
-            log_radiance, outputs["log_radiance_rate"], weights = moving
+            log_radiance, outputs["log_radiance_rate"], weights = self._composite_with_rate(
+                samples[within], ray_bundle[within]
+            )
             log_radiance, weights = torch.cat([ends, log_radiance]), torch.cat([weights_of_ends, weights])
         else:
             log_radiance, weights = self._composite(samples)

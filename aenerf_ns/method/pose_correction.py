@@ -434,7 +434,7 @@ class TwistSpline(nn.Module):
             dtype=torch.float64,
         )
         basis /= 6
-        # By analytic rates: forward mode would take some 40 launches more of a GPU's step.
+        # The rate is analytic: forward-mode differentiation would add some 40 kernel launches to a GPU's step.
         rate = torch.zeros(4, 4, dtype=torch.float64)
         rate[:3] = basis[1:] * torch.tensor([[1.0], [2.0], [3.0]]) / self._interval
         self._basis: Tensor = nn.Buffer(torch.cat([basis, rate], -1), persistent=False)

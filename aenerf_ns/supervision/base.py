@@ -200,7 +200,7 @@ class Sampler(ABC):
     Attributes:
         batch_type: the batches that are drawn.
         pixel_rays: the directions of the pixels, and the trajectory that times count from.
-        num_rays_per_batch: the most rays of a training batch.
+        num_rays_per_batch: the most rays of a training batch, which the datamanager sets.
     """
 
     batch_type: ClassVar[type[Batch]]

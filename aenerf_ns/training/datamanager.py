@@ -93,7 +93,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             self.train_pixel_sampler = self.config.sampler.setup(
                 dataset=self.train_dataset, supervision=supervision, device=self.device
             )
-            # The framework's exporters set it.
+            # Exporters of the framework change it.
             self.train_pixel_sampler.num_rays_per_batch = self.config.train_num_rays_per_batch
             if self.test_mode == "val":
                 self.train_pixel_sampler.prepare()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -65,10 +66,9 @@ def _program() -> str:
 
 
 def _portable(argument: str) -> str:
-    """Return an argument, or --option=argument, without the folders of this machine."""
-    option, sign, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
-    path = Path(value)
-    return option + sign + (str(Path("...", *path.parts[1:][-3:])) if path.is_absolute() else value)
+    """Return an argument, which may begin with ``NAME=``, without the folders of this machine."""
+    name, path = re.fullmatch(r"([^/=]*=)?(.*)", argument, re.DOTALL).groups("")  # type: ignore[union-attr]
+    return name + (str(Path("...", *Path(path).parts[1:][-3:])) if path.startswith("/") else path)
 
 
 def _cpu() -> str:

@@ -116,8 +116,8 @@ class Poses:
                 return None
             placed = made["results"]
             refined = placed.pop("refined_test_poses")
-            # They are most of the file, and stay in the folder of the runs.
-            del placed["views"]
+            # The views would be most of the file. They stay in the folder of the runs.
+            placed.pop("views", None)
             found = {"placed": placed, "refined": refined, "poses": self._pose_errors(run)}
             return {"scene": name, "case": case, "variant": variant, "seed": seed, **found}
 

@@ -80,7 +80,7 @@ def test_a_recording_without_poses_does_not_end_the_others(tmp_path: Path, monke
     def make(_: Runner, run: Run) -> dict:
         if "--poses events" in " ".join(run.convert):
             raise DataError("events", "they give no poses", "record longer")
-        return {"results": {**_run("", "", 0, 30.0)["placed"], "views": [], "refined_test_poses": {"psnr": 31.0}}}
+        return {"results": {**_run("", "", 0, 30.0)["placed"], "refined_test_poses": {"psnr": 31.0}}}
 
     monkeypatch.setattr(Runner, "make", make)
     monkeypatch.setattr(Poses, "_pose_errors", lambda *_: _run("", "", 0, 30.0)["poses"])

@@ -19,7 +19,7 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import EventPairs, event_counts
 from aenerf_ns.events.pairing import pair_events
-from aenerf_ns.events.picture import net_picture
+from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.simulator.esim import EventSimulator
@@ -224,7 +224,7 @@ def test_malformed_streams_are_refused(change: dict[str, np.ndarray], message: s
 
 
 def test_polarity_picture_shows_signs() -> None:
-    picture = net_picture(np.array([[0, -1], [2, 0]])).astype(int)
+    picture = polarity_picture(make_stream([(0, 1, 0, 1), (0, 1, 1, 1), (1, 0, 2, -1)], 2, 2)).astype(int)
     positive, negative, neither = picture[1, 0], picture[0, 1], picture[0, 0]
     assert positive[0] > neither[0] > positive[2]
     assert negative[2] > neither[2] > negative[0]

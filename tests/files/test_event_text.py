@@ -154,9 +154,10 @@ def test_read_the_spellings_that_are_unambiguous(name: str, tmp_path: Path) -> N
     assert file.time_span() == (expected[0][2], expected[-1][2])
 
 
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
 @pytest.mark.parametrize("name", ["format.csv", "geometry.csv", "e2vid.txt"])
-def test_take_the_size_that_the_file_states(name: str, tmp_path: Path) -> None:
-    path = written(tmp_path / name, SPELLINGS[name])
+def test_take_the_size_that_the_file_states(name: str, mark: str, tmp_path: Path) -> None:
+    path = written(tmp_path / name, mark + SPELLINGS[name])
     file = open_event_file(path)
     assert (file.width, file.height) == (96, 72)
     with pytest.raises(DataError, match="its sensor has 96 x 72 pixels, but 346 x 260 were given"):

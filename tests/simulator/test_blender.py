@@ -6,8 +6,9 @@ import json
 import os
 import signal
 import threading
+import time
 from collections import deque
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +122,9 @@ def test_interrupt(blend: Path, number: int) -> None:
     """Blender's own Python code, in the middle of a rendering, must not be what takes the exception."""
     renderer = BlenderRenderer(blend)
     renderer.render(OVERHEAD, LENS, 96, 72, 16)
-    pictures = (renderer.render(OVERHEAD, LENS, 96, 72, 16) for _ in count())
+    end = time.monotonic() + 30
+    in_time = takewhile(lambda _: time.monotonic() < end, count())
+    pictures = (renderer.render(OVERHEAD, LENS, 96, 72, 16) for _ in in_time)
     threading.Timer(0.3, os.kill, (os.getpid(), number)).start()
     with sigterm_as_system_exit(), pytest.raises((KeyboardInterrupt, SystemExit)):
         deque(pictures, maxlen=0)

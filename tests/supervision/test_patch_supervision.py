@@ -211,6 +211,11 @@ def test_displacements_are_those_of_the_flow_and_are_zero_where_nothing_happens(
         assert batch.displacement[index].numpy() == pytest.approx(expected, rel=1e-5), index
 
 
+def test_a_window_has_a_patch_at_least(random_poses: torch.Tensor) -> None:
+    _, batch = make_sampler(random_poses, pixels_per_window=1).sample(8 * 5)
+    assert batch.window.tolist() == np.repeat(np.arange(5), 4).tolist()
+
+
 def test_a_camera_without_patches_is_refused(random_poses: torch.Tensor) -> None:
     blind = CameraIntrinsics(WIDTH, HEIGHT, 9.0, 9.0, 4.5, 3.5, "radial_tangential", (-9.0, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(DataError, match="it gives no patch of 2 x 2 pixels a direction"):
