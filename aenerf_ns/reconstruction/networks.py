@@ -1,7 +1,7 @@
 """E2VID's and FireNet's networks, written anew from their descriptions and their weights files' names.
 
-Both map a voxel grid and the state after the grids before to an image and the next state. Attributes, and
-the members of sequences, are named as in the authors' weights files.
+Both map a voxel grid and the state after the grids before to an image and the next state. Attributes, and the members
+of sequences, are named as in the authors' weights files.
 """
 
 from __future__ import annotations

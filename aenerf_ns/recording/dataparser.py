@@ -67,9 +67,11 @@ class EventDataParser(DataParser):
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         """Read a dataset without poses: its cameras, and the times in nanoseconds and the files of its frames.
 
-        Called only where the file of :meth:`poses_path` is missing: a format that overrides one overrides both.
+        Called where the file of :meth:`poses_path` is missing: a format that overrides one overrides both. Here the
+        whole recording is read, and its reader says what is missing.
         """
-        raise NotImplementedError
+        recording = self.read_recording()
+        return recording, recording.frames
 
     def read_frames(self) -> tuple[Capture, list[tuple[int, Path]]]:
         """Read what poses can be estimated from: the events, and the timed reference views.

@@ -21,6 +21,7 @@ from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
+from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.dataset import EventDataset
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.scene import SCENE_KEY
@@ -174,3 +175,15 @@ def test_windows_read_the_events_once(
     # The pictures of the cameras are of these events, which are not read again as pairs.
     assert dataset.get_numpy_image(1).std() > 0
     assert len(reads) == 1
+
+
+def test_a_format_that_cannot_do_without_poses_says_which_are_missing(tmp_path: Path) -> None:
+    class Parser(EventDataParser):
+        def poses_path(self) -> Path:
+            return self.data / "poses.txt"
+
+        def read_recording(self) -> Recording:
+            raise AssertionError(read_tum_trajectory(self.poses_path()))
+
+    with pytest.raises(DataError, match=r"poses.txt: there is no such file"):
+        Parser(NativeDataParserConfig(data=write_native(tmp_path / "made"))).read_frames()
