@@ -95,11 +95,11 @@ def peers_parts(figures: Sequence[Figures]) -> list[str]:
     """Return a table of PSNR and the order of the methods for each kind of scene and speed, beside the paper's."""
     named = [name for name, rows in _ROWS_OF.items() if any(_of(figures, row=row) for row in rows)]
     parts = [
-        "PSNR: mean over scenes and seeds ± standard deviation over seeds, with test poses as placed / refined. Means "
-        "over what all rows of a table have in common. Of these methods only AE-NeRF corrects poses. The column with "
-        "pose correction gives the others this project's. The paper's PSNR of AE-NeRF is with correction. The paper "
-        "does not say on which poses it ran the others. In the other tables, rows without a method's name are "
-        "AE-NeRF's."
+        "PSNR: mean over scenes and seeds ± standard deviation over seeds, with test poses as placed / refined / as "
+        "placed, where the paper's network corrects the colors. Means over what all rows of a table have in common. Of "
+        "these methods only AE-NeRF corrects poses. The column with pose correction gives the others this project's. "
+        "The paper's PSNR of AE-NeRF is with correction. The paper does not say on which poses it ran the others. In "
+        "the other tables, rows without a method's name are AE-NeRF's."
     ]
     if plan.FILTERED in named:
         parts.append(
@@ -140,20 +140,24 @@ def _order(values: Mapping[str, float]) -> str:
 
 
 def _mean_and_spread(figures: Sequence[Figures]) -> str:
-    """Return the mean PSNR with test poses placed / refined, each with the standard deviation over seeds."""
+    """Return the mean PSNR with test poses placed / refined / placed under the paper's color correction, where that
+    was measured, each with the standard deviation over seeds."""
     if not figures:
         return "-"
     parts = []
-    for results in ([run["results"] for run in figures], [run["results"].get("refined_test_poses") for run in figures]):
-        if None in results:
+    results = [run["results"] for run in figures]
+    refined = [result.get("refined_test_poses", {}).get("psnr") for result in results]
+    for values in ([result["psnr"] for result in results], refined, [result.get("psnr_network") for result in results]):
+        if None in values:
             parts.append("-")
             continue
         by_seed: dict[int, list[float]] = {}
-        for run, result in zip(figures, results, strict=True):
-            by_seed.setdefault(run["seed"], []).append(result["psnr"])
+        for run, value in zip(figures, values, strict=True):
+            by_seed.setdefault(run["seed"], []).append(value)
         means = [fmean(values) for values in by_seed.values()]
         parts.append(f"{fmean(means):.2f}" + (f" ± {stdev(means):.2f}" if len(means) > 1 else ""))
-    return " / ".join(parts)
+    # Runs of earlier versions were not evaluated under the network.
+    return " / ".join(parts[:-1] if parts[-1] == "-" else parts)
 
 
 def poses_table(figures: Sequence[Figures]) -> str:

@@ -3,7 +3,8 @@
     python benchmarks/paper/worker.py RUN METHOD OPTIONS
 
 Runs in the benchmark's folder. The options put the trained run into ``outputs/RUN``. Writes
-``runs/RUN/evaluation.json``, pictures of the test views beside it, and, but for nerfacto, ``corrected.txt``.
+``runs/RUN/evaluation.json``, pictures of the test views beside it, and, but for nerfacto, ``corrected.txt``. Then the
+results have ``psnr_network`` too: the PSNR of the views as placed under the paper's color correction (15).
 
 Nerfstudio's nerfacto is run where it would fail, and with metrics that can be compared. Three things differ from
 Nerfstudio's own commands:
@@ -67,6 +68,9 @@ def main() -> None:
     from nerfstudio.scripts.eval import ComputePSNR
 
     from aenerf_ns.cli.export import ExportTrajectory
+    from aenerf_ns.cli.trained_run import open_run
+    from aenerf_ns.evaluation.color_fit import replace_color_correction
+    from aenerf_ns.evaluation.view_metrics import average_metrics, measure_reference_views
 
     sys.argv = ["ns-train", method, *options]
     train.entrypoint()
@@ -77,9 +81,13 @@ def main() -> None:
     folder = Path("runs") / name
     file = folder / "evaluation.json"
     ComputePSNR(config, file, folder / "pictures").main()
-    file.write_text(json.dumps({**json.loads(file.read_text("utf8")), "train_seconds": seconds}), "utf8")
+    evaluation = {**json.loads(file.read_text("utf8")), "train_seconds": seconds}
     if method != "nerfacto":
         ExportTrajectory(config, folder / "corrected.txt").main()
+        _, run, _ = open_run(config)
+        replace_color_correction(run, "network")
+        evaluation["results"]["psnr_network"] = average_metrics(measure_reference_views(run), False)["psnr"]
+    file.write_text(json.dumps(evaluation), "utf8")
 
 
 if __name__ == "__main__":

@@ -79,12 +79,16 @@ SCENES = {
         ("room COLMAP 125 Hz", "report", "room", "hard", "COLMAP's own errors",
          f"{_MIDDLE} --poses colmap --frame-rate 125 --seed 17"),
         *(
-            (f"{scene} 240 {speed}", "events", scene, speed, "240 x 180", f"{_SENSOR_240} {_NOISE} --seed {seed}")
-            for scene, *seeds in (
+            (f"{scene} 240 {name}", "events", scene, speed, about, f"{_SENSOR_240} {_NOISE} {sensor} --seed {seed}")
+            for scene, easy, hard in (
                 ("games", 34, 11), ("forklift", 31, 37), ("lounge", 35, 32), ("living_room", 36, 22),
                 ("gallery", 33, 38), ("workshop", 13, 39), ("room", 40, 41),
             )
-            for speed, seed in zip(("easy", "hard"), seeds, strict=True)
+            for name, speed, about, sensor, seed in (
+                ("easy", "easy", "240 x 180", "", easy),
+                ("hard", "hard", "240 x 180", "", hard),
+                ("davis346", "hard", "240 x 180, a real sensor", "--sensor davis346", hard),
+            )
         ),
     )
 }  # fmt: skip

@@ -221,6 +221,11 @@ def test_report_orders_methods() -> None:
         order = " < ".join(f"{name} ({mean:.2f})" for name, mean in means.items())
         assert f"- here, estimated poses, {setting}: {order}\n" in text
     assert "- images of the events: `aenerf reconstruct --events-per-pixel 0.35`\n" in text
+    # The paper's color correction stands beside, where it was measured.
+    assert f"| PAEv3D | - | {psnr['PAEv3D']:.2f} / - |" in text
+    for one in figures:
+        one["results"]["psnr_network"] = one["results"]["psnr"] + 0.25
+    assert f"| PAEv3D | - | {psnr['PAEv3D']:.2f} / - / {psnr['PAEv3D'] + 0.25:.2f} |" in tables.report(figures, {})
     # One method alone has no order.
     uncorrected = [one for one in figures if not one["row"].endswith(CORRECTED)]
     assert "which all correct" not in tables.report(uncorrected, {})
@@ -378,6 +383,7 @@ def test_two_processes_resume_a_benchmark_after_each_kill(tmp_path: Path) -> Non
     for one in figures:
         assert len(one["curve"]) >= 4
         assert one["results"]["psnr"] > 5
+        assert ("psnr_network" in one["results"]) == (one["row"] != CEILING)
     # Whichever ended last has written all of it.
     assert "missing" not in (bench / "report.md").read_text()
     assert not [path for path in bench.rglob("*") if ".partial" in path.name]

@@ -82,7 +82,6 @@ def test_images_have_poses_of_their_times(data: Path, tmp_path: Path) -> None:
 def test_network_reconstructs_with_given_weights(
     network: type[E2VID] | type[FireNet], data: Path, tmp_path: Path
 ) -> None:
-    torch.manual_seed(0)
     made = network()
     state = torch.nn.ModuleDict({made.name_in_file: made}).state_dict()
     torch.save({"state_dict": state}, tmp_path / "weights.pth.tar")

@@ -14,7 +14,6 @@ from aenerf_ns.method.ray_losses import distortion_loss
 
 @pytest.fixture
 def samples() -> RaySamples:
-    torch.manual_seed(0)
     rays = make_rays(15)
     rays.nears, rays.fars = torch.full((15, 1), 0.05), torch.full((15, 1), 100.0)
     return UniformLinDispPiecewiseSampler(num_samples=48).train()(rays)
