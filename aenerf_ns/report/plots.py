@@ -94,10 +94,12 @@ def event_rate(report: RunReport) -> go.Figure:
 def trajectory(reports: Sequence[RunReport]) -> go.Figure:
     """Plot the trajectories from above and from the side, in units of the recording."""
     figure = make_subplots(1, 2, subplot_titles=("from above", "from the side"))
+    # One for all: runs on the same true poses may have scenes that are turned otherwise.
+    upright = np.array(reports[0].poses.upright)
     for column, (across, up) in enumerate(((0, 1), (0, 2)), start=1):
         for run, report in enumerate(reports):
             for name, points in _paths(report, reports[:run]):
-                x, y = ([point[axis] for point in points] for axis in (across, up))
+                x, y = (np.array(points) @ upright.T).T[[across, up]]
                 shown = name if len(reports) == 1 or name == "true" else f"{name}, {report.name}"
                 _add_line(figure, x, y, shown, _line(name, run), column == 1, 1, column)
         figure.update_xaxes(title_text="x", row=1, col=column)

@@ -23,9 +23,9 @@ class RunPoses:
     Attributes:
         num_poses: given poses that the true ones cover, where these are known, else all.
         seconds: (N,) since the trajectory's start.
-        positions: (N, 3) of the ``estimated``, the ``corrected`` and, where they are known, the ``true`` poses in
-            units of the recording, with z up as far as the cameras tell. Aligned to the true trajectory where it is
-            known.
+        positions: (N, 3) of the ``estimated``, the ``corrected`` and, where they are known, the ``true`` poses in the
+            recording's world. Aligned to the true trajectory where it is known.
+        upright: (3, 3) rotation of that world, after which z is up as far as the cameras tell.
         evo: :func:`evo_errors` of the ``estimated`` and the ``corrected`` poses,
             over all of them. None without true poses.
         errors: :func:`errors_over_time` of both. None without true poses.
@@ -36,6 +36,7 @@ class RunPoses:
     num_poses: int
     seconds: list[float]
     positions: dict[str, list[list[float]]]
+    upright: list[list[float]]
     evo: dict[str, dict[str, dict[str, float]]] | None
     errors: dict[str, dict[str, list[float]]] | None
     correction: dict[str, list[float]] | None
@@ -72,7 +73,8 @@ def measure_poses(run: TrainedRun) -> RunPoses:
     return RunPoses(
         num_poses=len(times),
         seconds=seconds[::every].tolist(),
-        positions={name: (part[::every, :, 3] / scene.scale).tolist() for name, part in positions.items()},
+        positions={name: scene.to_recording(part[::every])[..., 3].tolist() for name, part in positions.items()},
+        upright=scene.frame.rotation.tolist(),
         evo=evo,
         errors=errors,
         correction=correction,

@@ -76,7 +76,7 @@ def make_report(name: str, **changes: Any) -> RunReport:
         "estimation": PosesReport(HOSTILE, picture()),
         "num_pairs": "1000 pairs",
         "drift": PolarityDrift(np.zeros((4, 6)), np.zeros((4, 6)), 0.06),
-        "poses": RunPoses(2, [0.0, 1.0], {"estimated": path, "true": path},
+        "poses": RunPoses(2, [0.0, 1.0], {"estimated": path, "true": path}, np.eye(3).tolist(),
                           {"estimated": kinds, "corrected": kinds}, {"estimated": over_time},
                           {axis: [0.0, 0.1] for axis in axes}),
         "evaluation": evaluation,
@@ -118,7 +118,7 @@ def test_page_shows_everything_escaped() -> None:
 def test_page_of_a_run_without_measurements() -> None:
     bare = dict.fromkeys(("record", "scalars", "check", "num_pairs", "drift", "pairs"))
     empty = {"pose_gaps_ns": [], "evaluation": {}, "chosen": {}, "pictures": {}, "missing": []}
-    poses = RunPoses(0, [0.0], {"estimated": [[0.0] * 3]}, None, None, None)
+    poses = RunPoses(0, [0.0], {"estimated": [[0.0] * 3]}, np.eye(3).tolist(), None, None, None)
     page = page_of([make_report("a", **bare, **empty, poses=poses)], [])
     for text in ("made by an earlier version", "No run kept its scalars", "There are no views with images",
                  "the recording has no true poses", "No run corrects poses", "Nothing is missing"):  # fmt: skip
