@@ -103,19 +103,15 @@ def check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -
     return False
 
 
-def check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording, scale: float) -> float | None:
-    """Describe how far away the scene is, and check that the scene box holds it.
-
-    Returns:
-        The median depth in the unit of the poses, or None if no tile has a depth.
-    """
+def check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording, scale: float) -> None:
+    """Describe how far away the scene is, and check that the scene box holds it."""
     energy, brightness, depth, point = (
         np.stack([getattr(part, name) for part in warped.given]) for name in ("energy", "brightness", "depth", "points")
     )
     trusted = (energy > _MIN_TILE_CONTRAST * contrast_of(warped.given) * brightness) & np.isfinite(depth)
     weight, depth, point = energy[trusted], depth[trusted], point[trusted]
     if len(depth) == 0:
-        return None
+        return
     near, median, far = _quantiles(depth, weight, (0.03, 0.5, 0.97))
     low, high = np.array([_quantiles(column, weight, (0.03, 0.97)) for column in point.T]).T
     result.figures.append(
@@ -143,7 +139,6 @@ def check_depth(result: CheckResult, warped: WarpedEvents, recording: Recording,
             result.problems.append(
                 f"the scene box holds only {share:.1%} of what is seen: state a larger scene_box, or none"
             )
-    return median
 
 
 def _quantiles(values: NDArray[np.float64], weights: NDArray[np.float64], shares: tuple[float, ...]) -> list[float]:

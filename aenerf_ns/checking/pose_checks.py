@@ -107,25 +107,3 @@ def check_steps(result: CheckResult, trajectory: Trajectory, window: TimeWindow)
             f"the poses jump (steps: {jumps.sum()}, the first after {times[:-1][jumps][0]} ns): tracking may have been "
             "lost there, or placeholders stand among the poses; leave these poses out"
         )
-
-
-def describe_motion(result: CheckResult, recording: Recording, depth: float | None) -> None:
-    """Describe how far the camera moves from an event of a pixel to the next event of that pixel."""
-    trajectory, focal = recording.trajectory, recording.event_camera.fx
-    covered = TimeWindow(trajectory.start, trajectory.end)
-    pairs = result.statistics.pair_times
-    pairs = pairs[covered.contains(pairs).all(1)]
-    if len(pairs) == 0:
-        return
-    before, after = (trajectory.interpolate(times) for times in pairs.T)
-    angles = rotation_angle(before, after).numpy()
-    lengths = (after - before)[..., 3].norm(dim=-1).numpy()
-    pixels = angles * focal + (0 if depth is None else lengths * focal / depth)
-    columns = ((pairs[:, 1] - pairs[:, 0]) * 1e-6, angles, lengths, pixels)
-    described = []
-    for name, share in (("median", 0.5), ("95 %", 0.95)):
-        interval, angle, length, pixel = (float(np.quantile(values, share)) for values in columns)
-        described.append(
-            f"{name} {interval:.3g} ms, {np.degrees(angle):.2g} degrees, {length:.2g} units, {pixel:.2g} px"
-        )
-    result.figures.append(f"Motion from an event of a pixel to its next: {'; '.join(described)}")

@@ -13,7 +13,7 @@ from aenerf_ns.checking.contrast_checks import check_contrast, check_depth
 from aenerf_ns.checking.event_checks import check_events, check_lens, check_polarity, check_thresholds
 from aenerf_ns.checking.frames import FrameChanges
 from aenerf_ns.checking.noise import NoiseRate
-from aenerf_ns.checking.pose_checks import check_poses, check_steps, describe_motion
+from aenerf_ns.checking.pose_checks import check_poses, check_steps
 from aenerf_ns.checking.result import CheckResult
 from aenerf_ns.checking.thresholds import PolarityBalance
 from aenerf_ns.events.statistics import event_statistics
@@ -63,8 +63,8 @@ def check(
         result.warped = WarpedEvents(runs, recording.trajectory, recording.event_camera)
         poses_fit = check_contrast(result, result.warped, is_simple)
     # Poses that do not fit give wrong depths.
-    depth = check_depth(result, result.warped, recording, scale) if poses_fit else None
-    describe_motion(result, recording, depth)
+    if poses_fit:
+        check_depth(result, result.warped, recording, scale)
     return result
 
 

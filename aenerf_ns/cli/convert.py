@@ -226,8 +226,8 @@ class Convert(DatasetCommand):
         given, truth = recording.trajectory, recording.ground_truth
         knots = None if truth is None else given.knots_covered_by(truth)
         found = refine_poses(recording, window, self.data, self.seed, self.weights, self._colmap_folder)
-        report = found.report()
-        say(found.summary())
+        report = found.report
+        say(report["summary"])
         paths = {"given": given.camera_to_worlds.numpy(), "refined": found.trajectory.camera_to_worlds.numpy()}
         if truth is None or knots is None:
             views = {

@@ -22,7 +22,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, move_poses, tracks_of
 from aenerf_ns.pose_estimation.event_images import MIN_IMAGES, match_event_images
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
-from aenerf_ns.pose_estimation.refinement import PoseRefinement, SharedError
+from aenerf_ns.pose_estimation.refinement import PoseRefinement
 from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.recording.recording import Recording
 
@@ -40,61 +40,16 @@ class RefinedPoses:
 
     Attributes:
         trajectory: at the times of the given poses, in their world.
-        times: (N,) times of the images in nanoseconds.
-        num_tracks: scene points that images see.
-        twists: (N, 6) corrections at the images: translations in the units of the poses, rotation vectors in radians.
-        shared_error: what the clock and the mount explain of the corrections.
-        is_weak: (N,) whether the tracks know no better than the given pose, which nearly stays.
+        report: figures as plain values for JSON. Its ``summary`` is a line of them.
         scene_box: (2, 3) corners of a box around what the camera goes around; None if it does not.
-        seconds: how long the last command took.
         draw: draws the images, their tracks and paths (:func:`~aenerf_ns.pose_estimation.picture.draw_poses`), given
             the paths.
     """
 
     trajectory: Trajectory
-    times: NDArray[np.int64]
-    num_tracks: int
-    twists: Array
-    shared_error: SharedError
-    is_weak: NDArray[np.bool_]
+    report: dict[str, Any]
     scene_box: Tensor | None
-    seconds: float
     draw: Callable[[Mapping[str, Array]], Image.Image]
-
-    def report(self) -> dict[str, Any]:
-        """Return the figures as plain values for JSON."""
-        degrees, translation = self._moved()
-        # First and last times of runs of images whose given poses nearly stay.
-        weak = [(int(self.times[first]), int(self.times[end - 1])) for first, end in runs_of(self.is_weak)]
-        return {
-            "images": len(self.times),
-            "tracks": self.num_tracks,
-            "correction_degrees": degrees,
-            "correction_translation": translation,
-            "shared_error": self.shared_error.report(),
-            "weak_stretches_ns": weak,
-            "seconds": self.seconds,
-            "summary": self.summary(),
-        }
-
-    def summary(self) -> str:
-        """Return a line of figures."""
-        degrees, translation = self._moved()
-        line = (
-            f"Poses refined: {self.num_tracks:,} tracks in {len(self.times)} images of the events move them by "
-            f"{degrees:.2g} degrees and {translation:.2g} of their units (root mean square)"
-        )
-        if self.shared_error.share > _MIN_SHARE and degrees > _MIN_DEGREES:
-            line += f"; {self.shared_error.summary()}"
-        if self.is_weak.any():
-            share = f"{self.is_weak.mean():.0%}"
-            line += f"; for {share} of the images the tracks know no better than the given poses, which nearly stay"
-        return line
-
-    def _moved(self) -> tuple[float, float]:
-        """Return the root mean square angle in degrees, and length, of the corrections."""
-        length, angle = np.sqrt(np.square(self.twists).reshape(-1, 2, 3).sum(-1).mean(0))
-        return float(np.rad2deg(angle)), float(length)
 
 
 def refine_poses(
@@ -161,14 +116,34 @@ def refine_poses(
     observations = observations_of(model, len(pictures))
     twists = np.stack([np.interp(given.times.numpy(), times, column) for column in refinement.twists.T], -1)
     moved = torch.from_numpy(move_poses(given.camera_to_worlds.numpy(), twists))
-    return RefinedPoses(
-        trajectory=Trajectory(given.times, moved, given.source),
-        times=times,
-        num_tracks=model.num_points3D(),
-        twists=refinement.twists,
-        shared_error=refinement.shared_error(),
-        is_weak=refinement.is_weak(),
-        scene_box=box_of(model),
-        seconds=time.perf_counter() - begin,
-        draw=partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images]),
+    report = {**_report(refinement, times, model.num_points3D()), "seconds": time.perf_counter() - begin}
+    draw = partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images])
+    return RefinedPoses(Trajectory(given.times, moved, given.source), report, box_of(model), draw)
+
+
+def _report(refinement: PoseRefinement, times: NDArray[np.int64], num_tracks: int) -> dict[str, Any]:
+    """Return the figures of a refinement of images at (N,) times in nanoseconds."""
+    shared_error, is_weak = refinement.shared_error(), refinement.is_weak()
+    translation, angle = map(float, np.sqrt(np.square(refinement.twists).reshape(-1, 2, 3).sum(-1).mean(0)))
+    degrees = math.degrees(angle)
+    summary = (
+        f"Poses refined: {num_tracks:,} tracks in {len(times)} images of the events move them by {degrees:.2g} degrees "
+        f"and {translation:.2g} of their units (root mean square)"
     )
+    if shared_error.share > _MIN_SHARE and degrees > _MIN_DEGREES:
+        summary += f"; {shared_error.summary()}"
+    if is_weak.any():
+        summary += (
+            f"; for {is_weak.mean():.0%} of the images the tracks know no better than the given poses, which nearly "
+            "stay"
+        )
+    return {
+        "images": len(times),
+        "tracks": num_tracks,
+        "correction_degrees": degrees,
+        "correction_translation": translation,
+        "shared_error": shared_error.report(),
+        # First and last times of runs of images whose given poses nearly stay.
+        "weak_stretches_ns": [(int(times[first]), int(times[end - 1])) for first, end in runs_of(is_weak)],
+        "summary": summary,
+    }
