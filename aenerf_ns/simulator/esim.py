@@ -28,16 +28,7 @@ Events = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.int64], NDArra
 
 
 @numba.njit(cache=True)
-def _fire(time, positive, packing, keys, position):
-    """Write the key of an event, unless ``keys`` is empty, and return the position after it."""
-    first_time, time_shift, pixel_key = packing
-    if len(keys) > 0:
-        keys[position] = (time - first_time) << time_shift | pixel_key | positive
-    return position + 1
-
-
-@numba.njit(cache=True)
-def _linear_events(interval, reference_log, reference_time, sensor, packing, keys, position):
+def _linear_events(interval, reference_log, reference_time, sensor, pixel, events):
     """Fire the events of one pixel while its log-intensity is linear.
 
     Args:
@@ -45,10 +36,11 @@ def _linear_events(interval, reference_log, reference_time, sensor, packing, key
         reference_log, reference_time: state of the pixel. The pixel has its reference if the time lies before the
             interval. Otherwise it takes its reference at that time, which may lie in a later interval.
         sensor: positive and negative threshold, and refractory period.
-        packing, keys, position: see `_fire`.
+        pixel: its number.
+        events: time, pixel and polarity of each event are appended to these.
 
     Returns:
-        the new reference, its time, and the position after the last event.
+        the new reference and its time.
     """
     start_log, end_log, start_time, end_time = interval
     positive_threshold, negative_threshold, refractory_period = sensor
@@ -71,20 +63,18 @@ def _linear_events(interval, reference_log, reference_time, sensor, packing, key
             break
         crossing = start_time + np.int64(np.rint(duration * ((crossing_log - start_log) / rise)))
         time = min(max(crossing, earliest + 1), end_time)
-        position = _fire(time, polarity > 0, packing, keys, position)
+        events.append((time, pixel, polarity))
         if refractory_period > 0:
             # Counted from the rounded time stamp. The log-intensity then changed by exactly the threshold over the
             # interval [t_prev + refractory period, t] that a reader of the stream forms.
             reference_time = time + refractory_period
         else:
             reference_log = crossing_log
-    return reference_log, reference_time, position
+    return reference_log, reference_time
 
 
 @numba.njit(cache=True)
-def _pixel_events(
-    interval, reference_log, reference_time, sensor, noise_times, noise_polarities, packing, keys, position
-):
+def _pixel_events(interval, reference_log, reference_time, sensor, noise_times, noise_polarities, pixel, events):
     """Fire the events of one pixel in one frame interval, which noise events cut into pieces.
 
     A noise event acts like any other: the pixel is blind for the refractory period, or takes the log-intensity of that
@@ -96,21 +86,19 @@ def _pixel_events(
         time = noise_times[i] if i < len(noise_times) else end_time
         log = start_log + (end_log - start_log) * ((time - start_time) / (end_time - start_time))
         piece = piece_log, log if time < end_time else end_log, piece_time, time
-        reference_log, reference_time, position = _linear_events(
-            piece, reference_log, reference_time, sensor, packing, keys, position
-        )
+        reference_log, reference_time = _linear_events(piece, reference_log, reference_time, sensor, pixel, events)
         piece_log, piece_time = log, time
         if i < len(noise_times) and reference_time < time:
-            position = _fire(time, noise_polarities[i] > 0, packing, keys, position)
+            events.append((time, pixel, noise_polarities[i]))
             reference_log = log
             if sensor[2] > 0:
                 reference_time = time + sensor[2]
-    return reference_log, reference_time, position
+    return reference_log, reference_time
 
 
 @numba.njit(cache=True)
-def _frame_events(frames, times, references, thresholds, refractory_period, noise, bits):
-    """Fire the events of all pixels in one frame interval: count them in one pass and write them in a second one.
+def _frame_events(frames, times, references, thresholds, refractory_period, noise):
+    """Fire the events of all pixels in one frame interval.
 
     Args:
         frames, times: log-intensity (H, W) and time at the start and at the end.
@@ -118,39 +106,33 @@ def _frame_events(frames, times, references, thresholds, refractory_period, nois
         thresholds: positive and negative (H, W).
         refractory_period: of all pixels.
         noise: pixels, times and polarities of noise events, sorted by pixel, row by row, then by time.
-        bits: numbers of bits that hold x and y.
 
     Returns:
-        keys that hold time, y, x and polarity, from the highest bits to the lowest. Sorting the keys orders the stream.
+        (N, 3) times, pixels and polarities, pixel by pixel.
     """
     height, width = frames[0].shape
-    x_bits, y_bits = bits
     noise_pixels, noise_times, noise_polarities = noise
-    keys = np.empty(0, np.int64)
-    position = 0
-    for is_written in (False, True):
-        if is_written:
-            keys = np.empty(position, np.int64)
-        position, last = 0, 0
-        for y in range(height):
-            for x in range(width):
-                first = last
-                while last < len(noise_pixels) and noise_pixels[last] == y * width + x:
-                    last += 1
-                log, time, position = _pixel_events(
-                    (frames[0][y, x], frames[1][y, x], times[0], times[1]),
-                    references[0][y, x],
-                    references[1][y, x],
-                    (thresholds[0][y, x], thresholds[1][y, x], refractory_period),
-                    noise_times[first:last],
-                    noise_polarities[first:last],
-                    (times[0], x_bits + y_bits + 1, (y << x_bits | x) << 1),
-                    keys,
-                    position,
-                )
-                if is_written:
-                    references[0][y, x], references[1][y, x] = log, time
-    return keys
+    events = [(np.int64(0), 0, np.int64(0)) for _ in range(0)]
+    last = 0
+    for y in range(height):
+        for x in range(width):
+            first, pixel = last, y * width + x
+            while last < len(noise_pixels) and noise_pixels[last] == pixel:
+                last += 1
+            references[0][y, x], references[1][y, x] = _pixel_events(
+                (frames[0][y, x], frames[1][y, x], times[0], times[1]),
+                references[0][y, x],
+                references[1][y, x],
+                (thresholds[0][y, x], thresholds[1][y, x], refractory_period),
+                noise_times[first:last],
+                noise_polarities[first:last],
+                pixel,
+                events,
+            )
+    table = np.empty((len(events), 3), np.int64)
+    for i, event in enumerate(events):
+        table[i, 0], table[i, 1], table[i, 2] = event
+    return table
 
 
 def _low_pass(
@@ -244,7 +226,6 @@ class EventSimulator:
         self.sensor = sensor
         self.log_epsilon = log_epsilon
         self.num_lost_events, self.longest_delay = 0, 0.0
-        self._bits = (width - 1).bit_length(), (height - 1).bit_length()
         self._channel_weights = np.array(LUMINANCE)
         if sensor.bayer_pattern:
             self._channel_weights = np.eye(3)[sensor.channels(width, height)]
@@ -278,7 +259,7 @@ class EventSimulator:
         Returns:
             x (N,) uint16, y (N,) uint16, t (N,) int64 in nanoseconds, p (N,) int8 of +1 or -1: the events in
             (previous frame, this frame], ordered by time, then by pixel unless they wait or share a tick. The
-            first frame gives no events. A readout may delay events beyond this frame.
+            first frame gives no events. A readout may delay events beyond this frame, and the clock rounds down.
 
         Raises:
             ValueError: a wrong shape, a negative or non-finite radiance, or a time that does not increase.
@@ -286,7 +267,6 @@ class EventSimulator:
         intensity = self._to_intensity(np.asarray(image))
         time_ns = int(time_ns)
         log_intensity = np.log(intensity + self.log_epsilon)
-        x_bits, y_bits = self._bits
         filtered = signal = log_intensity
         if not self._last:
             self._start_ns = self._time_ns = time_ns
@@ -294,47 +274,38 @@ class EventSimulator:
             self._reference_time = np.full(log_intensity.shape, time_ns, np.int64)
             if self.sensor.refractory_period > 0:
                 self._reference_time += self._rng.integers(0, self.sensor.refractory_period, log_intensity.shape)
-            keys = np.empty(0, np.int64)
+            events = np.empty((0, 3), np.int64)
         else:
-            longest = np.iinfo(np.int64).max >> (x_bits + y_bits + 1)
-            if not 0 < time_ns - self._time_ns <= longest:
-                raise ValueError(
-                    f"frame times must increase, by at most {longest} ns: got {time_ns} ns after {self._time_ns} ns"
-                )
+            if time_ns <= self._time_ns:
+                raise ValueError(f"frame times must increase: got {time_ns} ns after {self._time_ns} ns")
             last_intensity, last_log, last_filtered, last_signal = self._last
             if self._bandwidth is not None:
                 light = ((last_intensity + intensity) / 2 + _DARK_RADIANCE) / (1 + _DARK_RADIANCE)
                 time_constants = 2e-9 * math.pi * self._bandwidth * light * (time_ns - self._time_ns)
                 filtered = _low_pass(last_filtered, last_log, log_intensity, time_constants)
             signal = filtered + self._leak * (time_ns - self._start_ns)
-            keys = _frame_events(
+            events = _frame_events(
                 (last_signal, signal),
                 (self._time_ns, time_ns),
                 (self._reference_log, self._reference_time),
                 (self.positive_contrast_threshold, self.negative_contrast_threshold),
                 self.sensor.refractory_period,
                 self._shot_noise(intensity, time_ns),
-                self._bits,
             )
-            keys.sort()
-        x = (keys >> 1 & (1 << x_bits) - 1).astype(np.uint16)
-        y = (keys >> (1 + x_bits) & (1 << y_bits) - 1).astype(np.uint16)
-        t = self._time_ns + (keys >> (1 + x_bits + y_bits))
-        p = (2 * (keys & 1) - 1).astype(np.int8)
+        # A stable sort keeps the order of the pixels.
+        t, pixels, p = events[np.argsort(events[:, 0], kind="stable")].T
         if self._readout_period > 0:
             delayed = (t - self._start_ns).astype(np.float64)
-            pixels = y.astype(np.int64) * self.width + x
             self._busy_until, delay = _read_out(
                 delayed, pixels, self._busy_until, self._waits_until, self._readout_period
             )
             self.longest_delay = max(self.longest_delay, delay)
             is_read = delayed >= 0
             self.num_lost_events += len(t) - np.count_nonzero(is_read)
-            x, y, t, p = x[is_read], y[is_read], self._start_ns + delayed[is_read].astype(np.int64), p[is_read]
-        if self._tick > 1:
-            t -= t % self._tick
+            t, pixels, p = self._start_ns + delayed[is_read].astype(np.int64), pixels[is_read], p[is_read]
+        y, x = np.divmod(pixels, self.width)
         self._last, self._time_ns = (intensity, log_intensity, filtered, signal), time_ns
-        return x, y, t, p
+        return x.astype(np.uint16), y.astype(np.uint16), t - t % self._tick, p.astype(np.int8)
 
     def readout_note(self) -> str:
         """Say how many events the readout lost, and how long it delayed others."""

@@ -262,4 +262,4 @@ def _with_exposure(source: Path, scene: SimulationScene, renderer: Renderer) -> 
         brightest = max(brightest, float(radiance[np.isfinite(depth)].max(initial=0.0)))
     if brightest == 0:
         raise DataError(source, "no light reaches what the camera sees", "give it light, or another path")
-    return replace(scene, renderer=replace(renderer.with_gain(_MAX_RADIANCE / brightest), limit=1.0))
+    return replace(scene, renderer=replace(renderer, gain=_MAX_RADIANCE / brightest, limit=1.0))

@@ -28,7 +28,7 @@ class VideoInterval(NamedTuple):
 
     frame: NDArray[np.uint8]  # (height, width, 3), sRGB
     time: int  # of the frame, in nanoseconds
-    events: EventStream  # in (time of the frame before, time of this frame]; none for the first frame
+    events: EventStream  # since the frame before, as :class:`EventSimulator` returns them
 
 
 def quantization_epsilon(sensor: SensorModel) -> float:
@@ -108,7 +108,9 @@ class FlowInterpolation:
     def __init__(self, width: int, height: int, max_displacement: float) -> None:
         # Smaller pictures than the patches of the flow fail, or have no flow.
         if min(width, height) < 12:
-            raise ValueError(f"optical flow needs frames of 12 x 12 pixels or more, not {width} x {height}")
+            raise ValueError(
+                f"optical flow needs frames of 12 x 12 pixels or more, not {width} x {height}: --interpolation linear"
+            )
         self._max_displacement = max_displacement
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._columns, self._rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))

@@ -75,7 +75,7 @@ def test_ply_colors_are_srgb(tmp_path: Path) -> None:
 def test_obj_with_concave_polygon(tmp_path: Path) -> None:
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 0.7 0.1 0.1\n newmtl\tgreen\nKd 0.1 0.6 0.1\n")
     (tmp_path / "a.obj").write_text(
-        "mtllib a.mtl\nv 0 0 0\nv 1 1 0\nv 0 2 0\nv 0.4 1 0\nusemtl red\nf 1 2 3 4 # concave\n"
+        "mtllib a.mtl\nv 0 0 0\nv 1 1 0\nv 0 2 0\nv 0.4 1 0\nusemtl red\nf 1 2 \\\r\n3 4 # concave\n"
         "v 2 0 0\nv 3 0 0\nv 3 1 0\nusemtl green\nf -3 -2 -1#flat\n"
     )
     mesh = scaled(load_mesh(tmp_path / "a.obj", False), 2.0)

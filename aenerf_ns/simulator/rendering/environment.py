@@ -76,8 +76,10 @@ def load_environment(path: Path, turn_degrees: float = 0.0, gain: float = 1.0) -
     rows, columns = picture.shape[:2]
     if columns != 2 * rows:
         raise DataError(path, f"{columns} x {rows} pixels", "give an equirectangular .hdr, twice as wide as high")
-    if not np.isfinite(picture).all() or picture.min() < 0 or not 0 < picture.max() * gain < 1e12:
+    if not np.isfinite(picture).all() or picture.min() < 0 or picture.max() == 0:
         raise DataError(path, "radiance that is negative, infinite, or nowhere positive", "give another picture")
+    if (brightest := gain * picture.max()) >= 1e12:
+        raise DataError(path, f"its light times the gain of {gain:g} is {brightest:.3g}", "give a smaller gain")
     radiance = gain * picture[..., 2::-1]
     # A counterclockwise turn moves the content at +x towards +y, which is to the left.
     shift = turn_degrees / 360.0 * columns

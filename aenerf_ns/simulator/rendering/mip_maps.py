@@ -21,10 +21,6 @@ class MipMaps(NamedTuple):
     level: NDArray[np.int64]  # (L, 3) first texel, rows and columns
     first_level: NDArray[np.int64]  # (pictures + 1,)
 
-    def scaled(self, gain: float) -> MipMaps:
-        """Return the float32 pictures times a factor."""
-        return self._replace(texels=(gain * self.texels).astype(np.float32))
-
 
 def mip_maps(pictures: Sequence[NDArray[np.float32]], bits16: bool) -> MipMaps:
     """Build mip maps of pictures (rows, columns, 3). Every level keeps the mean of its picture, to a thousandth.

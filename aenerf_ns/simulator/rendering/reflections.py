@@ -43,11 +43,6 @@ class Reflections(NamedTuple):
     environment: MipMaps  # light from far away
     ambient: float  # radiance that arrives from everywhere
 
-    def scaled(self, gain: float) -> Reflections:
-        """Return the reflections of the same coats in ``gain`` times the light."""
-        lamps = self.lamps * np.array([1.0, 1.0, 1.0, gain])[:, None]
-        return self._replace(lamps=lamps, environment=self.environment.scaled(gain), ambient=gain * self.ambient)
-
 
 def make_reflections(
     mesh: Mesh, light_point: NDArray[np.integer], normal: Array, lamps: Array, environment: MipMaps, ambient: float
@@ -105,7 +100,7 @@ def _mirror(surface, light, reflections, rays, hits, focal_length, offset, mirro
     region, in radians, and the side of that region in meters.
     """
     for n in range(begin, end):
-        face, weights = hits.face[n], _weights(hits, n)
+        face, weights = hits.face[n], hit_weights(hits, n)
         direction = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
         size = length(direction)
         direction = divide(direction, size)
@@ -141,7 +136,7 @@ def _mirror(surface, light, reflections, rays, hits, focal_length, offset, mirro
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _weights(hits, n):
+def hit_weights(hits, n):
     """Return the barycentric coordinates of a hit."""
     wj, wk = float(hits.coordinates[n, 0]), float(hits.coordinates[n, 1])
     return 1.0 - wj - wk, wj, wk
@@ -165,7 +160,7 @@ def _reflect(surface, light, reflections, rays, hits, optics, diffuse, limit, ch
             slant = max(abs(facing) / length(normal), 0.02)
             region = (footprint + 2.0 * lobe * distance) / math.sqrt(slant)
             side = 0 if facing < 0.0 else 1
-            r, g, b = diffuse_radiance(surface, light, face, side, _weights(hits, n), region)
+            r, g, b = diffuse_radiance(surface, light, face, side, hit_weights(hits, n), region)
         r, g, b = r + ambient, g + ambient, b + ambient
         for lamp in reflections.lamps:
             covered = _covered_share(lamp, row(rays, n), direction, distance, lobe)

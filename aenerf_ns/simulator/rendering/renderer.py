@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numba
@@ -20,73 +20,29 @@ from numpy.typing import ArrayLike, NDArray
 from aenerf_ns.simulator.arrays import Array, Panorama
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
 from aenerf_ns.simulator.rendering.mip_maps import MipMaps, mip_maps, panorama
-from aenerf_ns.simulator.rendering.reflections import Reflections, add_reflections
-from aenerf_ns.simulator.rendering.surface import FOOTPRINT, Surface, diffuse_radiance
-from aenerf_ns.simulator.rendering.vectors import cross, dot, interpolate, row, subtract
+from aenerf_ns.simulator.rendering.reflections import Reflections, add_reflections, hit_weights
+from aenerf_ns.simulator.rendering.surface import FOOTPRINT, Surface, diffuse_radiance, face_normal
+from aenerf_ns.simulator.rendering.vectors import dot, length
 from aenerf_ns.threads import run_ranges
 
 POINT_SPREAD = 0.5
 """Standard deviation of a pixel's Gaussian point-spread function, in pixels."""
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _direction(rotation, intrinsics, x, y, offset):
-    """Return the direction of a ray, one meter long along the optical axis, ``offset`` pixels from a pixel's center."""
-    fx, fy, cx, cy = intrinsics
-    through = (x + 0.5 + offset[0] - cx) / fx, (y + 0.5 + offset[1] - cy) / fy, 1.0
-    return dot(row(rotation, 0), through), dot(row(rotation, 1), through), dot(row(rotation, 2), through)
-
-
-# Not parallel: starting threads for this little work takes longer than the work, above all on a busy machine.
-@numba.njit(cache=True, error_model="numpy")
-def _camera_rays(rotation, center, intrinsics, offsets, width, rays):
-    """Fill the rays (rows * width * samples, 6) of a picture."""
-    for i in range(len(rays)):
-        pixel, sample = divmod(i, len(offsets))
-        y, x = divmod(pixel, width)
-        rays[i, 0], rays[i, 1], rays[i, 2] = center[0], center[1], center[2]
-        rays[i, 3], rays[i, 4], rays[i, 5] = _direction(rotation, intrinsics, x, y, offsets[sample])
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _intersect(surface, face, origin, direction):
-    """Intersect a ray with the plane of a face (Möller and Trumbore, 1997).
-
-    Returns:
-        the barycentric coordinates, clamped to the face, and the normal, whose length is twice the area.
-    """
-    a, b, c = row(surface.faces, face)
-    corner = row(surface.vertices, a)
-    u, v = subtract(row(surface.vertices, b), corner), subtract(row(surface.vertices, c), corner)
-    normal = cross(u, v)
-    from_corner = subtract(origin, corner)
-    determinant = -dot(normal, direction)
-    q = cross(from_corner, direction)
-    second, third = dot(v, q) / determinant, -dot(u, q) / determinant
-    # A ray nearly parallel to the plane may meet it anywhere or nowhere.
-    second = second if 0.0 <= second < 1e9 else 0.0
-    third = third if 0.0 <= third < 1e9 else 0.0
-    total = second + third
-    if total > 1.0:
-        second, third = second / total, third / total
-    return (1.0 - second - third, second, third), normal
-
-
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _shade(surface, light, hits, camera, offsets, background, sky, limit, radiance, depth, begin, end):
-    """Shade rows of the hits of `_camera_rays` and fill ``radiance`` and ``depth``.
+def _shade(surface, light, rays, hits, focal, background, sky, limit, radiance, depth, begin, end):
+    """Shade rows of the hits of camera rays and fill ``radiance`` and ``depth``.
 
     A ray that hits nothing sees the panorama ``sky``, or ``background`` if ``sky`` is empty.
     """
-    width, (rotation, center, intrinsics) = depth.shape[1], camera
-    focal, samples = intrinsics[0], len(offsets)
-    origin, axis = (center[0], center[1], center[2]), (rotation[0, 2], rotation[1, 2], rotation[2, 2])
+    height, width = depth.shape
+    samples = len(rays) // (height * width)
     for y in range(begin, end):
         for x in range(width):
             red, green, blue, total_depth, found = 0.0, 0.0, 0.0, 0.0, 0
-            for s in range(samples):
-                direction = _direction(rotation, intrinsics, x, y, offsets[s])
-                face = hits[(y * width + x) * samples + s]
+            for n in range((y * width + x) * samples, (y * width + x + 1) * samples):
+                direction = float(rays[n, 3]), float(rays[n, 4]), float(rays[n, 5])
+                face = hits.face[n]
                 if face == NOTHING:
                     r, g, b = background[0], background[1], background[2]
                     if len(sky.level) > 0:
@@ -94,18 +50,14 @@ def _shade(surface, light, hits, camera, offsets, background, sky, limit, radian
                         r, g, b = panorama(sky, direction, FOOTPRINT / focal * per_radian)
                         r, g, b = min(r, limit), min(g, limit), min(b, limit)
                 else:
-                    weights, normal = _intersect(surface, face, origin, direction)
-                    point = interpolate(surface.vertices, row(surface.faces, face), weights)
-                    distance = dot(axis, subtract(point, origin))
+                    normal, distance = face_normal(surface, face), hits.distance[n]
                     facing = dot(normal, direction)
-                    footprint = 0.0
-                    if surface.texture[face] >= 0:
-                        # A pixel covers depth / focal length, stretched where the surface is seen at a slant; the
-                        # geometric mean of its two sides keeps textures crisp there without aliasing.
-                        slant = max(abs(facing) / math.sqrt(dot(normal, normal) * dot(direction, direction)), 0.02)
-                        footprint = FOOTPRINT * distance / (focal * math.sqrt(slant))
+                    # A pixel covers depth / focal length, stretched where the surface is seen at a slant; the
+                    # geometric mean of its two sides keeps textures crisp there without aliasing.
+                    slant = max(abs(facing) / (length(normal) * length(direction)), 0.02)
+                    footprint = FOOTPRINT * distance / (focal * math.sqrt(slant))
                     side = 0 if facing < 0.0 else 1
-                    r, g, b = diffuse_radiance(surface, light, face, side, weights, footprint)
+                    r, g, b = diffuse_radiance(surface, light, face, side, hit_weights(hits, n), footprint)
                     total_depth += distance
                     found += 1
                 red += r
@@ -126,6 +78,7 @@ class Renderer:
         surroundings: panorama that is seen where a ray hits nothing, or empty.
         limit: the radiance of the surroundings and of glossy surfaces is clipped to this value.
         reflections: reflections of glossy surfaces, or None if all surfaces are diffuse.
+        gain: factor of all light but the background's.
     """
 
     surface: Surface
@@ -135,6 +88,7 @@ class Renderer:
     surroundings: MipMaps
     limit: float
     reflections: Reflections | None
+    gain: float = 1.0
 
     def render(
         self, camera_to_world: ArrayLike, intrinsics: Sequence[float], width: int, height: int, samples: int
@@ -151,30 +105,23 @@ class Renderer:
             radiance (H, W, 3), linear RGB; depth (H, W) along the optical axis, the mean over the rays that hit, inf
             where none does. Both are float32.
         """
-        pose, lens = np.asarray(camera_to_world, np.float64), tuple(map(float, intrinsics))
+        pose, (fx, fy, cx, cy) = np.asarray(camera_to_world, np.float64), map(float, intrinsics)
         offsets = sample_offsets(samples)
-        rotation, center = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
-        rays = np.empty((height * width * samples, 6), np.float32)
-        _camera_rays(rotation, center, lens, offsets, width, rays)
+        x = (np.arange(width)[None, :, None] + 0.5 + offsets[:, 0] - cx) / fx
+        y = (np.arange(height)[:, None, None] + 0.5 + offsets[:, 1] - cy) / fy
+        rays = np.empty((height, width, samples, 6), np.float32)
+        rays[..., :3] = pose[:3, 3]
+        # One meter long along the optical axis.
+        rays[..., 3:] = x[..., None] * pose[:3, 0] + y[..., None] * pose[:3, 1] + pose[:3, 2]
+        rays = rays.reshape(-1, 6)
         hits = self.caster.cast(rays)
         radiance, depth = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
-        camera, scene = (rotation, center, lens), (self.background, self.surroundings, self.limit)
-        shade = partial(_shade, self.surface, self.light, hits.face, camera, offsets, *scene, radiance, depth)
-        run_ranges(shade, height)
+        limit = self.limit / self.gain
+        scene = self.background / self.gain, self.surroundings, limit
+        run_ranges(partial(_shade, self.surface, self.light, rays, hits, fx, *scene, radiance, depth), height)
         if self.reflections is not None:
-            add_reflections(
-                self.reflections, self.surface, self.light, self.caster, rays, hits, lens[0], self.limit, radiance
-            )
-        return radiance, depth
-
-    def with_gain(self, gain: float) -> Renderer:
-        """Return the renderer of the same scene in ``gain`` times the light. The background does not change."""
-        return replace(
-            self,
-            light=(gain * self.light).astype(np.float32),
-            surroundings=self.surroundings.scaled(gain),
-            reflections=self.reflections and self.reflections.scaled(gain),
-        )
+            add_reflections(self.reflections, self.surface, self.light, self.caster, rays, hits, fx, limit, radiance)
+        return np.float32(self.gain) * radiance, depth
 
 
 def make_surroundings(environment: Panorama | None) -> MipMaps:
