@@ -63,6 +63,8 @@ class EcdDataParser(EventDataParser):
             with open_image(images[0][1]) as image:
                 size = image.size
         width, height = (own if given is None else given for given, own in zip(stated, size, strict=True))
+        with value_errors_as_data_error(str(self.data), "correct --width or --height"):
+            CameraIntrinsics.guess(width, height)
         camera = _read_calibration(self.data / "calib.txt", (width, height))
         if not images and None in stated:
             CONSOLE.print(f"The sensor's size {width} x {height} is a guess: if it is another, give width and height.")

@@ -57,12 +57,19 @@ class EvenPosesDataParserConfig(ObjectDataParserConfig):
             source: the file or folder of the poses, for messages.
             images: folder of an image for each pose, or of none.
             first: default time of the first pose in nanoseconds. None: the time of the first event.
+
+        Raises:
+            DataError: there is no time for the poses.
         """
         if self.first_pose_time_ns is None:
             self.first_pose_time_ns = capture.event_file.time_span()[0] if first is None else first
         if self.last_pose_time_ns is None:
             self.last_pose_time_ns = capture.event_file.time_span()[1]
         duration, steps = self.last_pose_time_ns - self.first_pose_time_ns, max(len(poses) - 1, 1)
+        if duration < steps:
+            problem = f"its {len(poses)} poses are from {self.first_pose_time_ns} to {self.last_pose_time_ns} ns"
+            remedy = "give an earlier --first-pose-time-ns or a later --last-pose-time-ns"
+            raise DataError(str(self.data), problem, remedy)
         times = [self.first_pose_time_ns + duration * index // steps for index in range(len(poses))]
         reference = Trajectory(times, poses, source)
         # There may be no images.

@@ -15,7 +15,7 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
-from aenerf_ns.files.calibration import Calibration, read_calibration
+from aenerf_ns.files.calibration import Calibration, read_calibration, require_no_names
 from aenerf_ns.files.colmap import read_colmap_focal_shares, read_colmap_poses
 from aenerf_ns.files.event_reader import EventFile
 from aenerf_ns.files.limits import require_one
@@ -148,6 +148,7 @@ class OwnRecordingDataParser(EventDataParser):
         if file is None:
             found = [self._folder / name for name in _CALIBRATIONS if (self._folder / name).is_file()]
             if not found:
+                require_no_names(self._folder, config.event_camera, config.frame_camera)
                 return _guess_calibration(self._event_file())
             file = require_one(found, self._folder, f"of {' and '.join(_CALIBRATIONS)}", "give one as --calibration")
         return read_calibration(file, config.event_camera, config.frame_camera, has_images)

@@ -69,7 +69,7 @@ def read_calibration(
             has no camera of a name.
     """
     if path.suffix == ".json":
-        _require_no_names(path, event_camera, frame_camera)
+        require_no_names(path, event_camera, frame_camera)
         meta, lens = read_transforms(path, image_encoding="linear")
         with value_errors_as_data_error(path):
             sensor = SensorModel(**sensor_values(meta.event_camera))
@@ -82,7 +82,7 @@ def read_calibration(
     if isinstance(content, dict) and not content.keys().isdisjoint("Kk"):
         content = _as_file(content)
     if isinstance(content, dict) and "camera_matrix" in content:
-        _require_no_names(path, event_camera, frame_camera)
+        require_no_names(path, event_camera, frame_camera)
         lens = _camera_info(path, content)
         return Calibration(lens, lens, torch.eye(4, dtype=torch.float64), SensorModel(), "linear")
     cameras = read_camchain(path)
@@ -100,7 +100,7 @@ def read_calibration(
     return Calibration(cameras[event_name].lens(), cameras[frame_name].lens(), motion, SensorModel(), "linear")
 
 
-def _require_no_names(path: Path, *names: str | None) -> None:
+def require_no_names(path: Path, *names: str | None) -> None:
     """Raise a DataError if a camera is named for a file in which cameras have no names."""
     for name in names:
         if name is not None:

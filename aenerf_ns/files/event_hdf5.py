@@ -88,7 +88,7 @@ class Hdf5TableFile(EventTableFile):
         unit = _scalar(self._attributes(arrays).get("time_unit", super()._stated_unit(arrays)))
         if unit is not None and not (isinstance(unit, str) and unit in NANOSECONDS):
             raise DataError(self.path, f"its time unit is {unit!r}", f"use one of {', '.join(NANOSECONDS)}")
-        if self._given_unit not in (None, unit):
+        if unit and self._given_unit not in (None, unit):
             raise DataError(
                 self.path, f"it states its time unit, {unit!r}, but {self._given_unit} was given", "leave it out"
             )

@@ -118,10 +118,11 @@ class EventTableFile(EventFile):
 
     def read_assumed_unit(self) -> TimeUnit | None:
         with self.open_arrays() as arrays:
-            return self._given_unit or (None if self._stated_unit(arrays) else self._guessed_unit(arrays))
+            return None if self._stated_unit(arrays) else self._given_unit or self._guessed_unit(arrays)
 
     def _stated_unit(self, arrays: Mapping[str, Any]) -> TimeUnit | None:
-        return self._given_unit or self._layout.time_unit
+        """Return the unit that the file or its layout states. Where a file does not, one that is given counts."""
+        return None if self._given_unit else self._layout.time_unit
 
     def _guessed_unit(self, arrays: Mapping[str, Any]) -> TimeUnit:
         ends = ((0, SAMPLE), (max(self._length(arrays) - SAMPLE, 0), None))
@@ -129,7 +130,7 @@ class EventTableFile(EventFile):
 
     def _tick(self, arrays: Mapping[str, Any]) -> int:
         """Return the nanoseconds of the unit of the times."""
-        return NANOSECONDS[self._stated_unit(arrays) or self._guessed_unit(arrays)]
+        return NANOSECONDS[self._stated_unit(arrays) or self._given_unit or self._guessed_unit(arrays)]
 
     def _read(self, arrays: Mapping[str, Any], first: int, last: int, tick: int) -> EventStream:
         columns, offset = self._columns(arrays, first, last), arrays.get("time_offset", 0)
@@ -138,7 +139,7 @@ class EventTableFile(EventFile):
 
 def guess_time_unit(times: NDArray) -> TimeUnit:
     """Return microseconds, which event cameras count, for whole numbers, and seconds for decimals."""
-    return "s" if times.dtype.kind == "f" and (times != np.floor(times)).any() else "us"
+    return "s" if times.dtype.kind == "f" and (times > np.floor(times)).any() else "us"
 
 
 def events_from_columns(

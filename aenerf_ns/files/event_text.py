@@ -223,7 +223,7 @@ class TextEventFile(EventFile):
             file.seek(begin)
             # A line that begins ahead of this piece of the file is looked at with the piece before.
             begin += len(self._line(file)) if begin > 0 else 0
-            lines = file.read(end - begin).splitlines()
+            lines = file.read(end - begin).removeprefix(_BYTE_ORDER_MARK).splitlines()
             row, end = next((line for line in reversed(lines) if _is_row(line)), b""), begin
         return self._parse_block(row + b"\n", None, names)
 

@@ -111,11 +111,11 @@ class EventDataParser(DataParser):
         try:
             with reading(self.data):
                 if self._lacks_poses():
-                    raise DataError(
-                        str(self.poses_path()),
-                        "there are no such poses",
-                        f"give them, or have them estimated: {_ESTIMATE}",
-                    )
+                    problem = "there are no such poses"
+                    if getattr(self.config, "trajectory", None) is not None:
+                        problem += ", which --trajectory needs as the true ones"
+                    remedy = f"give them, or have them estimated: {_ESTIMATE}"
+                    raise DataError(str(self.poses_path()), problem, remedy)
                 recording = self.read_recording()
         except DataError as error:
             if self.guessed_format is None:

@@ -55,15 +55,17 @@ class EventDataParserConfig(DataParserConfig):
         """Return the dataparser.
 
         Raises:
-            DataError: a whole number among the options is beyond all times, or the longest gap is not positive.
+            DataError: a whole number among the options is beyond all times, or the longest gap or the scale is not
+                positive.
         """
         values = {option.name: getattr(self, option.name) for option in fields(self)}
         for option, value in values.items():
             if isinstance(value, int) and abs(value) > MAX_TIME:
                 name = f"--{option.replace('_', '-')}"
                 raise DataError(str(self.data), f"{name} is {value}", "give nanoseconds, which have 19 digits at most")
-        if self.max_pose_gap_ns is not None and self.max_pose_gap_ns <= 0:
-            raise DataError(str(self.data), f"max_pose_gap_ns is {self.max_pose_gap_ns}", "give a positive number")
+        for option in ("max_pose_gap_ns", "scale_factor"):
+            if values[option] is not None and not 0 < values[option] < float("inf"):
+                raise DataError(str(self.data), f"{option} is {values[option]}", "give a positive number")
         # A run's saved configuration is also read in other working directories.
         paths = {option: value.absolute() for option, value in values.items() if isinstance(value, Path)}
         return super(EventDataParserConfig, replace(self, **paths)).setup(**kwargs)  # type: ignore[arg-type]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import json
-import math
 import os
 import socket
 import tempfile
-import zlib
+import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -20,32 +20,29 @@ import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pair_store import EventPairs, map_rows
+from aenerf_ns.events.pair_store import BLOCK, EventPairs, map_rows
 from aenerf_ns.files.event_reader import EventFile
 
 # Counted up when the layout of the file, of the rows or of what is kept with them changes.
-_VERSION = 4
-# The end of the file: length of the description as JSON in front of it, and this word.
-_WORD = b"aenerf-pairs"
+_VERSION = 5
 # Attributes of a reader of events that are no options. The last four are read from the file when they are asked for.
 _NOT_OPTIONS = ("path", "left_out", "_span", "_clock_offset", "_stated_unit", "_with_commas")
-_NUMBERS = tuple(field.name for field in fields(EventPairs) if field.type == "int")
+_STORED = tuple(field.name for field in fields(EventPairs) if field.name != "rows")
 
 
 class PairFile:
     """Keep the pairs of an event file, or of a folder of event files, in a file beside it.
 
-    The file holds the rows of :class:`~aenerf_ns.events.pair_store.EventPairs`, then ``replacement_rows`` and
-    ``block_ends``, all as they are in memory, then a description as JSON, with what the pairs depend on besides the
-    events (``made_from``). It is written under another name, and renamed when it is whole.
+    The file holds the rows of :class:`~aenerf_ns.events.pair_store.EventPairs` as they are in memory, then an .npz
+    archive of the rest and of what the pairs depend on besides the events (``made_from``). It is written under another
+    name, and renamed when it is whole.
     """
 
     def __init__(self, events: EventFile, made_from: Mapping[str, Any]) -> None:
         self.path = events.path.with_name(events.path.name + ".pairs")
         options = {name: repr(value) for name, value in vars(events).items() if name not in _NOT_OPTIONS}
         stated = {"version": _VERSION, "files": _stamps(events.path), "reader": options, **made_from}
-        # JSON turns tuples into lists: compare what reading the file gives.
-        self._made_from = json.loads(json.dumps(stated))
+        self._made_from = json.dumps(stated, sort_keys=True)
         self._new: BinaryIO | None = None
         self._is_kept = False
 
@@ -57,7 +54,8 @@ class PairFile:
         try:
             with self.path.open("rb") as file:
                 found, problem = self._read(file), "is of other events or options"
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        # The libraries raise whatever they stumble over in a damaged file.
+        except Exception as error:
             found, problem = None, f"is not whole ({error})"
         if found is None:
             CONSOLE.print(f"{self.path} {problem}: it is made again.", style="yellow", markup=False)
@@ -71,32 +69,19 @@ class PairFile:
         """Read the pairs, None if they are of other events or options.
 
         Raises:
-            ValueError, KeyError or TypeError: the file is broken.
+            Exception: the file is broken.
         """
-        size = os.fstat(file.fileno()).st_size
-        file.seek(max(size - 8 - len(_WORD), 0))
-        length = int.from_bytes(file.read(8), "little")
-        if file.read() != _WORD:
-            raise ValueError("its last bytes are missing")
-        end = size - 8 - len(_WORD) - length
-        file.seek(max(end, 0))
-        about = json.loads(file.read(length))
-        if about["made_from"] != self._made_from:
-            return None
-        num_rows = about["num_rows"]
-        file.seek(16 * num_rows)
-        checksum, arrays = 0, []
-        for dtype, shape in about["arrays"]:
-            array = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)
-            checksum = zlib.crc32(array.data, checksum)
-            arrays.append(array)
-        if file.tell() != end or checksum != about["checksum"]:
-            raise ValueError("its parts have other sizes or bytes than it says")
-        replacement_rows, block_ends = arrays
-        numbers = {name: int(about["numbers"][name]) for name in _NUMBERS}
-        return EventPairs(
-            rows=map_rows(file, num_rows), replacement_rows=replacement_rows, block_ends=block_ends, **numbers
-        )
+        end_of_rows = zipfile.ZipFile(file).infolist()[0].header_offset
+        file.seek(end_of_rows)
+        with np.load(file) as stored:
+            if str(stored["made_from"]) != self._made_from:
+                return None
+            values = {name: stored[name] for name in _STORED}
+        num_rows = BLOCK * (len(values["block_ends"]) - 1)
+        if end_of_rows != 16 * num_rows:
+            raise ValueError("its rows are not as many as it says")
+        values = {name: value if value.ndim else int(value) for name, value in values.items()}
+        return EventPairs(rows=map_rows(file, num_rows), **values)
 
     def open(self) -> tuple[BinaryIO, Path]:
         """Open a new file for the rows. Return it with a folder for temporary files."""
@@ -129,20 +114,10 @@ class PairFile:
             return
         if not self._is_kept:
             return
-        checksum, arrays = 0, []
-        for array in (pairs.replacement_rows, pairs.block_ends):
-            self._new.write(array.data)
-            checksum = zlib.crc32(array.data, checksum)
-            arrays.append((array.dtype.str, array.shape))
-        about = {
-            "made_from": self._made_from,
-            "num_rows": len(pairs.rows),
-            "arrays": arrays,
-            "checksum": checksum,
-            "numbers": {name: getattr(pairs, name) for name in _NUMBERS},
-        }
-        text = json.dumps(about).encode()
-        self._new.write(text + len(text).to_bytes(8, "little") + _WORD)
+        # Not into the file itself: where the disk is full, zipfile would fail and say so once more.
+        archive = io.BytesIO()
+        np.savez(archive, made_from=self._made_from, **{name: getattr(pairs, name) for name in _STORED})
+        self._new.write(archive.getbuffer())
         self._new.flush()
         os.fsync(self._new.fileno())
         # Another host may have made it meanwhile: what that one maps would be gone from a network folder.
@@ -184,13 +159,13 @@ def _locked(folder: Path) -> Iterator[None]:
 
     The events' own lock is HDF5's, and a lock file would stay behind in the dataset.
     """
-    lock = os.open(folder, os.O_RDONLY)
-    try:
+    with ExitStack() as stack:
+        # A folder that may be entered, but not listed, cannot be opened.
         with suppress(OSError):
+            lock = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, lock)
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield
-    finally:
-        os.close(lock)
 
 
 def _stamps(path: Path) -> list[tuple[str, int, int]]:

@@ -32,6 +32,8 @@ def test_guessed_size_can_be_given(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "size 346 x 180 is a guess: if it is another" in capsys.readouterr().out
     with pytest.raises(DataError, match=r"line 1 has x = 300; .* check the sensor size"):
         list(EcdDataParserConfig(data=folder).setup().recording.event_file.chunks())
+    with pytest.raises(DataError, match=r"made: width must be .*, not 0; correct --width or --height"):
+        _ = EcdDataParserConfig(data=folder, width=0).setup().recording
 
 
 def test_ecd_text_reads(tmp_path: Path) -> None:
@@ -71,6 +73,9 @@ def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     assert views.metadata is not None
     taken = views.metadata[REFERENCE_SECONDS][0, 0].item()
     assert taken == pytest.approx(0.15 - 1e-9 * scene.trajectory.start)
+    (folder / "groundtruth.txt").unlink()
+    with pytest.raises(DataError, match="there are no such poses, which --trajectory needs as the true ones; give"):
+        parse(config)
 
 
 def test_read_the_real_recording(slider_depth: Path) -> None:

@@ -147,6 +147,8 @@ def test_an_event_file_that_states_its_size_is_enough(tmp_path: Path) -> None:
     assert not frames
     assert capture.intrinsics_origin == "guessed"
     assert (capture.event_camera.width, capture.event_camera.height) == (WIDTH, HEIGHT)
+    with pytest.raises(DataError, match="it has no camera cam1; give Kalibr's camchain"):
+        OwnRecordingDataParserConfig(data=tmp_path, frame_camera="cam1").setup().read_frames()
 
 
 def test_camchain_places_both_cameras(truth: Truth) -> None:

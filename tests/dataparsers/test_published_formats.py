@@ -89,6 +89,8 @@ def test_poses_without_times_take_a_unit(tmp_path: Path) -> None:
     assert recording.trajectory.end == recording.event_file.time_span()[1] == DURATION
     recording = recording_of(config_of("eventnerf-data", truth.data, first_pose_time_ns=5, last_pose_time_ns=105))
     assert recording.trajectory.times.tolist() == list(range(5, 106, 5))
+    with pytest.raises(DataError, match="its 21 poses are from 52 to 52 ns; give an earlier --first-pose-time-ns or"):
+        recording_of(config_of("eventnerf-data", truth.data, first_pose_time_ns=52, last_pose_time_ns=52))
 
 
 def test_the_last_pose_is_at_the_last_event_that_is_kept(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ def test_native_file_is_recognized(tmp_path: Path) -> None:
     # Its attribute states nanoseconds. Without it whole times are microseconds, whatever the types.
     assert events.time_span()[0] == columns["t"][0]
     assert events.assumed_unit() is None
+    assert open_hdf5_events(events.path, WIDTH, HEIGHT, "ns").assumed_unit() is None
     with h5py.File(tmp_path / "events.h5", "a") as file:
         del file["events"].attrs["time_unit"]
     assert open_events(tmp_path / "events.h5").time_span()[0] == columns["t"][0] * 1_000

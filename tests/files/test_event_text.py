@@ -54,6 +54,7 @@ def test_skip_blanks_comments_and_empty_lines(tmp_path: Path) -> None:
     path = written(tmp_path / "events.csv", '"P" , x,\ty,other,t,x\n1 , 3,4,-7.5,  8,9 # the second x is another\n')
     (events,) = open_events(path).chunks()
     assert (events.x[0], events.y[0], events.t[0], events.p[0]) == (3, 4, 8000, 1)
+    assert open_events(written(path, "\ufeff5 2 3 1\n")).time_span() == (5_000, 5_000)
 
 
 @pytest.mark.parametrize("end", ["\n" * 200_000, f"#{'x' * 5_000}\n", f"\n#{'x' * 60_000}" * 3])

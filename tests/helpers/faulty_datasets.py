@@ -182,7 +182,7 @@ _EVENTNERF_FAULTS: dict[str, Fault] = {
     "NaN pose": (write_text(MATRIX, "nan " * 16), MATRIX, "not finite"),
     "mirrored": (write_text(MATRIX, "1 0 0 0  0 1 0 0  0 0 -1 0  0 0 0 1"), "train/pose", "pose 3 is not a rigid"),
     "lost image": (remove("train/rgb/00003.png"), "train/rgb", "20 images for 21 poses"),
-    "one event time": (ONE_TIME, "train/pose", "pose 1 is at 0 ns, not after"),
+    "one event time": (ONE_TIME, "made", "its 21 poses are from 0 to 0 ns"),
 }
 
 

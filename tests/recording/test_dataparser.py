@@ -142,10 +142,12 @@ def test_images_are_thinned_within_the_window(tmp_path: Path) -> None:
     assert not isinstance(capture, Recording)
 
 
-def test_refuse_pose_gap_of_zero(tmp_path: Path) -> None:
-    truth = write_own(tmp_path / "made")
-    with pytest.raises(DataError, match="max_pose_gap_ns is 0"):
-        parse(config_of("event-recording-data", truth.data, max_pose_gap_ns=0))
+@pytest.mark.parametrize(
+    ("option", "value"), [("max_pose_gap_ns", 0), *(("scale_factor", value) for value in (0.0, -1.0, np.nan, np.inf))]
+)
+def test_refuse_what_is_not_positive(option: str, value: float, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=f"{option} is {value}; give a positive number"):
+        config_of("event-recording-data", tmp_path, **{option: value}).setup()
 
 
 @pytest.mark.parametrize("option", ["start_time_ns", "end_time_ns", "max_pose_gap_ns", "refractory_period_ns"])

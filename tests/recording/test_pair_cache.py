@@ -127,10 +127,9 @@ def test_changed_events_or_options_make_new_pairs(
         lambda content: b"",
         lambda content: b"x" * 5000,
         lambda content: content[16:],
-        lambda content: content + content[-20:],
-        lambda content: content.replace(b'"num_rows"', b'"num_cows"'),
-        # In the replacement rows, which stand behind 208 rows.
-        lambda content: content[:3400] + bytes([content[3400] ^ 1]) + content[3401:],
+        lambda content: content.replace(b"num_first", b"num_last_"),
+        # The last byte of the rows and of each part of the archive but one.
+        lambda content: content.replace(b"\0PK\3\4", b"\1PK\3\4"),
     ],
 )
 def test_broken_file_is_made_again(
@@ -200,7 +199,12 @@ def test_hosts_do_not_share_a_file(data: Path, long_recording: list[Path], monke
 def test_unwritable_folder_is_left_alone(
     data: Path, long_recording: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    original = Path.open
+    original, open_descriptor = Path.open, os.open
+
+    def unlisted(path: Path, *args: int) -> int:
+        if path == data:
+            raise PermissionError(13, "Permission denied")
+        return open_descriptor(path, *args)
 
     def refused(self: Path, mode: str = "r", *args: object, **options: object) -> object:
         if self.parent == data and mode != "rb" and "w" in mode:
@@ -208,6 +212,7 @@ def test_unwritable_folder_is_left_alone(
         return original(self, mode, *args, **options)
 
     monkeypatch.setattr(Path, "open", refused)
+    monkeypatch.setattr(os, "open", unlisted)
     first = opened(data).pairs
     out = " ".join(capsys.readouterr().out.split())
     assert "cannot be written to (Permission denied): the pairs are in" in out
