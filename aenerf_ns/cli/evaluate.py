@@ -8,6 +8,7 @@ from pathlib import Path
 
 from aenerf_ns.cli.console import say
 from aenerf_ns.cli.trained_run import RunCommand, open_run
+from aenerf_ns.errors import DataError
 from aenerf_ns.files.output_paths import creating, output_error, require_absent, require_writable
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
 
@@ -35,6 +36,8 @@ class Evaluate(RunCommand):
         if self.nerfbaselines is not None:
             require_absent(self.nerfbaselines, "--nerfbaselines")
         config, run, checkpoint = open_run(self.load_config, self.data)
+        if self.nerfbaselines is not None and run.views is None:
+            raise DataError(run.data, "it has no test views to predict", "leave out --nerfbaselines")
         from aenerf_ns.evaluation.color_fit import replace_color_correction
         from aenerf_ns.evaluation.evaluate import evaluate
 

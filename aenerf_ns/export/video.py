@@ -104,7 +104,7 @@ def sum_recorded_events(events: EventFile, times: NDArray[np.int64]) -> Iterator
     shape = (events.height, events.width)
     net = np.zeros(shape, np.int64)
     index, last = 0, len(times) - 1
-    for chunk in events.tracked():
+    for chunk in events.chunks():
         edges = np.searchsorted(chunk.t, times)
         while index < last:
             inside = slice(edges[index], edges[index + 1])

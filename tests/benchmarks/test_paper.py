@@ -332,8 +332,10 @@ def start(command: list[str], folder: Path) -> subprocess.Popen:
 
 def wait_for(pattern: str, folder: Path, process: subprocess.Popen) -> list[Path]:
     """Wait until a running process has made a file."""
+    deadline = time.monotonic() + 600
     while not (found := list(folder.glob(pattern))):
         assert process.poll() is None
+        assert time.monotonic() < deadline
         time.sleep(0.05)
     return found
 

@@ -36,7 +36,7 @@ def test_command_dies_with_its_parent(end: signal.Signals) -> None:
         assert parent.stdout.readline() == "ready\n"
         parent.send_signal(end)
         # The command holds the other end of this pipe until it ends.
-        assert parent.stdout.read() == ""
+        assert parent.communicate(timeout=60)[0] == ""
 
 
 def test_command_keeps_status_and_arguments() -> None:

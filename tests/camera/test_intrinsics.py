@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 import torch
 
@@ -51,45 +50,11 @@ def test_nerfstudio_has_the_same_rays(camera: CameraIntrinsics) -> None:
     assert rays.directions.dtype == torch.float32
 
 
-@OF_EACH_LENS
-def test_lens_in_other_terms_and_back(camera: CameraIntrinsics) -> None:
-    assert CameraIntrinsics.from_transforms(camera.width, camera.height, camera.to_transforms()) == camera
-    matrix, name = opencv_matrix(camera), "equidistant" if camera.lens_model == "fisheye" else "plumb_bob"
-    pinhole = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    again = CameraIntrinsics.from_opencv((camera.width, camera.height), pinhole, camera.distortion, name)
-    assert (again.cx, again.cy, again.distortion) == (camera.cx, camera.cy, camera.distortion)
-
-
-@pytest.mark.parametrize(
-    ("model", "distortion"),
-    [
-        ("PINHOLE", (0.0,) * 5),
-        ("OPENCV", (-0.3, 0.1, 0.002, -0.001, 0.0)),
-        ("FULL_OPENCV", (-0.3, 0.1, 0.002, -0.001, -0.02)),
-        ("OPENCV_FISHEYE", (0.05, -0.02, 0.01, -0.003)),
-    ],
-)
-def test_colmap_has_the_same_lens(model: str, distortion: tuple[float, ...]) -> None:
-    lens = "fisheye" if model == "OPENCV_FISHEYE" else "radial_tangential"
-    camera = CameraIntrinsics(80, 60, 70.0, 72.0, 41.0, 29.0, lens, distortion)
-    name, parameters = camera.to_colmap()
-    assert name == model
-    colmap = pycolmap.Camera(model=name, width=80, height=60, params=parameters)
-    directions, valid = camera.pixel_directions()
-    assert valid.all()
-    plane = (directions / -directions[..., 2:]).reshape(-1, 3) * [1, -1, -1]
-    columns, rows = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
-    pixels = colmap.img_from_cam(np.ascontiguousarray(plane))
-    np.testing.assert_allclose(pixels, np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fx": 0.0}, "fx must be from 0.01 to 1e[+]06 pixels, not 0"),
         ({"width": -1}, "width must be a whole number from 1 to 16384, not -1"),
         ({"cx": float("nan")}, "cx must be from"),
-        ({"distortion": (0.1, 0.2)}, "takes 5 numbers, not 2"),
         ({"lens_model": "kb4"}, "lens_model must be one of"),
     ],
 )

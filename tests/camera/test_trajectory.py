@@ -19,14 +19,7 @@ from aenerf_ns.errors import DataError
 EPOCH = 1_600_000_000_123_456_789
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-9, 9.99e-3, 1.001e-2, 1.0])
-def test_rotation_vectors_have_exact_derivatives(size: float) -> None:
-    vector = (size * torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64)).requires_grad_()
-    assert torch.autograd.gradcheck(rotation_from_vector, vector, atol=1e-8)
-    assert torch.autograd.gradgradcheck(rotation_from_vector, vector, atol=1e-6)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 9.9e-3, 0.5, 2.0, math.pi - 1e-6, math.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 0.999, 1.001, 2.0, math.pi - 1e-6, math.pi])
 def test_rotations_are_those_of_scipy(angle: float) -> None:
     vectors = angle * np.array([[0.48, -0.6, 0.64], [0, 0, 1], [0, -1, 0], [0.8, 0, -0.6]])
     expected = Rotation.from_rotvec(vectors)
@@ -181,16 +174,6 @@ def test_poses_resolve_nanoseconds_of_unix_time(random_poses: torch.Tensor) -> N
     here, there = trajectory.interpolate([EPOCH + 10**9 + 5, EPOCH + 10**9 + 6])
     _, rate = trajectory.pose_and_rate(torch.tensor([1.0], dtype=torch.float64))
     torch.testing.assert_close(there[:, 3] - here[:, 3], rate[0, :, 3] * 1e-9, rtol=1e-5, atol=1e-15)
-
-
-def test_rate_is_the_derivative_of_the_pose(random_poses: torch.Tensor) -> None:
-    trajectory = Trajectory(10**9 * np.arange(8), random_poses)
-    seconds = torch.tensor([0.0, 0.3, 2.0, 4.7], dtype=torch.float64)
-    pose, rate = trajectory.pose_and_rate(seconds)
-    assert torch.equal(pose, trajectory.pose(seconds))
-    _, expected = torch.func.jvp(trajectory.pose, (seconds,), (torch.ones_like(seconds),))
-    torch.testing.assert_close(rate, expected, rtol=0, atol=1e-13)
-    assert torch.autograd.gradcheck(trajectory.pose, seconds[1::2].requires_grad_())
 
 
 def test_times_outside_the_span_are_refused(random_poses: torch.Tensor) -> None:

@@ -19,11 +19,12 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.export.camera_model_files import ObservedPoints, PlacedImage, write_cameras
 from aenerf_ns.open3d_import import load_open3d
 
+# By the name of COLMAP's model.
 LENSES = {
-    "pinhole": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5),
-    "radial-tangential": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5, distortion=(-0.2, 0.05, 1e-3, -2e-3, 0.0)),
-    "with k3": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5, distortion=(-0.2, 0.05, 1e-3, -2e-3, 0.01)),
-    "fisheye": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5, "fisheye", (0.01, -0.02, 0.003, 0.001)),
+    "PINHOLE": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5),
+    "OPENCV": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5, distortion=(-0.2, 0.05, 1e-3, -2e-3, 0.0)),
+    "FULL_OPENCV": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5, distortion=(-0.2, 0.05, 1e-3, -2e-3, 0.01)),
+    "OPENCV_FISHEYE": CameraIntrinsics(64, 48, 50.0, 51.0, 31.5, 24.5, "fisheye", (0.01, -0.02, 0.003, 0.001)),
 }
 SPLITS = ("train", "train", "train", "val", "test", "test", "train", "train")
 
@@ -55,6 +56,7 @@ def test_pycolmap_reads_the_model(name: str, tmp_path: Path, random_poses: torch
     images, points = write(tmp_path, LENSES[name], random_poses)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert [model.images[index + 1].name for index in range(8)] == [image.name for image in images]
+    assert {camera.model.name for camera in model.cameras.values()} == {name}
     for index, image in enumerate(images):
         pose = model.images[index + 1].cam_from_world().inverse().matrix()
         np.testing.assert_allclose(pose, image.camera_to_world[:3], atol=1e-9)
@@ -67,7 +69,7 @@ def test_pycolmap_reads_the_model(name: str, tmp_path: Path, random_poses: torch
         np.testing.assert_array_equal(point.color, points.colors[number - 1])
         shown = image.points2D[element.point2D_idx].xy
         np.testing.assert_array_equal(shown, points.pixels[number - 1])
-        np.testing.assert_allclose(image.project_point(point.xyz), shown, atol=1e-3)
+        np.testing.assert_allclose(image.project_point(point.xyz), shown, atol=1e-6)
 
 
 def assert_read(outputs: DataparserOutputs, images: list[PlacedImage], points: ObservedPoints, folder: Path) -> None:
@@ -99,8 +101,8 @@ NERFSTUDIO = partial(NerfstudioDataParserConfig, load_3D_points=True, downscale_
     [
         *((NERFSTUDIO, lens) for lens in LENSES.values()),
         # The framework refuses COLMAP's only model with k3, and a fourth parameter of a fisheye lens.
-        *((COLMAP, LENSES[name]) for name in ("pinhole", "radial-tangential")),
-        (COLMAP, replace(LENSES["fisheye"], distortion=(0.01, -0.02, 0.003, 0.0))),
+        *((COLMAP, LENSES[name]) for name in ("PINHOLE", "OPENCV")),
+        (COLMAP, replace(LENSES["OPENCV_FISHEYE"], distortion=(0.01, -0.02, 0.003, 0.0))),
     ],
 )
 def test_framework_reads_the_cameras(
