@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.utils import skip_init
 
 from aenerf_ns.camera.image_encoding import ImageEncoding, encode
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
@@ -220,7 +221,7 @@ class NetworkColorCorrection(AffineColorCorrection):
 
     F is the affine map plus a small network, whose output is added to the display values of the affine map.
 
-    The weights of the network are buffers, not parameters, because :meth:`fit` learns them and training does not.
+    The weights of the network require no gradient, because :meth:`fit` learns them and training does not.
     """
 
     protocol = "network"
@@ -230,30 +231,26 @@ class NetworkColorCorrection(AffineColorCorrection):
         self.input_mean: Tensor = nn.Buffer(torch.zeros(num_channels))
         self.input_deviation: Tensor = nn.Buffer(torch.ones(num_channels))
         widths = (num_channels, *_HIDDEN, num_channels)
-        for layer, (num_inputs, num_outputs) in enumerate(pairwise(widths)):
-            self.register_buffer(f"weight_{layer}", torch.zeros(num_outputs, num_inputs))
-            self.register_buffer(f"bias_{layer}", torch.zeros(num_outputs))
+        layers: list[nn.Module] = []
+        for num_inputs, num_outputs in pairwise(widths):
+            # Bounded, so that radiance outside the range of the reference views is not sent astray.
+            layers += [skip_init(nn.Linear, num_inputs, num_outputs), nn.Tanh()]
+        self.network = nn.Sequential(*layers[:-1]).requires_grad_(False)
+        self._reset_network()
 
     def forward(self, log_radiance: Tensor) -> Tensor:
         """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
-        return (super().forward(log_radiance) + self._residual(log_radiance, self._layers)).clamp(0, 1)
+        return (super().forward(log_radiance) + self._residual(log_radiance)).clamp(0, 1)
 
     @property
     def fitted_on(self) -> str:
         """The views that the map was fitted on, in words."""
         views = super().fitted_on
-        return views if self._layers[-1][0].any() else f"{views}, its affine part only"
+        *_, last_weight, _ = self.network.parameters()
+        return views if last_weight.any() else f"{views}, its affine part only"
 
-    @property
-    def _layers(self) -> list[tuple[Tensor, Tensor]]:
-        return [(self.get_buffer(f"weight_{i}"), self.get_buffer(f"bias_{i}")) for i in range(len(_HIDDEN) + 1)]
-
-    def _residual(self, log_radiance: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
-        hidden = (log_radiance - self.input_mean) / self.input_deviation
-        for weight, bias in layers[:-1]:
-            # Bounded, so that radiance outside the range of the reference views is not sent astray.
-            hidden = torch.tanh(F.linear(hidden, weight, bias))
-        return F.linear(hidden, *layers[-1])
+    def _residual(self, log_radiance: Tensor) -> Tensor:
+        return self.network((log_radiance - self.input_mean) / self.input_deviation)
 
     @torch.no_grad()
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
@@ -267,19 +264,15 @@ class NetworkColorCorrection(AffineColorCorrection):
         self.input_deviation.copy_(log_radiance.std(0, unbiased=False).clamp_min(1e-6))
         missing = encode(reference, self.encoding) - super().forward(log_radiance)
         with torch.enable_grad():
-            learned = [(w.clone().requires_grad_(), b.clone().requires_grad_()) for w, b in self._layers]
-            optimizer = torch.optim.Adam(
-                [tensor for layer in learned for tensor in layer], lr=_LEARNING_RATE, fused=True
-            )
+            parameters = self.network.requires_grad_().parameters()
+            optimizer = torch.optim.Adam(parameters, lr=_LEARNING_RATE, fused=True)
             scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS)
             for _ in range(_STEPS):
-                optimizer.zero_grad()
-                F.mse_loss(self._residual(log_radiance, learned), missing).backward()
+                F.mse_loss(self._residual(log_radiance), missing).backward()
                 optimizer.step()
                 scheduler.step()
-        for stored, layer in zip(self._layers, learned, strict=True):
-            for buffer, tensor in zip(stored, layer, strict=True):
-                buffer.copy_(tensor)
+                optimizer.zero_grad()
+        self.network.requires_grad_(False)
 
     @torch.no_grad()
     def stretch(self, log_radiance: Tensor) -> None:
@@ -291,10 +284,11 @@ class NetworkColorCorrection(AffineColorCorrection):
         """Set the output to zero, which leaves the affine map, and the hidden layers to always the same weights."""
         # With a generator of its own: the choice of the protocol must not change the numbers that training draws.
         generator = torch.Generator().manual_seed(0)
-        for weight, bias in self._layers:
+        parameters = list(self.network.parameters())
+        for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
             weight.copy_(torch.randn(weight.shape, generator=generator) / weight.shape[1] ** 0.5)
             bias.zero_()
-        self._layers[-1][0].zero_()
+        parameters[-2].zero_()
 
 
 ColorCorrection = NoColorCorrection | AffineColorCorrection

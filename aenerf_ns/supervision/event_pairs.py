@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
+from torch import Tensor, nn
 
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.pair_store import (
@@ -37,7 +37,6 @@ from aenerf_ns.supervision.base import (
     SupervisionConfig,
 )
 from aenerf_ns.supervision.losses import reconstruction_loss, temporal_loss
-from aenerf_ns.supervision.sensor_parameters import SensorParameters
 
 # Share of a device's free memory that the table of pairs may take. The rest is for the model and its gradients.
 _SHARE_OF_FREE_MEMORY = 0.5
@@ -104,6 +103,10 @@ class PairSupervisionConfig(SupervisionConfig):
 class PairSupervision(ChangeSupervision):
     """Compares the rendered change of log-radiance between the two times of a pair with the events between them.
 
+    Events leave the scale of log-radiance open, so of the contrast thresholds only the ratio C+ / C− can be learned. C−
+    keeps the given value. The ratio is a softplus, so it is positive. The refractory period τ is a sigmoid times the
+    shortest interval between two events of a pixel, because no refractory period can exceed that interval.
+
     Args:
         config: what is learned of the sensor.
         sensor: see :class:`Supervision`.
@@ -118,9 +121,28 @@ class PairSupervision(ChangeSupervision):
         self, config: PairSupervisionConfig, sensor: SensorModel, loss_coefficients: PairLossCoefficients
     ) -> None:
         super().__init__(config, sensor, loss_coefficients)
-        self.sensor_parameters = SensorParameters(
-            sensor, config.learn_contrast_threshold_ratio, config.learn_refractory_period
-        )
+        self.raw_ratio: nn.Parameter | None = None
+        self.raw_refractory_period: nn.Parameter | None = None
+        if config.learn_contrast_threshold_ratio:
+            ratio = sensor.positive_contrast_threshold / sensor.negative_contrast_threshold
+            # The inverse of softplus, exact for large ratios too.
+            self.raw_ratio = nn.Parameter(torch.tensor(ratio + math.log(-math.expm1(-ratio))))
+        if config.learn_refractory_period:
+            self.raw_refractory_period = nn.Parameter(torch.tensor(0.0))
+            # Kept in checkpoints, because events are read for training only.
+            self._longest_refractory_period: Tensor = nn.Buffer(torch.tensor(torch.nan, dtype=torch.float64))
+
+    @property
+    def contrast_threshold_ratio(self) -> Tensor | None:
+        """C+ / C−, a scalar with a gradient, or None where it is not learned."""
+        return None if self.raw_ratio is None else F.softplus(self.raw_ratio)
+
+    @property
+    def refractory_period(self) -> Tensor | None:
+        """τ in seconds, a float64 scalar with a gradient, or None where it is not learned."""
+        if self.raw_refractory_period is None:
+            return None
+        return self._longest_refractory_period * torch.sigmoid(self.raw_refractory_period.double())
 
     @property
     def needs_rates(self) -> bool:
@@ -128,9 +150,16 @@ class PairSupervision(ChangeSupervision):
         return self.loss_coefficients.temporal_loss > 0
 
     def prepare(self, dataset: EventDataset) -> None:
-        """Bound the refractory period, where it is learned, by the shortest interval between events of a pixel."""
-        if self.config.learn_refractory_period:
-            self.sensor_parameters.bound_refractory_period(dataset.pairs.shortest_interval)
+        """Bound the refractory period, where it is learned, by the shortest interval between events of a pixel.
+
+        It starts at the sensor's value where that is positive, else at half of the bound.
+        """
+        if self.raw_refractory_period is not None:
+            # Longer than the sensor's refractory period.
+            shortest_interval = dataset.pairs.shortest_interval
+            self._longest_refractory_period.fill_(shortest_interval * 1e-9)
+            part = self.sensor.refractory_period / shortest_interval
+            self.raw_refractory_period.data.fill_(math.log(part / (1 - part)) if part > 0 else 0.0)
 
     def shift_ray_times(self, rays: RayBundle) -> dict[str, Tensor]:
         """Move the starts of the intervals to the end of the learned refractory period, and return what is learned.
@@ -140,10 +169,10 @@ class PairSupervision(ChangeSupervision):
             batch), scalars, each where it is learned.
         """
         learned: dict[str, Tensor] = {}
-        ratio = self.sensor_parameters.contrast_threshold_ratio
+        ratio = self.contrast_threshold_ratio
         if ratio is not None:
             learned["positive_contrast_threshold"] = ratio * self.sensor.negative_contrast_threshold
-        period = self.sensor_parameters.refractory_period
+        period = self.refractory_period
         if period is not None:
             assert rays.times is not None
             learned["interval_change"] = change = self.sensor.refractory_period * 1e-9 - period
@@ -192,7 +221,12 @@ class PairSupervision(ChangeSupervision):
 
     def learned_values(self) -> dict[str, float]:
         """Return C+ / C- and the refractory period in nanoseconds, each where it is learned."""
-        return self.sensor_parameters.learned_values()
+        values = {}
+        if self.contrast_threshold_ratio is not None:
+            values["contrast_threshold_ratio"] = self.contrast_threshold_ratio.item()
+        if self.refractory_period is not None:
+            values["refractory_period_ns"] = 1e9 * self.refractory_period.item()
+        return values
 
 
 @dataclass

@@ -111,7 +111,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             poses = correction.apply_to_camera(dataset.cameras.to(self.device)).to(dataset.cameras.device)
             # Without metadata: these cameras are in the scene's frame, and must not be carried there again.
             dataset.cameras = replace(dataset.cameras, camera_to_worlds=poses, metadata={})
-        if self.has_reference_views and self.test_mode != "inference":
+        if self.test_mode != "inference":
             # The loaders have copies of the cameras.
             self.setup_eval()
 

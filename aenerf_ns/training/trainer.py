@@ -151,7 +151,8 @@ class AENeRFTrainer(Trainer):
             # After the last checkpoint, and before the viewer waits for the user to end it.
             places = TrainingCallbackLocation
             self.callbacks.append(TrainingCallback([places.AFTER_TRAIN], self._record_end))
-            self.callbacks.append(TrainingCallback([places.AFTER_TRAIN_ITERATION], self._stop_if_asked))
+            # Before a step, when the one before it has been logged and evaluated, and before the others' preparations.
+            self.callbacks.insert(0, TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._stop_if_asked))
             with _one_line_if_not_written(self.base_dir / "config.yml") as path, atomic_write(path) as partial:
                 # With what the dataset has resolved: opening the run must give the same cameras.
                 assert isinstance(self.pipeline.datamanager, EventDataManager)
@@ -205,8 +206,10 @@ class AENeRFTrainer(Trainer):
                 signal.signal(number, handler)
 
     def _stop_if_asked(self, step: int) -> None:
-        # A training that is complete ends by itself.
-        if self._stopped_by and self._record is not None and step + 1 < self._steps.stop:
+        # A checkpoint needs a step. A training that is complete ends by itself.
+        if self._stopped_by and self._record is not None and step > self._steps.start:
+            # The state of the training in the checkpoint is that after the last step.
+            self.step = step = step - 1
             self.pipeline.color_fit.fit()
             self.save_checkpoint(step)
             self._record.write("stopped", step + 1 - self._steps.start)

@@ -5,13 +5,11 @@ from __future__ import annotations
 import base64
 import math
 import tempfile
-from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -21,7 +19,6 @@ from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 from aenerf_ns.method.model import AENeRFModel
-from aenerf_ns.method.pose_correction import world_rays
 from aenerf_ns.recording.dataset import EventDataset
 
 # A line of 200 points looks smooth and takes 5 KB.
@@ -105,32 +102,20 @@ class RecordingView:
             f"{len(events):,} events from {begin:+.1f} to {end:+.1f} ms: red positive, blue negative"
         )
 
-    @cached_property
-    def _directions(self) -> Tensor:
-        """(pixels, 3) float64 directions in the camera's frame."""
-        directions, _ = self.camera.pixel_directions()
-        return torch.from_numpy(directions).reshape(-1, 3).to(self._model.device)
-
     @torch.no_grad()
     def points(self, events: EventStream) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Return points (N, 3) in the scene of at most 2000 of the events, and their colors (N, 3).
 
         An event lies on the surface that its pixel sees from the corrected pose of its time, 1 % nearer to the camera.
         """
-        shown = events[:: max(math.ceil(len(events) / _MAX_POINTS), 1)]
+        if len(events) == 0:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+        shown = events[:: math.ceil(len(events) / _MAX_POINTS)]
         device = self._model.device
         seconds = self._model.camera_optimizer.trajectory.seconds(torch.from_numpy(shown.t).to(device))
-        pixels = torch.from_numpy(shown.y.astype(np.int64) * self.camera.width + shown.x).to(device)
-        origins, directions = world_rays(self._model.camera_optimizer.pose(seconds), self._directions[pixels])
-        count = len(pixels)
-        if count == 0:
-            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-        rays = RayBundle(
-            origins=origins.float(),
-            directions=directions.float(),
-            pixel_area=torch.full((count, 1), 1 / (self.camera.fx * self.camera.fy), device=device),
-            camera_indices=torch.zeros((count, 1), dtype=torch.long, device=device),
-        )
+        cameras = self.camera.cameras(self._model.camera_optimizer.pose(seconds)).to(device)
+        coordinates = torch.from_numpy(np.stack([shown.y, shown.x], -1) + 0.5).float().to(device)
+        rays = cameras.generate_rays(torch.arange(len(shown), device=device)[:, None], coords=coordinates)
         depth, accumulation = self._model.render_rays(rays, "depth", "accumulation")
         seen = (accumulation[:, 0] > _MIN_OPACITY).cpu().numpy()
         points = (rays.origins + _IN_FRONT * depth * rays.directions).cpu().numpy()

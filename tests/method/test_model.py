@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -86,7 +87,7 @@ def test_every_parameter_is_in_one_group_and_gets_a_gradient(backbone: dict[str,
     supervision = PairSupervisionConfig(learn_contrast_threshold_ratio=True, learn_refractory_period=True)
     parts = {"camera_optimizer": correction, "supervision": supervision, "loss_coefficients": ALL_LOSSES}
     model = make_model(bounded=bounded, **parts, **backbone)
-    model.supervision.sensor_parameters.bound_refractory_period(10_000)
+    model.supervision.prepare(SimpleNamespace(pairs=SimpleNamespace(shortest_interval=10_000)))
     # Denser than the proposals, or their loss has no gradient.
     model.field.average_init_density = 5.0
     outputs, batch = model(make_rays(15, with_times=True)), make_batch(5)

@@ -107,7 +107,7 @@ def test_with_the_temporal_loss_there_is_a_third_ray_in_all_losses(rays_per_pair
 
 def test_motion_from_twist_is_the_matrix_exponential() -> None:
     generator = torch.Generator().manual_seed(0)
-    for size in (0.0, 1e-9, 9.9e-3, 1.01e-2, 0.7, 3.0):
+    for size in (0.0, 1e-9, 0.999, 1.001, 3.0):
         twist = torch.randn(6, generator=generator, dtype=torch.float64)
         twist = twist * torch.tensor([1, 1, 1, *[size / float(twist[3:].norm())] * 3], dtype=torch.float64)
         generator_matrix = torch.zeros(4, 4, dtype=torch.float64)

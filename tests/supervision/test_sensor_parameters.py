@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,26 +12,30 @@ from nerfstudio.model_components.ray_samplers import UniformSampler
 
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.method.model import AENeRFModel
-from aenerf_ns.supervision.event_pairs import PairBatch, PairSupervisionConfig
-from aenerf_ns.supervision.sensor_parameters import SensorParameters
+from aenerf_ns.supervision.event_pairs import PairBatch, PairLossCoefficients, PairSupervision, PairSupervisionConfig
+
+
+def make_supervision(sensor: SensorModel, **learned: bool) -> PairSupervision:
+    supervision = PairSupervision(PairSupervisionConfig(**learned), sensor, PairLossCoefficients())
+    supervision.prepare(SimpleNamespace(pairs=SimpleNamespace(shortest_interval=10_000)))
+    return supervision
 
 
 @pytest.mark.parametrize("ratio", [1e-3, 0.5, 1.0, 1.458, 40.0])
 def test_the_ratio_starts_at_the_given_one(ratio: float) -> None:
-    parameters = SensorParameters(SensorModel(0.2 * ratio, 0.2), True, False)
-    assert parameters.contrast_threshold_ratio.item() == pytest.approx(ratio, rel=1e-4)
-    assert parameters.refractory_period is None
+    supervision = make_supervision(SensorModel(0.2 * ratio, 0.2), learn_contrast_threshold_ratio=True)
+    assert supervision.contrast_threshold_ratio.item() == pytest.approx(ratio, rel=1e-4)
+    assert supervision.refractory_period is None
 
 
 @pytest.mark.parametrize(("given", "expected"), [(0, 5e-6), (2_000, 2e-6), (9_999, 9.999e-6)])
 def test_the_refractory_period_starts_at_the_given_one_and_stays_below_the_bound(given: int, expected: float) -> None:
-    parameters = SensorParameters(SensorModel(refractory_period=given), False, True)
-    parameters.bound_refractory_period(10_000)
-    assert parameters.refractory_period.item() == pytest.approx(expected, rel=1e-3)
-    assert parameters.contrast_threshold_ratio is None
+    supervision = make_supervision(SensorModel(refractory_period=given), learn_refractory_period=True)
+    assert supervision.refractory_period.item() == pytest.approx(expected, rel=1e-3)
+    assert supervision.contrast_threshold_ratio is None
     for raw in (-200.0, 200.0):
-        parameters.raw_refractory_period.data.fill_(raw)
-        assert 0 <= parameters.refractory_period.item() <= 1e-5
+        supervision.raw_refractory_period.data.fill_(raw)
+        assert 0 <= supervision.refractory_period.item() <= 1e-5
 
 
 def make_learning_model() -> AENeRFModel:
@@ -42,7 +47,7 @@ def make_learning_model() -> AENeRFModel:
     ).double()
     torch.nn.init.uniform_(model.field.encoding.hash_table, -1, 1)
     model.field.average_init_density = 2.0
-    model.supervision.sensor_parameters.bound_refractory_period(50_000_000)
+    model.supervision.prepare(SimpleNamespace(pairs=SimpleNamespace(shortest_interval=50_000_000)))
     return model
 
 
@@ -61,7 +66,7 @@ def test_their_gradients_are_those_of_finite_differences() -> None:
         outputs = model(rays)
         return model.get_loss_dict(outputs, batch)["reconstruction_loss"]
 
-    for name, parameter in model.supervision.sensor_parameters.named_parameters():
+    for name, parameter in model.supervision.named_parameters():
         (gradient,) = torch.autograd.grad(loss(), parameter)
         values = []
         for step in (1e-5, -1e-5):
@@ -74,7 +79,7 @@ def test_their_gradients_are_those_of_finite_differences() -> None:
 
 def test_proposals_and_silent_pixels_tell_nothing_of_thresholds() -> None:
     model = make_learning_model().train()
-    ratio = model.supervision.sensor_parameters.raw_ratio
+    ratio = model.supervision.raw_ratio
     batch = replace(make_batch(5), ends_between_events=torch.ones(5, dtype=torch.bool))
     losses = model.get_loss_dict(model(make_rays(15, with_times=True)), batch)
     for name in ("interlevel_loss", "reconstruction_loss"):
@@ -89,8 +94,8 @@ def test_the_starts_of_the_intervals_move_and_what_lies_within_keeps_its_place()
     rays = make_rays(15, with_times=True)
     before = rays.times.clone()
     with torch.no_grad():
-        model.supervision.sensor_parameters.raw_refractory_period.add_(0.7)
-    period = model.supervision.sensor_parameters.refractory_period.item()
+        model.supervision.raw_refractory_period.add_(0.7)
+    period = model.supervision.refractory_period.item()
     outputs = model(rays)
     moved = rays.times - before
     torch.testing.assert_close(moved[:5], torch.full_like(moved[:5], period - 0.02), rtol=0, atol=1e-12)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import re
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ def test_names_exist(owner: str) -> None:
     for name in USED_NAMES[owner]:
         if cls:
             # Attributes of instances are nowhere but in the source of the class.
-            assert f"{name}" in inspect.getsource(getattr(found, cls)), name
+            assert re.search(rf"\b{name}\b", inspect.getsource(getattr(found, cls))), name
         else:
             assert hasattr(found, name)
 

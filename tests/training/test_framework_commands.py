@@ -42,7 +42,7 @@ from aenerf_ns.cli.evaluate import Evaluate
 from aenerf_ns.cli.export import ExportCameras, ExportFrames, ExportMesh, ExportTrajectory, ExportVideo
 from aenerf_ns.cli.report import ReportCommand
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.tum_trajectory import read_tum_trajectory
+from aenerf_ns.files.tum_trajectory import read_tum_trajectory, write_tum_trajectory
 from aenerf_ns.open3d_import import load_open3d
 
 # Of the run that all tests look at.
@@ -172,13 +172,24 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
     given, truth = (
         read_tum_trajectory(workspace / "room" / f"trajectory_{n}.txt") for n in ("estimated", "ground_truth")
     )
-    for poses, rate, times, expected in (
-        ("estimated", None, given.times, given),
-        ("corrected", None, given.times, truth),
-        ("ground-truth", 100.0, torch.arange(0, given.end + 1, 10_000_000), truth),
+    parser = yaml.load(trained.read_text(), Loader=yaml.Loader).pipeline.datamanager.dataparser
+    # The window begins with the first event, between the first two poses.
+    assert 0 < parser.start_time_ns < given.times[1]
+    regular = torch.arange(parser.start_time_ns, parser.end_time_ns + 1, 10_000_000)
+    # True poses of a part of the window.
+    cut = shutil.copytree(workspace / "room", workspace / "cut" / "room")
+    part = truth.crop(10**9, 3 * 10**9)
+    write_tum_trajectory(cut / "trajectory_ground_truth.txt", part)
+    for poses, rate, times, expected, data in (
+        ("estimated", None, given.times, given, None),
+        ("corrected", None, given.times, truth, None),
+        ("estimated", 100.0, regular, given, None),
+        ("ground-truth", 100.0, regular, truth, None),
+        ("ground-truth", None, truth.times[1:], truth, None),
+        ("ground-truth", 100.0, regular[(regular >= part.start) & (regular <= part.end)], part, cut),
     ):
         output = workspace / "exported" / "poses.txt"
-        ExportTrajectory(trained, output, poses, rate).main()
+        ExportTrajectory(trained, output, poses, rate, data=data).main()
         exported = read_tum_trajectory(output)
         assert torch.equal(exported.times, times)
         difference = (exported.camera_to_worlds - expected.interpolate(times)).abs().max()

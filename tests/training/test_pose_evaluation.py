@@ -196,8 +196,9 @@ def test_the_true_poses_may_be_in_another_world(tmp_path: Path) -> None:
     torch.testing.assert_close(in_recording, truth.camera_to_worlds, rtol=0, atol=1e-6)
 
 
-def test_a_trained_run_shows_and_exports_the_corrected_poses(tmp_path: Path) -> None:
-    pipeline = make_pipeline(tmp_path / "made", "test", pose_correction="spline")
+@pytest.mark.parametrize("num_views", [2, -1])
+def test_a_trained_run_shows_and_exports_the_corrected_poses(num_views: int, tmp_path: Path) -> None:
+    pipeline = make_pipeline(tmp_path / "made", "test", num_views=num_views, pose_correction="spline")
     correction, data = pipeline.model.camera_optimizer, pipeline.datamanager
     torch.nn.init.normal_(correction.twists.control_twists, std=0.05)
     estimated = data.train_dataset.cameras
@@ -216,6 +217,10 @@ def test_a_trained_run_shows_and_exports_the_corrected_poses(tmp_path: Path) -> 
     torch.testing.assert_close(opened.camera_to_worlds, expected)
     torch.testing.assert_close(correction.apply_to_camera(opened), expected)
     torch.testing.assert_close(homogeneous(correction(indices)), torch.eye(4).expand(len(indices), 4, 4))
+    # ns-render spiral starts there: without views at a training camera.
+    start, _ = data.eval_dataloader.get_camera(0)
+    assert torch.equal(start.camera_to_worlds[0], data.eval_dataset.cameras.camera_to_worlds[0])
+    assert not start.metadata
 
 
 def test_ground_truth_must_overlap_the_estimated_poses(random_poses: torch.Tensor) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import re
+import signal
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from nerfstudio.engine import trainer as framework_trainer
 from nerfstudio.engine.trainer import Trainer
 from torch.utils._pytree import keystr, tree_flatten_with_path
 
+from aenerf_ns.report.run_files import read_scalars
 from aenerf_ns.training.trainer import AENeRFTrainer
 
 NUM_STEPS = 60
@@ -97,3 +100,57 @@ def test_resumed_run_reaches_its_last_step(
     if counts_earlier_steps:
         with pytest.raises(SystemExit, match=r"^Error: ns-train: the checkpoint is of step 24; "):
             train_small_model(tmp_path, "third", 25, load_dir=resumed.checkpoint_dir)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> AENeRFTrainer:
+    return train_small_model(tmp_path_factory.mktemp("uninterrupted"), "whole", 12, steps_per_eval_batch=5)
+
+
+# Steps of which a batch is evaluated, with random numbers. The second is also logged.
+@pytest.mark.parametrize(("number", "asked_in"), [(signal.SIGINT, 5), (signal.SIGTERM, 10), (signal.SIGINT, 11)])
+def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint(
+    number: signal.Signals,
+    asked_in: int,
+    uninterrupted: AENeRFTrainer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    step = AENeRFTrainer.train_iteration
+
+    def asked(self: AENeRFTrainer, index: int) -> object:
+        if index == asked_in:
+            os.kill(os.getpid(), number)
+        return step(self, index)
+
+    def train(num_steps: int, **options: Any) -> AENeRFTrainer:
+        return train_small_model(tmp_path, "asked", num_steps, steps_per_eval_batch=5, **options)
+
+    before = signal.getsignal(number)
+    left = 11 - asked_in
+    with monkeypatch.context() as patch:
+        patch.setattr(AENeRFTrainer, "train_iteration", asked)
+        if left == 0:
+            # It ends by itself.
+            assert_equal(checkpoint(uninterrupted), checkpoint(train(12)))
+            return
+        with pytest.raises(SystemExit) as stopped:
+            train(12)
+    assert stopped.value.code == 128 + number
+    assert signal.getsignal(number) is before
+    (file,) = tmp_path.rglob("run.json")
+    record = json.loads(file.read_text())
+    assert (record["state"], record["steps"]) == ("stopped", asked_in + 1)
+    assert read_scalars(file.parent)["Train Loss"][0] == [0, 10][: 1 + asked_in // 10]
+    assert read_scalars(file.parent)["Eval Loss"][0] == [5, 10][: asked_in // 5]
+    said = capsys.readouterr().out
+    assert f"Stopped after step {asked_in}. Go on with the same command" in said
+    assert f"--load-dir {file.parent} --max-num-iterations {left} after the method's name, in place" in said
+    assert_equal(checkpoint(uninterrupted), checkpoint(train(left, load_dir=file.parent)))
+
+
+def test_a_training_that_is_asked_to_stop_before_its_first_step_takes_it(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        train_small_model(tmp_path, "asked", 12, prepare=lambda trainer: setattr(trainer, "_stopped_by", signal.SIGINT))
+    assert [path.name for path in tmp_path.rglob("*.ckpt")] == ["step-000000000.ckpt"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -96,29 +95,3 @@ def test_one_of_several_processes_does_not_wait_for_a_checkpoint() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with trainer._stopping_after_a_step():
         assert signal.getsignal(signal.SIGTERM) is before
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint(
-    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    step = AENeRFTrainer.train_iteration
-
-    def asked(self: AENeRFTrainer, index: int) -> object:
-        if index == 5:
-            os.kill(os.getpid(), number)
-        return step(self, index)
-
-    monkeypatch.setattr(AENeRFTrainer, "train_iteration", asked)
-    before = signal.getsignal(number)
-    with pytest.raises(SystemExit) as stopped:
-        train_small_model(tmp_path, "asked", 12)
-    assert stopped.value.code == 128 + number
-    assert signal.getsignal(number) is before
-    (file,) = tmp_path.rglob("run.json")
-    record = json.loads(file.read_text())
-    assert (record["state"], record["steps"]) == ("stopped", 6)
-    assert (file.parent / "nerfstudio_models" / "step-000000005.ckpt").is_file()
-    said = capsys.readouterr().out
-    assert "Stopped after step 5. Go on with the same command" in said
-    assert f"--load-dir {file.parent} --max-num-iterations 6 after the method's name, in place" in said

@@ -201,6 +201,9 @@ def test_evaluation_without_reference_views_is_of_poses(
     assert results["num_views"] == 0
     assert "psnr" not in results
     assert results["pose_errors"]["corrected"]["rotation_error_degrees"] < 1
+    with pytest.raises(DataError, match="it has no test views to predict; leave out --nerfbaselines"):
+        Evaluate(config, workspace / "again.json", nerfbaselines=workspace / "baselines").main()
+    assert not (workspace / "again.json").exists()
     (data / "trajectory_ground_truth.txt").unlink()
     with pytest.raises(DataError, match="it has no reference images to evaluate on"):
         Evaluate(config, workspace / "again.json").main()

@@ -237,8 +237,9 @@ def test_follow_looks_through_the_event_camera(browser: Browser, viewer: Viewer,
     eventually(lambda: not any(handle.visible for handle in viewer.camera_handles.values()))
     panel.at_time.value = 1.0
     pose = pipeline.model.camera_optimizer.pose(torch.tensor([1.0], dtype=torch.float64))[0].detach()
-    while not np.allclose(browser.wait_for("SetCameraPositionMessage")["position"], SCALE * pose[:, 3], atol=1e-6):
-        pass
+    eventually(
+        lambda: np.allclose(browser.wait_for("SetCameraPositionMessage")["position"], SCALE * pose[:, 3], atol=1e-6)
+    )
     # The time runs on by itself, and begins anew at the end.
     panel.at_time.value = DURATION
     panel.camera_plays.value = True
