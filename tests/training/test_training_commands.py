@@ -145,7 +145,8 @@ def test_two_processes_equal_one_with_twice_the_batch(
     for name, value in one["weights"].items():
         start, of_halves = one["before"][name], halves[0]["weights"][name]
         assert torch.equal(halves[0]["before"][name], start), name
-        if value.is_floating_point():
+        # A half of the rays tells as well where the times see a place: no process waits for the counts of the others.
+        if value.is_floating_point() and name != "warp._seen":
             assert (of_halves - value).norm() <= 1e-3 * (value - start).norm(), name
     assert one["weights"]["camera_optimizer.twists.control_twists"].any()
 
