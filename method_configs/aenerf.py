@@ -65,7 +65,7 @@ aenerf = MethodSpecification(
                 stats_to_track=(EventName.ITER_TRAIN_TIME, EventName.ETA),
             )
         ),
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 13, websocket_host="127.0.0.1"),
+        viewer=ViewerConfig(websocket_host="127.0.0.1"),
         vis="viewer",
     ),
     description="AE-NeRF: event camera to radiance field, on hash grids.",
