@@ -31,7 +31,7 @@ class ExportTrajectory(RunCommand):
     """corrected: after the run's pose correction. estimated: as given to the run. ground-truth: the true poses, within
     the run's time window."""
     rate: float | None = None
-    """Poses a second of the run's time window; by default at the times of the given poses."""
+    """Poses a second of the run's time window; by default at the times of the given or the true poses."""
 
     def main(self) -> None:
         """Load the run and write its poses."""
@@ -42,26 +42,23 @@ class ExportTrajectory(RunCommand):
         import torch
 
         from aenerf_ns.camera.trajectory import Trajectory
-        from aenerf_ns.export.times import regular_times
+        from aenerf_ns.export.times import times_at_rate
         from aenerf_ns.files.tum_trajectory import write_tum_trajectory
 
-        correction, window = run.model.camera_optimizer, run.scene.window
-        trajectory = correction.trajectory
-        # Those that cover the window, so that all of its events have a pose.
-        times = trajectory.times
+        correction = run.model.camera_optimizer
+        trajectory = estimated = correction.trajectory
         if self.poses == "ground-truth":
             true = run.scene.ground_truth
             if true is None:
                 raise DataError(run.data, "it has no true poses", "export corrected or estimated ones")
-            trajectory = true.to(run.device)
-            times = trajectory.knots_between(window.start, window.end)
+            trajectory = true.to(run.device).crop(estimated.start, estimated.end)
+        times = trajectory.times
         if self.rate is not None:
-            times = regular_times(window.start, window.end, self.rate).to(run.device)
+            times = times_at_rate(run.scene.window, self.rate).to(run.device)
             # The true poses may not cover all of it.
             times = times[(times >= trajectory.start) & (times <= trajectory.end)]
-        if len(times) < 2:
-            asked = "the default" if self.rate is None else f"{self.rate:g} poses a second"
-            raise DataError("--rate", f"{asked} gives no two poses in the run's time", "give a higher one")
+            if len(times) < 2:
+                raise DataError("--rate", f"{self.rate:g} poses a second give no two poses", "give a higher one")
         source = correction if self.poses == "corrected" else trajectory
         with torch.no_grad():
             poses = source.pose(trajectory.seconds(times))

@@ -65,7 +65,8 @@ class EventDataParserConfig(DataParserConfig):
                 raise DataError(str(self.data), f"{name} is {value}", "give nanoseconds, which have 19 digits at most")
         for option in ("max_pose_gap_ns", "scale_factor"):
             if values[option] is not None and not 0 < values[option] < float("inf"):
-                raise DataError(str(self.data), f"{option} is {values[option]}", "give a positive number")
+                name = f"--{option.replace('_', '-')}"
+                raise DataError(str(self.data), f"{name} is {values[option]}", "give a positive number")
         # A run's saved configuration is also read in other working directories.
         paths = {option: value.absolute() for option, value in values.items() if isinstance(value, Path)}
         return super(EventDataParserConfig, replace(self, **paths)).setup(**kwargs)  # type: ignore[arg-type]

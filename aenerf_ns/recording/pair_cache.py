@@ -56,7 +56,7 @@ class PairFile:
                 found, problem = self._read(file), "is of other events or options"
         # The libraries raise whatever they stumble over in a damaged file.
         except Exception as error:
-            found, problem = None, f"is not whole ({error})"
+            found, problem = None, f"is not whole, or of an earlier version ({error})"
         if found is None:
             CONSOLE.print(f"{self.path} {problem}: it is made again.", style="yellow", markup=False)
         return found

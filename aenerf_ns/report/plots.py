@@ -92,7 +92,7 @@ def event_rate(report: RunReport) -> go.Figure:
 
 
 def trajectory(reports: Sequence[RunReport]) -> go.Figure:
-    """Plot the trajectories from above and from the side, in units of the recording."""
+    """Plot the trajectories from above and from the side: the recording's world, turned upright, and its units."""
     figure = make_subplots(1, 2, subplot_titles=("from above", "from the side"))
     # One for all: runs on the same true poses may have scenes that are turned otherwise.
     upright = np.array(reports[0].poses.upright)

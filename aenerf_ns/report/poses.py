@@ -25,7 +25,7 @@ class RunPoses:
         seconds: (N,) since the trajectory's start.
         positions: (N, 3) of the ``estimated``, the ``corrected`` and, where they are known, the ``true`` poses in the
             recording's world. Aligned to the true trajectory where it is known.
-        upright: (3, 3) rotation of that world, after which z is up as far as the cameras tell.
+        upright: (3, 3) rotation of that world, after which z is up as far as the given poses tell.
         evo: :func:`evo_errors` of the ``estimated`` and the ``corrected`` poses,
             over all of them. None without true poses.
         errors: :func:`errors_over_time` of both. None without true poses.
@@ -74,7 +74,7 @@ def measure_poses(run: TrainedRun) -> RunPoses:
         num_poses=len(times),
         seconds=seconds[::every].tolist(),
         positions={name: scene.to_recording(part[::every])[..., 3].tolist() for name, part in positions.items()},
-        upright=scene.frame.rotation.tolist(),
+        upright=(align(poses["estimated"], reference).rotation.mT @ scene.frame.rotation).tolist(),
         evo=evo,
         errors=errors,
         correction=correction,

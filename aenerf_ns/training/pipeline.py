@@ -145,7 +145,7 @@ class AENeRFPipeline(VanillaPipeline):
                 CONSOLE.print(self._pose_diagnosis["summary"], soft_wrap=True)
 
         def fit(step: int) -> None:
-            # The main process writes the checkpoints, and DistributedDataParallel copies its buffers to the others.
+            # The main process alone writes the checkpoints and evaluates.
             if not comms.is_main_process():
                 return
             if step == steps[-1] or step_check(step, trainer.config.steps_per_save):

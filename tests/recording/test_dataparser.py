@@ -146,7 +146,7 @@ def test_images_are_thinned_within_the_window(tmp_path: Path) -> None:
     ("option", "value"), [("max_pose_gap_ns", 0), *(("scale_factor", value) for value in (0.0, -1.0, np.nan, np.inf))]
 )
 def test_refuse_what_is_not_positive(option: str, value: float, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=f"{option} is {value}; give a positive number"):
+    with pytest.raises(DataError, match=f"--{option.replace('_', '-')} is {value}; give a positive number"):
         config_of("event-recording-data", tmp_path, **{option: value}).setup()
 
 

@@ -103,11 +103,16 @@ def test_errors_match_evo(random_poses: torch.Tensor, tmp_path: Path) -> None:
     with NativeDatasetWriter(data, CameraIntrinsics(6, 4, 5.0, 5.0, 3.0, 2.0), SensorModel(), "srgb") as writer:
         writer.events.append(make_stream([(1, 1, 0, 1), (1, 1, 7 * SECOND, -1)], 6, 4))
         writer.add_trajectories(given, true)
-    found = measure_poses(make_pipeline(data, "test").trained_run())
+    run = make_pipeline(data, "test").trained_run()
+    found = measure_poses(run)
     assert found.num_poses == 2501
     assert {len(values) for values in found.errors["estimated"].values()} == {len(found.seconds)} == {501}
     # In the recording's world, where other runs on the same true poses lie too.
     np.testing.assert_allclose(found.positions["true"], true.interpolate(times[::5])[:, :3, 3], atol=1e-5)
+    # Turned upright they lie as in the scene of the given poses.
+    paths = found.positions["estimated"] @ np.array(found.upright).T, run.scene.trajectory.camera_to_worlds[::5, :3, 3]
+    shown, in_scene = (path / path.std() for path in (np.array(path) - np.array(path).mean(0) for path in paths))
+    np.testing.assert_allclose(shown, in_scene, atol=1e-4)
     files = [data / f"trajectory_{name}.txt" for name in ("ground_truth", "estimated")]
     paths = sync.associate_trajectories(*map(read_tum_trajectory_file, files))
     for name, expected in evo_statistics(*paths).items():

@@ -185,7 +185,7 @@ def test_exported_poses_are_in_the_world_of_the_recording(trained: Path, workspa
         ("corrected", None, given.times, truth, None),
         ("estimated", 100.0, regular, given, None),
         ("ground-truth", 100.0, regular, truth, None),
-        ("ground-truth", None, truth.times[1:], truth, None),
+        ("ground-truth", None, truth.times, truth, None),
         ("ground-truth", 100.0, regular[(regular >= part.start) & (regular <= part.end)], part, cut),
     ):
         output = workspace / "exported" / "poses.txt"

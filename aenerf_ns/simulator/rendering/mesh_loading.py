@@ -244,13 +244,29 @@ def triangulate(corners: Array) -> NDArray[np.int64]:
 
 
 def _triangulate_obj(text: str) -> str:
-    """Return the text of an .obj file with its polygons cut into triangles. trimesh fills concave ones by a fan."""
-    lines, num_vertices = text.split("\n"), 0
-    positions = np.array([line.split()[1:4] for line in lines if line.startswith(("v ", "v\t"))], np.float64)
+    """Return the text of an .obj file with its concave polygons cut into triangles. trimesh fills all by a fan."""
+    if not re.search(r"^f(?:[ \t]+\S+){4}", text, re.MULTILINE):
+        return text
+    lines = text.split("\n")
+    vertices: list[str] = []
+    polygons: dict[int, list[tuple[int, list[int]]]] = {}
     for number, line in enumerate(lines):
-        num_vertices += line.startswith(("v ", "v\t"))
-        if line.startswith(("f ", "f\t")) and len(names := line.split()[1:]) > 3:
+        if line.startswith(("v ", "v\t")):
+            vertices.append(line)
+        elif line.startswith(("f ", "f\t")) and len(names := line.split()[1:]) > 3:
             index = [int(name.partition("/")[0]) for name in names]
-            triangles = triangulate(positions[[i - 1 if i > 0 else num_vertices + i for i in index]])
-            lines[number] = "\n".join(f"f {names[a]} {names[b]} {names[c]}" for a, b, c in triangles)
+            corners = [i - 1 if i > 0 else len(vertices) + i for i in index]
+            polygons.setdefault(len(corners), []).append((number, corners))
+    positions = np.array([line.split()[1:4] for line in vertices], np.float64)
+    for rows in polygons.values():
+        corners = positions[np.array([row for _, row in rows])]
+        edges = np.roll(corners, -1, axis=1) - corners
+        turns = np.cross(edges, np.roll(edges, -1, axis=1))
+        normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1, keepdims=True)
+        concave = ((turns * normals).sum(axis=-1) < 0).any(axis=1)
+        for i in np.flatnonzero(concave):
+            number = rows[i][0]
+            names = lines[number].split()[1:]
+            triangles = (" ".join(names[k] for k in triangle) for triangle in triangulate(corners[i]))
+            lines[number] = "\n".join(f"f {triangle}" for triangle in triangles)
     return "\n".join(lines)
