@@ -24,25 +24,16 @@ def spread_times(window: TimeWindow, count: int) -> Tensor:
     return ends[piece] - (elapsed[piece] - middles)
 
 
-def regular_times(start: int, end: int, rate: float) -> Tensor:
-    """Return times in nanoseconds from a start to an end, at a rate per second.
-
-    Raises:
-        DataError: the rate gives more times than a reader of trajectories takes.
-    """
-    count = (end - start) * 1e-9 * rate
-    if count > MAX_ROWS:
-        raise DataError("--rate", f"{rate:g} gives {count:.3g} times", f"give one that gives at most {MAX_ROWS:,}")
-    return torch.arange(start, end + 1, round(1e9 / rate))
-
-
 def times_at_rate(window: TimeWindow, rate: float) -> Tensor:
     """Return times in nanoseconds, at a rate per second, in a time window but not in its gaps.
 
     Raises:
-        DataError: the rate gives no time, or too many.
+        DataError: the rate gives no time, or more than a reader of trajectories takes.
     """
-    times = regular_times(window.start, window.end, rate)
+    count = (window.end - window.start) * 1e-9 * rate
+    if count > MAX_ROWS:
+        raise DataError("--rate", f"{rate:g} gives {count:.3g} times", f"give one that gives at most {MAX_ROWS:,}")
+    times = torch.arange(window.start, window.end + 1, round(1e9 / rate))
     times = times[torch.from_numpy(window.contains(times))]
     if len(times) == 0:
         raise DataError("--rate", f"{rate:g} gives no time at which poses are known", "give a higher one")

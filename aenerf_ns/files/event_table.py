@@ -121,7 +121,7 @@ class EventTableFile(EventFile):
             return None if self._stated_unit(arrays) else self._given_unit or self._guessed_unit(arrays)
 
     def _stated_unit(self, arrays: Mapping[str, Any]) -> TimeUnit | None:
-        """Return the unit that the file or its layout states. Where a file does not, one that is given counts."""
+        """Return the unit that the file states. Where it states none, return its layout's, unless a unit is given."""
         return None if self._given_unit else self._layout.time_unit
 
     def _guessed_unit(self, arrays: Mapping[str, Any]) -> TimeUnit:

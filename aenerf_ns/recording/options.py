@@ -60,13 +60,11 @@ class EventDataParserConfig(DataParserConfig):
         """
         values = {option.name: getattr(self, option.name) for option in fields(self)}
         for option, value in values.items():
+            problem = f"--{option.replace('_', '-')} is {value}"
             if isinstance(value, int) and abs(value) > MAX_TIME:
-                name = f"--{option.replace('_', '-')}"
-                raise DataError(str(self.data), f"{name} is {value}", "give nanoseconds, which have 19 digits at most")
-        for option in ("max_pose_gap_ns", "scale_factor"):
-            if values[option] is not None and not 0 < values[option] < float("inf"):
-                name = f"--{option.replace('_', '-')}"
-                raise DataError(str(self.data), f"{name} is {values[option]}", "give a positive number")
+                raise DataError(str(self.data), problem, "give nanoseconds, which have 19 digits at most")
+            if option in ("max_pose_gap_ns", "scale_factor") and value is not None and not 0 < value < float("inf"):
+                raise DataError(str(self.data), problem, "give a positive number")
         # A run's saved configuration is also read in other working directories.
         paths = {option: value.absolute() for option, value in values.items() if isinstance(value, Path)}
         return super(EventDataParserConfig, replace(self, **paths)).setup(**kwargs)  # type: ignore[arg-type]

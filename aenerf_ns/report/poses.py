@@ -55,7 +55,8 @@ def measure_poses(run: TrainedRun) -> RunPoses:
     if true is None:
         # A learned clock does not turn the world.
         references["corrected"] = given.pose(psi.on_clock_of_poses(seconds.to(run.device)).cpu())
-    positions = {name: align(part, references[name])(part.double()) for name, part in poses.items()}
+    aligned = {name: align(part, references[name]) for name, part in poses.items()}
+    positions = {name: aligned[name](part.double()) for name, part in poses.items()}
     if true is not None:
         positions["true"] = reference
     every = -(-len(times) // _MAX_DRAWN)
@@ -74,7 +75,7 @@ def measure_poses(run: TrainedRun) -> RunPoses:
         num_poses=len(times),
         seconds=seconds[::every].tolist(),
         positions={name: scene.to_recording(part[::every])[..., 3].tolist() for name, part in positions.items()},
-        upright=(align(poses["estimated"], reference).rotation.mT @ scene.frame.rotation).tolist(),
+        upright=(aligned["estimated"].rotation.mT @ scene.frame.rotation).tolist(),
         evo=evo,
         errors=errors,
         correction=correction,

@@ -151,7 +151,7 @@ class AENeRFTrainer(Trainer):
             # After the last checkpoint, and before the viewer waits for the user to end it.
             places = TrainingCallbackLocation
             self.callbacks.append(TrainingCallback([places.AFTER_TRAIN], self._record_end))
-            # Before a step, when the one before it has been logged and evaluated, and before the others' preparations.
+            # First of all that comes before a step: the last step has then been logged and evaluated.
             self.callbacks.insert(0, TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._stop_if_asked))
             with _one_line_if_not_written(self.base_dir / "config.yml") as path, atomic_write(path) as partial:
                 # With what the dataset has resolved: opening the run must give the same cameras.
@@ -208,7 +208,7 @@ class AENeRFTrainer(Trainer):
     def _stop_if_asked(self, step: int) -> None:
         # A checkpoint needs a step. A training that is complete ends by itself.
         if self._stopped_by and self._record is not None and step > self._steps.start:
-            # The state of the training in the checkpoint is that after the last step.
+            # The checkpoint is of the last step, and not of the step that comes.
             self.step = step = step - 1
             self.pipeline.color_fit.fit()
             self.save_checkpoint(step)

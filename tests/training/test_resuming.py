@@ -107,7 +107,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> AENeRFTrainer:
     return train_small_model(tmp_path_factory.mktemp("uninterrupted"), "whole", 12, steps_per_eval_batch=5)
 
 
-# Steps of which a batch is evaluated, with random numbers. The second is also logged.
+# The training evaluates a batch at steps 5 and 10, which draws random numbers, and logs step 10. Step 11 is the last.
 @pytest.mark.parametrize(("number", "asked_in"), [(signal.SIGINT, 5), (signal.SIGTERM, 10), (signal.SIGINT, 11)])
 def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint(
     number: signal.Signals,

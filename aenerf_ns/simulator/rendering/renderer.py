@@ -52,10 +52,12 @@ def _shade(surface, light, rays, hits, focal, background, sky, limit, radiance, 
                 else:
                     normal, distance = face_normal(surface, face), hits.distance[n]
                     facing = dot(normal, direction)
-                    # A pixel covers depth / focal length, stretched where the surface is seen at a slant; the
-                    # geometric mean of its two sides keeps textures crisp there without aliasing.
-                    slant = max(abs(facing) / (length(normal) * length(direction)), 0.02)
-                    footprint = FOOTPRINT * distance / (focal * math.sqrt(slant))
+                    footprint = 0.0
+                    if surface.texture[face] >= 0:
+                        # A pixel covers depth / focal length, stretched where the surface is seen at a slant; the
+                        # geometric mean of its two sides keeps textures crisp there without aliasing.
+                        slant = max(abs(facing) / (length(normal) * length(direction)), 0.02)
+                        footprint = FOOTPRINT * distance / (focal * math.sqrt(slant))
                     side = 0 if facing < 0.0 else 1
                     r, g, b = diffuse_radiance(surface, light, face, side, hit_weights(hits, n), footprint)
                     total_depth += distance
