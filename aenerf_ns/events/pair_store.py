@@ -24,6 +24,8 @@ MAX_SPAN = 255
 """The most consecutive pairs that are joined."""
 COUNT_UNIT = 8
 """Counts are kept in eighths of an event, for changes that no event tells of."""
+MAX_MISSED = 4
+"""The most thresholds that a pixel is taken to miss after an event."""
 MAX_JOINED = 31
 """The most events merged into one that others are joined with. Counts of :data:`MAX_SPAN` pairs then fit in 16 bits."""
 BLOCK = 16
@@ -97,7 +99,7 @@ class EventPairs:
         later = self.rows[max(start, 1) : stop : step]
         earlier = self.rows[max(start, 1) - 1 : stop - 1 : step, 1]
         times, packed = later.T
-        positive, negative = event_counts(packed, earlier)
+        positive, negative = own_counts(packed, earlier)
         kept = is_pair(packed) & (positive != negative)
         order = np.flatnonzero(kept)[np.argsort(times[kept], kind="stable")]
         y, x = np.divmod(pixel_index(packed[order]), self.width)
@@ -144,12 +146,12 @@ def chain_index(packed: Any) -> Any:
 
 
 def event_counts(later: Any, earlier: Any) -> tuple[Any, Any]:
-    """Count the events of a pixel after an earlier row, up to and including a later one.
+    """Count the events of a pixel after an earlier row, up to and including a later one, and what it misses after each.
 
-    A pixel is blind for the refractory period τ after an event. Where a single event of the same polarity follows after
-    an interval dt, log-radiance is taken to change steadily: by τ / (dt − τ) thresholds, at most 7/8, while the pixel
-    is blind. This counts for the event that made it blind. Being less than one, it leaves the number of events that
-    share a time the whole part of what is counted from the row before.
+    A pixel is blind for the refractory period τ after an event. In an interval dt between two single events,
+    log-radiance changes by 1 / (dt − τ) thresholds per nanosecond on average. Between the middles of the two intervals
+    around an event this rate is taken to change steadily. What the pixel misses is τ times the rate in the middle of
+    its blindness, at most 4 thresholds. It counts for the event that made the pixel blind, in its own polarity.
 
     Args:
         later: packed numbers of rows.
@@ -163,6 +165,24 @@ def event_counts(later: Any, earlier: Any) -> tuple[Any, Any]:
     positive = (later - earlier) & COUNT_MASK
     negative = ((later >> NEGATIVE_SHIFT) - (earlier >> NEGATIVE_SHIFT)) & COUNT_MASK
     return positive / COUNT_UNIT, negative / COUNT_UNIT
+
+
+def own_counts(later: Any, before: Any) -> tuple[Any, Any]:
+    """Count the events of each row, given the row before it, without what their pixel misses after them.
+
+    Only a single event has something missed after it, of one polarity and never a whole number. So a whole count is of
+    events. A count that is not whole has the event if the other polarity has none.
+
+    Returns:
+        Numbers of positive and of negative events.
+    """
+    positive, negative = event_counts(later, before)
+    return _own(positive, negative), _own(negative, positive)
+
+
+def _own(count: Any, other: Any) -> Any:
+    is_whole = count % 1 == 0
+    return count * is_whole + (other == 0) * ~is_whole
 
 
 def map_rows(file: BinaryIO, num_rows: int) -> NDArray[np.int64]:

@@ -18,6 +18,7 @@ from aenerf_ns.events.pair_store import (
     COUNT_MASK,
     COUNT_UNIT,
     MAX_JOINED,
+    MAX_MISSED,
     MAX_SPAN,
     NEGATIVE_SHIFT,
     PIXEL_SHIFT,
@@ -31,10 +32,6 @@ from aenerf_ns.events.pair_store import (
 from aenerf_ns.events.stream import EventStream
 
 _MAX_MERGED = 255
-
-# A pair spans an event only where the intervals on both sides of it are so many refractory periods long. At a steady
-# rate, at most a third of a contrast threshold then goes unseen. Shorter pairs would cost more (benchmarks/LOG.md).
-_INTERVAL_TO_REFRACTORY_PERIOD = 4
 
 EVENTS_IN_MEMORY = 1 << 27
 """The most events that stay in memory, if there is a file for more: 16 bytes each, twice while they are sorted."""
@@ -60,8 +57,7 @@ def pair_events(
 
     Args:
         chunks: the stream in pieces, in the order of time, all of one sensor.
-        refractory_period: τ in nanoseconds. An event at most τ after the previous event of its pixel gives no pair. A
-            pair is joined with others only if its interval is at least 4 τ, and theirs are.
+        refractory_period: τ in nanoseconds. An event at most τ after the previous event of its pixel gives no pair.
         window: events outside the window are left out, and no pair spans a gap.
         usable: (height, width) whether the events of a pixel are used. None: all are.
         open_file: called once if the events are too many for memory. Returns a new file, open for reading and writing,
@@ -319,15 +315,6 @@ def _sort_into(entries, first_pixel, next_rows, rows):
 
 
 @numba.njit(cache=True)
-def missed_thresholds(interval, refractory_period):
-    """Return the thresholds, at most 7/8, that a pixel misses while it is blind, between two events of one polarity.
-
-    See :func:`aenerf_ns.events.pair_store.event_counts`. The interval in nanoseconds is longer than the period.
-    """
-    return min(refractory_period / (interval - refractory_period), (COUNT_UNIT - 1) / COUNT_UNIT)
-
-
-@numba.njit(cache=True)
 def _finish(rows, row, num_chains, refractory_period, block_ends):
     """Put maximum span and sums into the next rows, which hold each event's own counts, and add up the ends of blocks.
 
@@ -336,9 +323,8 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
 
     For the change that a blind pixel misses see :func:`aenerf_ns.events.pair_store.event_counts`.
     """
-    span = positive = negative = last_own = 0
-    rest = 0.0
-    was_long = False
+    span = positive = negative = last_interval = 0
+    rest = last_rate = 0.0
     for i in range(rows.shape[0]):
         block = (row + i) // BLOCK
         if (row + i) % BLOCK == 0:
@@ -348,31 +334,37 @@ def _finish(rows, row, num_chains, refractory_period, block_ends):
         if (own >> SPAN_SHIFT) & SPAN_MASK == 0:
             rows[i, 1] = pixel << PIXEL_SHIFT | num_chains
             num_chains += 1
-            positive = negative = last_own = 0
-            rest = 0.0
-            was_long = False
+            span = positive = negative = last_interval = 0
+            rest = last_rate = 0.0
             continue
         own &= (1 << SPAN_SHIFT) - 1
         interval = rows[i, 0] - rows[i - 1, 0]
         # A sum that has overflowed once stays negative, which tells of it.
         if block_ends[block + 1] >= 0:
             block_ends[block + 1] += interval
-        if refractory_period > 0 and own == last_own and (own == 1 or own == 1 << NEGATIVE_SHIFT):
-            # Rounding down leaves a rest, which is added at the next event.
-            rest += COUNT_UNIT * missed_thresholds(interval, refractory_period)
-            missed = int(rest)
-            rest -= missed
-            positive = (positive + missed * (own == 1)) & COUNT_MASK
-            negative = (negative + missed * (own != 1)) & COUNT_MASK
+        rate = 0.0
+        if own == 1 or own == 1 << NEGATIVE_SHIFT:
+            rate = (1 if own == 1 else -1) / (interval - refractory_period)
+        if refractory_period > 0 and rate * last_rate != 0:
+            # Both are mean rates, of the time without the blindness. In the middle of the blindness between them, a
+            # line through them is as far from each as the other's interval is long.
+            missed = (last_rate * interval + rate * last_interval) / (last_interval + interval) * refractory_period
+            # Rounding leaves a rest, which is added at the next event.
+            rest += COUNT_UNIT * min(max(missed, -MAX_MISSED), MAX_MISSED)
+            eighths = int(rest)
+            # Whole thresholds would pass for events.
+            if eighths % COUNT_UNIT == 0:
+                eighths -= np.sign(eighths)
+            rest -= eighths
+            positive = (positive + max(eighths, 0)) & COUNT_MASK
+            negative = (negative - min(eighths, 0)) & COUNT_MASK
             rows[i - 1, 1] = rows[i - 1, 1] >> SPAN_SHIFT << SPAN_SHIFT | negative << NEGATIVE_SHIFT | positive
-        last_own = own
-        is_long = interval >= _INTERVAL_TO_REFRACTORY_PERIOD * refractory_period
-        is_long &= max(own & COUNT_MASK, own >> NEGATIVE_SHIFT) <= MAX_JOINED
-        span = min(span + 1, MAX_SPAN) if is_long and was_long else 1
-        was_long = is_long
+        last_rate, last_interval = rate, interval
+        is_few = max(own & COUNT_MASK, own >> NEGATIVE_SHIFT) <= MAX_JOINED
+        span = min(span + 1, MAX_SPAN) if is_few else 0
         positive = (positive + COUNT_UNIT * (own & COUNT_MASK)) & COUNT_MASK
         negative = (negative + COUNT_UNIT * (own >> NEGATIVE_SHIFT)) & COUNT_MASK
-        rows[i, 1] = pixel << PIXEL_SHIFT | span << SPAN_SHIFT | negative << NEGATIVE_SHIFT | positive
+        rows[i, 1] = pixel << PIXEL_SHIFT | max(span, 1) << SPAN_SHIFT | negative << NEGATIVE_SHIFT | positive
     return num_chains
 
 

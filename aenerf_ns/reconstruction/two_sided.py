@@ -10,7 +10,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from aenerf_ns.events.pairing import missed_thresholds
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 
@@ -34,8 +33,7 @@ def log_intensities(
     with a decay in events and a blur where events are few.
 
     A pixel is blind for the refractory period τ after an event. Where an event of the same polarity follows after an
-    interval dt, the pixel is taken to have missed τ / (dt − τ) thresholds, at most 7/8, as training takes it to
-    (:func:`aenerf_ns.events.pair_store.event_counts`).
+    interval dt, the pixel is taken to have missed τ / (dt − τ) thresholds, at most 7/8.
 
     Args:
         batches: the stream in consecutive pieces, in the order of time, all of one sensor.
@@ -128,7 +126,7 @@ def _integrate(state, last, time, polarity, x, y, t, p, count, decay, rise, fall
         change = rise[row, column] if p[event] > 0 else fall[row, column]
         interval = abs(t[event] - time[row, column])
         if polarity[row, column] == p[event] and interval > refractory_period:
-            change *= 1 + missed_thresholds(interval, refractory_period)
+            change *= 1 + min(refractory_period / (interval - refractory_period), 7 / 8)
         kept = np.exp(-decay * (count + event - last[row, column])) * state[row, column]
         state[row, column] = kept + change
         last[row, column] = count + event

@@ -24,7 +24,7 @@ from aenerf_ns.events.pair_store import BLOCK, EventPairs, map_rows
 from aenerf_ns.files.event_reader import EventFile
 
 # Counted up when the layout of the file, of the rows or of what is kept with them changes.
-_VERSION = 5
+_VERSION = 6
 # Attributes of a reader of events that are no options. The last four are read from the file when they are asked for.
 _NOT_OPTIONS = ("path", "left_out", "_span", "_clock_offset", "_stated_unit", "_with_commas")
 _STORED = tuple(field.name for field in fields(EventPairs) if field.name != "rows")

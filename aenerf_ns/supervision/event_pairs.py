@@ -24,6 +24,7 @@ from aenerf_ns.events.pair_store import (
     event_counts,
     is_pair,
     max_span,
+    own_counts,
     pixel_index,
 )
 from aenerf_ns.events.sensor import SensorModel
@@ -43,6 +44,8 @@ _SHARE_OF_FREE_MEMORY = 0.5
 
 # Variance of rendered changes, in squared contrast thresholds, around what a pixel whose thresholds are right tells.
 _RENDERED_VARIANCE = 0.25
+# Of what a blind pixel misses, in squared contrast thresholds, for each threshold that it is taken to miss.
+_MISSED_VARIANCE = 0.25
 
 # t_sam: a truncated normal distribution over the interval of the pair's last event.
 _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
@@ -235,8 +238,7 @@ class PairSamplerConfig(SamplerConfig):
 
     _target: type = field(default_factory=lambda: PairSampler)
     max_events_per_pair: int = 64
-    """The most events of its pixel that a pair spans, up to 255. 1: consecutive events, as in the paper. Pairs are of
-    consecutive events wherever the refractory period is more than a quarter of the interval between two events."""
+    """The most events of its pixel that a pair spans, up to 255. 1: consecutive events, as in the paper."""
     silent_pair_share: float = 0.25
     """Share of the pairs of a batch that end at a random moment at a random pixel, between two events. The others end
     at a random event. 0: all of them, as in the paper."""
@@ -258,10 +260,9 @@ class PairSampler(Sampler):
     of it (:mod:`aenerf_ns.events.polarity_drift`), and pairs count less, the more is left of it.
 
     A pair's interval is [earlier time + refractory period, time of the later event or of the moment]. What a pixel
-    misses while it is blind, between the two, is counted as if log-radiance changed steadily. Where events follow each
-    other within a few refractory periods that says too little, and pairs do not reach back over them. A learned
-    refractory period needs pairs of consecutive events and none that end at moments, because the pixel may be blind at
-    a moment.
+    misses while it is blind, between the two, is taken from the rates of events around it
+    (:func:`~aenerf_ns.events.pair_store.event_counts`), and pairs count less, the more they miss. A learned refractory
+    period needs pairs of consecutive events and none that end at moments, because the pixel may be blind at a moment.
 
     Draws from torch's global generator of the device that holds the pairs, which Nerfstudio seeds. That is the device
     of the batches if the pairs take at most half of the device's free memory. Otherwise the pairs stay in host memory,
@@ -328,7 +329,7 @@ class PairSampler(Sampler):
         num_pairs = max(num_rays // (3 if with_time_within else 2), 1)
         device = self.pixel_rays.channels.device
         num_silent = round(self._silent_pair_share * num_pairs)
-        rows = self._table.draw(num_silent, num_pairs - num_silent, self._max_events_per_pair)
+        rows, spans = self._table.draw(num_silent, num_pairs - num_silent, self._max_events_per_pair)
         times, packed = rows.permute(2, 1, 0)
         end = self.pixel_rays.trajectory.seconds(times[0])
         last_start, start = self.pixel_rays.trajectory.seconds(times[1:] + self._refractory_period)
@@ -343,15 +344,19 @@ class PairSampler(Sampler):
             within.erfinv_().mul_(_WITHIN_DEVIATION * math.sqrt(2)).add_(_WITHIN_MEAN)
             seconds.append(last_start + within * last_interval)
         # The pair ends with its last event, so the change that the pixel misses after that event does not count.
-        last_count = torch.stack(event_counts(packed[0], packed[1])).floor()
+        last_count = torch.stack(own_counts(packed[0], packed[1]))
         count = torch.stack(event_counts(packed[1], packed[2]))
         # A pair that ends at a moment has not seen its last event.
         count[:, num_silent:] += last_count[:, num_silent:]
+        spans[:num_silent] -= 1
         pixel = pixel_index(packed[0])
         drift, variance, variance_of_all = self._drift
         num_events, surplus = count.sum(0), count[0] - count[1]
         # Thresholds that are both too large or too small make no drift, and differ between pixels as much.
         unknown = variance[pixel] * num_events**2 + variance_of_all * surplus**2
+        if self._refractory_period > 0:
+            # Events that share a pixel and a time are rare where there is a refractory period.
+            unknown = unknown + _MISSED_VARIANCE * (num_events - spans)
         batch = PairBatch(
             num_positive=count[0],
             num_negative=count[1],
@@ -401,7 +406,7 @@ class _PairTable:
                 torch.from_numpy(array).to(self._device) for array in arrays
             )
 
-    def draw(self, num_moments: int, num_events: int, max_events: int) -> Tensor:
+    def draw(self, num_moments: int, num_events: int, max_events: int) -> tuple[Tensor, Tensor]:
         """Draw pairs: first around uniform moments at uniform pixels, then pairs that end at uniform events.
 
         Args:
@@ -410,8 +415,7 @@ class _PairTable:
             max_events: the most events that a pair spans.
 
         Returns:
-            (N, 3, 2) int64 rows of the table on the device of the batches: of the event that the pair ends with, of the
-            event of its pixel before, and of the event that the pair begins with.
+            As :func:`find_rows`, on the device of the batches.
         """
         device = self._device
         moments = torch.randint(self._duration, (num_moments,), device=device)
@@ -421,15 +425,16 @@ class _PairTable:
         else:
             spans = (max_events + 1) ** torch.rand(num_moments + num_events, dtype=torch.float64, device=device)
             spans = spans.long().clamp_(max=max_events)
-        rows = find_rows(self._rows, self._replacement_rows, self._block_ends, moments, events, spans)
+        found = find_rows(self._rows, self._replacement_rows, self._block_ends, moments, events, spans)
         if device != self._batch_device:
-            rows = rows.pin_memory().to(self._batch_device, non_blocking=True)
-        return rows
+            rows, spans = (part.pin_memory().to(self._batch_device, non_blocking=True) for part in found)
+            return rows, spans
+        return found
 
 
 def find_rows(
     rows: Tensor, replacement_rows: Tensor, block_ends: Tensor, moments: Tensor, events: Tensor, spans: Tensor
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Find the rows of pairs in a table of pairs, without waiting for a GPU.
 
     Args:
@@ -440,7 +445,7 @@ def find_rows(
 
     Returns:
         (N, 3, 2) int64 rows: of the event that the pair ends with, of the event of its pixel before, and of the event
-        that the pair begins with.
+        that the pair begins with. (N,) int64, how many consecutive pairs are joined.
     """
     number = rows[:, 1][events]
     starts_chain = ~is_pair(number)
@@ -452,4 +457,4 @@ def find_rows(
     ends = block_ends[block + 1][:, None] - elapsed[:, -1:] + elapsed
     row = torch.cat([BLOCK * block + (ends <= moments[:, None]).sum(1), by_event])
     spans = spans.minimum(max_span(rows[:, 1][row]))
-    return rows[torch.stack([row, row - 1, row - spans], 1)]
+    return rows[torch.stack([row, row - 1, row - spans], 1)], spans

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.errors import DataError
-from aenerf_ns.events.pair_store import EventPairs, event_counts
+from aenerf_ns.events.pair_store import EventPairs, event_counts, own_counts
 from aenerf_ns.events.pairing import pair_events
 from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
@@ -60,7 +60,7 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     unused: int,
     window: tuple[int, int],
 ) -> None:
-    # Intervals that are shorter and longer than 4 refractory periods, in nanoseconds of Unix time.
+    # In nanoseconds of Unix time.
     rows = [(x, y, EPOCH + 3 * t, p) for x, y, t, p in rows]
     start, end = (EPOCH + time for time in window)
     usable = (unused >> np.arange(WIDTH * HEIGHT) & 1 == 0).reshape(HEIGHT, WIDTH)
@@ -85,13 +85,11 @@ def test_pairs_are_those_of_brute_force_however_the_stream_is_cut(
     distinct = len({(x, y, t) for x, y, t, _ in used})
     assert pairs.num_merged == len(used) - distinct >= sum(pair[4] + pair[5] - 1 for pair in found)
     assert len(pairs) + pairs.num_first + pairs.num_within_refractory_period == distinct
-    # A pair is joined with the pair that ends where it begins, if neither is too short.
+    # A pair is joined with the pair that ends where it begins.
     reaches: dict[tuple[int, int, int], int] = {}
     for x, y, begin, end, _, _, reach in found:
-        is_long = end - begin >= 4 * refractory_period
-        assert reach == 1 + (reaches.get((x, y, begin), 0) if is_long else 0)
-        if is_long:
-            reaches[x, y, end] = reach
+        assert reach == 1 + reaches.get((x, y, begin), 0)
+        reaches[x, y, end] = reach
     # The same in a file.
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "rows").open("w+b") as file:
         in_file = pair_events(
@@ -125,14 +123,15 @@ def test_pairs_are_found_by_place_and_by_number(
     events = np.arange(len(pairs))
     spans = generator.integers(1, 12, len(places) + len(events))
     arguments = (pairs.rows, pairs.replacement_rows, pairs.block_ends, places, events, spans)
-    found = find_rows(*map(torch.from_numpy, arguments))
+    found, joined = find_rows(*map(torch.from_numpy, arguments))
     ends = {(y * WIDTH + x, time): index for index, (x, y, _, time, *_) in enumerate(known)}
     drawn = []
-    for (end, before, first), span in zip(found.tolist(), spans.tolist(), strict=True):
+    for (end, before, first), span, num_joined in zip(found.tolist(), spans.tolist(), joined.tolist(), strict=True):
         index = ends[end[1] >> 40, end[0]]
         drawn.append(index)
         assert before[0] == known[index][2]
-        assert first[0] == known[index + 1 - min(span, known[index][6])][2]
+        assert num_joined == min(span, known[index][6])
+        assert first[0] == known[index + 1 - num_joined][2]
     assert drawn[: len(places)] == np.searchsorted(durations, places, side="right").tolist()
     assert sorted(drawn[len(places) :]) == list(range(len(known)))
 
@@ -160,8 +159,8 @@ def test_what_a_blind_pixel_misses_is_counted() -> None:
     assert num_events == 40
     for first in range(1, num_events - 3):
         for last in range(first + 1, num_events):
-            own = np.floor(event_counts(rows[last, 1], rows[last - 1, 1]))
-            positive, negative = own + event_counts(rows[last - 1, 1], rows[first, 1])
+            own = own_counts(rows[last, 1], rows[last - 1, 1])
+            positive, negative = np.array(own) + event_counts(rows[last - 1, 1], rows[first, 1])
             interval = rows[first, 0] + 2_000_000, rows[last, 0]
             begin, end = np.interp(interval, 1_000_000 * np.arange(602), log_radiance)
             # Rounding, and where the rise ends: what it rises after its last event has no event.

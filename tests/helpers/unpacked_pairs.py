@@ -12,8 +12,9 @@ def unpacked(pairs: EventPairs) -> list[tuple[int, ...]]:
     for row, (time, number) in enumerate(pairs.rows.tolist()):
         pixel, reach, low = number >> 40, number >> 32 & 255, number & 0xFFFFFFFF
         if reach:
-            # Whole events: the rest is what the pixel is blind to after them.
-            counts = ((low - positive) & 0xFFFF) // 8, (((low >> 16) - negative) & 0xFFFF) // 8
+            # In eighths of an event, with what the pixel is blind to after it: no whole number of events.
+            sums = (low - positive) & 0xFFFF, ((low >> 16) - negative) & 0xFFFF
+            counts = tuple(int(other == 0) if own % 8 else own // 8 for own, other in (sums, sums[::-1]))
             positive, negative = low & 0xFFFF, low >> 16
             place = (pixel % pairs.width, pixel // pairs.width)
             found.append((*place, int(pairs.rows[row - 1, 0]), time, *counts, reach))
