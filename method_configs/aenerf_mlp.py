@@ -10,7 +10,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from aenerf_ns.method.networks import FieldConfig, ProposalConfig
 from aenerf_ns.method.pose_correction import PoseCorrectionConfig
 from aenerf_ns.method_configs.aenerf import aenerf, optimized_by
-from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSamplerConfig
+from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSamplerConfig, PairSupervisionConfig
 from aenerf_ns.training.schedules import RelativeMultiStepSchedulerConfig
 from aenerf_ns.training.trainer import AENeRFTrainerConfig
 
@@ -35,6 +35,7 @@ def _make_config() -> AENeRFTrainerConfig:
     model.proposal = ProposalConfig(num_samples_per_ray=(64, 64), num_hidden_layers=4, hidden_dim=256)
     model.camera_optimizer = PoseCorrectionConfig(mode="network", trans_l2_penalty=0.0, rot_l2_penalty=0.0)
     model.moving_field = False
+    model.supervision = PairSupervisionConfig(allow_for_bandwidth=False)
     model.loss_coefficients = PairLossCoefficients(temporal_loss=1e-3)
     # docs/method.md has the reason for each number that is not the paper's 0.01.
     for group, adam in {

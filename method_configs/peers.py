@@ -65,7 +65,7 @@ robust_enerf, robust_enerf_small = peer(
     "Robust e-NeRF's supervision",
     "pairs of consecutive events",
     PairSamplerConfig(max_events_per_pair=1, silent_pair_share=0.0),
-    PairSupervisionConfig(),
+    PairSupervisionConfig(allow_for_bandwidth=False),
     PairLossCoefficients(),
     # Its own is 0.37. AE-NeRF's suits objects; in a room it costs 3 dB, and PAEv3D 2 dB (benchmarks/LOG.md).
     unbounded_init_density=0.3,

@@ -111,6 +111,7 @@ class Simulate(SimulationCommand):
                 writer.add_poses_report(report)
             for events in simulation.events():
                 writer.events.append(events)
+            writer.sensor = simulator.recorded_sensor()
             if writer.events.num_events == 0:
                 remedy = "give lower thresholds, or a scene with more contrast"
                 raise DataError(self.scene, "no pixel changes by a contrast threshold", remedy)

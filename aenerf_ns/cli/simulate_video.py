@@ -230,6 +230,7 @@ class SimulateVideo(SimulationCommand):
         for interval in video_events(video, simulator, self.interpolation, self.max_displacement):
             writer.events.append(interval.events)
             yield interval
+        writer.sensor = simulator.recorded_sensor()
         if writer.events.num_events == 0:
             raise DataError(video.source, "no pixel changes by a contrast threshold", "give a video of a moving camera")
 

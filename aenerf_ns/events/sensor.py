@@ -1,4 +1,4 @@
-"""The event sensor model: contrast thresholds, refractory period and Bayer pattern."""
+"""The event sensor model: contrast thresholds, refractory period, bandwidth and Bayer pattern."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ _MAX_PIXELS = 1 << 22
 _THRESHOLDS = (1e-4, 1e3)
 # Nanoseconds. Refractory periods are microseconds to milliseconds long.
 _MAX_REFRACTORY_PERIOD = 10**12
+# Hertz. Photoreceptors follow 1 Hz to 10 kHz.
+_MAX_BANDWIDTH = 1e9
 
 
 @dataclass(frozen=True)
@@ -32,16 +34,19 @@ class SensorModel:
         refractory_period: τ in nanoseconds. A pixel is blind for this time after each of its events.
         bayer_pattern: the color filters of the first two pixels of the first row and of the second, "RGGB" where pixel
             (0, 0) is red; "" for a monochrome sensor.
+        bandwidth: cutoff frequency in Hz of the low-pass filter through which a pixel sees log-radiance, where that has
+            its mean over the recording. 0 if it is not known: pixels are then taken to follow at once.
 
     Raises:
-        ValueError: a threshold is below 1e-4 or above 1e3, the refractory period is negative or beyond 1000 s, or the
-            pattern is unknown.
+        ValueError: a threshold is below 1e-4 or above 1e3, the refractory period is negative or beyond 1000 s, the
+            bandwidth is negative or beyond 1 GHz, or the pattern is unknown.
     """
 
     positive_contrast_threshold: float = 0.25
     negative_contrast_threshold: float = 0.25
     refractory_period: int = 0
     bayer_pattern: BayerPattern = ""
+    bandwidth: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("positive_contrast_threshold", "negative_contrast_threshold"):
@@ -52,6 +57,8 @@ class SensorModel:
             raise ValueError(
                 f"refractory_period must be from 0 to {_MAX_REFRACTORY_PERIOD:g} ns, not {self.refractory_period:g}"
             )
+        if not 0 <= self.bandwidth <= _MAX_BANDWIDTH:
+            raise ValueError(f"bandwidth must be from 0 to {_MAX_BANDWIDTH:g} Hz, not {self.bandwidth:g}")
         if self.bayer_pattern not in get_args(BayerPattern):
             known = ", ".join(f'"{pattern}"' for pattern in get_args(BayerPattern))
             raise ValueError(f'bayer_pattern must be one of {known}, not "{self.bayer_pattern}"')
@@ -70,8 +77,9 @@ class SensorModel:
 
 def sensor_values(stated: object) -> dict[str, Any]:
     """Return by their names in :class:`SensorModel` the values that an event camera, or the options, state: those
-    attributes of the same names, and ``refractory_period_ns``, that are not None."""
-    names = {field.name: field.name for field in fields(SensorModel)} | {"refractory_period": "refractory_period_ns"}
+    attributes of the same names, ``refractory_period_ns`` and ``bandwidth_hz``, that are not None."""
+    names = {field.name: field.name for field in fields(SensorModel)}
+    names |= {"refractory_period": "refractory_period_ns", "bandwidth": "bandwidth_hz"}
     values = {name: getattr(stated, key, None) for name, key in names.items()}
     return {name: value for name, value in values.items() if value is not None}
 

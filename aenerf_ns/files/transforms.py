@@ -74,6 +74,7 @@ class EventCamera(_Camera, kw_only=True):
     positive_contrast_threshold: float | None = None
     negative_contrast_threshold: float | None = None
     refractory_period_ns: int = 0
+    bandwidth_hz: float = 0.0
     bayer_pattern: str = ""
     T_frame_event: Matrix | None = None
 

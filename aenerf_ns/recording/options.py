@@ -81,6 +81,9 @@ class SensorOptions:
     """C-, in place of the dataset's value or of the assumed one. Its ratio to C+ matters."""
     refractory_period_ns: int | None = None
     """Time for which a pixel is blind after each event, in nanoseconds, in place of the dataset's value."""
+    bandwidth_hz: float | None = None
+    """Cutoff frequency in Hz of the pixels' low-pass filter at the recording's mean log-radiance, in place of the
+    dataset's value. 0: pixels follow at once."""
 
 
 @dataclass

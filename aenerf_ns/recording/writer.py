@@ -42,15 +42,19 @@ class _FolderWriter(ABC):
 
     Args:
         folder: the folder to create, or the lock on it that the caller holds.
+        sensor: see ``sensor`` below.
 
     Raises:
         DataError: the folder exists, cannot be created, or is being written by another process.
 
     Attributes:
         events: its method ``append`` takes the events, piece by piece in the order of time.
+        sensor: the sensor that took the events. Its bandwidth is written when the block ends, and may be set until
+            then.
     """
 
-    def __init__(self, folder: Path | OutputLock) -> None:
+    def __init__(self, folder: Path | OutputLock, sensor: SensorModel) -> None:
+        self.sensor = sensor
         self._cleanup = ExitStack()
         lock = self._cleanup.enter_context(OutputLock(folder)) if isinstance(folder, Path) else folder
         self._folder, self._partial = lock.output, lock.partial
@@ -117,7 +121,7 @@ class NativeDatasetWriter(_FolderWriter):
         has_estimated_intrinsics: bool = False,
         has_assumed_thresholds: bool = False,
     ) -> None:
-        super().__init__(folder)
+        super().__init__(folder, sensor)
         frame_camera = event_camera if frame_camera is None else frame_camera
         self._files: dict[Path, dict[str, Any]] = {}
         self._meta: dict[str, Any] = {
@@ -143,6 +147,7 @@ class NativeDatasetWriter(_FolderWriter):
     def _finish(self) -> None:
         if not (self._partial / "trajectory_estimated.txt").exists():
             raise ValueError("the dataset has no trajectory: call add_trajectories before leaving the block")
+        self._meta["event_camera"]["bandwidth_hz"] = self.sensor.bandwidth
         _write_json(self._partial / "transforms.json", self._meta)
 
     def add_trajectories(self, estimated: Trajectory, ground_truth: Trajectory | None = None) -> None:
@@ -249,15 +254,15 @@ class PoselessRecordingWriter(_FolderWriter):
     """
 
     def __init__(self, folder: Path | OutputLock, camera: CameraIntrinsics | None, sensor: SensorModel) -> None:
-        super().__init__(folder)
-        self._camera, self._sensor = camera, sensor
+        super().__init__(folder, sensor)
+        self._camera = camera
         self._images: list[str] = []
 
     def _finish(self) -> None:
         lines = ["# t[s] file", *self._images]
         (self._partial / IMAGE_LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
         if self._camera is not None:
-            calibration = {"image_encoding": "srgb", "event_camera": _event_camera(self._camera, self._sensor)}
+            calibration = {"image_encoding": "srgb", "event_camera": _event_camera(self._camera, self.sensor)}
             _write_json(self._partial / "calibration.json", calibration)
 
     def add_image(self, image: NDArray[np.uint8], time: int) -> None:
@@ -283,5 +288,6 @@ def _event_camera(camera: CameraIntrinsics, sensor: SensorModel) -> dict[str, An
         "positive_contrast_threshold": sensor.positive_contrast_threshold,
         "negative_contrast_threshold": sensor.negative_contrast_threshold,
         "refractory_period_ns": sensor.refractory_period,
+        "bandwidth_hz": sensor.bandwidth,
         "bayer_pattern": sensor.bayer_pattern,
     }

@@ -8,6 +8,7 @@ time. So a pixel may fire any number of events between two frames. What makes a 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -247,6 +248,8 @@ class EventSimulator:
         # Of the last frame: the intensity, its logarithm, that filtered, and the same with the leak.
         self._last: tuple[NDArray[np.float64], ...] = ()
         self._time_ns = 0
+        # The sum over time of the mean logarithm of the light that the bandwidth follows.
+        self._log_light = 0.0
 
     def __call__(self, image: ArrayLike, time_ns: int) -> Events:
         """Show the sensor the next frame.
@@ -282,6 +285,7 @@ class EventSimulator:
             if self._bandwidth is not None:
                 light = ((last_intensity + intensity) / 2 + _DARK_RADIANCE) / (1 + _DARK_RADIANCE)
                 time_constants = 2e-9 * math.pi * self._bandwidth * light * (time_ns - self._time_ns)
+                self._log_light += np.log(light).mean() * (time_ns - self._time_ns)
                 filtered = _low_pass(last_filtered, last_log, log_intensity, time_constants)
             signal = filtered + self._leak * (time_ns - self._start_ns)
             events = _frame_events(
@@ -306,6 +310,13 @@ class EventSimulator:
         y, x = np.divmod(pixels, self.width)
         self._last, self._time_ns = (intensity, log_intensity, filtered, signal), time_ns
         return x.astype(np.uint16), y.astype(np.uint16), t - t % self._tick, p.astype(np.int8)
+
+    def recorded_sensor(self) -> SensorModel:
+        """Return the sensor, with the bandwidth that its pixels had on average over the frames."""
+        if self._bandwidth is None:
+            return self.sensor
+        mean = self._log_light / max(self._time_ns - self._start_ns, 1)
+        return replace(self.sensor, bandwidth=self._bandwidth * math.exp(mean))
 
     def readout_note(self) -> str:
         """Say how many events the readout lost, and how long it delayed others."""

@@ -47,6 +47,10 @@ _RENDERED_VARIANCE = 0.25
 # Of what a blind pixel misses, in squared contrast thresholds, for each threshold that it is taken to miss.
 _MISSED_VARIANCE = 0.25
 
+# The radiance that a dark pixel seems to see where its bandwidth is concerned, over the mean one: v2e's 20 / 255 of
+# white, for a recording whose mean is 0.4 of white.
+_DARK_RADIANCE = 0.2
+
 # t_sam: a truncated normal distribution over the interval of the pair's last event.
 _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
 # Share of the distribution before it is cut.
@@ -71,6 +75,8 @@ class PairBatch(ChangeBatch):
         drift: (N,) float, how much of the change that the events tell of is due to the pixel's thresholds, in units of
             the mean contrast threshold.
         weight: (N,) float, the variance of a rendered change over that of its difference from the events' change.
+        start_rate: (N,) float, contrast thresholds that the pixel's signal rises by in a second at the first time.
+        end_rate: (N,) float, the same at the second time.
     """
 
     ends_between_events: Tensor
@@ -80,6 +86,8 @@ class PairBatch(ChangeBatch):
     pixel: Tensor
     drift: Tensor
     weight: Tensor
+    start_rate: Tensor
+    end_rate: Tensor
 
 
 @dataclass
@@ -101,6 +109,8 @@ class PairSupervisionConfig(SupervisionConfig):
     learn_refractory_period: bool = False
     """Learn the time for which a pixel is blind after each event, from the dataset's value. It can be at most the
     shortest interval between two events of a pixel. All pairs are then of consecutive events."""
+    allow_for_bandwidth: bool = True
+    """Allow for the lag of slow pixels, where the dataset states a bandwidth."""
 
 
 class PairSupervision(ChangeSupervision):
@@ -195,9 +205,35 @@ class PairSupervision(ChangeSupervision):
         return positive, self.sensor.negative_contrast_threshold
 
     def changes(self, outputs: Mapping[str, Any], batch: PairBatch) -> tuple[Tensor, Tensor]:
-        """Return the (N,) changes as rendered, and as the events say, less the drift of their pixels."""
+        """Return the (N,) changes as rendered, and as the events say, less the drift and the lag of their pixels."""
         rendered, change = super().changes(outputs, batch)
-        return rendered, change - batch.drift * self.loss_unit(outputs)
+        change = change - batch.drift * self.loss_unit(outputs)
+        if self.uses_bandwidth:
+            change = change + self._lag_change(outputs, batch)
+        return rendered, change
+
+    @property
+    def uses_bandwidth(self) -> bool:
+        """Whether the lag of slow pixels is allowed for, which takes the rates of their signals."""
+        return self.config.allow_for_bandwidth and self.sensor.bandwidth > 0
+
+    def _lag_change(self, outputs: Mapping[str, Any], batch: PairBatch) -> Tensor:
+        """Return the (N,) changes of what log-radiance is ahead of the signals that fire events.
+
+        The signal s follows log-radiance x through a low-pass filter of first order, ds/dt = (x − s) / T. So x is ahead
+        by T ds/dt, and ds/dt is the rate at which events follow each other. 1 / T is 2π times the bandwidth at the mean
+        of log-radiance, and rises with the rendered radiance.
+        """
+        positive, negative = self.thresholds(outputs)
+        ends = outputs["log_radiance"].detach().split(len(batch))[:2]
+        log_radiance = torch.stack([end.gather(1, batch.channel[:, None])[:, 0] for end in ends])
+        # Pairs that end at a moment are uniform over pixels and time. Without such pairs all are taken.
+        uniform = batch.ends_between_events | ~batch.ends_between_events.any()
+        mean = (log_radiance[1] * uniform).sum() / uniform.sum()
+        light = ((log_radiance - mean).exp() + _DARK_RADIANCE) / (1 + _DARK_RADIANCE)
+        rates = torch.stack([batch.start_rate, batch.end_rate])
+        ahead = rates * torch.where(rates > 0, positive, negative) / (2 * math.pi * self.sensor.bandwidth * light)
+        return ahead[1] - ahead[0]
 
     def losses(self, outputs: Mapping[str, Any], batch: PairBatch) -> dict[str, Tensor]:
         """Return the reconstruction loss (eq. 11), and while training the temporal loss (eq. 12) where it is on."""
@@ -301,6 +337,7 @@ class PairSampler(Sampler):
         self._silent_pair_share = 0.0 if consecutive else config.silent_pair_share
         self._needs_rates = supervision.needs_rates
         self._refractory_period = dataset.scene.sensor.refractory_period
+        self._needs_signal_rates = supervision.uses_bandwidth
 
     def prepare(self) -> None:
         """See :meth:`Sampler.prepare`."""
@@ -329,10 +366,12 @@ class PairSampler(Sampler):
         num_pairs = max(num_rays // (3 if with_time_within else 2), 1)
         device = self.pixel_rays.channels.device
         num_silent = round(self._silent_pair_share * num_pairs)
-        rows, spans = self._table.draw(num_silent, num_pairs - num_silent, self._max_events_per_pair)
+        rows, spans = self._table.draw(
+            num_silent, num_pairs - num_silent, self._max_events_per_pair, with_neighbors=self._needs_signal_rates
+        )
         times, packed = rows.permute(2, 1, 0)
         end = self.pixel_rays.trajectory.seconds(times[0])
-        last_start, start = self.pixel_rays.trajectory.seconds(times[1:] + self._refractory_period)
+        last_start, start = self.pixel_rays.trajectory.seconds(times[1:3] + self._refractory_period)
         last_interval = end - last_start
         # Given the interval that it lies in, a uniform moment is uniform there.
         part = torch.rand(num_silent, dtype=torch.float64, device=device)
@@ -349,6 +388,9 @@ class PairSampler(Sampler):
         # A pair that ends at a moment has not seen its last event.
         count[:, num_silent:] += last_count[:, num_silent:]
         spans[:num_silent] -= 1
+        start_rate = end_rate = torch.zeros(num_pairs, device=device)
+        if self._needs_signal_rates:
+            start_rate, end_rate = self._signal_rates(times, packed, num_silent)
         pixel = pixel_index(packed[0])
         drift, variance, variance_of_all = self._drift
         num_events, surplus = count.sum(0), count[0] - count[1]
@@ -368,8 +410,37 @@ class PairSampler(Sampler):
             pixel=pixel,
             drift=drift[pixel] * num_events,
             weight=_RENDERED_VARIANCE / (_RENDERED_VARIANCE + unknown),
+            start_rate=start_rate,
+            end_rate=end_rate,
         )
         return self.pixel_rays.rays(pixel, seconds), batch
+
+    def _signal_rates(self, times: Tensor, packed: Tensor, num_silent: int) -> tuple[Tensor, Tensor]:
+        """Return the rates of the pixels' signals at the starts and at the ends of pairs.
+
+        In an interval between two events the mean rate is known, without the time for which the pixel is blind. Rates
+        are on lines through the middles of two intervals. Where events are on one side only, and at moments, the rate
+        is that of the interval.
+
+        Args:
+            times, packed: (6, N) of the rows that :meth:`_PairTable.draw` returns with neighbors.
+            num_silent: number of pairs that end at moments, which come first.
+
+        Returns:
+            (N,) thresholds a second at the starts, and at the ends.
+        """
+        # Of the first and of the last event: the event before it, the event itself, and the event after it.
+        order = torch.tensor([[4, 1], [2, 0], [5, 3]], device=times.device)
+        times, packed = times[order], packed[order]
+        is_interval = is_pair(packed[1:])
+        positive, negative = own_counts(packed[1:], packed[:-1])
+        intervals = times.diff(dim=0)
+        rates = torch.where(is_interval, (positive - negative) / (intervals - self._refractory_period), 0) * 1e9
+        # The pixel is blind at first. A pair starts when that ends.
+        blind = self._refractory_period * torch.tensor([[1], [-1]], device=times.device)
+        part = torch.where(is_interval.all(0), (intervals[0] + blind) / intervals.sum(0), is_interval[1])
+        part[1, :num_silent] = 0
+        return torch.lerp(rates[0], rates[1], part).float().unbind(0)
 
     def residual_batch(self, num_rays: int) -> tuple[RayBundle, PairBatch]:
         """Draw a batch to look at, the same in every call, without the random numbers that training would draw next."""
@@ -406,16 +477,21 @@ class _PairTable:
                 torch.from_numpy(array).to(self._device) for array in arrays
             )
 
-    def draw(self, num_moments: int, num_events: int, max_events: int) -> tuple[Tensor, Tensor]:
+    def draw(
+        self, num_moments: int, num_events: int, max_events: int, with_neighbors: bool = False
+    ) -> tuple[Tensor, Tensor]:
         """Draw pairs: first around uniform moments at uniform pixels, then pairs that end at uniform events.
 
         Args:
             num_moments: number of pairs around moments.
             num_events: number of pairs that end at events.
             max_events: the most events that a pair spans.
+            with_neighbors: also return three rows more of each pair: those behind its last event's, before its first
+                event's, and behind it. A row there that is not of the same pixel is a chain start, or comes after one.
 
         Returns:
-            As :func:`find_rows`, on the device of the batches.
+            (N, 3, 2) or (N, 6, 2) int64 rows of the table, first those that :func:`find_rows` finds, and (N,) int64 how
+            many consecutive pairs are joined, on the device of the batches.
         """
         device = self._device
         moments = torch.randint(self._duration, (num_moments,), device=device)
@@ -426,15 +502,20 @@ class _PairTable:
             spans = (max_events + 1) ** torch.rand(num_moments + num_events, dtype=torch.float64, device=device)
             spans = spans.long().clamp_(max=max_events)
         found = find_rows(self._rows, self._replacement_rows, self._block_ends, moments, events, spans)
+        spans = found[:, 0] - found[:, 2]
+        if with_neighbors:
+            last, _, first = found.unbind(1)
+            # The table's first row is a chain start, so it may stand behind the last one.
+            found = torch.cat([found, torch.stack([last + 1, first - 1, first + 1], 1) % len(self._rows)], 1)
+        rows = self._rows[found]
         if device != self._batch_device:
-            rows, spans = (part.pin_memory().to(self._batch_device, non_blocking=True) for part in found)
-            return rows, spans
-        return found
+            rows, spans = (part.pin_memory().to(self._batch_device, non_blocking=True) for part in (rows, spans))
+        return rows, spans
 
 
 def find_rows(
     rows: Tensor, replacement_rows: Tensor, block_ends: Tensor, moments: Tensor, events: Tensor, spans: Tensor
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """Find the rows of pairs in a table of pairs, without waiting for a GPU.
 
     Args:
@@ -444,8 +525,8 @@ def find_rows(
         spans: (N,) int64, how many consecutive pairs to join that end with the found one, if that many may be joined.
 
     Returns:
-        (N, 3, 2) int64 rows: of the event that the pair ends with, of the event of its pixel before, and of the event
-        that the pair begins with. (N,) int64, how many consecutive pairs are joined.
+        (N, 3) int64 numbers of rows: of the event that the pair ends with, of the event of its pixel before, and of the
+        event that the pair begins with.
     """
     number = rows[:, 1][events]
     starts_chain = ~is_pair(number)
@@ -457,4 +538,4 @@ def find_rows(
     ends = block_ends[block + 1][:, None] - elapsed[:, -1:] + elapsed
     row = torch.cat([BLOCK * block + (ends <= moments[:, None]).sum(1), by_event])
     spans = spans.minimum(max_span(rows[:, 1][row]))
-    return rows[torch.stack([row, row - 1, row - spans], 1)], spans
+    return torch.stack([row, row - 1, row - spans], 1)

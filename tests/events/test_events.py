@@ -123,15 +123,14 @@ def test_pairs_are_found_by_place_and_by_number(
     events = np.arange(len(pairs))
     spans = generator.integers(1, 12, len(places) + len(events))
     arguments = (pairs.rows, pairs.replacement_rows, pairs.block_ends, places, events, spans)
-    found, joined = find_rows(*map(torch.from_numpy, arguments))
+    found = pairs.rows[find_rows(*map(torch.from_numpy, arguments))]
     ends = {(y * WIDTH + x, time): index for index, (x, y, _, time, *_) in enumerate(known)}
     drawn = []
-    for (end, before, first), span, num_joined in zip(found.tolist(), spans.tolist(), joined.tolist(), strict=True):
+    for (end, before, first), span in zip(found.tolist(), spans.tolist(), strict=True):
         index = ends[end[1] >> 40, end[0]]
         drawn.append(index)
         assert before[0] == known[index][2]
-        assert num_joined == min(span, known[index][6])
-        assert first[0] == known[index + 1 - num_joined][2]
+        assert first[0] == known[index + 1 - min(span, known[index][6])][2]
     assert drawn[: len(places)] == np.searchsorted(durations, places, side="right").tolist()
     assert sorted(drawn[len(places) :]) == list(range(len(known)))
 

@@ -16,7 +16,7 @@ from aenerf_ns.recording.writer import NativeDatasetWriter
 from helpers.streams import random_stream
 
 CAMERA = CameraIntrinsics(6, 4, 5.0, 5.5, 3.0, 2.0, "radial_tangential", (0.01, 0.0, 0.001, 0.0, 0.0))
-SENSOR = SensorModel(0.3, 0.2, 1000, "RGGB")
+SENSOR = SensorModel(0.3, 0.2, 1000, "RGGB", 300.0)
 START, END = 1_600_000_000_000_000_001, 1_600_000_002_000_000_001
 
 

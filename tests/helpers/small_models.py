@@ -103,10 +103,11 @@ def make_sampler(
     temporal: bool = False,
     learn_refractory_period: bool = False,
     drift: PolarityDrift | None = None,
+    stream: EventStream | None = None,
 ) -> PairSampler:
-    """A sampler of five events at two pixels."""
+    """A sampler of a stream, by default five events at two pixels."""
     rows = [(3, 1, 5_000, 1), (0, 2, 100_000, -1), (3, 1, 250_000_000, -1), (0, 2, 600_000_000, -1), (3, 1, 10**9, 1)]
-    stream = make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
+    stream = stream or make_stream([(x, y, EPOCH + t, p) for x, y, t, p in rows])
     _, usable = camera.pixel_directions()
     pairs = pair_events([stream], refractory_period=sensor.refractory_period, usable=usable)
     trajectory = Trajectory(KNOTS, random_poses)
@@ -186,4 +187,6 @@ def make_batch(num_pairs: int, device: torch.device | str = "cpu") -> PairBatch:
         pixel=zeros,
         drift=torch.zeros_like(positive),
         weight=torch.ones_like(positive),
+        start_rate=torch.zeros_like(positive),
+        end_rate=torch.zeros_like(positive),
     )

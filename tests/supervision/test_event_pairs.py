@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +15,10 @@ from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.polarity_drift import PolarityDrift
 from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.simulator.esim import EventSimulator
+from aenerf_ns.simulator.options import SensorNoise
+from aenerf_ns.supervision.base import ChangeSupervision
 from aenerf_ns.supervision.event_pairs import PairLossCoefficients, PairSupervisionConfig
 
 
@@ -120,6 +126,38 @@ def test_a_share_of_the_pairs_ends_at_uniform_moments(random_poses: torch.Tensor
         assert longer.any() == (index == 2)
         assert torch.allclose(starts[longer], torch.tensor(0.000_006, dtype=torch.float64))
         assert torch.allclose(starts[inside & ~longer], torch.tensor(start, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("refractory_period", [0, 500_000])
+def test_the_lag_of_a_slow_pixel_is_allowed_for(random_poses: torch.Tensor, refractory_period: int) -> None:
+    """One pixel sees log-radiance swing ten times a second, and follows it by milliseconds too late."""
+    mean = math.log(0.4)
+
+    def log_radiance(seconds: np.ndarray) -> np.ndarray:
+        return mean + 0.5 * np.sin(20 * math.pi * seconds)
+
+    given = SensorModel(0.02, 0.02, refractory_period)
+    simulator = EventSimulator(CAMERA.width, CAMERA.height, given, SensorNoise(bandwidth=100), log_epsilon=0.0)
+    picture = np.ones((CAMERA.height, CAMERA.width))
+    columns = []
+    for seconds in np.arange(0, 1, 1e-3):
+        picture[1, 3] = np.exp(log_radiance(seconds))
+        columns.append(simulator(picture, EPOCH + round(1e9 * seconds)))
+    stream = EventStream(*map(np.concatenate, zip(*columns, strict=True)), CAMERA.width, CAMERA.height)
+    assert set(stream.x.tolist()) == {3}
+    sensor = replace(given, bandwidth=100 * (0.4 + 20 / 255) / (1 + 20 / 255))
+    torch.manual_seed(0)
+    sampler = make_sampler(random_poses, sensor, max_events_per_pair=20, share=0.25, stream=stream)
+    rays, batch = sampler.sample(4000)
+    supervision = PairSupervisionConfig().setup(sensor=sensor, loss_coefficients=PairLossCoefficients())
+    outputs = {"log_radiance": torch.from_numpy(log_radiance(rays.times.numpy())).float()}
+    rendered, change = supervision.changes(outputs, batch)
+    as_told = ChangeSupervision.changes(supervision, outputs, batch)[1]
+    known = ~batch.ends_between_events
+    # At first the pixel's signal is at the mean. It swings in within some ten milliseconds.
+    known &= rays.times[:2000, 0] > 0.05
+    assert (rendered - as_told)[known].square().mean().sqrt() > 0.05
+    assert (rendered - change)[known].square().mean().sqrt() < 0.01
 
 
 @pytest.mark.parametrize("max_events_per_pair", [1, 3])
