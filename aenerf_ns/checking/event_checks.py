@@ -107,6 +107,13 @@ def check_thresholds(
     if correlation > 0:
         size, low, high = changes.negative_threshold(ratio)
         figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
+        bandwidth = changes.bandwidth(ratio)
+        if bandwidth is not None:
+            value, low, high = bandwidth
+            result.figures.append(
+                f"Bandwidth at the mean radiance, by the frames: {value:.3g} Hz ({low:.3g} to {high:.3g}; given: "
+                f"{sensor.bandwidth:.3g}). Where none is given, give the format --bandwidth-hz"
+            )
     # Reversed polarities reverse the ratio.
     is_reversed = correlation < _MIN_CORRELATION
     if abs(ratio - used) > _THRESHOLD_DEVIATIONS * uncertainty and not is_reversed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -14,14 +15,18 @@ from aenerf_ns.errors import DataError
 BayerPattern = Literal["", "RGGB", "BGGR", "GRBG", "GBRG"]
 
 
+# The radiance that a dark pixel seems to see where its bandwidth is concerned, over the mean one: v2e's 20 / 255 of
+# white, for a recording whose mean is 0.4 of white.
+_DARK_RADIANCE = 0.2
+
 # The largest event sensors have 1 million pixels. The directions of so many pixels take 0.5 GB for a moment.
 _MAX_PIXELS = 1 << 22
 # Real thresholds are 0.05 to 1. Only their ratio matters, so other units than log-radiance are accepted too.
 _THRESHOLDS = (1e-4, 1e3)
 # Nanoseconds. Refractory periods are microseconds to milliseconds long.
 _MAX_REFRACTORY_PERIOD = 10**12
-# Hertz. Photoreceptors follow 1 Hz to 10 kHz.
-_MAX_BANDWIDTH = 1e9
+# Hertz. Photoreceptors follow 1 Hz to 10 kHz. More stands for pixels that follow at once.
+_MAX_BANDWIDTH = 1e15
 
 
 @dataclass(frozen=True)
@@ -34,12 +39,12 @@ class SensorModel:
         refractory_period: τ in nanoseconds. A pixel is blind for this time after each of its events.
         bayer_pattern: the color filters of the first two pixels of the first row and of the second, "RGGB" where pixel
             (0, 0) is red; "" for a monochrome sensor.
-        bandwidth: cutoff frequency in Hz of the low-pass filter through which a pixel sees log-radiance, where that has
-            its mean over the recording. 0 if it is not known: pixels are then taken to follow at once.
+        bandwidth: cutoff frequency in Hz of the low-pass filter through which a pixel sees log-radiance, for a pixel
+            that sees the recording's mean radiance. 0 if it is not known: pixels are then taken to follow at once.
 
     Raises:
         ValueError: a threshold is below 1e-4 or above 1e3, the refractory period is negative or beyond 1000 s, the
-            bandwidth is negative or beyond 1 GHz, or the pattern is unknown.
+            bandwidth is negative or beyond 1e15 Hz, or the pattern is unknown.
     """
 
     positive_contrast_threshold: float = 0.25
@@ -67,6 +72,10 @@ class SensorModel:
     def num_channels(self) -> int:
         """Number of radiance channels the sensor sees: 1 for a monochrome sensor, 3 for a color one."""
         return 3 if self.bayer_pattern else 1
+
+    def time_constant(self, radiance: Any) -> Any:
+        """Return the seconds by which the pixels' low-pass filter lags, given radiances over their mean."""
+        return (1 + _DARK_RADIANCE) / (2 * math.pi * self.bandwidth * (radiance + _DARK_RADIANCE))
 
     def channels(self, width: int, height: int) -> NDArray[np.int64]:
         """Return the (height, width) radiance channels that the filters of raw pixels pass: 0 red, 1 green, 2 blue; 0

@@ -82,8 +82,8 @@ class SensorOptions:
     refractory_period_ns: int | None = None
     """Time for which a pixel is blind after each event, in nanoseconds, in place of the dataset's value."""
     bandwidth_hz: float | None = None
-    """Cutoff frequency in Hz of the pixels' low-pass filter at the recording's mean log-radiance, in place of the
-    dataset's value. 0: pixels follow at once."""
+    """Cutoff frequency in Hz of the low-pass filter of a pixel that sees the recording's mean radiance, in place of the
+    dataset's value. 0: pixels follow at once. With it, the size of the contrast thresholds matters."""
 
 
 @dataclass

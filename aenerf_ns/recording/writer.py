@@ -49,8 +49,7 @@ class _FolderWriter(ABC):
 
     Attributes:
         events: its method ``append`` takes the events, piece by piece in the order of time.
-        sensor: the sensor that took the events. Its bandwidth is written when the block ends, and may be set until
-            then.
+        sensor: the sensor that took the events, which is written when the block ends.
     """
 
     def __init__(self, folder: Path | OutputLock, sensor: SensorModel) -> None:
@@ -122,6 +121,7 @@ class NativeDatasetWriter(_FolderWriter):
         has_assumed_thresholds: bool = False,
     ) -> None:
         super().__init__(folder, sensor)
+        self._camera = event_camera
         frame_camera = event_camera if frame_camera is None else frame_camera
         self._files: dict[Path, dict[str, Any]] = {}
         self._meta: dict[str, Any] = {
@@ -129,7 +129,7 @@ class NativeDatasetWriter(_FolderWriter):
             "h": frame_camera.height,
             **frame_camera.to_transforms(),
             "image_encoding": image_encoding,
-            "event_camera": {"file": "events.h5", **_event_camera(event_camera, sensor)},
+            "event_camera": {"file": "events.h5"},
             "frames": [],
             **{f"{split}_filenames": [] for split in SPLITS},
         }
@@ -147,7 +147,7 @@ class NativeDatasetWriter(_FolderWriter):
     def _finish(self) -> None:
         if not (self._partial / "trajectory_estimated.txt").exists():
             raise ValueError("the dataset has no trajectory: call add_trajectories before leaving the block")
-        self._meta["event_camera"]["bandwidth_hz"] = self.sensor.bandwidth
+        self._meta["event_camera"] |= _event_camera(self._camera, self.sensor)
         _write_json(self._partial / "transforms.json", self._meta)
 
     def add_trajectories(self, estimated: Trajectory, ground_truth: Trajectory | None = None) -> None:

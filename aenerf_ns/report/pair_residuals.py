@@ -64,14 +64,16 @@ def measure_pair_residuals(run: TrainedRun) -> PairResiduals | None:
     supervision = run.model.supervision
     assert isinstance(supervision, PairSupervision)
     num_pairs = len(batch)
-    pieces = []
+    log_radiances = []
     chunk = max(run.model.config.eval_num_rays_per_chunk // 2, 1)
     for begin in range(0, num_pairs, chunk):
         chosen = torch.arange(begin, min(begin + chunk, num_pairs), device=run.device)
         outputs = run.model(rays[torch.cat([chosen, chosen + num_pairs])])
-        unit = supervision.loss_unit(outputs)
-        pieces.append(torch.stack([change / unit for change in supervision.changes(outputs, batch[chosen])]))
-    rendered, measured = torch.cat(pieces, -1).double().cpu().numpy()
+        log_radiances.append(outputs["log_radiance"].unflatten(0, (2, -1)))
+    outputs["log_radiance"] = torch.cat(log_radiances, 1).flatten(0, 1)
+    unit = supervision.loss_unit(outputs)
+    changes = torch.stack([change / unit for change in supervision.changes(outputs, batch)])
+    rendered, measured = changes.double().cpu().numpy()
     length = (batch.num_positive + batch.num_negative).floor().cpu().numpy()[at_events]
     pixel = batch.pixel.cpu().numpy()[at_events]
     rendered, measured = rendered[at_events], measured[at_events]

@@ -248,8 +248,8 @@ class EventSimulator:
         # Of the last frame: the intensity, its logarithm, that filtered, and the same with the leak.
         self._last: tuple[NDArray[np.float64], ...] = ()
         self._time_ns = 0
-        # The sum over time of the mean logarithm of the light that the bandwidth follows.
-        self._log_light = 0.0
+        # Of the light that the bandwidth follows: the mean over the pixels, summed over the nanoseconds.
+        self._sum_of_light = 0.0
 
     def __call__(self, image: ArrayLike, time_ns: int) -> Events:
         """Show the sensor the next frame.
@@ -285,7 +285,7 @@ class EventSimulator:
             if self._bandwidth is not None:
                 light = ((last_intensity + intensity) / 2 + _DARK_RADIANCE) / (1 + _DARK_RADIANCE)
                 time_constants = 2e-9 * math.pi * self._bandwidth * light * (time_ns - self._time_ns)
-                self._log_light += np.log(light).mean() * (time_ns - self._time_ns)
+                self._sum_of_light += light.mean() * (time_ns - self._time_ns)
                 filtered = _low_pass(last_filtered, last_log, log_intensity, time_constants)
             signal = filtered + self._leak * (time_ns - self._start_ns)
             events = _frame_events(
@@ -312,11 +312,12 @@ class EventSimulator:
         return x.astype(np.uint16), y.astype(np.uint16), t - t % self._tick, p.astype(np.int8)
 
     def recorded_sensor(self) -> SensorModel:
-        """Return the sensor, with the bandwidth that its pixels had on average over the frames."""
+        """Return the sensor, with the bandwidth that a pixel has at the mean radiance of the frames."""
         if self._bandwidth is None:
             return self.sensor
-        mean = self._log_light / max(self._time_ns - self._start_ns, 1)
-        return replace(self.sensor, bandwidth=self._bandwidth * math.exp(mean))
+        return replace(
+            self.sensor, bandwidth=self._bandwidth * self._sum_of_light / max(self._time_ns - self._start_ns, 1)
+        )
 
     def readout_note(self) -> str:
         """Say how many events the readout lost, and how long it delayed others."""

@@ -46,10 +46,8 @@ _SHARE_OF_FREE_MEMORY = 0.5
 _RENDERED_VARIANCE = 0.25
 # Of what a blind pixel misses, in squared contrast thresholds, for each threshold that it is taken to miss.
 _MISSED_VARIANCE = 0.25
-
-# The radiance that a dark pixel seems to see where its bandwidth is concerned, over the mean one: v2e's 20 / 255 of
-# white, for a recording whose mean is 0.4 of white.
-_DARK_RADIANCE = 0.2
+# The most contrast thresholds that log-radiance is taken to be ahead of a slow pixel's signal.
+_MAX_LAG = 4.0
 
 # t_sam: a truncated normal distribution over the interval of the pair's last event.
 _WITHIN_MEAN, _WITHIN_DEVIATION = 0.5, 0.25
@@ -221,18 +219,18 @@ class PairSupervision(ChangeSupervision):
         """Return the (N,) changes of what log-radiance is ahead of the signals that fire events.
 
         The signal s follows log-radiance x through a low-pass filter of first order, ds/dt = (x − s) / T. So x is ahead
-        by T ds/dt, and ds/dt is the rate at which events follow each other. 1 / T is 2π times the bandwidth at the mean
-        of log-radiance, and rises with the rendered radiance.
+        by T ds/dt, and ds/dt is the rate at which events follow each other. The rendered radiance gives T.
         """
         positive, negative = self.thresholds(outputs)
         ends = outputs["log_radiance"].detach().split(len(batch))[:2]
-        log_radiance = torch.stack([end.gather(1, batch.channel[:, None])[:, 0] for end in ends])
+        radiance = torch.stack([end.gather(1, batch.channel[:, None])[:, 0] for end in ends]).exp()
         # Pairs that end at a moment are uniform over pixels and time. Without such pairs all are taken.
         uniform = batch.ends_between_events | ~batch.ends_between_events.any()
-        mean = (log_radiance[1] * uniform).sum() / uniform.sum()
-        light = ((log_radiance - mean).exp() + _DARK_RADIANCE) / (1 + _DARK_RADIANCE)
+        mean = (radiance[1] * uniform).sum() / uniform.sum()
         rates = torch.stack([batch.start_rate, batch.end_rate])
-        ahead = rates * torch.where(rates > 0, positive, negative) / (2 * math.pi * self.sensor.bandwidth * light)
+        # Noise right after a blindness has any rate.
+        ahead = (rates * self.sensor.time_constant(radiance / mean)).clamp(-_MAX_LAG, _MAX_LAG)
+        ahead = ahead * torch.where(rates > 0, positive, negative)
         return ahead[1] - ahead[0]
 
     def losses(self, outputs: Mapping[str, Any], batch: PairBatch) -> dict[str, Tensor]:
@@ -366,12 +364,13 @@ class PairSampler(Sampler):
         num_pairs = max(num_rays // (3 if with_time_within else 2), 1)
         device = self.pixel_rays.channels.device
         num_silent = round(self._silent_pair_share * num_pairs)
-        rows, spans = self._table.draw(
-            num_silent, num_pairs - num_silent, self._max_events_per_pair, with_neighbors=self._needs_signal_rates
-        )
-        times, packed = rows.permute(2, 1, 0)
-        end = self.pixel_rays.trajectory.seconds(times[0])
-        last_start, start = self.pixel_rays.trajectory.seconds(times[1:3] + self._refractory_period)
+        rows, spans = self._table.draw(num_silent, num_pairs - num_silent, self._max_events_per_pair)
+        times, packed = rows.permute(3, 2, 1, 0)
+        # Of the first event, of the event before the last one, and of the last one.
+        first, before, last = packed[1, 0], packed[0, 1], packed[1, 1]
+        seconds_of = self.pixel_rays.trajectory.seconds
+        end = seconds_of(times[1, 1])
+        start, last_start = seconds_of(torch.stack([times[1, 0], times[0, 1]]) + self._refractory_period)
         last_interval = end - last_start
         # Given the interval that it lies in, a uniform moment is uniform there.
         part = torch.rand(num_silent, dtype=torch.float64, device=device)
@@ -383,22 +382,20 @@ class PairSampler(Sampler):
             within.erfinv_().mul_(_WITHIN_DEVIATION * math.sqrt(2)).add_(_WITHIN_MEAN)
             seconds.append(last_start + within * last_interval)
         # The pair ends with its last event, so the change that the pixel misses after that event does not count.
-        last_count = torch.stack(own_counts(packed[0], packed[1]))
-        count = torch.stack(event_counts(packed[1], packed[2]))
+        last_count = torch.stack(own_counts(last, before))
+        count = torch.stack(event_counts(before, first))
+        # Events that share a pixel and a time are rare where there is a refractory period.
+        missed = count.sum(0) - (spans - 1) if self._refractory_period > 0 else 0.0
         # A pair that ends at a moment has not seen its last event.
         count[:, num_silent:] += last_count[:, num_silent:]
-        spans[:num_silent] -= 1
         start_rate = end_rate = torch.zeros(num_pairs, device=device)
         if self._needs_signal_rates:
             start_rate, end_rate = self._signal_rates(times, packed, num_silent)
-        pixel = pixel_index(packed[0])
+        pixel = pixel_index(last)
         drift, variance, variance_of_all = self._drift
         num_events, surplus = count.sum(0), count[0] - count[1]
         # Thresholds that are both too large or too small make no drift, and differ between pixels as much.
-        unknown = variance[pixel] * num_events**2 + variance_of_all * surplus**2
-        if self._refractory_period > 0:
-            # Events that share a pixel and a time are rare where there is a refractory period.
-            unknown = unknown + _MISSED_VARIANCE * (num_events - spans)
+        unknown = variance[pixel] * num_events**2 + variance_of_all * surplus**2 + _MISSED_VARIANCE * missed
         batch = PairBatch(
             num_positive=count[0],
             num_negative=count[1],
@@ -419,28 +416,28 @@ class PairSampler(Sampler):
         """Return the rates of the pixels' signals at the starts and at the ends of pairs.
 
         In an interval between two events the mean rate is known, without the time for which the pixel is blind. Rates
-        are on lines through the middles of two intervals. Where events are on one side only, and at moments, the rate
-        is that of the interval.
+        lie on a line through the middles of the intervals before and after an event. Where only one of them is there,
+        and at moments, the rate is that of the interval. A learned refractory period does not count.
 
         Args:
-            times, packed: (6, N) of the rows that :meth:`_PairTable.draw` returns with neighbors.
+            times, packed: (3, 2, N) of the rows that :meth:`_PairTable.draw` returns.
             num_silent: number of pairs that end at moments, which come first.
 
         Returns:
             (N,) thresholds a second at the starts, and at the ends.
         """
-        # Of the first and of the last event: the event before it, the event itself, and the event after it.
-        order = torch.tensor([[4, 1], [2, 0], [5, 3]], device=times.device)
-        times, packed = times[order], packed[order]
         is_interval = is_pair(packed[1:])
         positive, negative = own_counts(packed[1:], packed[:-1])
         intervals = times.diff(dim=0)
         rates = torch.where(is_interval, (positive - negative) / (intervals - self._refractory_period), 0) * 1e9
-        # The pixel is blind at first. A pair starts when that ends.
-        blind = self._refractory_period * torch.tensor([[1], [-1]], device=times.device)
-        part = torch.where(is_interval.all(0), (intervals[0] + blind) / intervals.sum(0), is_interval[1])
+        # How far the pair's ends are from the middle of the interval before, doubled: a pair starts when the pixel is
+        # no longer blind.
+        beyond = intervals[0].double()
+        beyond[0] += self._refractory_period
+        beyond[1] -= self._refractory_period
+        part = torch.where(is_interval.all(0), beyond / intervals.sum(0), is_interval[1].double())
         part[1, :num_silent] = 0
-        return torch.lerp(rates[0], rates[1], part).float().unbind(0)
+        return torch.lerp(rates[0], rates[1], part.float()).unbind(0)
 
     def residual_batch(self, num_rays: int) -> tuple[RayBundle, PairBatch]:
         """Draw a batch to look at, the same in every call, without the random numbers that training would draw next."""
@@ -477,21 +474,18 @@ class _PairTable:
                 torch.from_numpy(array).to(self._device) for array in arrays
             )
 
-    def draw(
-        self, num_moments: int, num_events: int, max_events: int, with_neighbors: bool = False
-    ) -> tuple[Tensor, Tensor]:
+    def draw(self, num_moments: int, num_events: int, max_events: int) -> tuple[Tensor, Tensor]:
         """Draw pairs: first around uniform moments at uniform pixels, then pairs that end at uniform events.
 
         Args:
             num_moments: number of pairs around moments.
             num_events: number of pairs that end at events.
             max_events: the most events that a pair spans.
-            with_neighbors: also return three rows more of each pair: those behind its last event's, before its first
-                event's, and behind it. A row there that is not of the same pixel is a chain start, or comes after one.
 
         Returns:
-            (N, 3, 2) or (N, 6, 2) int64 rows of the table, first those that :func:`find_rows` finds, and (N,) int64 how
-            many consecutive pairs are joined, on the device of the batches.
+            (N, 2, 3, 2) int64 rows of the table, of each pair's first and last event: the row before the event's, its
+            own, and the row after it. Those of another pixel are told by chain starts. (N,) int64, how many
+            consecutive pairs are joined. Both are on the device of the batches.
         """
         device = self._device
         moments = torch.randint(self._duration, (num_moments,), device=device)
@@ -502,12 +496,9 @@ class _PairTable:
             spans = (max_events + 1) ** torch.rand(num_moments + num_events, dtype=torch.float64, device=device)
             spans = spans.long().clamp_(max=max_events)
         found = find_rows(self._rows, self._replacement_rows, self._block_ends, moments, events, spans)
-        spans = found[:, 0] - found[:, 2]
-        if with_neighbors:
-            last, _, first = found.unbind(1)
-            # The table's first row is a chain start, so it may stand behind the last one.
-            found = torch.cat([found, torch.stack([last + 1, first - 1, first + 1], 1) % len(self._rows)], 1)
-        rows = self._rows[found]
+        spans = found[:, 1] - found[:, 0]
+        # The table's first row is a chain start. So it may stand behind the last one, and the last one before it.
+        rows = self._rows[(found[..., None] + torch.arange(-1, 2, device=device)) % len(self._rows)]
         if device != self._batch_device:
             rows, spans = (part.pin_memory().to(self._batch_device, non_blocking=True) for part in (rows, spans))
         return rows, spans
@@ -525,8 +516,7 @@ def find_rows(
         spans: (N,) int64, how many consecutive pairs to join that end with the found one, if that many may be joined.
 
     Returns:
-        (N, 3) int64 numbers of rows: of the event that the pair ends with, of the event of its pixel before, and of the
-        event that the pair begins with.
+        (N, 2) int64 numbers of rows: of the event that the pair begins with, and of the one that it ends with.
     """
     number = rows[:, 1][events]
     starts_chain = ~is_pair(number)
@@ -538,4 +528,4 @@ def find_rows(
     ends = block_ends[block + 1][:, None] - elapsed[:, -1:] + elapsed
     row = torch.cat([BLOCK * block + (ends <= moments[:, None]).sum(1), by_event])
     spans = spans.minimum(max_span(rows[:, 1][row]))
-    return torch.stack([row, row - 1, row - spans], 1)
+    return torch.stack([row - spans, row], 1)

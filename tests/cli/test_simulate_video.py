@@ -94,15 +94,17 @@ def test_video_with_poses_becomes_a_dataset(
     parser = NativeDataParserConfig(data=output).setup()
     recording = parser.recording
     assert recording.event_camera == recording.frame_camera == CameraIntrinsics(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 7.5)
-    assert recording.sensor == SensorModel(0.3, 0.25, SENSORS["davis346"][0].refractory_period)
     assert recording.ground_truth is None
     torch.testing.assert_close(recording.trajectory.camera_to_worlds, make_poses().camera_to_worlds)
     # The events are those of the sensor that the options describe: one option changes one value of --sensor.
     noise = replace(SENSORS["davis346"][1], contrast_threshold_spread=0.02, leak_rate=2.0)
-    simulator = video_simulator(open_video(frames), recording.sensor, noise, seed=4)
+    sensor = SensorModel(0.3, 0.25, SENSORS["davis346"][0].refractory_period)
+    simulator = video_simulator(open_video(frames), sensor, noise, seed=4)
     intervals = video_events(open_video(frames), simulator, "linear")
     expected = np.concatenate([interval.events.t for interval in intervals])
     assert len(expected) > 500
+    assert recording.sensor == simulator.recorded_sensor()
+    assert 20 < recording.sensor.bandwidth < 300
     np.testing.assert_array_equal(read(recording.event_file)[:, 2], expected)
     thresholds = np.load(output / "thresholds_ground_truth.npz")
     np.testing.assert_array_equal(thresholds["positive"], simulator.positive_contrast_threshold)

@@ -123,14 +123,14 @@ def test_pairs_are_found_by_place_and_by_number(
     events = np.arange(len(pairs))
     spans = generator.integers(1, 12, len(places) + len(events))
     arguments = (pairs.rows, pairs.replacement_rows, pairs.block_ends, places, events, spans)
-    found = pairs.rows[find_rows(*map(torch.from_numpy, arguments))]
+    found = find_rows(*map(torch.from_numpy, arguments)).numpy()
     ends = {(y * WIDTH + x, time): index for index, (x, y, _, time, *_) in enumerate(known)}
     drawn = []
-    for (end, before, first), span in zip(found.tolist(), spans.tolist(), strict=True):
-        index = ends[end[1] >> 40, end[0]]
+    for first, last, span in zip(*found.T, spans.tolist(), strict=True):
+        index = ends[int(pairs.rows[last, 1]) >> 40, int(pairs.rows[last, 0])]
         drawn.append(index)
-        assert before[0] == known[index][2]
-        assert first[0] == known[index + 1 - min(span, known[index][6])][2]
+        assert pairs.rows[last - 1, 0] == known[index][2]
+        assert pairs.rows[first, 0] == known[index + 1 - min(span, known[index][6])][2]
     assert drawn[: len(places)] == np.searchsorted(durations, places, side="right").tolist()
     assert sorted(drawn[len(places) :]) == list(range(len(known)))
 
@@ -165,6 +165,25 @@ def test_what_a_blind_pixel_misses_is_counted() -> None:
             # Rounding, and where the rise ends: what it rises after its last event has no event.
             turns = interval[0] < 300_000_000 < interval[1]
             assert 0.25 * (positive - negative) == pytest.approx(end - begin, abs=0.25 / 8 + 0.25 * turns)
+
+
+@pytest.mark.parametrize(
+    ("times", "missed"),
+    [
+        # Right after the blindness: at most 4 thresholds, less an eighth, because whole ones would pass for events.
+        ((0, 1_001, 2_002, 3_003), (31 / 8, 0.0)),
+        # A rate that would miss one whole threshold.
+        ((0, 2_000, 4_000, 6_000), (7 / 8, 0.0)),
+        # The middle of the blindness is nearer to the middle of the shorter interval: 1/9 and 1/3 thresholds a period.
+        ((0, 10_000, 14_000, 24_000), ((4 / 9 + 10 / 3) / 14 // 0.125 / 8, 0.0)),
+    ],
+)
+def test_a_blind_pixel_misses_what_the_rates_say(times: tuple[int, ...], missed: tuple[float, float]) -> None:
+    rows = pair_events([make_stream([(0, 0, t, 1) for t in times])], refractory_period=1_000).rows
+    counts = event_counts(rows[2, 1], rows[1, 1]), event_counts(rows[1, 1], 0)
+    # The event itself, and what is missed after it.
+    assert counts[1] == (1 + missed[0], missed[1])
+    assert own_counts(rows[1, 1], 0) == own_counts(rows[2, 1], rows[1, 1]) == (1, 0)
 
 
 def test_a_table_that_cannot_be_made_is_refused() -> None:

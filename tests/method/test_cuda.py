@@ -51,7 +51,7 @@ NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA de
 def test_a_step_computes_on_the_device_alone(backbone: str, bounded: bool, correction: str, learned: bool) -> None:
     options: dict[str, Any] = {"proposal": {"num_samples_per_ray": (16, 8)}} if backbone == "mlp" else {}
     model = make_model(
-        SensorModel(bayer_pattern="RGGB"),
+        SensorModel(bayer_pattern="RGGB", bandwidth=0.0 if learned else 100.0),
         bounded=bounded,
         backbone=backbone,
         camera_optimizer=PoseCorrectionConfig(mode=correction),

@@ -227,6 +227,10 @@ def test_low_pass_follows_the_step_response() -> None:
     # Seen by v2e's rule, white has 14 times the bandwidth of black.
     assert (x == 0).sum() == 4
     assert t[x == 1][0] > 9 * t[x == 0][0]
+    # The bandwidth at the mean radiance.
+    light = (after.mean() + 20 / 255) / (1 + 20 / 255)
+    assert simulator.recorded_sensor().bandwidth == pytest.approx(100 * light, rel=1e-3)
+    assert make_simulator(0.2, 0.2).recorded_sensor().bandwidth == 0
 
 
 @pytest.mark.parametrize("coarse", [2, 10])

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.small_models import CAMERA, EPOCH, make_correction, make_sampler
+from helpers.small_models import CAMERA, EPOCH, make_batch, make_correction, make_sampler
+from helpers.streams import make_stream
 
 from aenerf_ns.camera.intrinsics import CameraIntrinsics
 from aenerf_ns.errors import DataError
@@ -131,12 +132,13 @@ def test_a_share_of_the_pairs_ends_at_uniform_moments(random_poses: torch.Tensor
 @pytest.mark.parametrize("refractory_period", [0, 500_000])
 def test_the_lag_of_a_slow_pixel_is_allowed_for(random_poses: torch.Tensor, refractory_period: int) -> None:
     """One pixel sees log-radiance swing ten times a second, and follows it by milliseconds too late."""
-    mean = math.log(0.4)
+    # A dark pixel seems to see a fifth of the mean.
+    mean = 5 * 20 / 255
 
     def log_radiance(seconds: np.ndarray) -> np.ndarray:
-        return mean + 0.5 * np.sin(20 * math.pi * seconds)
+        return np.log(mean / np.i0(0.5)) + 0.5 * np.sin(20 * math.pi * seconds)
 
-    given = SensorModel(0.02, 0.02, refractory_period)
+    given = SensorModel(0.05, 0.04, refractory_period)
     simulator = EventSimulator(CAMERA.width, CAMERA.height, given, SensorNoise(bandwidth=100), log_epsilon=0.0)
     picture = np.ones((CAMERA.height, CAMERA.width))
     columns = []
@@ -145,7 +147,7 @@ def test_the_lag_of_a_slow_pixel_is_allowed_for(random_poses: torch.Tensor, refr
         columns.append(simulator(picture, EPOCH + round(1e9 * seconds)))
     stream = EventStream(*map(np.concatenate, zip(*columns, strict=True)), CAMERA.width, CAMERA.height)
     assert set(stream.x.tolist()) == {3}
-    sensor = replace(given, bandwidth=100 * (0.4 + 20 / 255) / (1 + 20 / 255))
+    sensor = replace(given, bandwidth=100 * (mean + 20 / 255) / (1 + 20 / 255))
     torch.manual_seed(0)
     sampler = make_sampler(random_poses, sensor, max_events_per_pair=20, share=0.25, stream=stream)
     rays, batch = sampler.sample(4000)
@@ -153,11 +155,49 @@ def test_the_lag_of_a_slow_pixel_is_allowed_for(random_poses: torch.Tensor, refr
     outputs = {"log_radiance": torch.from_numpy(log_radiance(rays.times.numpy())).float()}
     rendered, change = supervision.changes(outputs, batch)
     as_told = ChangeSupervision.changes(supervision, outputs, batch)[1]
-    known = ~batch.ends_between_events
     # At first the pixel's signal is at the mean. It swings in within some ten milliseconds.
-    known &= rays.times[:2000, 0] > 0.05
+    known = ~batch.ends_between_events & (rays.times[:2000, 0] > 0.05)
     assert (rendered - as_told)[known].square().mean().sqrt() > 0.05
     assert (rendered - change)[known].square().mean().sqrt() < 0.01
+
+
+def test_signal_rates_lie_between_those_of_the_intervals(random_poses: torch.Tensor) -> None:
+    # One pixel's events after 100, 300, 700 and 1000 ms: +, -, +. The first has no interval before it.
+    rows = [(3, 1, EPOCH + 1_000_000 * t, p) for t, p in ((0, 1), (100, 1), (300, -1), (700, 1))]
+    period = 50_000_000
+    sampler = make_sampler(
+        random_poses,
+        SensorModel(0.2, 0.3, period, bandwidth=10.0),
+        max_events_per_pair=1,
+        share=0.25,
+        stream=make_stream(rows),
+    )
+    torch.manual_seed(0)
+    _, batch = sampler.sample(4000)
+    first, second, third = 1 / 0.05, -1 / 0.15, 1 / 0.35
+    # On the lines through the middles of two intervals: where the blindness after an event ends, and at an event.
+    ends_of_blindness = [first, first + 0.5 * (second - first), second + 0.25 / 0.6 * (third - second)]
+    at_events = [first + 1 / 6 * (second - first), second + 0.15 / 0.6 * (third - second), third]
+    silent = batch.ends_between_events
+    for i, (start, end, mean) in enumerate(zip(ends_of_blindness, at_events, (first, second, third), strict=True)):
+        here = (batch.last_interval - (0.05, 0.15, 0.35)[i]).abs() < 1e-6
+        for chosen, expected in ((here & ~silent, end), (here & silent, mean)):
+            assert chosen.any()
+            torch.testing.assert_close(batch.start_rate[chosen], torch.full((int(chosen.sum()),), start))
+            torch.testing.assert_close(batch.end_rate[chosen], torch.full((int(chosen.sum()),), expected))
+    assert batch.weight.isfinite().all()
+
+
+def test_a_burst_of_noise_makes_no_great_lag() -> None:
+    supervision = PairSupervisionConfig().setup(
+        sensor=SensorModel(0.2, 0.3, bandwidth=10.0), loss_coefficients=PairLossCoefficients()
+    )
+    batch = make_batch(4)
+    batch.start_rate, batch.end_rate = torch.tensor([0.0, 1e6, 0.0, -1e6]), torch.tensor([1e6, 0.0, -1e6, 0.0])
+    outputs = {"log_radiance": torch.zeros(8, 1)}
+    change, as_told = supervision.changes(outputs, batch)[1], ChangeSupervision.changes(supervision, outputs, batch)[1]
+    # Four thresholds, each of its polarity.
+    torch.testing.assert_close(change - as_told, torch.tensor([0.8, -0.8, -1.2, 1.2]))
 
 
 @pytest.mark.parametrize("max_events_per_pair", [1, 3])
