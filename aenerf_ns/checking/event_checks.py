@@ -96,7 +96,7 @@ def check_polarity(result: CheckResult, correlation: float | None) -> None:
 def check_thresholds(
     result: CheckResult, capture: Capture, changes: FrameChanges, balance: PolarityBalance, correlation: float
 ) -> None:
-    """Estimate the contrast thresholds."""
+    """Estimate the contrast thresholds and the bandwidth."""
     estimate, sensor = balance.ratio(), capture.sensor
     if estimate is None:
         return
@@ -107,13 +107,6 @@ def check_thresholds(
     if correlation > 0:
         size, low, high = changes.negative_threshold(ratio)
         figure += f"; by the frames, C- is {size:.2f} ({low:.2f} to {high:.2f}) and C+ {ratio * size:.2f}"
-        bandwidth = changes.bandwidth(ratio)
-        if bandwidth is not None:
-            value, low, high = bandwidth
-            result.figures.append(
-                f"Bandwidth at the mean radiance, by the frames: {value:.3g} Hz ({low:.3g} to {high:.3g}; given: "
-                f"{sensor.bandwidth:.3g}). Where none is given, give the format --bandwidth-hz"
-            )
     # Reversed polarities reverse the ratio.
     is_reversed = correlation < _MIN_CORRELATION
     if abs(ratio - used) > _THRESHOLD_DEVIATIONS * uncertainty and not is_reversed:
@@ -123,6 +116,13 @@ def check_thresholds(
         else:
             figure += f". If the given ones were a guess, give the format --positive-contrast-threshold {value}"
     result.figures.append(figure)
+    bandwidth = changes.bandwidth(ratio) if correlation > 0 else None
+    if bandwidth is not None:
+        frequency, low, high = bandwidth
+        given = f"given: {sensor.bandwidth:.3g}" if sensor.bandwidth > 0 else "to state it: --bandwidth-hz"
+        result.figures.append(
+            f"Bandwidth at the mean radiance, by the frames: {frequency:.3g} Hz ({low:.3g} to {high:.3g}; {given})"
+        )
 
 
 def check_lens(result: CheckResult, camera: CameraIntrinsics) -> None:

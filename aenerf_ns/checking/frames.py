@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 
 import numba
@@ -62,9 +63,7 @@ class FrameChanges:
             part = slice(*np.searchsorted(events.t, (start, end), side="right"))
             np.add.at(sums, ((events.p[part] < 0).astype(int), events.y[part], events.x[part]), weights[part])
         columns = events.x, events.y, events.t, events.p
-        _find_rates(
-            columns, self._moments, self._refractory_period, self._last_time, self._num_passed, self._rates
-        )
+        _find_rates(columns, self._moments, self._refractory_period, self._last_time, self._num_passed, self._rates)
 
     def correlation(self) -> float | None:
         """Return the correlation of the sums of polarities with the changes of the frames, from −1 to 1.
@@ -94,7 +93,7 @@ class FrameChanges:
         range is that of the black levels that frames may have, and of halves of the frames.
         """
         lags = []
-        for gray, part in [(_GRAY, slice(None)), *((g, slice(i, None, 2)) for g in (_GRAY, *_GRAY_RANGE) for i in (0, 1))]:
+        for gray, part in product((_GRAY, *_GRAY_RANGE), (slice(None), slice(0, None, 2), slice(1, None, 2))):
             events, frames, lag, delay = self._changes(ratio, gray, part)
             if len(events) < _MIN_PIXELS:
                 return None

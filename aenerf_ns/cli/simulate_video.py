@@ -212,9 +212,10 @@ class SimulateVideo(SimulationCommand):
             for frame, time, _ in self._write_events(writer, video, simulator):
                 if time in kept:
                     writer.add_image(frame, time)
-        missing = (
-            "" if camera else 'calibration.json (with "image_encoding": "srgb" and the thresholds of this command) and '
-        )
+        missing = ""
+        if camera is None:
+            stated = f'"bandwidth_hz": {writer.sensor.bandwidth:.4g}, thresholds and refractory period of this command'
+            missing = f'calibration.json (with "image_encoding": "srgb", {stated}) and '
         return (
             f"{self.output}: {writer.events.num_events:,} events of {len(video.times)} frames, {len(kept)} images, "
             f"no poses.\nTo train on them, add {missing}trajectory.txt (docs/your_data.md)."

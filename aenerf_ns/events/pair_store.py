@@ -151,7 +151,7 @@ def event_counts(later: Any, earlier: Any) -> tuple[Any, Any]:
     A pixel is blind for the refractory period τ after an event. In an interval dt between two single events,
     log-radiance changes by 1 / (dt − τ) thresholds per nanosecond on average. Between the middles of the two intervals
     around an event this rate is taken to change steadily. What the pixel misses is τ times the rate in the middle of
-    its blindness, at most 4 thresholds. It counts for the event that made the pixel blind, in its own polarity.
+    its blindness, at most 4 thresholds. It counts for the event that made the pixel blind, with the sign of the rate.
 
     Args:
         later: packed numbers of rows.

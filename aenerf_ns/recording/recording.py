@@ -43,7 +43,7 @@ class Capture:
     Attributes:
         event_file: the events, not yet read.
         event_camera: the event camera's lens.
-        sensor: the event camera's contrast thresholds, refractory period and Bayer pattern.
+        sensor: the event camera's.
         frame_camera: the lens of the camera that took the images.
         image_encoding: whether the images' values are sRGB or linear in radiance.
         has_assumed_thresholds: whether neither the dataset nor an option states the contrast thresholds.

@@ -77,7 +77,7 @@ class Supervision(nn.Module, ABC):
 
     Args:
         config: the options of the supervision.
-        sensor: the dataset's contrast thresholds, refractory period and Bayer pattern.
+        sensor: the dataset's.
         loss_coefficients: weights of the losses.
 
     Attributes:

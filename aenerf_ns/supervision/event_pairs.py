@@ -300,7 +300,7 @@ class PairSampler(Sampler):
 
     Draws from torch's global generator of the device that holds the pairs, which Nerfstudio seeds. That is the device
     of the batches if the pairs take at most half of the device's free memory. Otherwise the pairs stay in host memory,
-    or in their file, and a step copies one pinned array to the device without waiting.
+    or in their file, and a step copies two pinned arrays to the device without waiting.
 
     Args:
         config, dataset, device: see :class:`Sampler`.
@@ -437,7 +437,8 @@ class PairSampler(Sampler):
         beyond[1] -= self._refractory_period
         part = torch.where(is_interval.all(0), beyond / intervals.sum(0), is_interval[1].double())
         part[1, :num_silent] = 0
-        return torch.lerp(rates[0], rates[1], part.float()).unbind(0)
+        start, end = torch.lerp(rates[0], rates[1], part.float())
+        return start, end
 
     def residual_batch(self, num_rays: int) -> tuple[RayBundle, PairBatch]:
         """Draw a batch to look at, the same in every call, without the random numbers that training would draw next."""

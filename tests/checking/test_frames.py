@@ -1,0 +1,55 @@
+"""What the change from frame to frame tells of the sensor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from aenerf_ns.camera.image_encoding import decode
+from aenerf_ns.camera.intrinsics import CameraIntrinsics
+from aenerf_ns.camera.time_window import TimeWindow
+from aenerf_ns.checking.frames import FrameChanges
+from aenerf_ns.events.sensor import SensorModel
+from aenerf_ns.events.stream import EventStream
+from aenerf_ns.simulator.esim import EventSimulator
+from aenerf_ns.simulator.options import SensorNoise
+
+WIDTH, HEIGHT = 40, 30
+
+
+@pytest.mark.parametrize("bandwidth", [None, 100.0])
+def test_frames_tell_the_bandwidth(tmp_path: Path, bandwidth: float | None) -> None:
+    # Smooth patches from dark to bright that move by a pixel in 4 ms, there and back.
+    coarse = np.random.default_rng(0).uniform(-3, 0, (HEIGHT // 5 + 1, 40))
+    texture = cv2.resize(coarse, (200, HEIGHT))
+    sensor = SensorModel(0.1, 0.1, 100_000)
+    simulator = EventSimulator(WIDTH, HEIGHT, sensor, SensorNoise(bandwidth=bandwidth))
+    columns, frames = [], []
+    for millisecond in range(600):
+        shift = abs(300 - millisecond) / 4
+        positions = np.arange(WIDTH) + shift
+        picture = np.exp([np.interp(positions, np.arange(200), row) for row in texture])
+        columns.append(simulator(picture, 1_000_000 * millisecond))
+        if millisecond % 40 == 30:
+            levels = np.searchsorted(decode((np.arange(255) + 0.5) / 255, "srgb"), picture).astype(np.uint8)
+            frames.append((1_000_000 * millisecond, tmp_path / f"{millisecond}.png"))
+            Image.fromarray(levels).save(frames[-1][1])
+    camera = CameraIntrinsics(WIDTH, HEIGHT, 40.0, 40.0, 20.0, 15.0)
+    capture = SimpleNamespace(sensor=sensor, event_camera=camera, frame_camera=camera, image_encoding="srgb")
+    changes = FrameChanges(capture, frames, TimeWindow())
+    events = EventStream(*map(np.concatenate, zip(*columns, strict=True)), WIDTH, HEIGHT)
+    for chunk in (events[:3000], events[3000:]):
+        changes.add(chunk, np.ones(len(chunk)))
+    found = changes.bandwidth(1.0)
+    if bandwidth is None:
+        assert found is None
+    else:
+        assert found is not None
+        value, low, high = found
+        assert low <= value <= high
+        assert value == pytest.approx(simulator.recorded_sensor().bandwidth, rel=0.2)
