@@ -119,9 +119,9 @@ def check_thresholds(
     bandwidth = changes.bandwidth(ratio) if correlation > 0 else None
     if bandwidth is not None:
         frequency, low, high = bandwidth
-        given = f"given: {sensor.bandwidth:.3g}" if sensor.bandwidth > 0 else "to state it: --bandwidth-hz"
+        given = f"given: {sensor.bandwidth:.0f}" if sensor.bandwidth > 0 else "to state it: --bandwidth-hz"
         result.figures.append(
-            f"Bandwidth at the mean radiance, by the frames: {frequency:.3g} Hz ({low:.3g} to {high:.3g}; {given})"
+            f"Bandwidth at the mean radiance, by the frames: {frequency:.0f} Hz ({low:.0f} to {high:.0f}; {given})"
         )
 
 

@@ -97,8 +97,8 @@ class FrameChanges:
             events, frames, lag, delay = self._changes(ratio, gray, part)
             if len(events) < _MIN_PIXELS:
                 return None
-            coefficients = _robust_fit(np.stack([events, lag, delay]), frames)
-            lags.append(coefficients[1] / coefficients[0])
+            threshold, ahead, _ = _robust_fit(np.stack([events, lag, delay]), frames)
+            lags.append(ahead / threshold if threshold > 0 else 0.0)
         if not min(lags) > 0:
             return None
         return 1 / lags[0], 1 / max(lags), 1 / min(lags)

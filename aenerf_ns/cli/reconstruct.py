@@ -106,6 +106,7 @@ class Reconstruct(DatasetCommand):
         num_images = num_posed = 0
         for time, image in source(batches_of(copied(), num_events)):
             num_images += 1
+            time -= recording.sensor.image_lag
             if known.contains(time) and reference.start <= time <= reference.end:
                 num_posed += 1
                 writer.add_image("train", image, homogeneous(reference.interpolate(time)), time)

@@ -26,7 +26,9 @@ _THRESHOLDS = (1e-4, 1e3)
 # Nanoseconds. Refractory periods are microseconds to milliseconds long.
 _MAX_REFRACTORY_PERIOD = 10**12
 # Hertz. Photoreceptors follow 1 Hz to 10 kHz. More stands for pixels that follow at once.
-_MAX_BANDWIDTH = 1e15
+_BANDWIDTHS = (1e-6, 1e15)
+# Radiance over the mean, of the pixels whose lag edges in images of the events have: their dark sides fire less.
+_EDGE_RADIANCE = 2.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class SensorModel:
 
     Raises:
         ValueError: a threshold is below 1e-4 or above 1e3, the refractory period is negative or beyond 1000 s, the
-            bandwidth is negative or beyond 1e15 Hz, or the pattern is unknown.
+            bandwidth is neither 0 nor from 1e-6 to 1e15 Hz, or the pattern is unknown.
     """
 
     positive_contrast_threshold: float = 0.25
@@ -62,8 +64,9 @@ class SensorModel:
             raise ValueError(
                 f"refractory_period must be from 0 to {_MAX_REFRACTORY_PERIOD:g} ns, not {self.refractory_period:g}"
             )
-        if not 0 <= self.bandwidth <= _MAX_BANDWIDTH:
-            raise ValueError(f"bandwidth must be from 0 to {_MAX_BANDWIDTH:g} Hz, not {self.bandwidth:g}")
+        low, high = _BANDWIDTHS
+        if self.bandwidth != 0 and not low <= self.bandwidth <= high:
+            raise ValueError(f"bandwidth must be 0, or from {low:g} to {high:g} Hz, not {self.bandwidth:g}")
         if self.bayer_pattern not in get_args(BayerPattern):
             known = ", ".join(f'"{pattern}"' for pattern in get_args(BayerPattern))
             raise ValueError(f'bayer_pattern must be one of {known}, not "{self.bayer_pattern}"')
@@ -76,6 +79,11 @@ class SensorModel:
     def time_constant(self, radiance: Any) -> Any:
         """Return the seconds by which the pixels' low-pass filter lags, given radiances over their mean."""
         return (1 + _DARK_RADIANCE) / (2 * math.pi * self.bandwidth * (radiance + _DARK_RADIANCE))
+
+    @property
+    def image_lag(self) -> int:
+        """Nanoseconds by which images of the events show what was seen before, 0 without a bandwidth."""
+        return round(1e9 * self.time_constant(_EDGE_RADIANCE)) if self.bandwidth > 0 else 0
 
     def channels(self, width: int, height: int) -> NDArray[np.int64]:
         """Return the (height, width) radiance channels that the filters of raw pixels pass: 0 red, 1 green, 2 blue; 0

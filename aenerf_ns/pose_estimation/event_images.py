@@ -37,8 +37,6 @@ _BLUR, _PERCENTILES = 0.8, (1.0, 99.0)
 _NUM_MOTIONS, _CORNERS = 100, (200, 0.02, 4)
 # Pixels that a match must have moved. What a sensor adds or loses leaves ghosts where the scene was, which stand still.
 _MIN_MOTION = 0.5
-# Over the mean: of the pixels whose lag the edges in an image have, because their dark sides fire fewer events.
-_EDGE_RADIANCE = 2.0
 MIN_IMAGES = 3
 """Images that poses are estimated from, at least."""
 
@@ -87,8 +85,8 @@ def images_of_events(
         weights: file of a network that makes the images; by default, a filter makes them.
 
     Returns:
-        The (N,) times in nanoseconds, increasing, at which light made what the images show, and the images: (height, width) gray, or (height, width, 3) where a
-        network makes them.
+        The (N,) times in nanoseconds, increasing, of the light that the images show, and the images: (height, width)
+        gray, or (height, width, 3) where a network makes them.
 
     Raises:
         DataError: there are too few events for three images.
@@ -124,11 +122,9 @@ def images_of_events(
         drift = drift_of_events(kept.filtered(events.tracked("Comparing the pixels")), capture.sensor.refractory_period)
     if share < 1 or (drift is not None and drift.any()):
         images = make_images(round(share * num_events), drift)
-    times = np.array([moment for moment, _ in images], np.int64)
-    if capture.sensor.bandwidth > 0:
-        times -= round(1e9 * capture.sensor.time_constant(_EDGE_RADIANCE))
+    times = np.array([moment for moment, _ in images], np.int64) - capture.sensor.image_lag
     # Events of one time may end one image and begin the next.
-    later = np.append(True, np.diff(times) > 0) & (times >= window.start)
+    later = np.append(True, np.diff(times) > 0)
     return times[later], [image for (_, image), is_later in zip(images, later, strict=True) if is_later]
 
 

@@ -75,8 +75,8 @@ class SensorOptions:
     """Values of the sensor that take the place of the dataset's."""
 
     positive_contrast_threshold: float | None = None
-    """C+, in place of the dataset's value or of the one assumed for its sensor. The size of both thresholds only sets
-    the scale of the log-radiance, which color correction finds."""
+    """C+, in place of the dataset's value or of the one assumed for its sensor. Without a bandwidth, the
+    size of both thresholds only sets the scale of log-radiance, which color correction finds."""
     negative_contrast_threshold: float | None = None
     """C-, in place of the dataset's value or of the assumed one. Its ratio to C+ matters."""
     refractory_period_ns: int | None = None

@@ -313,11 +313,8 @@ class EventSimulator:
 
     def recorded_sensor(self) -> SensorModel:
         """Return the sensor, with the bandwidth that a pixel has at the mean radiance of the frames."""
-        if self._bandwidth is None:
-            return self.sensor
-        return replace(
-            self.sensor, bandwidth=self._bandwidth * self._sum_of_light / max(self._time_ns - self._start_ns, 1)
-        )
+        mean_light = self._sum_of_light / max(self._time_ns - self._start_ns, 1)
+        return replace(self.sensor, bandwidth=(self._bandwidth or 0.0) * mean_light)
 
     def readout_note(self) -> str:
         """Say how many events the readout lost, and how long it delayed others."""

@@ -54,7 +54,7 @@ _NATIVE_FAULTS: dict[str, Fault] = {
     "no focal length": (native(lambda m: m["event_camera"].pop("fl_x")), "transforms.json", "event_camera: "),
     "no threshold": (camera(positive_contrast_threshold=None), "transforms.json", "positive_contrast"),
     "negative threshold": (camera(negative_contrast_threshold=-1), "transforms.json", "negative_contrast"),
-    "negative bandwidth": (camera(bandwidth_hz=-1.0), "transforms.json", "bandwidth must be from 0"),
+    "negative bandwidth": (camera(bandwidth_hz=-1.0), "transforms.json", "bandwidth must be 0, or from"),
     "negative blindness": (camera(refractory_period_ns=-1), "transforms.json", "refractory_period must be from 0"),
     "unknown Bayer pattern": (camera(bayer_pattern="RGBG"), "transforms.json", '"RGBG"'),
     "unknown lens": (camera(camera_model="KB4"), "transforms.json", "event_camera: the lens model is 'KB4'"),

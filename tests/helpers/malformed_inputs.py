@@ -204,7 +204,7 @@ _MILLISECONDS = set_attribute("time_unit", "ms")
 # Values in transforms.json, by the keys that lead to them: one or two for each way in which values are refused.
 _JSON_VALUES: dict[tuple, list] = {
     ("event_camera", "refractory_period_ns"): [10**10, 2**63 - 1],
-    ("event_camera", "bandwidth_hz"): [-1, 1e300],
+    ("event_camera", "bandwidth_hz"): [-1, 1e-300, 1e300],
     ("event_camera", "cx"): ["RAW:1e300"],
     ("event_camera", "k1"): ["RAW:-1e10"],
     ("event_camera", "k2"): ["RAW:1e300"],
