@@ -247,7 +247,7 @@ class EventSimulator:
         self._busy_until, self._waits_until = 0.0, np.zeros(height * width)
         # Of the last frame: the intensity, its logarithm, that filtered, and the same with the leak.
         self._last: tuple[NDArray[np.float64], ...] = ()
-        self._time_ns = 0
+        self._start_ns = self._time_ns = 0
         # Of the light that the bandwidth follows: the mean over the pixels, summed over the nanoseconds.
         self._sum_of_light = 0.0
 
