@@ -27,7 +27,8 @@ _THRESHOLDS = (1e-4, 1e3)
 _MAX_REFRACTORY_PERIOD = 10**12
 # Hertz. Photoreceptors follow 1 Hz to 10 kHz. More stands for pixels that follow at once.
 _BANDWIDTHS = (1e-6, 1e15)
-# Radiance over the mean, of the pixels whose lag edges in images of the events have: their dark sides fire less.
+# Over the mean radiance. An edge in an image of the events lags as a pixel of this radiance does: the dark side of an
+# edge lags more, but fires fewer events.
 _EDGE_RADIANCE = 2.0
 
 
@@ -82,7 +83,7 @@ class SensorModel:
 
     @property
     def image_lag(self) -> int:
-        """Nanoseconds by which images of the events show what was seen before, 0 without a bandwidth."""
+        """Nanoseconds from the light to the image of the events that shows it; 0 without a bandwidth."""
         return round(1e9 * self.time_constant(_EDGE_RADIANCE)) if self.bandwidth > 0 else 0
 
     def channels(self, width: int, height: int) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""What the change from frame to frame tells of the sensor."""
+"""The bandwidth of a sensor, from its events and the frames between which they lie."""
 
 from __future__ import annotations
 

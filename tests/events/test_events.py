@@ -23,7 +23,7 @@ from aenerf_ns.events.picture import polarity_picture
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.simulator.esim import EventSimulator
-from aenerf_ns.supervision.event_pairs import find_rows
+from aenerf_ns.supervision.pair_table import find_rows
 
 WIDTH, HEIGHT = 4, 3
 EPOCH = 1_600_000_000_000_000_000

@@ -77,7 +77,7 @@ def test_pairs_count_less_the_more_their_pixel_misses(random_poses: torch.Tensor
     assert longer.any()
     assert not longer.all()
     # The rates before and after it are -1 / 187.5 ms and 1 / 687.5 ms, so -1 / 275 ms in the middle of its blindness:
-    # 0.23 thresholds are missed, of which one eighth is counted, and the rest with the next event's.
+    # the pixel misses 0.23 thresholds. One eighth counts here. The rest counts after the next event.
     assert (batch.num_positive[longer] == 1).all()
     assert (batch.num_negative[longer] == 1.125).all()
     torch.testing.assert_close(batch.weight, 0.25 / (0.25 + 0.25 * 0.125 * longer))
