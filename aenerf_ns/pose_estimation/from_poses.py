@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from aenerf_ns.camera.alignment import rotation_angle
 from aenerf_ns.camera.time_window import TimeWindow, runs_of
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
@@ -65,8 +66,9 @@ def refine_poses(
     COLMAP matches images that are made of the events (:func:`match_event_images`), and triangulates tracks from the
     poses. The poses then follow the tracks, as far as these are to be trusted more
     (:class:`~aenerf_ns.pose_estimation.refinement.PoseRefinement`), in some rounds. Intrinsics stay as they are. Given
-    poses between images are moved as their neighbors are. A seed gives the same poses again, to the last bit on one
-    machine with one version of COLMAP.
+    poses between images are moved as their neighbors are, or replaced by a spline through these
+    (:func:`poses_between_images`). A seed gives the same poses again, to the last bit on one machine with one version
+    of COLMAP.
 
     Args:
         recording: its events, poses and intrinsics.
@@ -114,11 +116,50 @@ def refine_poses(
             model, tracks = triangulate(refinement.poses, limits)
             refinement.follow(tracks)
     observations = observations_of(model, len(pictures))
-    twists = np.stack([np.interp(given.times.numpy(), times, column) for column in refinement.twists.T], -1)
-    moved = torch.from_numpy(move_poses(given.camera_to_worlds.numpy(), twists))
+    trajectory, is_interpolated = poses_between_images(given, times, refinement, depth)
     report = {**_report(refinement, times, model.num_points3D()), "seconds": time.perf_counter() - begin}
+    if is_interpolated:
+        report["summary"] += "; the given poses jump from one to the next, so those between images are interpolated"
     draw = partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images])
-    return RefinedPoses(Trajectory(given.times, moved, given.source), report, box_of(model), draw)
+    return RefinedPoses(trajectory, report, box_of(model), draw)
+
+
+def poses_between_images(
+    given: Trajectory, times: NDArray[np.int64], refinement: PoseRefinement, depth: float
+) -> tuple[Trajectory, bool]:
+    """Return the refined poses at the times of the given ones, and whether those between images are a spline.
+
+    Given poses that are moved as the neighboring images are keep the given motion. Where errors jump from pose to pose,
+    that motion is worse than none, and a spline through the poses of the images is better. What foretells every other
+    image better is taken.
+
+    Args:
+        given: the given poses.
+        times: (N,) of the images in nanoseconds.
+        refinement: of their poses.
+        depth: of the scene, in the units of the poses.
+    """
+    refined = torch.from_numpy(refinement.poses)
+
+    def moved(at: NDArray[np.int64], images: slice) -> Tensor:
+        twists = [np.interp(at, times[images], column[images]) for column in refinement.twists.T]
+        return torch.from_numpy(move_poses(given.interpolate(at).numpy(), np.stack(twists, -1)))
+
+    def interpolated(at: NDArray[np.int64], images: slice) -> Tensor:
+        return Trajectory(times[images], refined[images], given.source).interpolate(at)
+
+    def error(find: Callable[[NDArray[np.int64], slice], Tensor]) -> float:
+        found, left_out = find(times[1:-1:2], slice(None, None, 2)), refined[1:-1:2]
+        offsets = (found - left_out)[..., 3] / depth
+        return float((rotation_angle(found, left_out).square() + offsets.square().sum(-1)).mean())
+
+    at = given.times.numpy()
+    poses = moved(at, slice(None))
+    is_interpolated = error(interpolated) < error(moved)
+    if is_interpolated:
+        is_between = (at >= times[0]) & (at <= times[-1])
+        poses[is_between] = interpolated(at[is_between], slice(None))
+    return Trajectory(given.times, poses, given.source), is_interpolated
 
 
 def _report(refinement: PoseRefinement, times: NDArray[np.int64], num_tracks: int) -> dict[str, Any]:

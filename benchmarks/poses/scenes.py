@@ -51,6 +51,7 @@ _MIDDLE = "--width 160 --height 120"
 _FEW_FRAMES = "--max-displacement 1"
 _SENSOR_240 = f"--width 240 --height 180 {_FEW_FRAMES} --validation-views 4 --test-views 10"
 _RGGB = "--bayer-pattern RGGB"
+_JUMPS = "--pose-noise-kind gauss-markov --pose-noise-correlation-time 0.078"
 _LARGE_NOISE = "--pose-noise-degrees 3 --pose-noise-translation 0.08"
 SCENES = {
     name: PoseScene(split, scene, speed, tuple(options.split()), about)  # type: ignore[arg-type]
@@ -72,22 +73,22 @@ SCENES = {
         ("object large noise davis346", "events", "object", "hard", "large noise, a real sensor",
          f"{_MIDDLE} {_FEW_FRAMES} {_LARGE_NOISE} --sensor davis346 --seed 18"),
         ("room Gauss-Markov", "events", "room", "hard", "noise that jumps from pose to pose",
-         f"{_MIDDLE} {_FEW_FRAMES} {_NOISE} --pose-noise-kind gauss-markov --pose-noise-correlation-time 0.078 "
-         "--seed 19"),
+         f"{_MIDDLE} {_FEW_FRAMES} {_NOISE} {_JUMPS} --seed 19"),
         ("object COLMAP 25 Hz", "report", "object", "hard", "COLMAP's own errors",
          f"{_MIDDLE} --poses colmap --frame-rate 25 --seed 16"),
         ("room COLMAP 125 Hz", "report", "room", "hard", "COLMAP's own errors",
          f"{_MIDDLE} --poses colmap --frame-rate 125 --seed 17"),
         *(
-            (f"{scene} 240 {name}", "events", scene, speed, about, f"{_SENSOR_240} {_NOISE} {sensor} --seed {seed}")
+            (f"{scene} 240 {name}", "events", scene, speed, about, f"{_SENSOR_240} {_NOISE} {options} --seed {seed}")
             for scene, easy, hard in (
                 ("games", 34, 11), ("forklift", 31, 37), ("lounge", 35, 32), ("living_room", 36, 22),
                 ("gallery", 33, 38), ("workshop", 13, 39), ("room", 40, 41),
             )
-            for name, speed, about, sensor, seed in (
+            for name, speed, about, options, seed in (
                 ("easy", "easy", "240 x 180", "", easy),
                 ("hard", "hard", "240 x 180", "", hard),
                 ("davis346", "hard", "240 x 180, a real sensor", "--sensor davis346", hard),
+                ("Gauss-Markov", "hard", "240 x 180, noise that jumps from pose to pose", _JUMPS, hard),
             )
         ),
     )

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.pose_estimation.bundle_adjustment import TrackAdjustment, Tracks, move_poses
+from aenerf_ns.pose_estimation.from_poses import poses_between_images
 from aenerf_ns.pose_estimation.refinement import PoseRefinement
 from aenerf_ns.simulator.paths import look_at
 
@@ -156,3 +160,32 @@ def test_poses_without_tracks_stay_as_given(truth: np.ndarray) -> None:
     assert errors(refinement.poses[:26], truth[:26])[0] < 0.3 * errors(given[:26], truth[:26])[0]
     # As given, but for what the last images with tracks tell of the next ones.
     assert np.abs(refinement.twists[36:]).max() < 0.3 * np.abs(refinement.twists).max()
+
+
+@pytest.mark.parametrize(("shake", "kind", "left"), [(0.5, "smooth", 0.03), (0.0, "gauss-markov", 0.01)])
+def test_poses_between_images_keep_the_given_motion_unless_it_jumps(
+    truth: np.ndarray, shake: float, kind: Literal["smooth", "gauss-markov"], left: float
+) -> None:
+    images = (SECONDS * 1e9).astype(np.int64)
+    times = np.arange(-20_000_000, 1_220_000_000, 4_000_000)
+    inside = (times >= 0) & (times <= images[-1])
+    path = Trajectory(images, torch.from_numpy(truth))
+    # The camera stands still ahead of the first image and after the last. It shakes faster than images show.
+    steady = Trajectory(times, path.interpolate(times.clip(0, images[-1])))
+    true = perturb(steady, shake, 0.0, 0.01, seed=2)
+    given = perturb(true, 1.5, 0.04, 0.3 if kind == "smooth" else 0.08, seed=1, kind=kind)
+    refinement = PoseRefinement(SECONDS, given.interpolate(images).numpy(), depth=2.5, seed=0)
+    back = given.interpolate(images)[:, :, :3].mT
+    moves = (back @ (true.interpolate(images) - given.interpolate(images))[:, :, 3:])[..., 0]
+    turns = Rotation.from_matrix(back @ true.interpolate(images)[:, :, :3]).as_rotvec()
+    refinement.twists = np.concatenate([moves, turns], 1)
+
+    found, is_interpolated = poses_between_images(given, images, refinement, 2.5)
+    assert is_interpolated == (kind == "gauss-markov")
+    assert torch.equal(found.times, given.times)
+    degrees, distance = errors(found.camera_to_worlds[inside].numpy(), true.camera_to_worlds[inside].numpy())
+    assert degrees < left
+    assert distance < 0.05 * left
+    # Ahead of the first image there is no spline: poses move as the image does.
+    moved = move_poses(given.camera_to_worlds[:5].numpy(), np.tile(refinement.twists[0], (5, 1)))
+    np.testing.assert_allclose(found.camera_to_worlds[:5], moved, atol=1e-12)
