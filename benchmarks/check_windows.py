@@ -26,7 +26,7 @@ from aenerf_ns.cli.dataset import DatasetCommand
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_reader import EventFile
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 from aenerf_ns.recording.recording import Recording
 from aenerf_ns.recording.time_units import require_one_unit
 from benchmarks.runs import run_benchmark, write_result
@@ -172,20 +172,19 @@ class CheckWindows:
         """Check the windows, and write what was found."""
         found: list[dict[str, Any]] = []
         kinds = {"right": (lambda *given: given, self.right)} | {name: (f, self.wrong) for name, f in MISTAKES.items()}
-        with progress_bar() as progress:
-            for folder in progress.track(self.recordings, description="Recordings"):
-                recording = DatasetCommand(folder).open_dataset().recording
-                recording = replace(recording, trajectory=recording.ground_truth or recording.trajectory)
-                events = EventStream.concatenate(list(recording.event_file.chunks()))
-                rng = np.random.default_rng(0)
-                for kind, (change, count) in kinds.items():
-                    wrong_events, wrong_recording = change(events, recording)
-                    for length in np.minimum(10 ** rng.uniform(8, 9, count), events.t[-1] - events.t[0]):
-                        start = int(rng.integers(events.t[0], events.t[-1] - int(length) + 1))
-                        problems, has_enough = find_problems(wrong_events, wrong_recording, start, start + int(length))
-                        window = {"start": start, "seconds": length * 1e-9, "enough_events": has_enough}
-                        found.append({"recording": folder.name, "kind": kind, **window, "problems": problems})
-                write_result(self.output, {"table": table(found), "windows": found}, show=False)
+        for folder in track(self.recordings, "Recordings"):
+            recording = DatasetCommand(folder).open_dataset().recording
+            recording = replace(recording, trajectory=recording.ground_truth or recording.trajectory)
+            events = EventStream.concatenate(list(recording.event_file.chunks()))
+            rng = np.random.default_rng(0)
+            for kind, (change, count) in kinds.items():
+                wrong_events, wrong_recording = change(events, recording)
+                for length in np.minimum(10 ** rng.uniform(8, 9, count), events.t[-1] - events.t[0]):
+                    start = int(rng.integers(events.t[0], events.t[-1] - int(length) + 1))
+                    problems, has_enough = find_problems(wrong_events, wrong_recording, start, start + int(length))
+                    window = {"start": start, "seconds": length * 1e-9, "enough_events": has_enough}
+                    found.append({"recording": folder.name, "kind": kind, **window, "problems": problems})
+            write_result(self.output, {"table": table(found), "windows": found}, show=False)
 
 
 def table(found: list[dict[str, Any]]) -> dict[str, dict[str, int]]:

@@ -15,7 +15,7 @@ from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.files.event_arrays import XYTP_MATRIX, ArrayEventFile, load_npy
 from aenerf_ns.files.event_reader import EventFile
-from aenerf_ns.files.limits import list_files, require_one
+from aenerf_ns.files.limits import list_files, require_one, visible_files
 from aenerf_ns.files.tum_trajectory import read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
@@ -70,7 +70,7 @@ class ENeRFEsimDataParser(EventDataParser):
         return self.config.make_recording(reference, capture, reference_views=views_on_trajectory(images, reference))
 
     def poses_path(self) -> Path:
-        lists = sorted(self.data.glob("*poses_all*.txt")) or [self.data / "poses_all.txt"]
+        lists = visible_files(self.data, "*poses_all*.txt") or [self.data / "poses_all.txt"]
         return require_one(lists, self.data, "files *poses_all*.txt", "leave the poses of the scene only")
 
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:

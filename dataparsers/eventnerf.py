@@ -17,7 +17,7 @@ from aenerf_ns.camera.trajectory import Trajectory, require_rigid
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_arrays import XYTP_MEMBERS, ArrayEventFile
-from aenerf_ns.files.limits import list_files, read_text, require_one
+from aenerf_ns.files.limits import list_files, read_text, require_one, visible_files
 from aenerf_ns.files.text import TimeUnit, parse_numbers
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import ObjectDataParserConfig
@@ -115,7 +115,7 @@ class EventNeRFDataParser(EventDataParser):
     def read_capture(self) -> tuple[Capture, list[tuple[int, Path]]]:
         split = self._split()
         # A trained run is opened without its events.
-        events = sorted((split / "events").glob("*.npz")) or [split / "events" / "events.npz"]
+        events = visible_files(split / "events", "*.npz") or [split / "events" / "events.npz"]
         file = require_one(events, split / "events", "files *.npz", "leave the events of the scene only")
         capture = self.config.make_capture(
             SensorModel(bayer_pattern="RGGB" if self.config.color else ""),

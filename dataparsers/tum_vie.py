@@ -17,7 +17,7 @@ from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.files.event_hdf5 import COLUMNS_IN_GROUP, Hdf5TableFile
 from aenerf_ns.files.json_file import read_json
-from aenerf_ns.files.limits import require_one
+from aenerf_ns.files.limits import require_one, visible_files
 from aenerf_ns.files.tum_trajectory import poses_from_quaternions, read_tum_trajectory
 from aenerf_ns.recording.dataparser import EventDataParser
 from aenerf_ns.recording.options import PublishedDataParserConfig
@@ -166,7 +166,7 @@ def _event_files(data: Path) -> list[Path]:
     if _EVENT_FILE.fullmatch(data.name):
         return [data]
     parts = ("-events_left.h5", "-vi_gt_data")
-    names = {path.name.removesuffix(part) for part in parts for path in data.glob(f"?*{part}")}
+    names = {path.name.removesuffix(part) for part in parts for path in visible_files(data, f"?*{part}")}
     return [data / f"{name}-events_left.h5" for name in sorted(names)]
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import binary_opening
 from torch import Tensor
 
 from aenerf_ns.camera.rotation import quaternion_from_rotation, rotation_from_quaternion
@@ -49,7 +50,9 @@ def pose_polynomials(seconds: Tensor, poses: Tensor) -> Tensor:
     values = torch.cat([poses[:, :, 3], quaternions], -1)
     steps = seconds.diff()[:, None]
     chords = values.diff(dim=0) / steps
-    in_spline = _in_spline(steps[:, 0], 2 * angles[:, 0])
+    known = ~is_gap(steps[:, 0]) & (2 * angles[:, 0] <= _MAX_TURN)
+    # A spline has two segments or more.
+    in_spline = torch.from_numpy(binary_opening(known.cpu().numpy(), np.ones(2))).to(known.device)
     slopes = _spline_slopes(seconds, values, in_spline)
     # The slopes of steady motions, in which quaternions move along great circles.
     scale = 1 / (torch.sinc(angles / math.pi) * steps)
@@ -80,15 +83,6 @@ def is_gap(steps: Tensor) -> Tensor:
     longest[1:] = _MAX_SEGMENT_RATIO * steps[:-1]
     longest[:-1] = torch.minimum(longest[:-1], _MAX_SEGMENT_RATIO * steps[1:])
     return steps > longest
-
-
-def _in_spline(steps: Tensor, turns: Tensor) -> Tensor:
-    """Return which of the (N,) segments, of given lengths and angles, belong to a spline of at least two segments."""
-    known = ~is_gap(steps) & (turns <= _MAX_TURN)
-    beside = torch.zeros_like(known)
-    beside[1:] |= known[:-1]
-    beside[:-1] |= known[1:]
-    return known & beside
 
 
 def _spline_slopes(seconds: Tensor, values: Tensor, in_spline: Tensor) -> Tensor:

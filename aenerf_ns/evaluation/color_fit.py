@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -14,35 +13,21 @@ from torch import Tensor
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.method.color_correction import NoColorCorrection
 from aenerf_ns.method.color_protocol import ColorCorrectionProtocol
-from aenerf_ns.method.model import AENeRFModel
-from aenerf_ns.recording.dataset import EventDataset
 
 
 class ColorFit:
-    """Fits a model's color correction on pixels of its protocol's reference views, the same in every run.
+    """Fits the color correction of a run on pixels of its protocol's reference views, the same in every run.
 
     Without such views, the percentiles of the training cameras' renderings are stretched over the display's range.
-
-    Args:
-        model: holds the color correction.
-        dataset: the training cameras.
-        read_reference_views: reads the reference views of a split; None where there are none.
     """
 
-    def __init__(
-        self,
-        model: AENeRFModel,
-        dataset: EventDataset,
-        read_reference_views: Callable[[Literal["val", "test"]], EventDataset | None],
-    ) -> None:
-        self._model = model
-        self._dataset = dataset
-        self._read_reference_views = read_reference_views
+    def __init__(self, run: TrainedRun) -> None:
+        self._run = run
         # Chosen once: otherwise every fit would read the images again.
         self._pixels: tuple[Cameras, Tensor, Tensor, Tensor | None] | None = None
         # The sign of the slope that was printed last.
         self._was_reversed: bool | None = None
-        if model.color_correction.protocol == "affine-test":
+        if run.model.color_correction.protocol == "affine-test":
             CONSOLE.print(
                 "[yellow]Color correction affine-test is fitted on the test views themselves: only to compare with "
                 "figures that were made so."
@@ -51,7 +36,7 @@ class ColorFit:
     @torch.no_grad()
     def fit(self, share: float = 1.0) -> None:
         """Fit the color correction on a share of the configured number of pixels. A share below 1 makes a rough fit."""
-        model, correction = self._model, self._model.color_correction
+        model, correction = self._run.model, self._run.model.color_correction
         if isinstance(correction, NoColorCorrection):
             return
         if self._pixels is None:
@@ -79,11 +64,11 @@ class ColorFit:
             the cameras of the views; of each pixel (N, 1) the index of its camera, (N, 2) row and column, and
             (N, channels) the radiance of the reference image, None where there are no reference views.
         """
-        references = self._read_reference_views(split)
-        views = references or self._dataset
+        references = self._run.read_reference_views(split)
+        views = references or self._run.dataset
         generator = torch.Generator().manual_seed(0)
-        cameras, device = views.cameras, self._model.device
-        count = max(self._model.config.color_correction_num_rays, len(views))
+        cameras, device = views.cameras, self._run.device
+        count = max(self._run.model.config.color_correction_num_rays, len(views))
         # Every view is drawn as often as the others, in random order, so any part is spread over the views too.
         index = (torch.arange(count) % len(views))[torch.randperm(count, generator=generator)]
         size = torch.cat([cameras.height, cameras.width], -1)[index]
@@ -94,11 +79,11 @@ class ColorFit:
             for view in range(len(views)):
                 rows, columns = pixels[index == view].T
                 image[index == view] = views.get_image_float32(view)[rows, columns, :3]
-            radiance = self._model.reference_radiance(image).to(device)
+            radiance = self._run.model.reference_radiance(image).to(device)
         return cameras.to(device), index[:, None].to(device), (pixels + 0.5).to(device), radiance
 
 
 def replace_color_correction(run: TrainedRun, protocol: ColorCorrectionProtocol) -> None:
     """Replace the color correction of a run by another protocol, fitted anew on the run's data."""
     run.model.color_correction = run.model.new_color_correction(protocol).to(run.device)
-    ColorFit(run.model, run.dataset, run.read_reference_views).fit()
+    ColorFit(run).fit()

@@ -9,10 +9,7 @@ import torch
 
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
-from aenerf_ns.method.model import AENeRFModel
-from aenerf_ns.method.pose_correction import PoseCorrection
-from aenerf_ns.recording.dataset import EventDataset
-from aenerf_ns.supervision.base import Sampler
+from aenerf_ns.evaluation.run import TrainedRun
 
 # Poses are not corrected if they are turned by less than this in radians, and moved by less than this in extents of
 # the trajectory. Noisy batches alone move exact poses further.
@@ -30,19 +27,14 @@ _MIN_EVENTS = 2_000
 _NUM_POSES = 10_000
 
 
-def diagnose(model: AENeRFModel, dataset: EventDataset, sampler: Sampler | None) -> dict[str, Any]:
-    """Measure figures that tell whether pose correction failed.
-
-    Args:
-        model: at the end of training, with pose correction.
-        dataset: the training data.
-        sampler: draws the batches.
+def diagnose(run: TrainedRun) -> dict[str, Any]:
+    """Measure figures that tell whether the pose correction of a run failed, at the end of its training.
 
     Returns:
         The figures and a ``summary`` of them in words, as plain values, which JSON and checkpoints can hold. The
         contrasts are None where there are too few events, and there are no stretches where batches are not of pairs.
     """
-    correction, scene = model.camera_optimizer, dataset.scene
+    correction, scene = run.model.camera_optimizer, run.dataset.scene
     estimated, corrected, _ = (scene.to_recording(poses) for poses in correction.compared_poses())
     # After alignment, because the scene may drift together with all poses, which changes nothing.
     size = pose_errors(corrected, estimated)
@@ -51,8 +43,8 @@ def diagnose(model: AENeRFModel, dataset: EventDataset, sampler: Sampler | None)
         "correction_translation_recording_units": size["translation_error"],
         "correction_translation_extents": size["translation_error"] * scene.scale / correction.translation_unit,
         "clock_change_share_of_limit": abs(float(correction.clock_change_share())),
-        **_compare_contrast(correction, dataset),
-        "stretches": _measure_stretches(model, sampler),
+        **_compare_contrast(run),
+        "stretches": _measure_stretches(run),
     }
     return {"summary": summarize(figures), **figures}
 
@@ -92,8 +84,9 @@ def summarize(figures: dict[str, Any]) -> str:
 
 
 @torch.no_grad()
-def _measure_stretches(model: AENeRFModel, sampler: Sampler | None) -> list[dict[str, float]]:
+def _measure_stretches(run: TrainedRun) -> list[dict[str, float]]:
     """Measure the reconstruction loss of newly drawn pairs by stretch of time, beside the loss of a constant field."""
+    model, sampler = run.model, run.sampler
     drawn = None if sampler is None else sampler.residual_batch(2 * _NUM_STRETCHES * _PAIRS_PER_STRETCH)
     if drawn is None:
         return []
@@ -121,13 +114,13 @@ def _measure_stretches(model: AENeRFModel, sampler: Sampler | None) -> list[dict
     return stretches
 
 
-def _compare_contrast(correction: PoseCorrection, dataset: EventDataset) -> dict[str, Any]:
+def _compare_contrast(run: TrainedRun) -> dict[str, Any]:
     """Compare the contrast of events warped by the estimated and by the corrected poses."""
     # Imported lazily: every ns-* command imports this module, and numba is slow to import.
     from aenerf_ns.checking.contrast import WarpedEvents
     from aenerf_ns.checking.hypotheses import Hypothesis
 
-    events = dataset.timeline
+    correction, events = run.model.camera_optimizer, run.dataset.timeline
     if len(events) < _MIN_EVENTS:
         return {"contrast_estimated": None, "contrast_corrected": None, "contrast_is_clearly_lower": False}
     base = correction.trajectory
@@ -138,7 +131,7 @@ def _compare_contrast(correction: PoseCorrection, dataset: EventDataset) -> dict
             homogeneous(source.pose(base.seconds(times.to(base.times.device))).cpu()) @ OPENCV_TO_OPENGL
             for source in (base, correction)
         )
-    warped = WarpedEvents([events], Trajectory(times, corrected), dataset.scene.event_camera)
+    warped = WarpedEvents([events], Trajectory(times, corrected), run.dataset.scene.event_camera)
     comparison = warped.compare(Hypothesis("estimated", poses=lambda _: estimated))
     assert comparison is not None
     return {

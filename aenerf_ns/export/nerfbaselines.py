@@ -44,10 +44,8 @@ def export_predictions(run: TrainedRun, folder: Path, config: TrainerConfig, vie
     names = picture_names(run.views.image_filenames)
     info = describe_run(config.method_name, run.data.name, config.max_num_iterations)
     write_predictions(folder / _PREDICTIONS, _render_views(run, names), info)
-    # The evaluator reads the views in the order of their names.
-    placed = [view["placed"] for _, view in sorted(zip(names, views, strict=True), key=lambda pair: pair[0])]
-    metrics = {name: [view[name] for view in placed] for name in IMAGE_METRICS if name in placed[0]}
-    write_results(folder / _RESULTS_FILE, folder / _PREDICTIONS, info, metrics)
+    placed = {name: view["placed"] for name, view in zip(names, views, strict=True)}
+    write_results(folder / _RESULTS_FILE, folder / _PREDICTIONS, info, placed)
 
 
 @torch.no_grad()
@@ -94,9 +92,12 @@ def write_predictions(
 
 
 def write_results(
-    path: Path, predictions: Path, info: Mapping[str, Any], metrics: Mapping[str, Sequence[float]]
+    path: Path, predictions: Path, info: Mapping[str, Any], views: Mapping[str, Mapping[str, float]]
 ) -> None:
-    """Write the metrics of predictions in a folder as JSON, each metric's values in the order of the views' names."""
+    """Write the metrics of predictions in a folder as JSON, given those of each view by its name."""
+    # nerfbaselines reads the views in the order of their files.
+    ordered = [views[name] for name in sorted(views, key="{}.png".format)]
+    metrics = {name: [view[name] for view in ordered] for name in IMAGE_METRICS if name in ordered[0]}
     encoded = {
         name: base64.b64encode(np.asarray(values, "<f4").tobytes()).decode("ascii") for name, values in metrics.items()
     }

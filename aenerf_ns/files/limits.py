@@ -144,13 +144,21 @@ def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> 
         )
 
 
+def visible_files(folder: Path, pattern: str) -> list[Path]:
+    """List the files of a folder that match a pattern, in the order of their names.
+
+    Hidden ones do not count: macOS puts one beside each file that it copies to other disks.
+    """
+    return sorted(file for file in folder.glob(pattern) if not file.name.startswith("."))
+
+
 def list_files(folder: Path, pattern: str) -> list[Path]:
-    """List the files of a dataset's folder that match a pattern, in the order of their names, but not hidden ones.
+    """List the :func:`visible_files` of a dataset's folder that match a pattern.
 
     Raises:
         DataError: there is none.
     """
-    files = sorted(file for file in folder.glob(pattern) if not file.name.startswith("."))
+    files = visible_files(folder, pattern)
     if not files:
         raise DataError(folder, f"it holds no {pattern}", "copy all files of the dataset")
     return files

@@ -15,7 +15,7 @@ from torch import Tensor
 from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reading
-from aenerf_ns.files.limits import file_inside
+from aenerf_ns.files.limits import file_inside, visible_files
 from aenerf_ns.files.text import UNIT_NAMES, TimeUnit, parse_times, read_header, read_rows
 from aenerf_ns.recording.recording import ReferenceView, Split
 from aenerf_ns.recording.time_units import unit_steps
@@ -37,9 +37,7 @@ Item = TypeVar("Item")
 
 def image_files(folder: Path) -> list[Path]:
     """Return the PNG and JPEG images of a folder in the order of their names; none if the folder does not exist."""
-    # macOS puts a hidden file beside each file that it copies to other disks.
-    files = (file for file in folder.glob("*") if not file.name.startswith("."))
-    return sorted(file for file in files if file.suffix.lower() in IMAGE_SUFFIXES)
+    return [file for file in visible_files(folder, "*") if file.suffix.lower() in IMAGE_SUFFIXES]
 
 
 def image_files_of_poses(folder: Path, num_poses: int) -> list[Path]:

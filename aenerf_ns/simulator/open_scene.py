@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import astuple
 
-from aenerf_ns.errors import DataError
+from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.files.json_file import read_json
 from aenerf_ns.files.limits import file_inside
 from aenerf_ns.simulator.arrays import Array
@@ -155,10 +155,8 @@ def _load_scene(path: Path, seed: int) -> SimulationScene:
     if is_bare:
         half_diagonal = 0.5 * float(np.linalg.norm(np.ptp(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0)))
         scale = _RADIUS / (_RADII * half_diagonal) if half_diagonal > 0 else 1.0
-    try:
+    with value_errors_as_data_error(file, "give a mesh of triangles"):
         mesh, num_coincident = repair(scaled(mesh, scale))
-    except ValueError as error:
-        raise DataError(file, str(error), "give a mesh of triangles") from error
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
     notes = []

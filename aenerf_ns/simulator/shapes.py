@@ -64,21 +64,17 @@ def mesh_of(
         KeyError: the texture of a shape is missing.
     """
     index = {name: i for i, name in enumerate(textures)}
-    vertices, faces, uv, color, count = [], [], [], [], 0
+    parts: list[Surface] = []
     for shape in shapes:
         local, corners, tiles = shape.surface(min(spacing, shape.spacing))
         # Not a matrix product, which may round equal rows differently: the two sides of a seam must not part.
-        vertices.append((local[:, None, :] * shape.rotation).sum(axis=-1) + np.asarray(shape.center))
-        faces.append(corners + count)
-        uv.append(tiles + shape.texture_offset)
-        color.append(np.tile(np.asarray(shape.tint, np.float64), (len(local), 1)))
-        count += len(local)
-    sizes = [len(part) for part in faces]
+        world = (local[:, None, :] * shape.rotation).sum(axis=-1) + np.asarray(shape.center)
+        parts.append((world, corners, tiles + shape.texture_offset))
+    sizes = [len(corners) for _, corners, _ in parts]
+    tints = np.array([shape.tint for shape in shapes], np.float64)
     mesh = Mesh(
-        np.concatenate(vertices),
-        np.concatenate(faces),
-        np.concatenate(uv),
-        np.concatenate(color),
+        *_join(parts),
+        np.repeat(tints, [len(world) for world, _, _ in parts], axis=0),
         np.repeat([index[shape.texture] for shape in shapes], sizes),
         np.repeat([shape.emission for shape in shapes], sizes).astype(np.float64),
         np.repeat([gloss.get(shape.texture, DIFFUSE) for shape in shapes], sizes, axis=0),

@@ -17,7 +17,7 @@ from aenerf_ns.camera.trajectory import Trajectory
 from aenerf_ns.errors import DataError
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 from aenerf_ns.simulator.esim import NOISELESS, EventSimulator
 from aenerf_ns.simulator.frames import frame_parameters
 from aenerf_ns.simulator.options import SensorNoise
@@ -93,11 +93,9 @@ class Simulation:
     def events(self) -> Iterator[EventStream]:
         """Render the path densely and yield the events of each frame interval. Call it once."""
         camera = self._camera
-        frames = zip(self._frames, self._times, strict=True)
-        with progress_bar() as progress:
-            for parameter, time in progress.track(frames, total=len(self._frames), description="Simulating events"):
-                image = self._render(self._scene.path(float(parameter)), RAYS_PER_PIXEL)[0]
-                yield EventStream(*self.simulator(image, int(time)), camera.width, camera.height, "simulation")
+        for parameter, time in zip(track(self._frames, "Simulating events"), self._times, strict=True):
+            image = self._render(self._scene.path(float(parameter)), RAYS_PER_PIXEL)[0]
+            yield EventStream(*self.simulator(image, int(time)), camera.width, camera.height, "simulation")
 
     def frame_times(self, frame_rate: float, exposure: float) -> NDArray[np.int64]:
         """Return the middles of the exposures of a camera that takes frames along the path, in nanoseconds.

@@ -15,7 +15,7 @@ from aenerf_ns.camera.image_encoding import decode, to_channels
 from aenerf_ns.events.sensor import SensorModel
 from aenerf_ns.events.stream import EventStream
 from aenerf_ns.pose_estimation.video import Video
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 from aenerf_ns.simulator.esim import NOISELESS, EventSimulator
 from aenerf_ns.simulator.frames import DISPLACEMENT_PERCENTILE
 from aenerf_ns.simulator.options import Interpolation, SensorNoise
@@ -72,21 +72,19 @@ def video_events(
     epsilon = simulator.log_epsilon
     flow = FlowInterpolation(video.width, video.height, max_displacement) if interpolation == "flow" else None
     before: tuple[NDArray[np.uint8], NDArray[np.float64], int] | None = None
-    with progress_bar() as progress:
-        frames = zip(video, video.times.tolist(), strict=True)
-        for frame, time in progress.track(frames, total=len(video.times), description="Simulating events"):
-            seen = to_channels(torch.from_numpy(_GRAY_LEVELS[frame]), simulator.sensor.num_channels).squeeze(-1).numpy()
-            pieces = []
-            if flow is not None and before is not None:
-                first_frame, first_seen, start = before
-                logs = (np.log(picture + epsilon) for picture in (first_seen, seen))
-                for fraction, log_between in flow.between(first_frame, frame, *logs):
-                    radiance = np.maximum(np.exp(log_between) - epsilon, 0)
-                    pieces.append(simulator(radiance, start + round(fraction * (time - start))))
-            pieces.append(simulator(seen, time))
-            x, y, t, p = (np.concatenate(column) for column in zip(*pieces, strict=True))
-            yield VideoInterval(frame, time, EventStream(x, y, t, p, video.width, video.height, video.source))
-            before = frame, seen, time
+    for frame, time in zip(video, track(video.times.tolist(), "Simulating events"), strict=True):
+        seen = to_channels(torch.from_numpy(_GRAY_LEVELS[frame]), simulator.sensor.num_channels).squeeze(-1).numpy()
+        pieces = []
+        if flow is not None and before is not None:
+            first_frame, first_seen, start = before
+            logs = (np.log(picture + epsilon) for picture in (first_seen, seen))
+            for fraction, log_between in flow.between(first_frame, frame, *logs):
+                radiance = np.maximum(np.exp(log_between) - epsilon, 0)
+                pieces.append(simulator(radiance, start + round(fraction * (time - start))))
+        pieces.append(simulator(seen, time))
+        x, y, t, p = (np.concatenate(column) for column in zip(*pieces, strict=True))
+        yield VideoInterval(frame, time, EventStream(x, y, t, p, video.width, video.height, video.source))
+        before = frame, seen, time
 
 
 class FlowInterpolation:

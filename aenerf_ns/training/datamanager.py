@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
@@ -45,15 +44,9 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     train_pixel_sampler: Sampler | None
     has_reference_views: bool
 
-    def __init__(
-        self,
-        config: EventDataManagerConfig,
-        device: torch.device | str = "cpu",
-        test_mode: Literal["test", "val", "inference"] = "val",
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, config: EventDataManagerConfig, **kwargs: Any) -> None:
         with errors_as_one_line():
-            super().__init__(config, device=device, test_mode=test_mode, **kwargs)
+            super().__init__(config, **kwargs)
 
     def resolved_config(self) -> EventDataManagerConfig:
         """Return the configuration with what the dataparser resolved: its format, its paths and its time window."""

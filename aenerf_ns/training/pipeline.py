@@ -73,7 +73,7 @@ class AENeRFPipeline(VanillaPipeline):
         self.training_state = TrainingState()
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
-        self.color_fit = ColorFit(self.model, self.datamanager.train_dataset, self.datamanager.reference_views)
+        self.color_fit = ColorFit(self.trained_run())
         self._unchecked_losses: dict[str, Tensor] = {}
         self._steps_per_log = 1
         # The viewer, where one runs, finds its elements here and names their folder after the attribute.
@@ -140,8 +140,7 @@ class AENeRFPipeline(VanillaPipeline):
 
         def diagnose_poses(step: int) -> None:
             if step == steps[-1] and self.model.camera_optimizer.is_learned and comms.is_main_process():
-                data = self.datamanager
-                self._pose_diagnosis = diagnose(self.model, data.train_dataset, data.train_pixel_sampler)
+                self._pose_diagnosis = diagnose(self.trained_run())
                 CONSOLE.print(self._pose_diagnosis["summary"], soft_wrap=True)
 
         def fit(step: int) -> None:

@@ -178,7 +178,8 @@ class AENeRFTrainer(Trainer):
                 super().train()
             except BaseException:
                 if self._record is not None:
-                    self._record.write("stopped", self.step - self._steps.start)
+                    # Nerfstudio counts from 0 until it takes the first step of a run that goes on.
+                    self._record.write("stopped", max(self.step - self._steps.start, 0))
                 raise
 
     @contextmanager

@@ -158,7 +158,7 @@ class RecordingPanel(nn.Module):
         events = self.view.events(seconds, count)
         if is_new:
             # Training changes no events.
-            self.events_picture.content = self.view.described_picture(events, seconds)
+            self.events_picture.show(self.view.described_picture(events, seconds))
         scene = self._viewer.viser_server.scene
         camera = self.view.camera
         wxyz, position = self._in_viewer(pose)
@@ -235,7 +235,7 @@ class RecordingPanel(nn.Module):
     def _show_figures(self) -> None:
         if self._viewer is not None:
             # Nerfstudio's own line of the step stands still where rendering takes long.
-            self.accuracy.content = f"**Step** {self._viewer.step:,}\n\n{self.view.figures()}"
+            self.accuracy.show(f"**Step** {self._viewer.step:,}\n\n{self.view.figures()}")
 
     def _follow(self) -> None:
         """Begin or end to look through the event camera."""

@@ -10,7 +10,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from aenerf_ns.cli.termination import sigterm_as_system_exit
 from aenerf_ns.errors import DataError
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 from benchmarks.paper.figures import draw
 from benchmarks.paper.plan import Plan, Run
 from benchmarks.paper.running import Runner
@@ -60,16 +60,15 @@ class Bench(Plan):
 def _make(runner: Runner, runs: list[Run]) -> dict[str, str]:
     """Make all runs and return the errors of the failed ones, by the name of the run."""
     failures = {}
-    with progress_bar() as progress:
-        for run in progress.track(runs, description="Runs"):
-            try:
-                made = runner.make(run)
-            except DataError as error:
-                failures[run.name] = str(error)
-                CONSOLE.print(f"[red]{run.name}: {error}")
-            else:
-                done = "another process is making it" if made is None else f"PSNR {made['results']['psnr']:.2f} dB"
-                CONSOLE.print(f"{run.name}: {done}")
+    for run in track(runs, "Runs"):
+        try:
+            made = runner.make(run)
+        except DataError as error:
+            failures[run.name] = str(error)
+            CONSOLE.print(f"[red]{run.name}: {error}")
+        else:
+            done = "another process is making it" if made is None else f"PSNR {made['results']['psnr']:.2f} dB"
+            CONSOLE.print(f"{run.name}: {done}")
     return failures
 
 

@@ -37,12 +37,10 @@ def _canvas(number: int) -> Material:
 
 # A furnished living room
 
-_LIVING_LOW, _LIVING_HIGH, _LIVING_HEIGHT = (-3.4, -2.7), (3.4, 2.7), 2.7
-
 
 def living_room(library: Library) -> Model:
     """Build sofas around a low table, bookcases, a piano, plants and pictures, with a wide window to the right."""
-    low, high, z = _LIVING_LOW, _LIVING_HIGH, _LIVING_HEIGHT
+    low, high, z = (-3.4, -2.7), (3.4, 2.7), 2.7
     sage = paint("sage wallpaper", tx.striped_wallpaper, ["b3b99f", "a5ad92", "bcc1a9"])
     sand = paint("sand plaster", tx.mottled, ["c2b08f", "cbbb9d", "d4c6ab"], 0.05)
     brick = paint("painted bricks", tx.bricks, ["b08a72", "b9967f", "c2a28d"], "bfb3a3")
@@ -136,12 +134,10 @@ def terrace(library: Library) -> Model:
 
 # A gallery
 
-_GALLERY_LOW, _GALLERY_HIGH, _GALLERY_HEIGHT = (-7.0, -3.2), (7.0, 3.2), 4.0
-
 
 def gallery(library: Library) -> Model:
     """Build a long hall with paintings on its walls, columns, and exhibits on plinths along its middle."""
-    low, high, z = _GALLERY_LOW, _GALLERY_HIGH, _GALLERY_HEIGHT
+    low, high, z = (-7.0, -3.2), (7.0, 3.2), 4.0
     plaster = paint("gallery plaster", tx.mottled, ["c4b7a3", "ccc1af", "d3cabb"], 0.05)
     red = paint("gallery red", tx.mottled, ["a5685a", "ad7365", "b57f72"], 0.05)
     marble = paint("marble", tx.mottled, ["b7b2a8", "c4c0b7", "d0ccc4"], 0.05)
@@ -184,12 +180,10 @@ GALLERY_LAMPS = tuple(lamp(x, y, 3.7, 0.4, (14, 13.2, 12)) for x in (-5.4, -1.8,
 
 # A workshop
 
-_WORKSHOP_LOW, _WORKSHOP_HIGH, _WORKSHOP_HEIGHT = (-5.5, -4.5), (5.5, 4.5), 4.2
-
 
 def workshop(library: Library) -> Model:
     """Build a workshop with a fork-lift truck, crates, barrels, shelves, lockers and a stair, under high windows."""
-    low, high, z = _WORKSHOP_LOW, _WORKSHOP_HIGH, _WORKSHOP_HEIGHT
+    low, high, z = (-5.5, -4.5), (5.5, 4.5), 4.2
     brick = paint("workshop bricks", tx.bricks, ["a06a55", "ab7863", "b58875"], "b0a596")
     block = paint("concrete blocks", tx.bricks, ["9a978f", "a3a098", "aba8a1"], "8f8c85", rows=8, columns=4)
     concrete = paint("workshop floor", tx.mottled, ["8a8882", "95938d", "a09e99"], 0.1, size=512)

@@ -15,8 +15,7 @@ import shlex
 import statistics
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -73,15 +72,19 @@ class Training:
     Args:
         side: what to train.
         folder: for the log, the run, and the packages of earlier commits.
-        ending: the last arguments of ns-train.
+        data: the dataset.
     """
 
-    def __init__(self, side: Side, folder: Path, ending: tuple[str, ...]) -> None:
+    def __init__(self, side: Side, folder: Path, data: Path) -> None:
         self._packages = None if side.commit is None else _install(side.commit, folder)
         self._log = folder / f"{len(list(folder.glob('*.log')))}.log"
         paths = [str(self._packages or ""), os.environ.get("PYTHONPATH", "")]
         threads = {"OMP_NUM_THREADS": str(side.threads), "NUMBA_NUM_THREADS": str(side.threads)}
         output = ("--output-dir", str(self._log.with_suffix("")))
+        device = ("--machine.device-type", "cuda" if _ON_GPU else "cpu", "--vis", "tensorboard")
+        # nerfacto reads the images with the estimated poses.
+        images = ("nerfstudio-data",) if side.arguments[0] == "nerfacto" else ()
+        ending = (*device, *images, "--data", str(data.resolve()))
         command = (sys.executable, str(_WORKER), *side.arguments, *output, *ending)
         with self._log.open("w", encoding="utf8") as log:
             self._process = subprocess.Popen(
@@ -122,7 +125,7 @@ class Training:
             raise DataError(package, "another commit's package would be measured", "check PYTHONPATH")
         return about
 
-    def end(self) -> None:
+    def close(self) -> None:
         """End the process, and with it the processes that it has started."""
         self._process.communicate()
 
@@ -169,27 +172,14 @@ class StepCost:
         with TemporaryDirectory() as folder:
             for name in self.measure:
                 sides = comparisons[name]
-                with self._trainings(sides, Path(folder)) as trainings:
+                with ExitStack() as stack:
+                    started = (Training(side, Path(folder), self.data) for side in sides)
+                    trainings = [stack.enter_context(closing(training)) for training in started]
                     figures = self._cost(trainings, long=not _ON_GPU and "full" in name)
                 described = [{**vars(side), "arguments": shlex.join(side.arguments)} for side in sides]
                 rows.append({"measurement": name, "baseline": described[0], "subject": described[1], **figures})
                 # The file is written after each comparison, because all of them take long.
                 write_result(self.output, {"rows": rows})
-
-    @contextmanager
-    def _trainings(self, sides: tuple[Side, Side], folder: Path) -> Iterator[list[Training]]:
-        """Start the trainings of both sides, and end them."""
-        trainings: list[Training] = []
-        try:
-            for side in sides:
-                # nerfacto reads the images with the estimated poses.
-                images = ("nerfstudio-data",) if side.arguments[0] == "nerfacto" else ()
-                device = ("--machine.device-type", "cuda" if _ON_GPU else "cpu", "--vis", "tensorboard")
-                trainings.append(Training(side, folder, (*device, *images, "--data", str(self.data.resolve()))))
-            yield trainings
-        finally:
-            for training in trainings:
-                training.end()
 
     def _cost(self, trainings: list[Training], long: bool) -> dict[str, Any]:
         """Return the cost of steps and of pictures.

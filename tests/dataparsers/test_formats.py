@@ -79,6 +79,19 @@ def test_conversion_to_native_changes_nothing(written: tuple[str, Truth], tmp_pa
     np.testing.assert_array_equal(read(before.event_file), read(after.event_file))
 
 
+def test_hidden_files_of_macos_change_nothing(written: tuple[str, Truth]) -> None:
+    name, truth = written
+    before = recording_of(config_of(name, truth.data))
+    for path in list(truth.data.rglob("*")):
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\26\7")
+    assert recognize(truth.data) == name
+    after = recording_of(config_of(name, truth.data))
+    np.testing.assert_array_equal(read(after.event_file), read(before.event_file))
+    for split, views in before.reference_views.items():
+        assert [view.file for view in after.reference_views[split]] == [view.file for view in views]
+    assert_same_poses(after.trajectory.camera_to_worlds, before.trajectory.camera_to_worlds.numpy())
+
+
 # The events and the poses of each format, and the number of frames with times of their own.
 FILES = {
     "robust-enerf-data": ("raw_events.npz", "camera_poses.npz", 0),

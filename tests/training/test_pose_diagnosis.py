@@ -60,8 +60,7 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def diagnosed(pipeline: AENeRFPipeline) -> dict[str, Any]:
-    run = pipeline.trained_run()
-    return diagnose(run.model, run.dataset, run.sampler)
+    return diagnose(pipeline.trained_run())
 
 
 def move(pipeline: AENeRFPipeline, size: float) -> None:

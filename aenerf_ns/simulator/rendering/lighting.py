@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from aenerf_ns.progress import progress_bar
+from aenerf_ns.progress import track
 from aenerf_ns.simulator.arrays import Array, Panorama
 from aenerf_ns.simulator.rendering.embree import NOTHING, RayCaster
 from aenerf_ns.simulator.rendering.environment import row_weights, split
@@ -197,24 +197,23 @@ def compute_light(
     sky_light = np.zeros((2 * count, 3), np.float32)
     links = np.empty((2 * count, _DIRECTIONS), np.int32)
     buried = np.empty(2 * count, np.bool_)
-    with progress_bar() as progress:
-        for start in progress.track(range(0, 2 * count, _CHUNK), description="Lighting the scene"):
-            part = slice(start, start + _CHUNK)
-            p, n, j = positions[part], normals[part], jitter[part]
-            for emitter in emitters:
-                rays, weights = _lamp_rays(p, n, j, emitter, offset)
-                _clear_blocked(caster, rays, weights)
-                received = weights.reshape(len(p), -1).mean(axis=1)
-                sharp[part] += received[:, None] * emitter[3].astype(np.float32)
-            if sun is not None:
-                rays, weights, colors = sun.rays(p, n, j)
-                _clear_blocked(caster, rays, weights)
-                sharp[part] += (weights[:, None] * colors).reshape(len(p), -1, 3).mean(axis=1)
-            rays = np.empty((len(p) * _DIRECTIONS, 6), np.float32)
-            run_ranges(partial(_gathering_rays, p, n, j, directions, rays), len(p))
-            hits = caster.cast(rays)
-            found = links[part], sky_light[part], buried[part]
-            run_ranges(partial(_gather, surface, count, rays, hits, size[part], sky, *found), len(p))
+    for start in track(range(0, 2 * count, _CHUNK), "Lighting the scene"):
+        part = slice(start, start + _CHUNK)
+        p, n, j = positions[part], normals[part], jitter[part]
+        for emitter in emitters:
+            rays, weights = _lamp_rays(p, n, j, emitter, offset)
+            _clear_blocked(caster, rays, weights)
+            received = weights.reshape(len(p), -1).mean(axis=1)
+            sharp[part] += received[:, None] * emitter[3].astype(np.float32)
+        if sun is not None:
+            rays, weights, colors = sun.rays(p, n, j)
+            _clear_blocked(caster, rays, weights)
+            sharp[part] += (weights[:, None] * colors).reshape(len(p), -1, 3).mean(axis=1)
+        rays = np.empty((len(p) * _DIRECTIONS, 6), np.float32)
+        run_ranges(partial(_gathering_rays, p, n, j, directions, rays), len(p))
+        hits = caster.cast(rays)
+        found = links[part], sky_light[part], buried[part]
+        run_ranges(partial(_gather, surface, count, rays, hits, size[part], sky, *found), len(p))
     albedo = np.tile(_mean_albedo(surface, count), (2, 1))
     direct = sharp + sky_light + np.float32(ambient)
     # The mean over a point's rays of the light at their ends, as a matrix.
