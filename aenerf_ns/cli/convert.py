@@ -19,6 +19,7 @@ from aenerf_ns.cli.dataset import (
     training_command,
     views_to_copy,
 )
+from aenerf_ns.cli.four_words import four_words
 from aenerf_ns.cli.ranges import require_seed
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, value_errors_as_data_error
@@ -37,19 +38,6 @@ if TYPE_CHECKING:
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.recording.recording import Capture, Recording
     from aenerf_ns.recording.writer import NativeDatasetWriter
-
-# Takes exactly four words. As an optional tuple, the option would also take the dataset if it follows.
-_Region = Annotated[
-    tuple[int, int, int, int] | None,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=4,
-        metavar="X Y WIDTH HEIGHT",
-        instance_from_str=lambda words: tuple(int(word) for word in words),
-        is_instance=lambda value: value is None or isinstance(value, tuple),
-        str_from_instance=lambda value: [str(value)],
-    ),
-]
-
 
 @dataclass
 class Convert(DatasetCommand):
@@ -71,7 +59,7 @@ class Convert(DatasetCommand):
     """Leave out events and images before this time on the clock of the events, in nanoseconds."""
     end_time_ns: int | None = None
     """Leave out events and images after this time on the clock of the events, in nanoseconds."""
-    region: _Region = None
+    region: Annotated[tuple[int, int, int, int] | None, four_words(int, "X Y WIDTH HEIGHT")] = None
     """Keep only this part of the sensor, in pixels."""
     drop_hot_pixels: bool = False
     """Leave out pixels that fire by themselves. Reads the events twice."""

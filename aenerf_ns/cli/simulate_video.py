@@ -11,6 +11,7 @@ import tyro
 
 from aenerf_ns.cli.console import say
 from aenerf_ns.cli.dataset import say_scene_box, training_command
+from aenerf_ns.cli.four_words import four_words
 from aenerf_ns.cli.simulation import SimulationCommand
 from aenerf_ns.cli.termination import exclusive_output
 from aenerf_ns.errors import DataError, reading, require_file, value_errors_as_data_error
@@ -47,9 +48,9 @@ class SimulateVideo(SimulationCommand):
     trajectory: Path | None = None
     """Poses of the video's camera, as t tx ty tz qx qy qz qw in seconds on the clock of the video, camera-to-world,
     OpenCV camera axes. Needs the camera's intrinsics."""
-    intrinsics: tuple[float, float, float, float] | None = None
-    """Intrinsics of the video's camera without distortion: fl_x fl_y cx cy in pixels. cx and cy count from the edge of
-    the image."""
+    intrinsics: Annotated[tuple[float, float, float, float] | None, four_words(float, "FL_X FL_Y CX CY")] = None
+    """Intrinsics of the video's camera without distortion, in pixels. CX and CY count from the edge of the
+    image."""
     calibration: Path | None = None
     """The video's camera: calibration.json, or the camchain.yaml that Kalibr writes. Without this option and without
     --intrinsics, --poses colmap estimates the lens."""

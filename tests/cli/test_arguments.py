@@ -87,8 +87,9 @@ def test_report_takes_several_runs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("video", ["V", "--video V"])
 def test_video_is_positional_or_named(video: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    command = parse(f"simulate-video {video} --output O --intrinsics 1 2 3 4", monkeypatch)
-    assert (command.video, command.output, command.intrinsics) == (Path("V"), Path("O"), (1.0, 2.0, 3.0, 4.0))
+    for line in (f"{video} --output O --intrinsics 1 2 3 4", f"--output O --intrinsics 1 2 3 4 {video}"):
+        command = parse(f"simulate-video {line}", monkeypatch)
+        assert (command.video, command.output, command.intrinsics) == (Path("V"), Path("O"), (1.0, 2.0, 3.0, 4.0))
 
 
 # The exit status, and a part of what is printed, for mistakes in arguments and for paths that cannot be.
