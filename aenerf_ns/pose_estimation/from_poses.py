@@ -33,6 +33,8 @@ _MIN_TRACKS = 50
 _MAX_IMAGES = 1000
 # From this share of corrections of a visible size on, the clock and the mount are named.
 _MIN_SHARE, _MIN_DEGREES = 0.5, 0.2
+# Degrees: a motion between images that is off by less is kept.
+_SMALL_JUMP = 0.05
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def poses_between_images(
 
     Given poses that are moved as the neighboring images are keep the given motion. Where errors jump from pose to pose,
     that motion is worse than none, and a spline through the poses of the images is better. What foretells every other
-    image better is taken.
+    image better is taken: the given motion if it is off by little.
 
     Args:
         given: the given poses.
@@ -155,7 +157,7 @@ def poses_between_images(
 
     at = given.times.numpy()
     poses = moved(at, slice(None))
-    is_interpolated = error(interpolated) < error(moved)
+    is_interpolated = max(error(interpolated), math.radians(_SMALL_JUMP) ** 2) < error(moved)
     if is_interpolated:
         is_between = (at >= times[0]) & (at <= times[-1])
         poses[is_between] = interpolated(at[is_between], slice(None))
