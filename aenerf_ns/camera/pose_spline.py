@@ -51,7 +51,7 @@ def pose_polynomials(seconds: Tensor, poses: Tensor) -> Tensor:
     steps = seconds.diff()[:, None]
     chords = values.diff(dim=0) / steps
     known = ~is_gap(steps[:, 0]) & (2 * angles[:, 0] <= _MAX_TURN)
-    # A spline has two segments or more.
+    # Opening drops runs of one segment: a spline needs two.
     in_spline = torch.from_numpy(binary_opening(known.cpu().numpy(), np.ones(2))).to(known.device)
     slopes = _spline_slopes(seconds, values, in_spline)
     # The slopes of steady motions, in which quaternions move along great circles.

@@ -8,8 +8,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
 from aenerf_ns.cli.console import say
 from aenerf_ns.cli.dataset import (
     DatasetCommand,
@@ -38,6 +36,7 @@ if TYPE_CHECKING:
     from aenerf_ns.recording.output_lock import OutputLock
     from aenerf_ns.recording.recording import Capture, Recording
     from aenerf_ns.recording.writer import NativeDatasetWriter
+
 
 @dataclass
 class Convert(DatasetCommand):

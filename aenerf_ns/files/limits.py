@@ -145,7 +145,7 @@ def require_unpacked_size(path: Path, name: str, unpacked: int, packed: int) -> 
 
 
 def visible_files(folder: Path, pattern: str) -> list[Path]:
-    """List the files of a folder that match a pattern, in the order of their names.
+    """List the files and folders in a folder that match a pattern, in the order of their names.
 
     Hidden ones do not count: macOS puts one beside each file that it copies to other disks.
     """

@@ -33,8 +33,9 @@ _MIN_TRACKS = 50
 _MAX_IMAGES = 1000
 # From this share of corrections of a visible size on, the clock and the mount are named.
 _MIN_SHARE, _MIN_DEGREES = 0.5, 0.2
-# Degrees: a motion between images that is off by less is kept.
-_SMALL_JUMP = 0.05
+# Degrees, or as much by translation: a given motion between images that is off by less is kept. So a camera that moves
+# most evenly does not lose its own poses. And images that judge it, at least.
+_SMALL_JUMP, _MIN_JUDGED = 0.05, 16
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def refine_poses(
     COLMAP matches images that are made of the events (:func:`match_event_images`), and triangulates tracks from the
     poses. The poses then follow the tracks, as far as these are to be trusted more
     (:class:`~aenerf_ns.pose_estimation.refinement.PoseRefinement`), in some rounds. Intrinsics stay as they are. Given
-    poses between images are moved as their neighbors are, or replaced by a spline through these
+    poses between images are moved as their neighbors are, or replaced by a spline through the images' poses
     (:func:`poses_between_images`). A seed gives the same poses again, to the last bit on one machine with one version
     of COLMAP.
 
@@ -121,7 +122,7 @@ def refine_poses(
     trajectory, is_interpolated = poses_between_images(given, times, refinement, depth)
     report = {**_report(refinement, times, model.num_points3D()), "seconds": time.perf_counter() - begin}
     if is_interpolated:
-        report["summary"] += "; the given poses jump from one to the next, so those between images are interpolated"
+        report["summary"] += "; between images, a smooth path fits better than the given motion, and is taken"
     draw = partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images])
     return RefinedPoses(trajectory, report, box_of(model), draw)
 
@@ -132,8 +133,8 @@ def poses_between_images(
     """Return the refined poses at the times of the given ones, and whether those between images are a spline.
 
     Given poses that are moved as the neighboring images are keep the given motion. Where errors jump from pose to pose,
-    that motion is worse than none, and a spline through the poses of the images is better. What foretells every other
-    image better is taken: the given motion if it is off by little.
+    a spline through the images' poses is better. Both predict images that are left out: every second, and three of
+    four. The errors with half and with a quarter of the images tell by extrapolation what is left with all of them.
 
     Args:
         given: the given poses.
@@ -143,24 +144,30 @@ def poses_between_images(
     """
     refined = torch.from_numpy(refinement.poses)
 
-    def moved(at: NDArray[np.int64], images: slice) -> Tensor:
+    def moved(at: NDArray[np.int64], images: NDArray[np.int64]) -> Tensor:
         twists = [np.interp(at, times[images], column[images]) for column in refinement.twists.T]
         return torch.from_numpy(move_poses(given.interpolate(at).numpy(), np.stack(twists, -1)))
 
-    def interpolated(at: NDArray[np.int64], images: slice) -> Tensor:
+    def interpolated(at: NDArray[np.int64], images: NDArray[np.int64]) -> Tensor:
         return Trajectory(times[images], refined[images], given.source).interpolate(at)
 
-    def error(find: Callable[[NDArray[np.int64], slice], Tensor]) -> float:
-        found, left_out = find(times[1:-1:2], slice(None, None, 2)), refined[1:-1:2]
-        offsets = (found - left_out)[..., 3] / depth
-        return float((rotation_angle(found, left_out).square() + offsets.square().sum(-1)).mean())
+    def error(predict: Callable[[NDArray[np.int64], NDArray[np.int64]], Tensor], step: int) -> float:
+        kept = np.arange(0, len(times), step)
+        left_out = np.setdiff1d(np.arange(kept[-1]), kept)
+        found, refined_there = predict(times[left_out], kept), refined[left_out]
+        offsets = (found - refined_there)[..., 3].norm(dim=-1) / depth
+        # The median, because images beside gaps are predicted badly.
+        return float(torch.hypot(rotation_angle(found, refined_there), offsets).median())
 
-    at = given.times.numpy()
-    poses = moved(at, slice(None))
-    is_interpolated = max(error(interpolated), math.radians(_SMALL_JUMP) ** 2) < error(moved)
+    poses = moved(given.times.numpy(), np.arange(len(times)))
+    is_interpolated = False
+    if len(times) >= _MIN_JUDGED:
+        of_motion, of_spline = (error(way, 2) ** 2 / max(error(way, 4), 1e-12) for way in (moved, interpolated))
+        is_interpolated = max(of_spline, math.radians(_SMALL_JUMP)) < of_motion
     if is_interpolated:
-        is_between = (at >= times[0]) & (at <= times[-1])
-        poses[is_between] = interpolated(at[is_between], slice(None))
+        spline = Trajectory(times, refined, given.source)
+        between = given.knots_known_to(spline)
+        poses[torch.isin(given.times, between)] = spline.interpolate(between)
     return Trajectory(given.times, poses, given.source), is_interpolated
 
 

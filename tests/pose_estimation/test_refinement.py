@@ -162,30 +162,55 @@ def test_poses_without_tracks_stay_as_given(truth: np.ndarray) -> None:
     assert np.abs(refinement.twists[36:]).max() < 0.3 * np.abs(refinement.twists).max()
 
 
-@pytest.mark.parametrize(("shake", "kind", "left"), [(0.5, "smooth", 0.03), (0.0, "gauss-markov", 0.01)])
-def test_poses_between_images_keep_the_given_motion_unless_it_jumps(
-    truth: np.ndarray, shake: float, kind: Literal["smooth", "gauss-markov"], left: float
-) -> None:
+def refined_images(
+    truth: np.ndarray,
+    chosen: np.ndarray,
+    shake: float,
+    kind: Literal["smooth", "gauss-markov"],
+    correlation_time: float,
+) -> tuple[Trajectory, Trajectory, np.ndarray, PoseRefinement]:
+    """True and given poses every 4 ms, and the times and the refinement of images whose poses it has mended."""
     images = (SECONDS * 1e9).astype(np.int64)
     times = np.arange(-20_000_000, 1_220_000_000, 4_000_000)
-    inside = (times >= 0) & (times <= images[-1])
     path = Trajectory(images, torch.from_numpy(truth))
     # The camera stands still ahead of the first image and after the last. It shakes faster than images show.
     steady = Trajectory(times, path.interpolate(times.clip(0, images[-1])))
     true = perturb(steady, shake, 0.0, 0.01, seed=2)
-    given = perturb(true, 1.5, 0.04, 0.3 if kind == "smooth" else 0.08, seed=1, kind=kind)
-    refinement = PoseRefinement(SECONDS, given.interpolate(images).numpy(), depth=2.5, seed=0)
+    given = perturb(true, 1.5, 0.04, correlation_time, seed=1, kind=kind)
+    images = images[chosen]
+    refinement = PoseRefinement(SECONDS[chosen], given.interpolate(images).numpy(), depth=2.5, seed=0)
     back = given.interpolate(images)[:, :, :3].mT
     moves = (back @ (true.interpolate(images) - given.interpolate(images))[:, :, 3:])[..., 0]
     turns = Rotation.from_matrix(back @ true.interpolate(images)[:, :, :3]).as_rotvec()
     refinement.twists = np.concatenate([moves, turns], 1)
+    return true, given, images, refinement
 
+
+@pytest.mark.parametrize(
+    ("shake", "kind", "correlation_time", "left"),
+    # A spline would be better in the second case, too, by little.
+    [(0.5, "smooth", 0.3, 0.03), (0.0, "smooth", 0.3, 0.03), (0.0, "gauss-markov", 0.08, 0.01)],
+)
+def test_poses_between_images_keep_the_given_motion_unless_it_jumps(
+    truth: np.ndarray, shake: float, kind: Literal["smooth", "gauss-markov"], correlation_time: float, left: float
+) -> None:
+    true, given, images, refinement = refined_images(truth, np.arange(COUNT), shake, kind, correlation_time)
     found, is_interpolated = poses_between_images(given, images, refinement, 2.5)
     assert is_interpolated == (kind == "gauss-markov")
     assert torch.equal(found.times, given.times)
+    inside = (given.times >= 0) & (given.times <= images[-1])
     degrees, distance = errors(found.camera_to_worlds[inside].numpy(), true.camera_to_worlds[inside].numpy())
     assert degrees < left
     assert distance < 0.05 * left
-    # Ahead of the first image there is no spline: poses move as the image does.
-    moved = move_poses(given.camera_to_worlds[:5].numpy(), np.tile(refinement.twists[0], (5, 1)))
-    np.testing.assert_allclose(found.camera_to_worlds[:5], moved, atol=1e-12)
+
+
+def test_poses_far_from_images_keep_the_given_motion(truth: np.ndarray) -> None:
+    chosen = np.r_[0:12, 26:COUNT]
+    true, given, images, refinement = refined_images(truth, chosen, 0.0, "gauss-markov", 0.08)
+    found, is_interpolated = poses_between_images(given, images, refinement, 2.5)
+    assert is_interpolated
+    far = (given.times < 0) | ((given.times > images[11]) & (given.times < images[12])) | (given.times > images[-1])
+    twists = np.stack([np.interp(given.times, images, column) for column in refinement.twists.T], -1)
+    moved = move_poses(given.camera_to_worlds.numpy(), twists)
+    np.testing.assert_allclose(found.camera_to_worlds[far], moved[far], atol=1e-12)
+    assert errors(found.camera_to_worlds[~far].numpy(), true.camera_to_worlds[~far].numpy())[0] < 0.03
