@@ -33,9 +33,9 @@ _MIN_TRACKS = 50
 _MAX_IMAGES = 1000
 # From this share of corrections of a visible size on, the clock and the mount are named.
 _MIN_SHARE, _MIN_DEGREES = 0.5, 0.2
-# Degrees, or as much by translation: a given motion between images that is off by less is kept. So a camera that moves
-# most evenly does not lose its own poses. And images that judge it, at least.
-_SMALL_JUMP, _MIN_JUDGED = 0.05, 16
+# A given motion between images is kept if it is off by less than this in degrees, or as much by translation, or by less
+# than this times what a spline is; and if there are fewer images than this.
+_SMALL_JUMP, _CLEARLY, _MIN_JUDGED = 0.05, 2.0, 16
 
 
 @dataclass(frozen=True)
@@ -142,32 +142,32 @@ def poses_between_images(
         refinement: of their poses.
         depth: of the scene, in the units of the poses.
     """
-    refined = torch.from_numpy(refinement.poses)
+    images, twists = Trajectory(times, torch.from_numpy(refinement.poses), given.source), refinement.twists
 
-    def moved(at: NDArray[np.int64], images: NDArray[np.int64]) -> Tensor:
-        twists = [np.interp(at, times[images], column[images]) for column in refinement.twists.T]
-        return torch.from_numpy(move_poses(given.interpolate(at).numpy(), np.stack(twists, -1)))
+    def moved(at: Tensor, kept: Trajectory) -> Tensor:
+        chosen = np.isin(times, kept.times)
+        twists_there = [np.interp(at, times[chosen], column[chosen]) for column in twists.T]
+        return torch.from_numpy(move_poses(given.interpolate(at).numpy(), np.stack(twists_there, -1)))
 
-    def interpolated(at: NDArray[np.int64], images: NDArray[np.int64]) -> Tensor:
-        return Trajectory(times[images], refined[images], given.source).interpolate(at)
+    def interpolated(at: Tensor, kept: Trajectory) -> Tensor:
+        return kept.interpolate(at)
 
-    def error(predict: Callable[[NDArray[np.int64], NDArray[np.int64]], Tensor], step: int) -> float:
-        kept = np.arange(0, len(times), step)
-        left_out = np.setdiff1d(np.arange(kept[-1]), kept)
-        found, refined_there = predict(times[left_out], kept), refined[left_out]
-        offsets = (found - refined_there)[..., 3].norm(dim=-1) / depth
-        # The median, because images beside gaps are predicted badly.
-        return float(torch.hypot(rotation_angle(found, refined_there), offsets).median())
+    def error(predict: Callable[[Tensor, Trajectory], Tensor], step: int) -> float:
+        """Return the root mean square over the time without gaps, in radians, with each ``step``-th image."""
+        kept = Trajectory(images.times[::step], images.camera_to_worlds[::step], given.source)
+        at = images.knots_known_to(kept)
+        found, refined = predict(at, kept), images.interpolate(at)
+        squares = rotation_angle(found, refined).square() + ((found - refined)[..., 3] / depth).square().sum(-1)
+        spans = torch.from_numpy(np.gradient(times.astype(np.float64))[np.isin(times, at)])
+        return float((spans * squares).sum() / spans.sum()) ** 0.5
 
-    poses = moved(given.times.numpy(), np.arange(len(times)))
-    is_interpolated = False
+    poses, is_interpolated = moved(given.times, images), False
     if len(times) >= _MIN_JUDGED:
         of_motion, of_spline = (error(way, 2) ** 2 / max(error(way, 4), 1e-12) for way in (moved, interpolated))
-        is_interpolated = max(of_spline, math.radians(_SMALL_JUMP)) < of_motion
+        is_interpolated = of_motion > max(_CLEARLY * of_spline, math.radians(_SMALL_JUMP))
     if is_interpolated:
-        spline = Trajectory(times, refined, given.source)
-        between = given.knots_known_to(spline)
-        poses[torch.isin(given.times, between)] = spline.interpolate(between)
+        between = given.knots_known_to(images)
+        poses[torch.isin(given.times, between)] = images.interpolate(between)
     return Trajectory(given.times, poses, given.source), is_interpolated
 
 
