@@ -149,9 +149,6 @@ def poses_between_images(
         twists_there = [np.interp(at, times[chosen], column[chosen]) for column in twists.T]
         return torch.from_numpy(move_poses(given.interpolate(at).numpy(), np.stack(twists_there, -1)))
 
-    def interpolated(at: Tensor, kept: Trajectory) -> Tensor:
-        return kept.interpolate(at)
-
     def error(predict: Callable[[Tensor, Trajectory], Tensor], step: int) -> float:
         """Return the root mean square over the time without gaps, in radians, with each ``step``-th image."""
         kept = Trajectory(images.times[::step], images.camera_to_worlds[::step], given.source)
@@ -163,7 +160,8 @@ def poses_between_images(
 
     poses, is_interpolated = moved(given.times, images), False
     if len(times) >= _MIN_JUDGED:
-        of_motion, of_spline = (error(way, 2) ** 2 / max(error(way, 4), 1e-12) for way in (moved, interpolated))
+        ways = moved, lambda at, kept: kept.interpolate(at)
+        of_motion, of_spline = (error(way, 2) ** 2 / max(error(way, 4), 1e-12) for way in ways)
         is_interpolated = of_motion > max(_CLEARLY * of_spline, math.radians(_SMALL_JUMP))
     if is_interpolated:
         between = given.knots_known_to(images)
