@@ -23,7 +23,7 @@ from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.bundle_adjustment import Array, Tracks, move_poses, tracks_of
 from aenerf_ns.pose_estimation.event_images import MIN_IMAGES, match_event_images
 from aenerf_ns.pose_estimation.picture import draw_poses, observations_of
-from aenerf_ns.pose_estimation.refinement import PoseRefinement
+from aenerf_ns.pose_estimation.refinement import PoseRefinement, SharedError
 from aenerf_ns.pose_estimation.scene_box import box_of
 from aenerf_ns.recording.recording import Recording
 
@@ -33,6 +33,8 @@ _MIN_TRACKS = 50
 _MAX_IMAGES = 1000
 # From this share of corrections of a visible size on, the clock and the mount are named.
 _MIN_SHARE, _MIN_DEGREES = 0.5, 0.2
+# Of the scene's distance. Wherever refinement worked, it was below 0.03 (benchmarks/LOG.md).
+_MAX_MOUNT_SHARE = 0.4
 # A given motion between images is kept if it is off by less than this in degrees, or as much by translation, or by less
 # than this times what a spline is; and if there are fewer images than this.
 _SMALL_JUMP, _CLEARLY, _MIN_JUDGED = 0.05, 2.0, 16
@@ -78,7 +80,8 @@ def refine_poses(
         window, source, seed, weights, folder: see :func:`match_event_images`.
 
     Raises:
-        DataError: there are too few events for three images with a pose, or too few tracks.
+        DataError: there are too few events for three images with a pose, or too few tracks, or the tracks contradict
+            the poses (:func:`require_near_mount`).
     """
     begin = time.perf_counter()
     given = recording.trajectory
@@ -118,6 +121,7 @@ def refine_poses(
         for limits in _ROUNDS[1:]:
             model, tracks = triangulate(refinement.poses, limits)
             refinement.follow(tracks)
+    require_near_mount(refinement.shared_error(), depth, source)
     observations = observations_of(model, len(pictures))
     trajectory, is_interpolated = poses_between_images(given, times, refinement, depth)
     report = {**_report(refinement, times, model.num_points3D()), "seconds": time.perf_counter() - begin}
@@ -125,6 +129,21 @@ def refine_poses(
         report["summary"] += "; between images, a smooth path fits better than the given motion, and is taken"
     draw = partial(draw_poses, [pictures[i] for i in images], [observations[i] for i in images])
     return RefinedPoses(trajectory, report, box_of(model), draw)
+
+
+def require_near_mount(found: SharedError, depth: float, source: str | Path) -> None:
+    """Raise a DataError if the tracks move the camera far in its mount, as no rig is off.
+
+    Around an object that is nearly a change of scale, which tracks do not tell, and the other errors stay.
+    """
+    distance = float(np.linalg.norm(found.mount[:3]))
+    if distance > _MAX_MOUNT_SHARE * depth:
+        raise DataError(
+            source,
+            f"its poses fit the tracks only if the camera were moved by {distance:.2g} of their units in its mount, "
+            f"and the scene is {depth:.2g} away",
+            "they are too wrong, or too few for so fast a motion, to be refined: estimate them anew (--poses events)",
+        )
 
 
 def poses_between_images(

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from aenerf_ns.camera.alignment import pose_errors
 from aenerf_ns.camera.noise import perturb
 from aenerf_ns.camera.trajectory import Trajectory
+from aenerf_ns.errors import DataError
 from aenerf_ns.pose_estimation.bundle_adjustment import TrackAdjustment, Tracks, move_poses
-from aenerf_ns.pose_estimation.from_poses import poses_between_images
-from aenerf_ns.pose_estimation.refinement import PoseRefinement
+from aenerf_ns.pose_estimation.from_poses import poses_between_images, require_near_mount
+from aenerf_ns.pose_estimation.refinement import PoseRefinement, SharedError
 from aenerf_ns.simulator.paths import look_at
 
 FOCAL, COUNT, POINTS = 100.0, 40, 400
@@ -214,3 +215,12 @@ def test_poses_far_from_images_keep_the_given_motion(truth: np.ndarray) -> None:
     moved = move_poses(given.camera_to_worlds.numpy(), twists)
     np.testing.assert_allclose(found.camera_to_worlds[far], moved[far], atol=1e-12)
     assert errors(found.camera_to_worlds[~far].numpy(), true.camera_to_worlds[~far].numpy())[0] < 0.03
+
+
+def test_poses_that_tracks_contradict_are_refused() -> None:
+    turned = np.array([0.0, 0.0, 0.5, 0.1, 0.0, 0.0])
+    require_near_mount(SharedError(0.01, turned, 1.0), 2.5, "scene")
+    with pytest.raises(
+        DataError, match=r"scene: .* moved by 2 of their units .* the scene is 2.5 away; .*--poses events"
+    ):
+        require_near_mount(SharedError(0.01, 4 * turned, 1.0), 2.5, "scene")
