@@ -33,7 +33,7 @@ _MIN_TRACKS = 50
 _MAX_IMAGES = 1000
 # From this share of corrections of a visible size on, the clock and the mount are named.
 _MIN_SHARE, _MIN_DEGREES = 0.5, 0.2
-# Of the scene's distance. Wherever refinement worked, it was below 0.03 (benchmarks/LOG.md).
+# Of the scene's distance. Wherever refinement worked, a mount was moved by a hundredth of it (benchmarks/LOG.md).
 _MAX_MOUNT_SHARE = 0.4
 # A given motion between images is kept if it is off by less than this in degrees, or as much by translation, or by less
 # than this times what a spline is; and if there are fewer images than this.

@@ -73,7 +73,7 @@ class AENeRFPipeline(VanillaPipeline):
         self.training_state = TrainingState()
         if test_mode != "inference":
             self.datamanager.supervise(self.model.supervision)
-        # The run has no diagnosis yet, which this does not ask for.
+        # Made ahead of training: this run's diagnosis stays empty, and the fit does not read it.
         self.color_fit = ColorFit(self.trained_run())
         self._unchecked_losses: dict[str, Tensor] = {}
         self._steps_per_log = 1
