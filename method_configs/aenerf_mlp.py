@@ -1,4 +1,7 @@
-"""``ns-train aenerf-mlp``: the paper's recipe, on its large networks in place of hash grids, for a GPU and hours."""
+"""``ns-train aenerf-mlp`` and ``aenerf-mlp-small``: the paper's recipe, on its networks in place of hash grids.
+
+The first has the paper's size, for a GPU and hours; the second is for a CPU and half an hour.
+"""
 
 from __future__ import annotations
 
@@ -55,4 +58,30 @@ def _make_config() -> AENeRFTrainerConfig:
 aenerf_mlp = MethodSpecification(
     config=_make_config(),
     description="AE-NeRF by the paper's recipe, on its MLPs: slow, for a GPU.",
+)
+
+
+def _make_small_config() -> AENeRFTrainerConfig:
+    config = deepcopy(aenerf_mlp.config)
+    data = config.pipeline.datamanager
+    data.train_num_rays_per_batch = data.eval_num_rays_per_batch = 512
+    model = config.pipeline.model
+    model.field = FieldConfig(
+        num_samples_per_ray=24,
+        num_hidden_layers=4,
+        hidden_dim=128,
+        geometry_feature_dim=32,
+        xavier_initialization=True,
+    )
+    model.proposal = ProposalConfig(num_samples_per_ray=(48,), num_hidden_layers=2, hidden_dim=32)
+    model.eval_num_rays_per_chunk = 1 << 13
+    for group in ("networks", "proposals"):
+        # Narrow networks bear three times the rate.
+        config.optimizers[group]["optimizer"].lr = 3e-3
+    return replace(config, method_name="aenerf-mlp-small", max_num_iterations=4000)
+
+
+aenerf_mlp_small = MethodSpecification(
+    config=_make_small_config(),
+    description="AE-NeRF by the paper's recipe, on narrow MLPs: for a CPU.",
 )

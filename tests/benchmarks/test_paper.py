@@ -25,7 +25,8 @@ from PIL import Image
 from aenerf_ns.dataparsers.native import NativeDataParserConfig
 from aenerf_ns.errors import DataError
 from aenerf_ns.method.image_metrics import ImageMetrics
-from aenerf_ns.method_configs.aenerf import aenerf, aenerf_small
+from aenerf_ns.method_configs.aenerf import aenerf_small
+from aenerf_ns.method_configs.aenerf_mlp import aenerf_mlp, aenerf_mlp_small
 from benchmarks.paper import tables
 from benchmarks.paper.figures import draw, error_map
 from benchmarks.paper.plan import (
@@ -95,7 +96,7 @@ def test_weights_choose_e2vid(tmp_path: Path) -> None:
 
 def test_losses_are_compared_on_equal_pairs() -> None:
     option = "--pipeline.datamanager.train-num-rays-per-batch"
-    for scale, method in (("tiny", aenerf_small), ("full", aenerf)):
+    for scale, method in (("tiny", aenerf_mlp_small), ("full", aenerf_mlp)):
         own = method.config.pipeline.datamanager.train_num_rays_per_batch
         runs = small_plan(scale=scale, tables=("losses",), seeds=(1,), scenes=("room",))
         assert {run.method for run in runs} == {method.config.method_name}
