@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -36,12 +35,6 @@ _FOCAL_FACTORS = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
 # offsets need other times of the poses.
 _MAX_LEARNED_OFFSET = 100_000_000
 
-Value = TypeVar("Value")
-
-
-def _identity(value: Value) -> Value:
-    return value
-
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -58,8 +51,8 @@ class Hypothesis:
 
     name: str
     remedy: str = ""
-    poses: Callable[[Tensor], Tensor] = _identity
-    plane: Callable[[NDArray[np.float64]], NDArray[np.float64]] = _identity
+    poses: Callable[[Tensor], Tensor] = lambda poses: poses
+    plane: Callable[[NDArray[np.float64]], NDArray[np.float64]] = lambda plane: plane
     focal_factor: float = 1.0
     clock_offset: int = 0
 
