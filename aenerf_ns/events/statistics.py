@@ -90,14 +90,10 @@ def _count(x, y, t, width, counts, last_time, sample, state):
         elif previous != _NEVER:
             if state[0] % state[2] == 0:
                 if state[1] == sample.shape[0]:
-                    half = sample.shape[0] // 2
-                    for k in range(half):
-                        sample[k] = sample[2 * k]
-                    state[1] = half
+                    state[1] //= 2
                     state[2] *= 2
-                if state[0] % state[2] == 0:
-                    sample[state[1], 0] = previous
-                    sample[state[1], 1] = t[i]
-                    state[1] += 1
+                    sample[: state[1]] = sample[::2]
+                sample[state[1]] = previous, t[i]
+                state[1] += 1
             state[0] += 1
     return repeated
