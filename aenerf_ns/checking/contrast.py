@@ -10,7 +10,7 @@ are by Rebecq et al. 2018, "EMVS".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -160,23 +160,21 @@ class WarpedEvents:
             The comparison, or None if too few events have a pose and a direction under the hypothesis.
         """
         covered = TimeWindow(self._trajectory.start, self._trajectory.end)
-        given, alternative, indices = [], [], []
+        compared: dict[int, tuple[WarpedSlice, WarpedSlice]] = {}
         has_direction = np.isfinite(hypothesis.plane(self._plane) + self._plane).all(-1)
         for index in range(len(self._slices))[slices]:
-            events, as_given = self._slices[index], self.given[index]
+            events = self._slices[index]
             visible = has_direction[events.y, events.x]
             usable = visible & covered.contains(events.t + hypothesis.clock_offset)
             if usable.sum() < max(_MIN_USABLE_SHARE * visible.sum(), 2):
                 continue
             part = events[usable]
-            given.append(as_given if usable.all() else self._warp(part, GIVEN))
-            alternative.append(self._warp(part, hypothesis))
-            indices.append(index)
-        if not given:
+            as_given = self.given[index] if usable.all() else self._warp(part, GIVEN)
+            compared[index] = as_given, self._warp(part, hypothesis)
+        if not compared:
             return None
-        single = [_compare(hypothesis, [one], [other]) for one, other in zip(given, alternative, strict=True)]
-        in_favor = {index for index, found in zip(indices, single, strict=True) if found.is_clearly_better}
-        return replace(_compare(hypothesis, given, alternative), slices_in_favor=frozenset(in_favor))
+        in_favor = {index for index, pair in compared.items() if _compare(hypothesis, [pair]).is_clearly_better}
+        return replace(_compare(hypothesis, compared.values()), slices_in_favor=frozenset(in_favor))
 
     def compare_alternatives(self) -> list[Comparison]:
         """Compare all alternatives whose events the poses cover, and return the comparisons, the best first.
@@ -297,18 +295,16 @@ def contrast_of(slices: Sequence[WarpedSlice]) -> float:
     return float(sum(s.energy.sum() for s in slices) / max(sum(s.brightness.sum() for s in slices), 1e-30))
 
 
-def _compare(hypothesis: Hypothesis, given: list[WarpedSlice], alternative: list[WarpedSlice]) -> Comparison:
+def _compare(hypothesis: Hypothesis, pairs: Iterable[tuple[WarpedSlice, WarpedSlice]]) -> Comparison:
+    given, alternative = zip(*pairs, strict=True)
+    residuals = zip(_residuals(given), _residuals(alternative), strict=True)
     # The standard error of the difference of two ratios of sums, over the tiles.
-    error = np.sqrt(
-        sum(
-            np.square(_residuals(other, alternative) - _residuals(one, given)).sum()
-            for one, other in zip(given, alternative, strict=True)
-        )
-    )
+    error = np.sqrt(sum(np.square(other - one).sum() for one, other in residuals))
     difference = (contrast_of(alternative) - contrast_of(given)) / max(float(error), 1e-12)
     return Comparison(hypothesis, contrast_of(alternative), contrast_of(given), difference)
 
 
-def _residuals(one: WarpedSlice, slices: Sequence[WarpedSlice]) -> NDArray[np.float64]:
-    """Return by how much each (R, C) tile of one slice raises the contrast of all slices, to first order."""
-    return (one.energy - contrast_of(slices) * one.brightness) / max(sum(s.brightness.sum() for s in slices), 1e-30)
+def _residuals(slices: Sequence[WarpedSlice]) -> list[NDArray[np.float64]]:
+    """Return by how much each (R, C) tile of each slice raises the contrast of all slices, to first order."""
+    contrast, brightness = contrast_of(slices), max(sum(s.brightness.sum() for s in slices), 1e-30)
+    return [(one.energy - contrast * one.brightness) / brightness for one in slices]
