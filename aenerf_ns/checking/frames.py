@@ -44,18 +44,19 @@ class FrameChanges:
         times = sorted(files) if capture.frame_camera == capture.event_camera else []
         starts = np.unique(np.linspace(0, len(times) - 2, _MAX_PAIRS).astype(int)) if len(times) > 1 else []
         self._spans = [(times[i], times[i + 1]) for i in starts]
-        self._files, self._camera = files, capture.event_camera
         self._encoding = capture.image_encoding
-        # Of the frames that were read, by their times.
-        self._levels: dict[int, NDArray[np.uint8]] = {}
         # Of the positive and of the negative events.
-        size = (self._camera.height, self._camera.width)
+        size = (capture.event_camera.height, capture.event_camera.width)
         self._sums = np.zeros((len(self._spans), 2, *size))
         # Of the events around each frame, a second; the frames that each pixel has passed, and its last event.
         self._moments = np.unique(np.array(self._spans, np.int64))
         self._rates = np.zeros((len(self._moments), *size), np.float32)
         self._num_passed, self._last_time = np.zeros(size, np.int64), np.full(size, _NEVER)
         self._refractory_period = capture.sensor.refractory_period
+        self._gray_levels: dict[int, NDArray[np.uint8]] = {}
+        for time in self._moments.tolist():
+            check_image(files[time], capture.event_camera)
+            self._gray_levels[time] = np.asarray(read_image(files[time]).convert("L"))
 
     def add(self, events: EventStream, weights: NDArray[np.float64]) -> None:
         """Add a piece of the stream of events. The (N,) weights say for how many thresholds each event stands."""
@@ -111,24 +112,18 @@ class FrameChanges:
         """
         levels = decode(np.arange(256) / 255, self._encoding)
         logs = np.log(levels + levels[gray])
-        radiances = [levels[self._gray_levels(time)] + levels[gray] for time in self._moments.tolist()]
+        radiances = [levels[shown] + levels[gray] for shown in self._gray_levels.values()]
         mean = np.mean(radiances) if radiances else 1.0
         changes = [np.empty((4, 0))]
         for (positive, negative), span in zip(self._sums[part], self._spans[part], strict=True):
             seen = positive + negative > 0
-            log = [logs[self._gray_levels(time)][seen] for time in span]
+            log = [logs[self._gray_levels[time]][seen] for time in span]
             rate = self._rates[np.searchsorted(self._moments, span)][:, seen]
             rate = np.where(rate > 0, ratio * rate, rate)
             lag = rate * SensorModel(bandwidth=1.0).time_constant(np.exp(log) / mean)
             events = ratio * positive - negative
             changes.append(np.stack([events[seen], log[1] - log[0], lag[1] - lag[0], rate[1] - rate[0]]))
         return np.concatenate(changes, 1)
-
-    def _gray_levels(self, time: int) -> NDArray[np.uint8]:
-        if time not in self._levels:
-            check_image(self._files[time], self._camera)
-            self._levels[time] = np.asarray(read_image(self._files[time]).convert("L"))
-        return self._levels[time]
 
 
 def _robust_fit(columns: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
