@@ -51,15 +51,16 @@ def pose_polynomials(seconds: Tensor, poses: Tensor) -> Tensor:
     steps = seconds.diff()[:, None]
     chords = values.diff(dim=0) / steps
     known = ~is_gap(steps[:, 0]) & (2 * angles[:, 0] <= _MAX_TURN)
-    # Opening drops runs of one segment: a spline needs two.
-    in_spline = torch.from_numpy(binary_opening(known.cpu().numpy(), np.ones(2))).to(known.device)
-    slopes = _spline_slopes(seconds, values, in_spline)
     # The slopes of steady motions, in which quaternions move along great circles.
     scale = 1 / (torch.sinc(angles / math.pi) * steps)
     leaving = torch.cat([chords[:, :3], scale * (end - torch.cos(angles) * start)], -1)
     arriving = torch.cat([chords[:, :3], scale * (torch.cos(angles) * end - start)], -1)
-    leaving = torch.where(in_spline[:, None], slopes[:-1], leaving)
-    arriving = torch.where(in_spline[:, None], slopes[1:], arriving)
+    # A spline begins and ends where a segment that belongs to one meets a segment, or an end, that does not. Opening
+    # drops runs of one segment: a spline needs two.
+    for first, last in runs_of(binary_opening(known.cpu().numpy(), np.ones(2))):
+        x, y = (column[first : last + 1].cpu().numpy() for column in (seconds, values))
+        slopes = torch.from_numpy(CubicSpline(x, y, bc_type="not-a-knot")(x, 1)).to(values)
+        leaving[first:last], arriving[first:last] = slopes[:-1], slopes[1:]
     second, third = 3 * chords - 2 * leaving - arriving, leaving + arriving - 2 * chords
     return torch.stack([values[:-1], leaving, second / steps, third / steps**2], 1)
 
@@ -83,20 +84,3 @@ def is_gap(steps: Tensor) -> Tensor:
     longest[1:] = _MAX_SEGMENT_RATIO * steps[:-1]
     longest[:-1] = torch.minimum(longest[:-1], _MAX_SEGMENT_RATIO * steps[1:])
     return steps > longest
-
-
-def _spline_slopes(seconds: Tensor, values: Tensor, in_spline: Tensor) -> Tensor:
-    """Return the (N, columns) derivatives at the knots of the splines, and zeros at the other knots.
-
-    Args:
-        seconds: (N,) times of the knots.
-        values: (N, columns) at the knots.
-        in_spline: (N - 1,) which segments belong to a spline.
-    """
-    x, y = seconds.cpu().numpy(), values.cpu().numpy()
-    slopes = np.zeros_like(y)
-    # A spline begins and ends where a segment that belongs to one meets a segment, or an end, that does not.
-    for first, last in runs_of(in_spline.cpu().numpy()):
-        knots = slice(first, last + 1)
-        slopes[knots] = CubicSpline(x[knots], y[knots], bc_type="not-a-knot")(x[knots], 1)
-    return torch.from_numpy(slopes).to(values)
