@@ -40,22 +40,6 @@ class Tracks:
     focal_length: float
 
 
-@dataclass(frozen=True)
-class PoseInformation:
-    """The robust sum of squared reprojection errors (square pixels) around some poses, as a quadratic function of small
-    twists of N poses. The points take their best positions for each of them.
-
-    Attributes:
-        hessian: (6 N, 6 N).
-        gradient: (6 N,).
-        group_gradients: (G, 6 N) the gradient's parts by groups of neighboring points.
-    """
-
-    hessian: Array
-    gradient: Array
-    group_gradients: Array
-
-
 def tracks_of(model: Any, images: Sequence[int]) -> Tracks:
     """Return the tracks of a COLMAP model.
 
@@ -112,8 +96,14 @@ class TrackAdjustment:
             self._eliminate_points(poses)
             self._move_points(self._pull)
 
-    def linearize(self, poses: Array) -> PoseInformation:
-        """Return what the tracks say of poses (N, 3, 4), camera-to-world, by Gauss and Newton's method."""
+    def linearize(self, poses: Array) -> tuple[Array, Array]:
+        """Return the robust sum of squared reprojection errors (square pixels) around poses (N, 3, 4), camera-to-world,
+        as a quadratic function of small twists of them. The points take their best positions for each of these.
+
+        Returns:
+            The (6 N, 6 N) Hessian by Gauss and Newton's method, and the (G, 6 N) parts of the gradient by groups of
+            neighboring points.
+        """
         images, points, count = self._tracks.images, self._tracks.points, len(poses)
         local, errors, weights, projection, of_point = self._eliminate_points(poses)
         # A camera that turns by w moves a point y in its frame by the cross product of y and w.
@@ -130,8 +120,7 @@ class TrackAdjustment:
         blocks[range(count), :, range(count)] += _sum_by(images, weighted @ of_pose, count)
         parts = (weighted @ errors - mixed @ self._pull[points])[..., 0]
         group_gradients = _sum_by(self._groups[points] * count + images, parts, (self._groups.max() + 1) * count)
-        group_gradients = group_gradients.reshape(-1, 6 * count)
-        return PoseInformation(hessian, group_gradients.sum(0), group_gradients)
+        return hessian, group_gradients.reshape(-1, 6 * count)
 
     def move_points(self, twists: Array) -> None:
         """Move the points to where they belong after twists (6 N,) of the poses that were linearized last."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial.transform import Rotation
 
-from aenerf_ns.pose_estimation.bundle_adjustment import Array, PoseInformation, TrackAdjustment, Tracks, move_poses
+from aenerf_ns.pose_estimation.bundle_adjustment import Array, TrackAdjustment, Tracks, move_poses
 
 # Errors of neighboring tracks are alike, and those of all tracks of an image partly so: the variance that groups of
 # tracks show is too small by this factor. From exact poses of three scenes, chosen so that poses stay.
@@ -117,7 +117,7 @@ class PoseRefinement:
         adjustment = TrackAdjustment(tracks, self._seed)
         adjustment.adjust_points(self.poses, 3)
         for _ in range(_STEPS_PER_ROUND):
-            twists = self._solve(adjustment.linearize(self.poses))
+            twists = self._solve(*adjustment.linearize(self.poses))
             adjustment.move_points((twists - self.twists).ravel())
             self.twists = twists
             adjustment.adjust_points(self.poses, 2)
@@ -139,11 +139,11 @@ class PoseRefinement:
         variances, gains = (matrix.diagonal().reshape(-1, 6)[:, 3:].sum(1) for matrix in (prior, gained))
         return gains < _WEAK * variances
 
-    def _solve(self, information: PoseInformation) -> Array:
+    def _solve(self, hessian: Array, group_gradients: Array) -> Array:
         """Update the variances of the prior, and return the (N, 6) most probable twists."""
-        noise = self._noise(information)
-        self._weight = information.hessian / noise
-        pull = self._weight @ self.twists.ravel() - information.gradient / noise
+        noise = self._noise(hessian, group_gradients)
+        self._weight = hessian / noise
+        pull = self._weight @ self.twists.ravel() - group_gradients.sum(0) / noise
         # The trace of a process's covariance times another matrix is a mean over random draws from the process.
         normal = np.random.default_rng(self._seed).normal(size=(_NUM_TIMES, len(self.twists), 6 * _NUM_DRAWS))
         draws = (self._roots @ normal).reshape(*normal.shape[:2], 6, _NUM_DRAWS) * self._units[:, None]
@@ -179,11 +179,11 @@ class PoseRefinement:
         """Return the (N, N) covariance of each component of the errors that change in time, in square radians."""
         return np.tensordot(self._variances[:_NUM_TIMES], self._correlations, 1)
 
-    def _noise(self, information: PoseInformation) -> float:
+    def _noise(self, hessian: Array, group_gradients: Array) -> float:
         """Return the variance of a track's error in square pixels, from how groups of tracks pull at the poses."""
         covariance = self._covariance()
-        pulls = information.group_gradients.reshape(-1, *self.twists.shape) * self._units
-        blocks = np.einsum("ncmc,c->nm", information.hessian.reshape(*self.twists.shape * 2), np.square(self._units))
+        pulls = group_gradients.reshape(-1, *self.twists.shape) * self._units
+        blocks = np.einsum("ncmc,c->nm", hessian.reshape(*self.twists.shape * 2), np.square(self._units))
         pulled = np.einsum("gnc,nm,gmc->", pulls, covariance, pulls, optimize=True)
         return _COHERENCE * max(_MIN_VARIANCE, float(pulled / max(np.sum(covariance * blocks), 1e-30)))
 
