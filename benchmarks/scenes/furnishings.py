@@ -9,7 +9,7 @@ import numpy as np
 
 from aenerf_ns.simulator import textures as tx
 from benchmarks.scenes.assets import Library
-from benchmarks.scenes.meshes import Material, Model, colored_copy, join, paint
+from benchmarks.scenes.meshes import Material, Model, colored_copy, paint
 from benchmarks.scenes.shapes import box, disc, rectangle, revolved
 
 _BOOK_COLORS = ("8c3b32", "35608c", "4a7a4f", "b98a3a", "6f4a7a", "a8a090", "396b73", "a35f3a")
@@ -48,7 +48,7 @@ def books(width: float, depth: float, height: float, seed: int, fill: float = 1.
         thick, tall = rng.uniform(0.018, 0.05), height * rng.uniform(0.68, 0.92)
         deep, set_back = depth * rng.uniform(0.7, 0.9), rng.uniform(0, 0.02)
         if x + thick > width * fill:
-            return join(row)
+            return sum(row, Model())
         color = tx.linear_color(_BOOK_COLORS[rng.integers(len(_BOOK_COLORS))]) / tx.linear_color("b0aca2")
         low, high = np.array([x, set_back, 0]), np.array([x + thick, set_back + deep, tall])
         row.append(box(low, high, colored_copy(cover, color), without="yzZ"))
@@ -74,20 +74,18 @@ def bookcase(
                 room = levels[k + 1] - thick - level
                 row = books(high - low - 0.004, depth - 0.03, room, seed + 16 * k + column, fill)
                 parts.append(row.moved((low + 0.002, -depth / 2 + 0.01, level)))
-    return join(parts)
+    return sum(parts, Model())
 
 
 def framed_picture(width: float, height: float, canvas: Material, frame: Material, border: float = 0.05) -> Model:
     """Make a picture whose back lies in the plane y = 0, its middle at the origin."""
     x, z, b = width / 2, height / 2, border
-    return join(
-        (
-            box((-x - b, -0.04, -z - b), (-x, 0, z + b), frame, 0.3),
-            box((x, -0.04, -z - b), (x + b, 0, z + b), frame, 0.3),
-            box((-x, -0.04, z), (x, 0, z + b), frame, 0.3),
-            box((-x, -0.04, -z - b), (x, 0, -z), frame, 0.3),
-            rectangle((-x, -0.015, -z), (width, 0, 0), (0, 0, height), canvas),
-        )
+    return (
+        box((-x - b, -0.04, -z - b), (-x, 0, z + b), frame, 0.3)
+        + box((x, -0.04, -z - b), (x + b, 0, z + b), frame, 0.3)
+        + box((-x, -0.04, z), (x, 0, z + b), frame, 0.3)
+        + box((-x, -0.04, -z - b), (x, 0, -z), frame, 0.3)
+        + rectangle((-x, -0.015, -z), (width, 0, 0), (0, 0, height), canvas)
     )
 
 
@@ -120,7 +118,7 @@ def wall(
         if reveal is not None:
             parts.append(box((x0, 0, z0), (x1, 0.15, z1), reveal, 0.5, without="yY").inside_out())
     piece(end, width, 0, height)
-    return join(parts)
+    return sum(parts, Model())
 
 
 def window(width: float, height: float, material: Material, columns: int = 2, rows: int = 2) -> Model:
@@ -133,7 +131,7 @@ def window(width: float, height: float, material: Material, columns: int = 2, ro
         box((bar, -0.4 * bar, z), (width - bar, 0.4 * bar, z + bar), material, without="xX")
         for z in np.linspace(0, height - bar, rows + 1)
     ]
-    return join(uprights + rails)
+    return sum(uprights + rails, Model())
 
 
 Placing = tuple[str, float, float, float]
@@ -171,20 +169,18 @@ def room(
     ]
     parts.append(rectangle((0, 0, 0), (wide, 0, 0), (0, deep, 0), *floor).moved((x0, y0, 0)))
     parts.append(rectangle((0, 0, 0), (wide, 0, 0), (0, -deep, 0), *ceiling).moved((x0, y1, height)))
-    return join(parts)
+    return sum(parts, Model())
 
 
 def skirting(low: tuple[float, float], high: tuple[float, float], material: Material, height: float = 0.1) -> Model:
     """Make boards along the foot of the walls of a room."""
     (x0, y0), (x1, y1) = low, high
     t = 0.02
-    return join(
-        (
-            box((x0, y1 - t, 0), (x1, y1, height), material, without="xXYz"),
-            box((x0, y0, 0), (x1, y0 + t, height), material, without="xXyz"),
-            box((x0, y0 + t, 0), (x0 + t, y1 - t, height), material, without="xyYz"),
-            box((x1 - t, y0 + t, 0), (x1, y1 - t, height), material, without="XyYz"),
-        )
+    return (
+        box((x0, y1 - t, 0), (x1, y1, height), material, without="xXYz")
+        + box((x0, y0, 0), (x1, y0 + t, height), material, without="xXyz")
+        + box((x0, y0 + t, 0), (x0 + t, y1 - t, height), material, without="xyYz")
+        + box((x1 - t, y0 + t, 0), (x1, y1 - t, height), material, without="XyYz")
     )
 
 

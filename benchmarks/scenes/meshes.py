@@ -6,7 +6,7 @@ Lengths are in meters and the z axis points up. Corners run counter-clockwise, s
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,11 +109,6 @@ class Model:
     def with_dropped(self, model: Model, x: float, y: float, turn_degrees: float = 0, below: float = np.inf) -> Model:
         """Put another model down at (x, y), on the highest surface lower than ``below``."""
         return self + model.standing().moved((x, y, self.height_under(x, y, below)), turn_degrees)
-
-
-def join(models: Iterable[Model]) -> Model:
-    """Return all parts of several models as one model."""
-    return Model(tuple(part for model in models for part in model.parts))
 
 
 def paint(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from benchmarks.scenes.meshes import Material, Model, Part, join, not_degenerate
+from benchmarks.scenes.meshes import Material, Model, Part, not_degenerate
 
 
 def rectangle(origin: ArrayLike, u: ArrayLike, v: ArrayLike, material: Material, tile: float | None = None) -> Model:
@@ -31,7 +31,7 @@ def box(low: ArrayLike, high: ArrayLike, material: Material, tile: float | None 
         "z": (low + y, x, -y),
         "Z": (high - x - y, x, y),
     }
-    return join(rectangle(*side, material, tile) for name, side in sides.items() if name not in without)
+    return sum((rectangle(*side, material, tile) for name, side in sides.items() if name not in without), Model())
 
 
 def revolved(profile: Sequence[tuple[float, float]], material: Material, tile: float = 0.5, sides: int = 48) -> Model:
