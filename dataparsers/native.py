@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from aenerf_ns.camera.intrinsics import CameraIntrinsics
-from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, Trajectory, homogeneous
+from aenerf_ns.camera.trajectory import OPENCV_TO_OPENGL, homogeneous
 from aenerf_ns.errors import DataError, value_errors_as_data_error
 from aenerf_ns.events.sensor import SensorModel, sensor_values, states_thresholds
 from aenerf_ns.files.event_hdf5 import Hdf5EventFile
@@ -52,16 +51,15 @@ class NativeDataParser(EventDataParser):
         if self.config.auto_scale_poses is None:
             self.config.auto_scale_poses = meta.auto_scale_poses
         true_poses = path.with_name("trajectory_ground_truth.txt")
-        trajectory = read_tum_trajectory(self.poses_path())
-        ground_truth = read_tum_trajectory(true_poses) if true_poses.exists() else None
-        return Recording(
+        recording = Recording(
             **vars(capture),
-            trajectory=trajectory,
-            reference_views=_read_views(path, meta, capture.frame_camera, trajectory, ground_truth),
+            trajectory=read_tum_trajectory(self.poses_path()),
+            reference_views={},
             scene_box=None if meta.scene_box is None else torch.tensor(meta.scene_box, dtype=torch.float64),
-            ground_truth=ground_truth,
+            ground_truth=read_tum_trajectory(true_poses) if true_poses.exists() else None,
             max_pose_gap=meta.max_pose_gap_ns,
         )
+        return replace(recording, reference_views=_read_views(path, meta, recording))
 
     def poses_path(self) -> Path:
         return self.data / f"trajectory_{self.config.poses.replace('-', '_')}.txt"
@@ -101,14 +99,12 @@ class NativeDataParser(EventDataParser):
             return SensorModel(**values)
 
 
-def _read_views(
-    path: Path, meta: Transforms, lens: CameraIntrinsics, trajectory: Trajectory, ground_truth: Trajectory | None
-) -> dict[Split, list[ReferenceView]]:
+def _read_views(path: Path, meta: Transforms, recording: Recording) -> dict[Split, list[ReferenceView]]:
     """Return the images of each split. A frame that has a time but no pose gets the reference trajectory's pose."""
-    reference = trajectory if ground_truth is None else ground_truth
+    truth = recording.ground_truth
     mount = torch.eye(4, dtype=torch.float64)
     if meta.event_camera.T_frame_event is not None or any(frame.transform_matrix is None for frame in meta.frames):
-        mount = frame_from_event(path, meta.event_camera, lens)
+        mount = frame_from_event(path, meta.event_camera, recording.frame_camera)
     # None for a frame that is left out.
     views: dict[str, ReferenceView | None] = {}
     for index, frame in enumerate(meta.frames):
@@ -123,10 +119,10 @@ def _read_views(
             pose = rigid_motion(path, f"{key}.transform_matrix", frame.transform_matrix) @ OPENCV_TO_OPENGL
         elif time is None:
             raise DataError(path, f"{key} has neither transform_matrix nor timestamp", "give one of them")
-        elif ground_truth is not None and not ground_truth.start <= time <= ground_truth.end:
+        elif truth is not None and not truth.start <= time <= truth.end:
             continue
         else:
-            pose = homogeneous(reference.interpolate(time)) @ torch.linalg.inv(mount)
+            pose = homogeneous(recording.reference_trajectory.interpolate(time)) @ torch.linalg.inv(mount)
         views[name] = ReferenceView(file, pose, time)
     num_lost = sum(view is None for view in views.values())
     if num_lost:
