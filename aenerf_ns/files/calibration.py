@@ -110,13 +110,9 @@ def require_no_names(path: Path, *names: str | None) -> None:
 
 def _as_file(message: dict[str, Any]) -> dict[str, Any]:
     """Return a message camera_info of ROS 1 or 2 with the names of the file."""
-    names = {"width": "image_width", "height": "image_height"}
-    names |= {name: name for name in ("distortion_model", "binning_x", "binning_y", "roi")}
-    matrices = {"k": "camera_matrix", "d": "distortion_coefficients"}
+    names = {"width": "image_width", "height": "image_height", "k": "camera_matrix", "d": "distortion_coefficients"}
     values = {name.lower(): value for name, value in message.items() if isinstance(name, str)}
-    return {names[name]: values[name] for name in names if name in values} | {
-        matrices[name]: {"data": values[name]} for name in matrices if name in values
-    }
+    return {names.get(name, name): {"data": value} if name in ("k", "d") else value for name, value in values.items()}
 
 
 def _camera_info(path: Path, content: dict[str, Any]) -> CameraIntrinsics:
