@@ -73,7 +73,7 @@ class EcdDataParser(EventDataParser):
 
 
 def _read_calibration(path: Path, size: tuple[int, int]) -> CameraIntrinsics:
-    rows = read_rows(path, "fx fy cx cy k1 k2 p1 p2 k3")
+    rows, _, _ = read_rows(path, "fx fy cx cy k1 k2 p1 p2 k3")
     if not rows:
         raise DataError(path, "the file is empty", "it must hold fx fy cx cy k1 k2 p1 p2 k3")
     values = parse_numbers(path, rows)[0].tolist()

@@ -6,7 +6,6 @@ import codecs
 import re
 from collections.abc import Sequence
 from decimal import Decimal
-from itertools import takewhile
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aenerf_ns.errors import DataError
-from aenerf_ns.files.limits import MAX_LINE, MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
+from aenerf_ns.files.limits import MAX_ROWS, MAX_TABLE_BYTES, MAX_TIME, bounded, require_at_most
 
 TimeUnit = Literal["ns", "us", "ms", "s"]
 NANOSECONDS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
@@ -24,8 +23,6 @@ TIME_NAME = re.compile(
     r"\W*(?:t|ts|time\w*?|stamp\w*?|secs?|seconds)(?:(?:\s*\[|_)(ns|us|ms|s)\b\]?)?(?!\w)", re.IGNORECASE
 )
 """The name of the column of times. It may state their unit, as timestamp [ns], t[us] and time_us do."""
-# The beginning of a row.
-_NUMBER = re.compile(r"\s*[-+.\d]")
 
 POSE_COLUMNS = "t tx ty tz qx qy qz qw"
 """The columns of a trajectory in the format of the TUM RGB-D benchmark."""
@@ -37,9 +34,12 @@ def require_utf8(path: Path, beginning: bytes) -> None:
         raise DataError(path, "it is text in UTF-16, or no text", "save it as UTF-8, or give a file of text")
 
 
-def read_rows(path: Path, columns: str) -> list[list[str]]:
+def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[str], TimeUnit | None]:
     """Read rows of fields between white space or commas. Leave out empty lines, comments after #, and a first line of
     names.
+
+    Returns:
+        The rows, the lines ahead of them in lower case, and the unit that these state of the times.
 
     Raises:
         DataError: the file is missing, cannot be read or has too many rows, or a row does not have the fields that
@@ -47,32 +47,28 @@ def read_rows(path: Path, columns: str) -> list[list[str]]:
     """
     expected = len(columns.split())
     rows: list[list[str]] = []
+    header: list[str] = []
     with bounded(path, "table of numbers"), path.open(encoding="utf-8-sig", errors="replace") as file:
         require_at_most(path, MAX_TABLE_BYTES)
         require_utf8(path, bytes(file.buffer.read(64)))
         file.seek(0)
         for number, line in enumerate(file, start=1):
-            line = line.split("#", 1)[0]
-            fields = line.split()
-            if "," in line and (len(fields) != expected or fields[0].endswith(",")):
-                fields = [field.strip() for field in line.rstrip().split(",")]
+            text = line.split("#", 1)[0]
+            fields = text.split()
+            if "," in text and (len(fields) != expected or fields[0].endswith(",")):
+                fields = [field.strip() for field in text.rstrip().split(",")]
             if not fields or (not rows and len(fields) == expected and TIME_NAME.match(fields[0])):
+                if not rows:
+                    header.append(line.lower())
                 continue
             if len(fields) != expected:
                 remedy = f"each line must hold the {expected}, between blanks or commas: {columns}"
-                raise DataError(path, f"line {number} has {len(fields)} fields: {line.rstrip()[:60]!r}", remedy)
+                raise DataError(path, f"line {number} has {len(fields)} fields: {text.rstrip()[:60]!r}", remedy)
             if len(rows) == MAX_ROWS:
                 raise DataError(path, f"it has more than {MAX_ROWS:,} rows", "cut the recording, or leave rows out")
             rows.append(fields)
-    return rows
-
-
-def read_header(path: Path) -> tuple[list[str], TimeUnit | None]:
-    """Return the lines ahead of the rows in lower case, and the unit that they state of the times."""
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        lines = takewhile(lambda line: not _NUMBER.match(line), iter(lambda: file.readline(MAX_LINE), ""))
-        header = [line.lower() for line in lines]
-    return header, next((name[1] for name in map(TIME_NAME.match, header) if name and name[1]), None)  # type: ignore
+    stated = next((name[1] for name in map(TIME_NAME.match, header) if name and name[1]), None)
+    return rows, header, stated  # type: ignore[return-value]
 
 
 def parse_numbers(path: Path, rows: list[list[str]]) -> NDArray[np.float64]:

@@ -20,7 +20,6 @@ from aenerf_ns.files.text import (
     format_seconds,
     parse_numbers,
     parse_times,
-    read_header,
     read_rows,
 )
 
@@ -38,10 +37,9 @@ def read_tum_trajectory(path: Path, unit: TimeUnit = "s") -> Trajectory:
         DataError: the file is missing, a value is not finite, a quaternion is not of unit length, or the times do
             not increase.
     """
-    rows = read_rows(path, POSE_COLUMNS)
+    rows, header, stated = read_rows(path, POSE_COLUMNS)
     if not rows:
         raise DataError(path, "the file holds no poses", "write one pose a line: t tx ty tz qx qy qz qw")
-    header, stated = read_header(path)
     times = parse_times(path, [row[0] for row in rows], stated or unit)
     values = parse_numbers(path, [row[1:] for row in rows])
     orders = [order for order in map(_quaternion_order, header) if sorted(order) in (sorted("wxyz"), sorted("0123"))]

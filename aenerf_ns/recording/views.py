@@ -16,7 +16,7 @@ from aenerf_ns.camera.time_window import TimeWindow
 from aenerf_ns.camera.trajectory import Trajectory, homogeneous
 from aenerf_ns.errors import DataError, reading
 from aenerf_ns.files.limits import file_inside, visible_files
-from aenerf_ns.files.text import UNIT_NAMES, TimeUnit, parse_times, read_header, read_rows
+from aenerf_ns.files.text import UNIT_NAMES, TimeUnit, parse_times, read_rows
 from aenerf_ns.recording.recording import ReferenceView, Split
 from aenerf_ns.recording.time_units import unit_steps
 
@@ -60,13 +60,13 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
     Raises:
         DataError: the list or an image is missing, or a line does not hold the two.
     """
-    rows = read_rows(path, "t file")
+    rows, _, stated = read_rows(path, "t file")
     files = [file_inside(path.parent, name, path) for _, name in rows]
     for file, (_, name) in zip(files, rows, strict=True):
         with reading(file):
             if not file.is_file():
                 raise DataError(path, f"it names {name}, which does not exist", "copy the images too")
-    times = parse_times(path, [row[0] for row in rows], read_header(path)[1] or "s").tolist()
+    times = parse_times(path, [row[0] for row in rows], stated or "s").tolist()
     return list(zip(times, files, strict=True))
 
 
@@ -84,7 +84,7 @@ def read_image_times(folder: Path, path: Path, unit: TimeUnit) -> list[tuple[int
     files = image_files(folder)
     if not files:
         return []
-    times = parse_times(path, [row[0] for row in read_rows(path, "t")], unit).tolist()
+    times = parse_times(path, [row[0] for row in read_rows(path, "t")[0]], unit).tolist()
     if len(files) != len(times):
         raise DataError(
             path, f"it has {len(times)} times for {len(files)} images", "copy all images and the list of their times"
