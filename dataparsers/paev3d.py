@@ -127,14 +127,10 @@ def _read_camera_pose(path: Path) -> Tensor:
             raise ValueError(f"it has {entry.file_size:,} bytes")
         read_npy_header(member)
         objects = [item for item in _ArrayUnpickler(member).load().values if isinstance(item, dict)]
-        pose = next((getattr(item.get("pose"), "values", None) for item in objects if _is_camera(item)), None)
+        camera = next((item for item in objects if item.get("name") == "Camera"), {})
+        pose = getattr(camera.get("pose"), "values", None)
         if not isinstance(pose, np.ndarray) or pose.shape != (4, 4) or pose.dtype.kind not in "iuf":
             raise ValueError("it holds no 'Camera' with a pose of 4 x 4 numbers")
         matrix = torch.from_numpy(pose.astype(np.float64))
     require_rigid(matrix[None], path)
     return matrix
-
-
-def _is_camera(item: dict) -> bool:
-    # Not by ==, which compares arrays value by value.
-    return isinstance(item.get("name"), str) and item["name"] == "Camera"
