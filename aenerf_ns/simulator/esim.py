@@ -136,20 +136,6 @@ def _frame_events(frames, times, references, thresholds, refractory_period, nois
     return table
 
 
-def _low_pass(
-    filtered: NDArray[np.float64],
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    time_constants: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return what a first-order filter that holds ``filtered`` holds after its input went linearly from start to end.
-
-    ``time_constants`` is the duration in units of the filter's time constant.
-    """
-    decay = np.expm1(-time_constants)
-    return end + (filtered - start) * (1 + decay) + (end - start) * decay / time_constants
-
-
 @numba.njit(cache=True)
 def _read_out(times, pixels, busy_until, waits_until, period):
     """Delay events by a readout that takes them one by one, in their order.
@@ -284,9 +270,12 @@ class EventSimulator:
             last_intensity, last_log, last_filtered, last_signal = self._last
             if self._bandwidth is not None:
                 light = ((last_intensity + intensity) / 2 + _DARK_RADIANCE) / (1 + _DARK_RADIANCE)
-                time_constants = 2e-9 * math.pi * self._bandwidth * light * (time_ns - self._time_ns)
                 self._sum_of_light += light.mean() * (time_ns - self._time_ns)
-                filtered = _low_pass(last_filtered, last_log, log_intensity, time_constants)
+                # What a first-order filter holds after its input went linearly from the last logarithm to this one, in
+                # so many of its time constants.
+                time_constants = 2e-9 * math.pi * self._bandwidth * light * (time_ns - self._time_ns)
+                decay, rise = np.expm1(-time_constants), log_intensity - last_log
+                filtered = log_intensity + (last_filtered - last_log) * (1 + decay) + rise * decay / time_constants
             signal = filtered + self._leak * (time_ns - self._start_ns)
             events = _frame_events(
                 (last_signal, signal),
