@@ -181,19 +181,15 @@ def pixel_errors(poses: Tensor, reference: Tensor, seconds: Tensor, camera: dict
         later = torch.searchsorted(seconds, seconds + (lag - 1e-6))
         first = (later < len(seconds)).nonzero()[:, 0]
         later = later[first]
-        expected, found = (_points_seen_later(points, source[first], source[later]) for source in (true, aligned))
+        # The points as seen from each of the first poses, in the frame of the later pose: (N, K, 3).
+        motions = (torch.linalg.inv(source[later]) @ source[first] for source in (true, aligned))
+        expected, found = (points @ motion[:, :3, :3].mT + motion[:, None, :3, 3] for motion in motions)
         offset = focal * (found[..., :2] / found[..., 2:] - expected[..., :2] / expected[..., 2:])
         in_front = torch.minimum(expected[..., 2], found[..., 2]) > 0.1 * depth
         in_picture = (focal * expected[..., :2] / expected[..., 2:]).abs() < half
         squares = offset[in_front & in_picture.all(-1)].square().sum(-1)
         errors[str(lag)] = float(squares.mean().sqrt()) if len(squares) else math.nan
     return errors
-
-
-def _points_seen_later(points: Tensor, poses: Tensor, later: Tensor) -> Tensor:
-    """Return points (K, 3), seen from each of (N, 4, 4) poses, as (N, K, 3) in the frames of later poses (N, 4, 4)."""
-    motion = torch.linalg.inv(later) @ poses
-    return points @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
 
 
 def _camera(data: Path) -> dict[str, float]:
