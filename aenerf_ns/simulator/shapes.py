@@ -107,12 +107,6 @@ def axes(right: ArrayLike, up: ArrayLike) -> Array:
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
-def vertical_rotation(degrees: float) -> Array:
-    """Return the world-from-local rotation (3, 3) about the vertical."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-
-
 ALONG_X = axes((0, 1, 0), (0, 0, 1))
 ALONG_Y = axes((0, 0, 1), (1, 0, 0))
 """Rotations that lay a cylinder along a world axis."""
@@ -134,7 +128,9 @@ def rotated_box(center: ArrayLike, size: ArrayLike, degrees: float, texture: str
         scale: side of one tile of the texture, in meters.
         rest: more attributes of the `Shape`.
     """
-    return Shape(partial(_box, np.asarray(size, float), scale), center, vertical_rotation(degrees), texture, **rest)
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    return Shape(partial(_box, np.asarray(size, float), scale), center, turn, texture, **rest)
 
 
 def sphere(center: ArrayLike, radius: float, texture: str, scale: float, **rest: Any) -> Shape:
