@@ -33,9 +33,12 @@ def check_contrast(result: CheckResult, warped: WarpedEvents, is_simple: bool) -
 
     ``is_simple`` says that a simpler problem was found, which may be the reason of all that this finds.
     """
-    still, alternatives = warped.compare_without_motion(), warped.compare_alternatives()
-    shuffled = warped.shuffled_contrasts()
     figures, problems = result.figures, result.problems
+    still = warped.compare_without_motion()
+    if still is None:
+        problems.append("the lens gives no direction to the pixels of nearly all events: check its distortion")
+        return False
+    alternatives, shuffled = warped.compare_alternatives(), warped.shuffled_contrasts()
     mean, deviation = float(shuffled.mean()), float(shuffled.std())
     num_slices, seconds = len(warped.spans), np.median([end - start for start, end in warped.spans]) * 1e-9
     figures.append(

@@ -393,6 +393,15 @@ def test_a_lens_of_another_size_is_no_wrong_axes(changes: dict, problems: list[s
     assert "as if" not in output.split("problem")[-1]
 
 
+def test_a_lens_that_ends_before_the_events_is_named(shorter: Path) -> None:
+    events = all_events(open_native(shorter))
+    rewrite(shorter, events[events.x < 12])
+    edit_json("transforms.json", lambda meta: meta["event_camera"].update(k1=-20.0))(shorter)
+    status, output = run(shorter)
+    assert status == 1
+    assert "the lens gives no direction to the pixels of nearly all events" in output
+
+
 def test_one_slice_gives_no_verdict(room: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(room, tmp_path / "room")
     rewrite(folder, all_events(open_native(folder))[:3500])

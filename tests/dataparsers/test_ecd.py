@@ -52,6 +52,18 @@ def test_ecd_text_reads(tmp_path: Path) -> None:
     assert len(parse(config, "test").image_filenames) == 1
 
 
+def test_names_of_images_hold_a_blank_or_a_hash(tmp_path: Path) -> None:
+    folder = write_ecd(tmp_path / "made")
+    config = EcdDataParserConfig(data=folder)
+    names = [name for _, name in (line.split() for line in (folder / "images.txt").read_text().splitlines())]
+    files = [f"view {k}#1.png" for k in range(len(names))]
+    for name, file in zip(names, files, strict=True):
+        (folder / name).rename(folder / file)
+    lines = [f"0.{k}5,{file}  # a view" for k, file in enumerate(files)]
+    (folder / "images.txt").write_text("# t,file\n" + "\n".join(lines))
+    assert [path.name for _, path in config.setup().read_capture()[1]] == files
+
+
 def test_ecd_text_may_be_given_other_poses(tmp_path: Path) -> None:
     folder = write_ecd(tmp_path / "made")
     truth = read_tum_trajectory(folder / "groundtruth.txt")
