@@ -90,7 +90,8 @@ def self_test(device: torch.device) -> None:
 
 @compiled
 def _cell(positions, i, scale, mask):
-    """Return a point's distances from the lower corner of its cell, and the indices of the 8 corners in the table.
+    """Return a point's distances from the lower corner of its cell and from the upper one, as x, y, z, u, v, w, and the
+    indices of the 8 corners in the table.
 
     The first axis changes fastest from corner to corner.
     """
@@ -105,7 +106,8 @@ def _cell(positions, i, scale, mask):
     a, b, c, d = x0 ^ y0, x1 ^ y0, x0 ^ y1, x1 ^ y1
     near = (a ^ z0) & mask, (b ^ z0) & mask, (c ^ z0) & mask, (d ^ z0) & mask
     far = (a ^ z1) & mask, (b ^ z1) & mask, (c ^ z1) & mask, (d ^ z1) & mask
-    return (x - low_x, y - low_y, z - low_z), near + far
+    x, y, z, unit = x - low_x, y - low_y, z - low_z, np.float32(1)
+    return (x, y, z, unit - x, unit - y, unit - z), near + far
 
 
 @compiled
@@ -132,9 +134,7 @@ def _corner_products(rows, indices, first, second):
 @compiled
 def _weights(offsets):
     """Return the trilinear weights of the corners."""
-    one = np.float32(1)
-    x, y, z = offsets
-    u, v, w = one - x, one - y, one - z
+    x, y, z, u, v, w = offsets
     a, b, c, d = u * v, x * v, u * y, x * y
     return a * w, b * w, c * w, d * w, a * z, b * z, c * z, d * z
 
@@ -142,9 +142,7 @@ def _weights(offsets):
 @compiled
 def _weight_rates(offsets, rates):
     """Return the derivatives of the corners' weights while the offsets move."""
-    one = np.float32(1)
-    x, y, z = offsets
-    u, v, w = one - x, one - y, one - z
+    x, y, z, u, v, w = offsets
     p, q, r = rates
     # Of the weights in the plane of the first two axes.
     ta, tb, tc, td = -p * v - q * u, p * v - q * x, q * u - p * y, p * y + q * x
@@ -162,9 +160,7 @@ def _value(weights, values):
 @compiled
 def _slopes(offsets, values):
     """Return the derivatives of the interpolated value along the axes."""
-    one = np.float32(1)
-    x, y, z = offsets
-    u, v, w = one - x, one - y, one - z
+    x, y, z, u, v, w = offsets
     a, b, c, d, e, f, g, h = values
     return (
         w * (v * (b - a) + y * (d - c)) + z * (v * (f - e) + y * (h - g)),
@@ -176,9 +172,7 @@ def _slopes(offsets, values):
 @compiled
 def _mixed_slopes(offsets, values):
     """Return the second derivatives along two axes: first and second, first and third, second and third."""
-    one = np.float32(1)
-    x, y, z = offsets
-    u, v, w = one - x, one - y, one - z
+    x, y, z, u, v, w = offsets
     a, b, c, d, e, f, g, h = values
     return (
         w * ((d - c) - (b - a)) + z * ((h - g) - (f - e)),
