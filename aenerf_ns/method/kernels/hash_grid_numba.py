@@ -182,23 +182,10 @@ def _mixed_slopes(offsets, values):
 
 
 @compiled
-def _add(rows, index, first, second):
-    rows[index, 0] += first
-    rows[index, 1] += second
-
-
-@compiled
 def _add_to_corners(rows, indices, weights, first, second):
-    a, b, c, d, e, f, g, h = indices
-    k, l, m, n, o, p, q, r = weights  # noqa: E741
-    _add(rows, a, k * first, k * second)
-    _add(rows, b, l * first, l * second)
-    _add(rows, c, m * first, m * second)
-    _add(rows, d, n * first, n * second)
-    _add(rows, e, o * first, o * second)
-    _add(rows, f, p * first, p * second)
-    _add(rows, g, q * first, q * second)
-    _add(rows, h, r * first, r * second)
+    for corner in range(8):
+        rows[indices[corner], 0] += weights[corner] * first
+        rows[indices[corner], 1] += weights[corner] * second
 
 
 @compiled
