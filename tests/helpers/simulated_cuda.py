@@ -52,36 +52,14 @@ _TAKE_INDICES = {aten.index.Tensor, aten.index_put_.default, aten.index_put.defa
 @cache
 def device() -> torch.device:
     """The simulated device. Asked for first, it is made known to torch for the rest of the process."""
-    from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+    from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-    _setup_privateuseone_for_python_backend("simulated", _Backend())
-    return torch.device("simulated", 0)
-
-
-class _Backend:
-    """Answer the questions that torch asks a kind of device."""
-
-    def is_initialized(self) -> bool:
-        return True
-
+    backend = _DummyBackendModule()
     # Otherwise it would become the default of data loaders and of other tests in this process.
-    def is_available(self) -> bool:
-        return False
-
-    def current_device(self) -> int:
-        return 0
-
-    def device_count(self) -> int:
-        return 1
-
-    def get_amp_supported_dtype(self) -> list[torch.dtype]:
-        return [torch.float16, torch.bfloat16]
-
-    def _is_in_bad_fork(self) -> bool:
-        return False
-
-    def manual_seed_all(self, seed: int) -> None:
-        pass
+    backend.is_available = lambda: False
+    backend.get_amp_supported_dtype = lambda: [torch.float16, torch.bfloat16]
+    _setup_privateuseone_for_python_backend("simulated", backend)
+    return torch.device("simulated", 0)
 
 
 class OnDevice(Tensor):
