@@ -24,7 +24,7 @@ from aenerf_ns.evaluation.poses import compare_with_ground_truth
 from aenerf_ns.evaluation.run import TrainedRun
 from aenerf_ns.evaluation.view_metrics import average_metrics, measure_reference_views
 from aenerf_ns.method.model import AENeRFModel
-from aenerf_ns.supervision.base import Batch, ChangeBatch
+from aenerf_ns.supervision.base import ChangeBatch
 from aenerf_ns.training.datamanager import EventDataManager
 from aenerf_ns.training.framework import mean_step_seconds, steps_of
 from aenerf_ns.training.preflight import provide_ffmpeg, require_camera_path
@@ -112,7 +112,10 @@ class AENeRFPipeline(VanillaPipeline):
         outputs = self._model(rays)
         metrics = {}
         if step_check(step, self._steps_per_log, run_at_zero=True):
-            metrics = self.model.get_metrics_dict(outputs, batch) | self._rate(batch)
+            metrics = self.model.get_metrics_dict(outputs, batch)
+            seconds = mean_step_seconds()
+            if seconds is not None and isinstance(batch, ChangeBatch):
+                metrics["pairs_per_second"] = comms.get_world_size() * len(batch) / seconds
             if step_check(step, _POSE_ERROR_INTERVAL, run_at_zero=True):
                 errors = compare_with_ground_truth(self.model.camera_optimizer, self.datamanager.train_dataset.scene)
                 if errors is not None:
@@ -120,13 +123,6 @@ class AENeRFPipeline(VanillaPipeline):
         losses = self.model.get_loss_dict(outputs, batch, metrics)
         self._unchecked_losses = losses
         return outputs, losses, metrics
-
-    def _rate(self, batch: Batch) -> dict[str, float]:
-        """Return ``pairs_per_second`` at the mean time of a step, where a batch holds pairs of times."""
-        seconds = mean_step_seconds()
-        if seconds is None or not isinstance(batch, ChangeBatch):
-            return {}
-        return {"pairs_per_second": comms.get_world_size() * len(batch) / seconds}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
