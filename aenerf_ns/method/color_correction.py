@@ -120,6 +120,7 @@ class AffineColorCorrection(nn.Module):
         self.scale.copy_(scale)
         self.offset.copy_(y_mean - scale * x_mean)
         self.num_views.fill_(num_views)
+        self._reset_rest()
 
     @torch.no_grad()
     def stretch(self, log_radiance: Tensor) -> None:
@@ -136,6 +137,10 @@ class AffineColorCorrection(nn.Module):
         self.scale.fill_(scale)
         self.offset.fill_(ends[0] - scale * low)
         self.num_views.zero_()
+        self._reset_rest()
+
+    def _reset_rest(self) -> None:
+        """Set what a protocol adds to the affine map so that it adds nothing."""
 
 
 class AffineTestColorCorrection(AffineColorCorrection):
@@ -183,7 +188,6 @@ class TranslatedGammaColorCorrection(AffineColorCorrection):
         The affine fit is the start. This takes milliseconds, so a rough fit is the same.
         """
         super().fit(log_radiance, reference, num_views)
-        self.black.fill_(_EPSILON)
         if len(reference) < 3:
             # Fewer pixels than unknowns.
             return
@@ -193,10 +197,7 @@ class TranslatedGammaColorCorrection(AffineColorCorrection):
             for buffer, value in zip((self.scale, self.offset, self.black), fitted.tolist(), strict=True):
                 buffer[channel] = value
 
-    @torch.no_grad()
-    def stretch(self, log_radiance: Tensor) -> None:
-        """Apply the percentile stretch, without reference images."""
-        super().stretch(log_radiance)
+    def _reset_rest(self) -> None:
         self.black.fill_(_EPSILON)
 
 
@@ -236,7 +237,7 @@ class NetworkColorCorrection(AffineColorCorrection):
             # Bounded, so that radiance outside the range of the reference views is not sent astray.
             layers += [skip_init(nn.Linear, num_inputs, num_outputs), nn.Tanh()]
         self.network = nn.Sequential(*layers[:-1]).requires_grad_(False)
-        self._reset_network()
+        self._reset_rest()
 
     def forward(self, log_radiance: Tensor) -> Tensor:
         """Return display values in [0, 1] (..., channels) for rendered log-radiance (..., channels)."""
@@ -256,7 +257,6 @@ class NetworkColorCorrection(AffineColorCorrection):
     def fit(self, log_radiance: Tensor, reference: Tensor, num_views: int, rough: bool = False) -> None:
         """Fit the affine map, then, unless ``rough``, the network to the error of display values left, by Adam."""
         super().fit(log_radiance, reference, num_views)
-        self._reset_network()
         if rough:
             return
         log_radiance = log_radiance.detach()
@@ -274,13 +274,7 @@ class NetworkColorCorrection(AffineColorCorrection):
                 optimizer.zero_grad()
         self.network.requires_grad_(False)
 
-    @torch.no_grad()
-    def stretch(self, log_radiance: Tensor) -> None:
-        """Apply the percentile stretch alone, without reference images."""
-        super().stretch(log_radiance)
-        self._reset_network()
-
-    def _reset_network(self) -> None:
+    def _reset_rest(self) -> None:
         """Set the output to zero, which leaves the affine map, and the hidden layers to always the same weights."""
         # With a generator of its own: the choice of the protocol must not change the numbers that training draws.
         generator = torch.Generator().manual_seed(0)
