@@ -288,6 +288,8 @@ def _with_poses(
     from aenerf_ns.recording.views import MAX_VIEWS, views_on_trajectory
 
     trajectory, report = found.trajectory, found.report()
+    # In place of what a dataset has: its scene box is in the world of its own poses, and its longest gap about these.
+    new: dict[str, Any] = {"trajectory": trajectory, "scene_box": found.scene_box, "max_pose_gap": found.max_pose_gap()}
     if capture.intrinsics_origin == "guessed":
         if capture.frame_camera == capture.event_camera:
             capture = replace(capture, frame_camera=found.camera)
@@ -313,14 +315,7 @@ def _with_poses(
                 f"Compared with the given poses, which are kept as ground truth: mean errors "
                 f"{errors['rotation_error_degrees']:.2f} degrees and {errors['translation_error']:.2g} of their units."
             )
-            # The dataset's scene box is in the world of the given poses, and its longest gap is about these poses.
-            recording = replace(
-                capture,
-                trajectory=trajectory,
-                ground_truth=truth,
-                scene_box=found.scene_box,
-                max_pose_gap=found.max_pose_gap(),
-            )
+            recording = replace(capture, ground_truth=truth, **new)
             return recording, report, found.draw and found.draw(paths)
         say(
             f"The given poses, from {truth.start} to {truth.end} ns, are of another time than the estimated ones, from "
@@ -328,12 +323,6 @@ def _with_poses(
         )
     placed = [(time, file) for time, file in images if trajectory.start <= time <= trajectory.end]
     views = views_on_trajectory(placed, trajectory)
-    recording = Recording(
-        **{field.name: getattr(capture, field.name) for field in fields(Capture)},
-        trajectory=trajectory,
-        scene_box=found.scene_box,
-        max_pose_gap=found.max_pose_gap(),
-        reference_views=views,
-        max_views=MAX_VIEWS,
-    )
+    camera = {field.name: getattr(capture, field.name) for field in fields(Capture)}
+    recording = Recording(**camera, **new, reference_views=views, max_views=MAX_VIEWS)
     return recording, report, found.draw and found.draw(paths)
