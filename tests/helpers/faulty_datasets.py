@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from helpers.dataset_faults import (
     replace_line,
     saved_as,
     set_attribute,
+    set_in,
     write_bytes,
     write_text,
 )
@@ -32,8 +33,7 @@ DTYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 MIRRORED, SCALED = np.diag([1.0, 1, -1, 1]).tolist(), np.diag([2.0, 2, 2, 1]).tolist()
 
 
-def native(edit: Callable[[dict], object]) -> Change:
-    return edit_json("transforms.json", edit)
+native = partial(edit_json, "transforms.json")
 
 
 def top(**values: object) -> Change:
@@ -85,8 +85,7 @@ _NATIVE_FAULTS: dict[str, Fault] = {
 }
 
 
-def pose(line: str) -> Change:
-    return replace_line("groundtruth.txt", 2, line)
+pose = partial(replace_line, "groundtruth.txt", 2)
 
 
 def image_times(ticks: int) -> Change:
@@ -121,10 +120,6 @@ _ECD_FAULTS: dict[str, Fault] = {
 CALIBRATION, POSES, VIEWS = "camera_calibration.npz", "camera_poses.npz", "views/transforms_val.json"
 
 
-def views(edit: Callable[[dict], object]) -> Change:
-    return edit_json(VIEWS, edit)
-
-
 _ROBUST_FAULTS: dict[str, Fault] = {
     "no intrinsics": (edit_npz(CALIBRATION, intrinsics=None), CALIBRATION, "no array intrinsics"),
     "flat intrinsics": (edit_npz(CALIBRATION, intrinsics=np.ones(9)), CALIBRATION, "intrinsics: expected `array`"),
@@ -134,21 +129,17 @@ _ROBUST_FAULTS: dict[str, Fault] = {
     "decimal times": (edit_npz(POSES, T_wc_timestamp=np.zeros(N_POSES)), POSES, "T_wc_timestamp has type float64"),
     "fewer times": (edit_npz(POSES, T_wc_timestamp=np.arange(3)), POSES, "T_wc_position has type float64 and shape"),
     "no image": (remove("views/val/r_1.png"), VIEWS, "frames[1] names ./val/r_1"),
-    "no angle": (views(lambda m: m.pop("camera_angle_x")), VIEWS, "neither camera_angle_x nor intrinsics"),
-    "angle is 0": (views(lambda m: m.update(camera_angle_x=0)), VIEWS, "camera_angle_x"),
-    "other angle": (views(lambda m: m.update(camera_angle_x=1)), "transforms_test.json", "that of the other split"),
+    "no angle": (edit_json(VIEWS, lambda m: m.pop("camera_angle_x")), VIEWS, "neither camera_angle_x nor intrinsics"),
+    "angle is 0": (set_in(VIEWS, "camera_angle_x", value=0), VIEWS, "camera_angle_x"),
+    "other angle": (set_in(VIEWS, "camera_angle_x", value=1), "transforms_test.json", "that of the other split"),
 }
 
-CAMERAS, MOCAP, TRUTH = "camera-calibrationA.json", "mocap-imu-calibrationA.json", "mocap-desk2-vi_gt_data"
-
-
-def tum_cameras(edit: Callable[[dict], object]) -> Change:
-    return edit_json(CAMERAS, lambda meta: edit(meta["value0"]))
+CAMERAS, TRUTH = "camera-calibrationA.json", "mocap-desk2-vi_gt_data"
 
 
 _TUM_VIE_FAULTS: dict[str, Fault] = {
     "no calibration": (remove("camera-*"), CAMERAS, "no such file"),
-    "pinhole": (tum_cameras(lambda m: m["intrinsics"][2].update(camera_type="ds")), CAMERAS, "[2].camera_type"),
+    "pinhole": (set_in(CAMERAS, "value0", "intrinsics", 2, "camera_type", value="ds"), CAMERAS, "[2].camera_type"),
     "a word": (replace_line(f"{TRUTH}/mocap_data.txt", 1, "early 0 0 0 0 0 0 1"), "mocap_data.txt", "in microseconds"),
     "lost image": (remove(f"{TRUTH}/left_images/00001.jpg"), "image_timestamps_left.txt", "3 times for 2 images"),
 }

@@ -7,6 +7,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -47,16 +48,9 @@ def camera(**values: object) -> Change:
     return edit_json("transforms.json", lambda meta: meta["event_camera"].update(values))
 
 
-def poses(content: str) -> Change:
-    return write_text("trajectory_estimated.txt", content)
-
-
-def robust_poses(**arrays: object) -> Change:
-    return edit_npz("camera_poses.npz", **arrays)
-
-
-def robust_events(**arrays: object) -> Change:
-    return edit_npz("raw_events.npz", **arrays)
+poses = partial(write_text, "trajectory_estimated.txt")
+robust_poses = partial(edit_npz, "camera_poses.npz")
+robust_events = partial(edit_npz, "raw_events.npz")
 
 
 def view(path: str) -> Change:
