@@ -140,13 +140,11 @@ def _fill_features(positions, tangents, table, scales, out, rates, num_points, s
     scale = tl.load(scales + level)
     x, y, z = _load_vectors(positions, point, inside)
     low_x, low_y, low_z, x, y, z = _cell(x, y, z, scale)
-    first = tl.zeros([block], tl.float32)
-    second = tl.zeros([block], tl.float32)
+    first, second = 0.0, 0.0
     if tangents is not None:
         p, q, r = _load_vectors(tangents, point, inside)
         p, q, r = p * scale, q * scale, r * scale
-        first_rate = tl.zeros([block], tl.float32)
-        second_rate = tl.zeros([block], tl.float32)
+        first_rate, second_rate = 0.0, 0.0
     for corner in tl.static_range(8):
         index, wx, wy, wz, sx, sy, sz = _corner(low_x, low_y, low_z, x, y, z, size - 1, corner)
         a, b = _load_features(table + 2 * level * size, index, inside)
@@ -180,13 +178,9 @@ def _add_gradients(
         p, q, r = p * scale, q * scale, r * scale
         first_rate, second_rate = _load_features(grad_rates, level * num_points + point, inside)
     if to_positions is not None:
-        gx = tl.zeros([block], tl.float32)
-        gy = tl.zeros([block], tl.float32)
-        gz = tl.zeros([block], tl.float32)
+        gx, gy, gz = 0.0, 0.0, 0.0
         if tangents is not None:
-            hx = tl.zeros([block], tl.float32)
-            hy = tl.zeros([block], tl.float32)
-            hz = tl.zeros([block], tl.float32)
+            hx, hy, hz = 0.0, 0.0, 0.0
     for corner in tl.static_range(8):
         index, wx, wy, wz, sx, sy, sz = _corner(low_x, low_y, low_z, x, y, z, size - 1, corner)
         weight = wx * wy * wz
